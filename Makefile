@@ -1,0 +1,65 @@
+# make [demo|test|lint|types|bench|clean]; each sets up what it needs in .venv first.
+# PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
+
+SHELL := /bin/sh
+.SHELLFLAGS := -ec
+.ONESHELL:
+.PHONY: demo test lint types bench clean
+
+PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
+	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
+PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
+BIN := .venv/bin
+READY := .venv/.ready
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+demo: $(READY)
+	@$(BIN)/mirrorskin demo -o demo
+
+test: lint types
+	@$(BIN)/python -m pytest
+
+lint: $(READY)
+	@$(BIN)/ruff check --quiet
+	$(BIN)/ruff format --check --quiet
+
+# From tests: at the top, mypy takes our io for the standard library's.
+types: $(READY)
+	@cd tests
+	../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml $(PACKAGES:%=-p mirrorskin.%)
+
+bench: $(READY)
+	@$(BIN)/mirrorskin bench
+
+clean:
+	@rm -rf .venv build dist *.egg-info .hypothesis .import_linter_cache
+	find . -name .git -prune -o -type d \( -name __pycache__ -o -name '.*_cache' \) -prune -exec rm -rf {} +
+
+# The stamp is written last, so a half-made environment never passes for done.
+$(READY): pyproject.toml
+	@trap '[ $$? = 0 ] || rm -rf .venv' EXIT
+	# The interpreter below any active environment, which may be the one that is rebuilt here.
+	python=$$("$(PYTHON)" -c 'import sys; assert sys.version_info >= (3, 11); print(sys._base_executable)' \
+	    2>/dev/null) || {
+	    echo 'make: Python 3.11 or newer is needed; install it, or name it: make PYTHON=/path/to/python3' >&2
+	    exit 1
+	}
+	rm -rf .venv
+	echo 'setting up .venv (once, a minute or two)'
+	if "$$python" -c 'import ensurepip, venv' 2>/dev/null; then "$$python" -m venv .venv
+	elif command -v uv >/dev/null; then uv venv --quiet --seed --python "$$python" .venv
+	elif command -v virtualenv >/dev/null; then virtualenv --quiet --python "$$python" .venv
+	else
+	    echo "make: $$python cannot make environments; install Debian's python3-venv, or uv, or virtualenv" >&2
+	    exit 1
+	fi
+	$(PIP) install --editable '.[dev]'
+	$(BIN)/python -P -c 'from mirrorskin.kernels import pocl; pocl.verify()' 2>/dev/null || {
+	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'
+	    $(PIP) install --editable '.[linker]'
+	}
+	# mypy and editors do not follow an editable install; they do follow links.
+	site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+	mkdir -p "$$site/mirrorskin"
+	for package in $(PACKAGES); do ln -sfn "$$PWD/$$package" "$$site/mirrorskin/$$package"; done
+	touch $@
