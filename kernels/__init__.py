@@ -1,0 +1,1 @@
+"""OpenCL: the devices, and each kernel beside its NumPy reference."""

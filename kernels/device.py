@@ -1,0 +1,421 @@
+"""The device layer: choose a device, compile for it, hold arrays on it, run kernels.
+
+It knows no algorithm. Nothing here touches OpenCL before the first call.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import re
+import threading
+import time
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Literal
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import DTypeLike, NDArray
+
+from mirrorskin.kernels import pocl
+from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
+from mirrorskin.kernels.profile import Profile
+
+DeviceKind = Literal["gpu", "cpu", "other"]
+
+_log = logging.getLogger("mirrorskin.kernels")
+_PAGE = 4096
+_INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
+_NO_ROOM = {
+    cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
+    cl.status_code.OUT_OF_HOST_MEMORY,
+    cl.status_code.OUT_OF_RESOURCES,
+    cl.status_code.INVALID_BUFFER_SIZE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """What can be told of a device without opening it.
+
+    Attributes
+    ----------
+    name, platform, driver : str
+    kind : {"gpu", "cpu", "other"}
+    compute_units : int
+    memory, max_allocation : int
+        Bytes in all, and in one buffer.
+    shares_memory : bool
+        Whether it works in the host's own memory.
+    float64 : bool
+        Whether it has double precision.
+    """
+
+    name: str
+    platform: str
+    driver: str
+    kind: DeviceKind
+    compute_units: int
+    memory: int
+    max_allocation: int
+    shares_memory: bool
+    float64: bool
+
+    @property
+    def title(self) -> str:
+        """Platform and name, as ``--device`` understands them."""
+        return f"{self.platform}: {self.name}"
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return what OpenCL offers on this machine, in the order that ``open_device`` numbers it."""
+    return [_describe(device) for device in _find()]
+
+
+def open_device(choice: str | Device | None = None) -> Device:
+    """Open a device; the same choice gives the same object, with what it has compiled.
+
+    Parameters
+    ----------
+    choice : str, Device or None
+        A number of ``list_devices``, ``"gpu"``, ``"cpu"``, or a part of the platform's and device's
+        names. None takes what ``PYOPENCL_CTX`` names, else the first GPU, else the first CPU.
+
+    Raises
+    ------
+    UnknownDeviceError
+        No device, or more than one, answers to the name.
+    DeviceError
+        There is no OpenCL device at all, or it cannot run a kernel.
+    """
+    if isinstance(choice, Device):
+        return choice
+    return _open(_choose(choice))
+
+
+class Device:
+    """An open device: its context and queue, its compiled programs, its profile.
+
+    Attributes
+    ----------
+    info : DeviceInfo
+    context, queue
+        The OpenCL objects.
+    profile : Profile
+        What was run on it so far.
+    max_allocation : int
+        Bytes that one array may take.
+    tile : int
+        Pixels that one work-item should handle: many where an item is a core's loop, one where it is
+        a lane.
+    """
+
+    def __init__(self, device: cl.Device) -> None:
+        self.info = _describe(device)
+        if _is_pocl(device):
+            pocl.verify()
+        self.profile = Profile()
+        self.max_allocation = self.info.max_allocation
+        self.tile = 1024 if self.info.kind == "cpu" else 1
+        self._group = 1 if self.info.kind == "cpu" else 128
+        self.context = cl.Context([device])
+        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._lock = threading.Lock()
+        self._kernels = _ThreadKernels()
+        _log.info("using %s (driver %s)", self.info.title, self.info.driver)
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
+        """Make room for an array on the device.
+
+        Parameters
+        ----------
+        name : str
+            What the profile calls it.
+        shape : tuple of int
+        dtype : dtype
+
+        Raises
+        ------
+        DeviceMemoryError
+            It does not fit; a smaller one may.
+        """
+        return Array(self, name, shape, np.dtype(dtype))
+
+    def kernel(self, file: str, name: str, **defines: str | int) -> Kernel:
+        """Return a kernel of ``file.cl``, compiled once for each set of defines.
+
+        Parameters
+        ----------
+        file, name : str
+            The file in ``mirrorskin.kernels`` without its ending, and the function in it.
+        **defines : str or int
+            Macros to set; ``TILE`` is always set to the device's.
+
+        Raises
+        ------
+        DeviceError
+            It does not compile; the message quotes the line.
+        """
+        options = tuple(f"-D{key}={value}" for key, value in sorted({"TILE": self.tile, **defines}.items()))
+        made, key = self._kernels.made, (file, name, options)
+        if key not in made:
+            made[key] = Kernel(self, name, cl.Kernel(self._program(file, options), name))
+        return made[key]
+
+    def finish(self) -> None:
+        """Wait until everything given to the device is done."""
+        self.queue.finish()
+
+    def _program(self, file: str, options: tuple[str, ...]) -> cl.Program:
+        with self._lock:
+            if (file, options) not in self._programs:
+                self._programs[file, options] = self._build(file, options)
+            return self._programs[file, options]
+
+    def _build(self, file: str, options: tuple[str, ...]) -> cl.Program:
+        source = resources.files("mirrorskin.kernels").joinpath(f"{file}.cl").read_text(encoding="utf-8")
+        start = time.perf_counter()
+        try:
+            program: cl.Program = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options])
+        except cl.RuntimeError as error:
+            raise DeviceError(_explain_build(f"{file}.cl", source, str(error), self.info)) from error
+        self.profile.add("compile", file, time.perf_counter() - start)
+        return program
+
+
+class Array:
+    """An array that host and device both see: one memory where they share it, a copy each otherwise.
+
+    The host writes it at first; ``upload`` hands it to the device and ``download`` brings it back, which
+    moves nothing on a device that shares the host's memory.
+    """
+
+    def __init__(self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.name = name
+        self._device = device
+        self._shared = device.info.shares_memory
+        self._mapped: cl.MemoryMap | None = None
+        self._buffer: cl.Buffer | None = None
+        nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+        if nbytes > device.max_allocation:
+            raise DeviceMemoryError(_no_room(device, name, nbytes))
+        try:
+            self.host = _aligned(shape, dtype)
+        except MemoryError as error:
+            raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
+        self._allocate()
+        self.claim()
+
+    def claim(self) -> None:
+        """Let the host write anew, whatever the device holds."""
+        if self._shared and self._mapped is None:
+            view, _ = cl.enqueue_map_buffer(
+                self._device.queue,
+                self.buffer,
+                cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
+                0,
+                self.host.shape,
+                self.host.dtype,
+                is_blocking=True,
+            )
+            self._mapped = view.base
+
+    def upload(self, rows: int | None = None) -> None:
+        """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
+        if self._buffer is None:
+            self._allocate()
+        if not self._shared:
+            part = self.host[:rows]
+            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
+            self._device.profile.watch("upload", self.name, event, part.nbytes)
+
+    def download(self) -> NDArray[Any]:
+        """Wait for the device and return what it wrote, in the host's array."""
+        if self._shared:
+            self.claim()
+        else:
+            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
+            self._device.profile.watch("download", self.name, event, self.host.nbytes)
+        return self.host
+
+    def park(self) -> None:
+        """Make room on the device: keep the content on the host until the next upload."""
+        if not self._shared and self._buffer is not None:
+            self.download()
+            self.drop()
+
+    def drop(self) -> None:
+        """Make room on the device, and forget what the device held."""
+        if not self._shared and self._buffer is not None:
+            self._buffer.release()
+            self._buffer = None
+
+    @property
+    def buffer(self) -> cl.Buffer:
+        """The device's side, for kernels; the host must not write while they run."""
+        if self._buffer is None:
+            raise RuntimeError(f"{self.name} is parked: upload it first")
+        if self._mapped is not None:
+            self._mapped.release()
+            self._mapped = None
+        return self._buffer
+
+    def _allocate(self) -> None:
+        flags = cl.mem_flags.READ_WRITE
+        try:
+            if self._shared:
+                self._buffer = cl.Buffer(
+                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self.host
+                )
+            else:
+                self._buffer = cl.Buffer(self._device.context, flags, size=self.host.nbytes)
+                # Drivers allocate at first use; asking for it here makes a lack of memory show here.
+                undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
+                cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
+        except cl.Error as error:
+            if error.code not in _NO_ROOM:
+                raise
+            raise DeviceMemoryError(_no_room(self._device, self.name, self.host.nbytes)) from error
+
+
+class Kernel:
+    """A compiled kernel, ready to run over so many items."""
+
+    def __init__(self, device: Device, name: str, kernel: cl.Kernel) -> None:
+        self.name = name
+        self._device = device
+        self._kernel = kernel
+
+    def __call__(self, items: int, *args: Array | np.generic, moved: int) -> None:
+        """Put one run on the device's queue.
+
+        Parameters
+        ----------
+        items : int
+            Work-items needed; more may start, so the kernel checks its bounds.
+        *args : Array or NumPy scalar
+            The kernel's arguments in order; arrays belong to the device by now.
+        moved : int
+            Bytes that it must read and write, for the profile.
+        """
+        group = self._device._group
+        size = -(-items // group) * group
+        values = [arg.buffer if isinstance(arg, Array) else arg for arg in args]
+        event = self._kernel(self._device.queue, (size,), (group,), *values)
+        self._device.profile.watch("kernel", self.name, event, moved)
+
+
+class _ThreadKernels(threading.local):
+    """Each thread's own kernel objects: setting the arguments of one is not thread-safe."""
+
+    def __init__(self) -> None:
+        self.made: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
+
+
+def _find() -> list[cl.Device]:
+    pocl.prepare()
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader's way to say that there is none
+        return []
+    return [device for platform in platforms for device in _devices_of(platform)]
+
+
+def _devices_of(platform: cl.Platform) -> list[cl.Device]:
+    try:
+        return platform.get_devices()
+    except cl.RuntimeError:  # a driver without its hardware
+        return []
+
+
+def _describe(device: cl.Device) -> DeviceInfo:
+    kind: DeviceKind = "other"
+    if device.type & cl.device_type.GPU:
+        kind = "gpu"
+    elif device.type & cl.device_type.CPU:
+        kind = "cpu"
+    return DeviceInfo(
+        name=device.name.strip(),
+        platform=device.platform.name.strip(),
+        driver=device.driver_version,
+        kind=kind,
+        compute_units=device.max_compute_units,
+        memory=device.global_mem_size,
+        max_allocation=device.max_mem_alloc_size,
+        shares_memory=bool(device.host_unified_memory),
+        float64="cl_khr_fp64" in device.extensions,
+    )
+
+
+def _is_pocl(device: cl.Device) -> bool:
+    return "Portable Computing Language" in device.platform.name
+
+
+def _choose(choice: str | None) -> cl.Device:
+    devices = _find()
+    if not devices:
+        reason = pocl.why_no_device()
+        raise DeviceError(f"no OpenCL device found: {reason or _INSTALL}")
+    if choice is None:
+        return _default(devices)
+    matches = _matching(choice, devices)
+    if len(matches) != 1:
+        known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
+        problem = "no such device" if not matches else "more than one device answers to that"
+        raise UnknownDeviceError(f"device {choice!r}: {problem}; there is {known}")
+    return matches[0]
+
+
+def _matching(choice: str, devices: list[cl.Device]) -> list[cl.Device]:
+    if choice.isdecimal():
+        return devices[int(choice) : int(choice) + 1]
+    wanted = choice.casefold().strip()
+    if wanted in ("gpu", "cpu"):
+        return [device for device in devices if _describe(device).kind == wanted][:1]
+    return [device for device in devices if wanted and wanted in _describe(device).title.casefold()]
+
+
+def _default(devices: list[cl.Device]) -> cl.Device:
+    if "PYOPENCL_CTX" in os.environ:
+        try:
+            return cl.create_some_context(interactive=False).devices[0]
+        except (cl.Error, RuntimeError, ValueError, IndexError) as error:
+            named = os.environ["PYOPENCL_CTX"]
+            raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} names no device: {error}") from error
+    ranks = {"gpu": 0, "cpu": 1, "other": 2}
+    return min(devices, key=lambda device: ranks[_describe(device).kind])
+
+
+@functools.cache
+def _open(device: cl.Device) -> Device:
+    return Device(device)
+
+
+def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Zeros that start on a page, so that a device sharing the memory need not copy them."""
+    nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    raw = np.zeros(nbytes + _PAGE, np.uint8)
+    start = -raw.ctypes.data % _PAGE
+    return raw[start : start + nbytes].view(dtype).reshape(shape)
+
+
+def _no_room(device: Device, name: str, nbytes: int) -> str:
+    return (
+        f"{device.info.title} has no room for {name} ({nbytes / 1e6:.1f} MB; "
+        f"one buffer holds at most {device.max_allocation / 1e6:.1f} MB)"
+    )
+
+
+def _explain_build(file: str, source: str, log: str, info: DeviceInfo) -> str:
+    """Quote the first line that a compiler complains of, in one line."""
+    found = re.search(r":(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
+    if found is None:
+        errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
+        return f"{file} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
+    number, message = int(found[1]), found[3].strip()
+    lines = source.splitlines()
+    quoted = f" `{lines[number - 1].strip()}`" if 0 < number <= len(lines) else ""
+    return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"

@@ -1,0 +1,88 @@
+"""What was done on a device, how long it took and how many bytes it moved."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Literal
+
+import pyopencl as cl
+
+Kind = Literal["compile", "upload", "kernel", "download"]
+
+_PENDING_LIMIT = 1024  # events held before they are read, so that an endless run stays bounded
+
+
+@dataclass(slots=True)
+class Record:
+    """All runs of one piece of work.
+
+    Attributes
+    ----------
+    kind : {"compile", "upload", "kernel", "download"}
+    name : str
+        Kernel, program or array.
+    runs : int
+    seconds, fastest : float
+        Of all runs together, and of the fastest one.
+    bytes : int
+        Moved between device memory and the work, all runs together.
+    """
+
+    kind: Kind
+    name: str
+    runs: int = 0
+    seconds: float = 0.0
+    fastest: float = float("inf")
+    bytes: int = 0
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second over all runs; 0 where no time was taken."""
+        return self.bytes / self.seconds if self.seconds > 0 else 0.0
+
+
+class Profile:
+    """The records of a device, told apart by kind and name."""
+
+    def __init__(self) -> None:
+        self._records: dict[tuple[Kind, str], Record] = {}
+        self._pending: list[tuple[Kind, str, cl.Event, int]] = []
+        self._lock = threading.Lock()
+
+    def add(self, kind: Kind, name: str, seconds: float, nbytes: int = 0) -> None:
+        """Count one run that took ``seconds``."""
+        with self._lock:
+            self._add(kind, name, seconds, nbytes)
+
+    def watch(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
+        """Count the run that ``event`` ends, once it is over."""
+        with self._lock:
+            self._pending.append((kind, name, event, nbytes))
+            if len(self._pending) >= _PENDING_LIMIT:
+                self._settle()
+
+    def records(self) -> list[Record]:
+        """Wait for what is under way and return all records, longest first."""
+        with self._lock:
+            self._settle()
+            return sorted(self._records.values(), key=lambda record: -record.seconds)
+
+    def clear(self) -> None:
+        """Forget everything so far."""
+        with self._lock:
+            self._settle()
+            self._records.clear()
+
+    def _settle(self) -> None:
+        for kind, name, event, nbytes in self._pending:
+            event.wait()
+            self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
+        self._pending.clear()
+
+    def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
+        record = self._records.setdefault((kind, name), Record(kind, name))
+        record.runs += 1
+        record.seconds += seconds
+        record.fastest = min(record.fastest, seconds)
+        record.bytes += nbytes

@@ -1,0 +1,40 @@
+"""The devices that the tests run on: every one that OpenCL finds, in every way of holding memory."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels.device import Device, list_devices
+
+FOUND = list_devices()
+if not FOUND:
+    raise RuntimeError("no OpenCL device found: the tests need one; 'make test' brings PoCL")
+
+# A device that shares the host's memory can also be treated as one that does not.
+WAYS = [
+    (number, shared)
+    for number, info in enumerate(FOUND)
+    for shared in ([True, False] if info.shares_memory else [False])
+]
+
+
+@pytest.fixture(
+    scope="session", params=WAYS, ids=[f"{FOUND[n].kind}{n}-{'shared' if s else 'copied'}" for n, s in WAYS]
+)
+def device(request):
+    """Every OpenCL device, and each that shares the host's memory once more with copies."""
+    number, shared = request.param
+    opened = Device(device_layer._find()[number])
+    opened.info = dataclasses.replace(opened.info, shares_memory=shared)
+    return opened
+
+
+@pytest.fixture
+def small_device(device):
+    """The device with a limit to its buffers that a test may set."""
+    limit = device.max_allocation
+    yield device
+    device.max_allocation = limit

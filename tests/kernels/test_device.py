@@ -1,0 +1,160 @@
+"""The device layer: the choice, arrays in both kinds of memory, builds that fail, profiles."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels import limits, pocl
+from mirrorskin.kernels.device import list_devices, open_device
+from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
+
+
+def test_the_same_choice_is_the_same_device():
+    assert open_device("0") is open_device(list_devices()[0].title)
+    assert open_device(open_device()) is open_device()
+
+
+def test_a_device_is_chosen_by_part_of_its_name_in_any_case():
+    info = list_devices()[0]
+    assert open_device(info.title.upper()).info == info
+    assert open_device(info.kind).info.kind == info.kind
+
+
+@pytest.mark.parametrize("name", ["99", "no such thing", ""])
+def test_an_unknown_device_is_refused_and_the_known_ones_are_listed(name):
+    with pytest.raises(UnknownDeviceError, match="no such device") as caught:
+        open_device(name)
+    assert list_devices()[0].name in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_the_environment_may_choose(monkeypatch):
+    monkeypatch.setenv("PYOPENCL_CTX", "0:0")
+    assert open_device().info == list_devices()[0]
+    monkeypatch.setenv("PYOPENCL_CTX", "99")
+    with pytest.raises(UnknownDeviceError, match="PYOPENCL_CTX='99' names no device"):
+        open_device()
+
+
+def test_without_any_device_the_remedy_is_named(monkeypatch):
+    monkeypatch.setattr(device_layer, "_find", list)
+    monkeypatch.setattr(pocl, "why_no_device", lambda: None)
+    with pytest.raises(DeviceError, match="no OpenCL device found: install"):
+        open_device()
+
+
+def test_a_kernel_that_does_not_compile_is_quoted(device):
+    with pytest.raises(DeviceError, match=r"limits.cl line \d+ does not compile") as caught:
+        device.kernel("limits", "read_all", get_global_id="1")
+    assert "\n" not in str(caught.value)
+    assert "`const int base = get_global_id(0) * WORDS;`" in str(caught.value)
+
+
+def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
+    mine = device.kernel("limits", "copy_all")
+    assert device.kernel("limits", "copy_all") is mine
+    device.profile.clear()
+    others = []
+    thread = threading.Thread(target=lambda: others.append(device.kernel("limits", "copy_all")))
+    thread.start()
+    thread.join()
+    assert others[0] is not mine
+    assert not device.profile.records()
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 4099, 50_000])
+def test_the_limits_kernels_do_what_their_references_do(device, count):
+    words = np.random.default_rng(0).integers(0, 2**32, (count, 4), np.uint32)
+    each = 16 * device.tile
+    items = -(-count // each)
+    source, target = (
+        device.array("source", (count, 4), np.uint32),
+        device.array("target", (count, 4), np.uint32),
+    )
+    sums = device.array("sums", (items,), np.uint32)
+    source.host[:] = words
+    source.upload()
+    device.kernel("limits", "read_all")(items, source, np.int32(count), sums, moved=words.nbytes)
+    device.kernel("limits", "copy_all")(items, source, np.int32(count), target, moved=2 * words.nbytes)
+    np.testing.assert_array_equal(sums.download(), limits.read_all(words, each))
+    np.testing.assert_array_equal(target.download(), limits.copy_all(words))
+
+
+def test_a_parked_array_keeps_its_content(device):
+    array = device.array("numbers", (3, 5), np.float32)
+    array.host[:] = np.arange(15).reshape(3, 5)
+    array.upload()
+    array.park()
+    array.upload()
+    np.testing.assert_array_equal(array.download(), np.arange(15).reshape(3, 5))
+
+
+def test_only_the_first_rows_travel_when_asked(device):
+    array = device.array("numbers", (4, 3), np.int32)
+    array.host[:] = 1
+    array.upload()
+    array.claim()
+    array.host[:] = 2
+    array.upload(rows=2)
+    if not device.info.shares_memory:
+        np.testing.assert_array_equal(array.download(), [[2] * 3] * 2 + [[1] * 3] * 2)
+        uploads = [record for record in device.profile.records() if record.name == "numbers"]
+        assert sum(record.bytes for record in uploads if record.kind == "upload") >= 48 + 24
+
+
+def test_arrays_start_on_a_page(device):
+    for count in (1, 5, 4097):
+        assert device.array("odd", (count,), np.uint8).host.ctypes.data % 4096 == 0
+
+
+def test_a_lack_of_memory_is_told_apart(small_device):
+    small_device.max_allocation = 100
+    with pytest.raises(DeviceMemoryError, match="no room for too much"):
+        small_device.array("too much", (101,), np.uint8)
+    small_device.array("just enough", (100,), np.uint8)
+
+
+def test_a_drivers_own_lack_of_memory_is_told_apart(small_device, monkeypatch):
+    small_device.max_allocation = 2**60
+    monkeypatch.setattr(small_device, "info", replace(small_device.info, shares_memory=False))
+    monkeypatch.setattr(device_layer, "_aligned", lambda shape, dtype: np.broadcast_to(np.uint8(0), shape))
+    with pytest.raises(DeviceMemoryError, match="no room for maps"):
+        small_device.array("maps", (2**50,), np.uint8)
+
+
+def test_the_hosts_own_lack_of_memory_is_told_apart(small_device):
+    small_device.max_allocation = 2**60
+    with pytest.raises(DeviceMemoryError, match="no room for maps"):
+        small_device.array("maps", (2**50,), np.uint8)
+
+
+def test_the_profile_tells_what_was_run(device):
+    device.profile.clear()
+    source, target = (device.array(name, (64, 4), np.uint32) for name in ("source", "target"))
+    source.upload()
+    for _ in range(3):
+        device.kernel("limits", "copy_all")(4, source, np.int32(64), target, moved=2048)
+    target.download()
+    records = {(record.kind, record.name): record for record in device.profile.records()}
+    kernel = records["kernel", "copy_all"]
+    assert (kernel.runs, kernel.bytes) == (3, 3 * 2048)
+    assert 0 < kernel.fastest <= kernel.seconds
+    assert kernel.bandwidth == pytest.approx(kernel.bytes / kernel.seconds)
+    copied = not device.info.shares_memory
+    assert (("upload", "source") in records) is copied
+    assert (("download", "target") in records) is copied
+
+
+def test_the_profile_stays_bounded(device):
+    device.profile.clear()
+    array = device.array("source", (1, 4), np.uint32)
+    array.upload()
+    kernel = device.kernel("limits", "copy_all")
+    for _ in range(2500):
+        kernel(1, array, np.int32(0), array, moved=1)
+    assert len(device.profile._pending) < 1024
+    runs = {record.name: record.runs for record in device.profile.records()}
+    assert runs["copy_all"] == 2500

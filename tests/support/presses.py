@@ -1,0 +1,72 @@
+"""Stacks for the onset's tests, and second opinions on what its answer is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mirrorskin.engine.onset import Onset
+from mirrorskin.engine.references import light_levels, reference_pair
+from mirrorskin.kernels import onset as reference
+
+SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
+
+
+def random_press(dtype, frames, shape, seed=0, noise=0.008):
+    """Ramps and steps of random height, place and duration, with noise: some pixels never turn light."""
+    generator = np.random.default_rng(seed)
+    dark, bright = SPEC[dtype]
+    start = generator.integers(-2, frames + 2, shape)
+    lasts = generator.choice([1e-3, 1, 4, 20], shape)
+    plateau = generator.uniform(0.2, 1.1, shape)
+    number = np.arange(frames)[:, np.newaxis, np.newaxis]
+    share = plateau * np.clip((number - start) / lasts, 0, 1) + generator.normal(0, noise, (frames, *shape))
+    counts = dark + (bright - dark) * share
+    if dtype == "float32":
+        return counts.astype(dtype)
+    return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
+
+
+def numpy_onset(frames, travel, dark, bright, noise, threshold=0.5, hold=2, subframe=True, own_dark=False):
+    """Run the kernels' NumPy references over a stack, in one block."""
+    shape, dtype = frames.shape[1:], frames.dtype
+    low, high = reference_pair(dark, bright, shape, dtype)
+    level, light = (part.reshape(-1) for part in light_levels(low, high, threshold, dtype))
+    flat = frames.reshape(len(frames), -1)
+    onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
+    last, before, at, after = (np.zeros(level.size, dtype) for _ in range(4))
+    reference.onset_scan(flat, 0, hold, light, onset, last, before, at, after)
+    plateau = flat[0].astype(np.float32) if own_dark else low.reshape(-1).astype(np.float32)
+    tolerances = (3 * noise * (np.sqrt(2) if own_dark else 1), 3 * noise * np.sqrt(2))
+    height, sigma, status = reference.onset_heights(
+        onset, before, at, after, level, plateau, np.asarray(travel, float), *tolerances, noise, subframe
+    )
+    maps = (height, sigma, status, np.maximum(onset, reference.DARK))
+    return Onset(*(values.reshape(shape) for values in maps), noise)
+
+
+def first_run(light, hold):
+    """Return the first index of the first run of `hold` trues, or of one that lasts to the end; else -1."""
+    for start in range(len(light)):
+        run = light[start : start + hold]
+        if all(run):
+            return start
+    return -1
+
+
+def assert_equal(left, right):
+    """Hold two onsets equal to the last bit."""
+    for name in ("height", "sigma", "status", "frame"):
+        np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
+
+
+def assert_within_an_ulp(found, expected, travel):
+    """Hold a device's onset against the reference's: same states, heights within one float32 ulp."""
+    np.testing.assert_array_equal(found.status, expected.status)
+    np.testing.assert_array_equal(found.frame, expected.frame)
+    answered = expected.status == 1
+    np.testing.assert_array_equal(np.isnan(found.height), ~answered)
+    exact = expected.height[answered]
+    # Near zero a height is the difference of travels, known to no less than their float64 rounding.
+    ulp = np.spacing(np.abs(exact).astype(np.float32)) + 1e-12 * np.max(np.abs(travel))
+    assert np.all(np.abs(found.height[answered] - exact) <= ulp)
+    np.testing.assert_allclose(found.sigma[answered], expected.sigma[answered], rtol=1e-5, atol=1e-9)

@@ -1,0 +1,101 @@
+"""Small stacks, a source that is made of them, and what to ask of the files that hold them."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+
+from mirrorskin import hw, io
+
+SHAPE = (8, 5, 7)
+TRAVEL = np.round(np.arange(8) * 0.3, 10)
+
+
+def random_stack(dtype="uint8", shape=SHAPE, seed=0):
+    """Noise over the whole range of a type; float frames hold a NaN as well."""
+    generator = np.random.default_rng(seed)
+    dtype = np.dtype(dtype)
+    if dtype.kind == "f":
+        stack = generator.normal(100, 30, shape).astype(dtype)
+        stack.flat[0] = np.nan
+        return stack
+    return generator.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+
+
+def sphere(dtype="uint8"):
+    """The twin, pressed on a ball: 8 frames of 7 x 5."""
+    return hw.Twin(object="sphere", shape=SHAPE[1:], pixel_size=(0.5, 0.6), travel=TRAVEL, dtype=dtype)
+
+
+class MadeUp:
+    """A source of given frames, which may fail on the way or announce another number of them."""
+
+    rewindable = False
+    name = "made up"
+
+    def __init__(self, frames, header, announced=None, fails=None, **series):
+        self.frames, self.header, self.motion = frames, header, header.motion
+        self.shape = (announced or len(frames), *frames.shape[1:])
+        self.dtype = frames.dtype
+        self.left = False
+        self._fails, self._series, self._next = fails, series, 0
+
+    def read(self, out=None, /):
+        part = slice(self._next, min(self._next + (1 if out is None else len(out)), len(self.frames)))
+        if self._fails is not None and part.stop > 3:
+            raise self._fails
+        if part.start == len(self.frames):
+            return None
+        self._next = part.stop
+        return io.Block(self.frames[part], part.start, **{n: v[part] for n, v in self._series.items()})
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.left = True
+
+
+def record(source, path, compression="raw", block=1, truth=None):
+    """Record a source in blocks of so many frames."""
+    with io.Recorder(source, path, compression, truth=truth) as recorder:
+        out = np.empty((block, *source.shape[1:]), source.dtype)
+        while recorder.read(out) is not None:
+            pass
+    return path
+
+
+def read_all(source, block):
+    """Read a source in blocks; return the frames, and the series of what the blocks say beside them."""
+    out = np.empty((block, *source.shape[1:]), source.dtype)
+    blocks = []
+    while (got := source.read(out)) is not None:
+        assert got.index == sum(len(frames) for frames, *_ in blocks)
+        blocks.append((got.frames.copy(), got.time, got.travel, got.phase))
+    return tuple(None if parts[0] is None else np.concatenate(parts) for parts in zip(*blocks, strict=True))
+
+
+def assert_same(found, expected):
+    """Hold two headers, truths or results equal: arrays to the last bit and type, the rest by value."""
+    for name in expected.__dataclass_fields__:
+        left, right = getattr(found, name), getattr(expected, name)
+        if isinstance(right, np.ndarray):
+            assert left.dtype == right.dtype, name
+            np.testing.assert_array_equal(left, right, err_msg=name)
+        else:
+            assert left == right, name
+
+
+def plot_of(path):
+    """Walk to what a NeXus viewer plots unasked; return its group, its signal and its axes."""
+    node = h5py.File(path)
+    while isinstance(node, h5py.Group) and node.attrs["NX_class"] != "NXdata":
+        node = node[node.attrs["default"]]
+    signal = node[node.attrs["signal"]]
+    axes = list(node.attrs.get("axes", []))
+    assert len(axes) in (0, signal.ndim)
+    for length, axis in zip(signal.shape, axes, strict=False):
+        assert axis == "." or node[axis].shape == (length,)
+    for name in node.attrs.get("auxiliary_signals", []):
+        assert node[name].shape == signal.shape
+    return node, signal, axes
