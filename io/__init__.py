@@ -1,0 +1,49 @@
+"""Shared types, and the files: recordings, results, other people's frames."""
+
+from mirrorskin.io.atomic import check_output
+from mirrorskin.io.describe import describe
+from mirrorskin.io.frames import open_frames
+from mirrorskin.io.positions import check_phase, check_travel
+from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
+from mirrorskin.io.recording import Recording, Steps, open_recording
+from mirrorskin.io.result import open_result, save_result
+from mirrorskin.io.types import (
+    FRAME_DTYPES,
+    MOTIONS,
+    Block,
+    Header,
+    InputError,
+    Motion,
+    ProcessValue,
+    Result,
+    Source,
+    Truth,
+    pixel_axes,
+)
+
+__all__ = [
+    "COMPRESSIONS",
+    "FRAME_DTYPES",
+    "MOTIONS",
+    "Block",
+    "Compression",
+    "Header",
+    "InputError",
+    "Motion",
+    "ProcessValue",
+    "Recorder",
+    "Recording",
+    "Result",
+    "Source",
+    "Steps",
+    "Truth",
+    "check_output",
+    "check_phase",
+    "check_travel",
+    "describe",
+    "open_frames",
+    "open_recording",
+    "open_result",
+    "pixel_axes",
+    "save_result",
+]

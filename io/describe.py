@@ -1,0 +1,79 @@
+"""What a file holds, for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.layout import MARK
+from mirrorskin.io.recording import Recording, open_recording
+from mirrorskin.io.result import MARK as RESULT_MARK
+from mirrorskin.io.result import open_result
+from mirrorskin.io.types import Result
+
+
+def describe(path: str | Path) -> dict[str, str]:
+    """Tell what an HDF5 file holds: a recording, a result, or someone else's stacks.
+
+    Returns
+    -------
+    dict of str
+        Names and values to print.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is damaged.
+    """
+    path = Path(path)
+    with Hdf5File(path) as file:
+        ours, result = file.marked(MARK), file.marked(RESULT_MARK)
+        stacks = {} if ours or result else file.stacks()
+    if ours:
+        with open_recording(path) as recording:
+            return _recording(recording)
+    if result:
+        return _result(open_result(path))
+    return {"kind": "HDF5 file of another layout", "stacks": str(len(stacks)), **stacks}
+
+
+def _recording(recording: Recording) -> dict[str, str]:
+    header = recording.header
+    count, rows, columns = recording.shape
+    facts = {
+        "kind": "recording",
+        "title": header.title,
+        "start": header.start_time,
+        "motion": recording.motion,
+        "frames": f"{count} of {columns} x {rows}, {recording.dtype}",
+        "storage": recording.storage,
+    }
+    if header.pixel_size is not None:
+        x, y = header.pixel_size
+        facts["pixel size"] = f"{x:g} x {y:g} mm, field {x * columns:g} x {y * rows:g} mm"
+    facts |= _range("travel", recording.travel, "mm")
+    facts |= _range("phase", None if recording.phase is None else np.degrees(recording.phase), "deg")
+    if header.tilt is not None:
+        facts["tilt"] = f"{np.degrees(header.tilt):g} deg"
+    for name in ("dark", "bright"):
+        reference = getattr(header, name)
+        facts[f"{name} reference"] = "none" if reference is None else _median(reference)
+    facts["truth"] = "none" if recording.truth is None else "height, zenith, azimuth, contact"
+    return facts
+
+
+def _median(reference: NDArray[np.float32]) -> str:
+    known = reference[np.isfinite(reference)]
+    return f"{np.median(known):g} counts (median)" if known.size else "no pixel known"
+
+
+def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str, str]:
+    return {} if values is None else {name: f"{values[0]:g} to {values[-1]:g} {unit}"}
+
+
+def _result(result: Result) -> dict[str, str]:
+    maps = {f"map {name}": f"{' x '.join(map(str, m.shape))} {m.dtype}" for name, m in result.maps().items()}
+    return {"kind": "result", **maps, **{name: str(value) for name, value in result.process.items()}}

@@ -1,0 +1,234 @@
+"""HDF5 files of unknown hands: open them, follow their links, and read nothing that is not there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.plain import plainly
+from mirrorskin.io.storage import check_storage
+from mirrorskin.io.types import InputError
+from mirrorskin.io.units import factor
+
+Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
+Shape = tuple[int, ...]
+
+_LINKS_DEEP = 16
+
+
+class Hdf5File:
+    """An HDF5 file to read, and the files in its own folder that it refers to.
+
+    Parameters
+    ----------
+    path : Path
+    memory_limit : int, optional
+        Bytes that HDF5 may have to unpack at once.
+
+    Attributes
+    ----------
+    path : Path
+    memory_limit : int or None
+
+    Raises
+    ------
+    InputError
+        There is no such file, it is no HDF5, or it is damaged.
+    """
+
+    def __init__(self, path: Path, memory_limit: int | None = None) -> None:
+        self.path = path
+        self.memory_limit = memory_limit
+        self._home = Path(os.path.realpath(path)).parent
+        self._files: dict[str, h5py.File] = {}
+        self._root = self.open_beside(None, path, "")
+
+    def close(self) -> None:
+        """Close the file and those it refers to."""
+        for file in self._files.values():
+            file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+    def where(self, node: Node) -> str:
+        """Return the file and the name of an object, for messages."""
+        filename = node.file.filename
+        return f"{self.path if filename == self._root.filename else filename}: {node.name}"
+
+    def find(self, name: str) -> Node | None:
+        """Return an object, or None where it is simply not there.
+
+        Raises
+        ------
+        InputError
+            A link on the way leads nowhere, in a circle, or out of the file's folder.
+        """
+        return self.walk(self._root, name)
+
+    def follow(self, name: str, remedy: str) -> Node:
+        """Return an object; one that is not there raises InputError with the remedy."""
+        node = self.find(name)
+        if node is None:
+            raise InputError(f"{self.path}: there is no {name}: {remedy}")
+        return node
+
+    def names(self, group: str) -> list[str]:
+        """Return the names in a group; none where there is no such group."""
+        node = self.find(group)
+        with plainly(f"{self.path}: {group}"):
+            return list(node) if isinstance(node, h5py.Group) else []
+
+    def marked(self, mark: str) -> bool:
+        """Tell whether a file is one of ours: whether its entry has a certain attribute."""
+        entry = self.find("/entry")
+        with plainly(f"{self.path}: /entry"):
+            return isinstance(entry, h5py.Group) and mark in entry.attrs
+
+    def stacks(self) -> dict[str, str]:
+        """Return the three-dimensional datasets that the file itself holds: their names, sizes and types."""
+        found: dict[str, str] = {}
+
+        def visit(name: str, node: Node) -> None:
+            if isinstance(node, h5py.Dataset) and node.ndim == 3:
+                found[f"/{name}"] = f"{' x '.join(map(str, node.shape))} {node.dtype}"
+
+        with plainly(str(self.path)):
+            self._root.visititems(visit)
+        return dict(sorted(found.items()))
+
+    def read(self, node: Node, *shapes: Shape, unit: str | None = None, remedy: str = "") -> NDArray[Any]:
+        """Read numbers, once it is sure that they are there.
+
+        Parameters
+        ----------
+        node : h5py.Dataset
+        *shapes : tuple of int
+            The shapes that it may have.
+        unit : str, optional
+            The unit to return; the attribute ``units`` is obeyed, and without one it is in this unit.
+        remedy : str, optional
+            The end of the message if it does not fit.
+
+        Raises
+        ------
+        InputError
+            No numbers, another shape, an unknown unit, or a file that does not hold what it claims.
+        """
+        where, remedy = self.where(node), remedy and f": {remedy}"
+        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb":
+            raise InputError(f"{where} holds no numbers{remedy}")
+        if node.shape not in shapes:
+            needed = " or ".join(map(str, dict.fromkeys(shapes)))
+            raise InputError(f"{where} has shape {node.shape} where {needed} is needed{remedy}")
+        check_storage(self, node)
+        with plainly(where):
+            values: NDArray[Any] = np.asarray(node[()])
+            given = str(_first(node.attrs.get("units", unit)) or unit)
+        return values if unit is None else values * factor(given, unit, where)
+
+    def value(self, node: Node) -> Any:
+        """Read one text or number, alone or in an array of one."""
+        with plainly(self.where(node)):
+            if node.shape not in ((), (1,)):
+                raise ValueError(f"shape {node.shape} where one value is needed")
+            return _first(node[()])
+
+    def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
+        """Do what ``find`` does, from any object on and after so many links."""
+        if depth > _LINKS_DEEP:
+            raise InputError(f"{self.where(node)}: its links go round in a circle; name a dataset itself")
+        for part in name.split("/"):
+            if part not in ("", "."):
+                following = self._step(node, part, depth)
+                if following is None:
+                    return None
+                node = following
+        return node
+
+    def open_beside(self, node: Node | None, filename: str | Path, what: str) -> h5py.File:
+        """Open a file that an object refers to; the file itself if there is none."""
+        path = self.path if node is None else self.beside(node, str(filename), what)
+        real = os.path.realpath(path)
+        if real not in self._files:
+            _check_file(path)
+            with plainly(str(path)):
+                self._files[real] = h5py.File(real, "r")
+        return self._files[real]
+
+    def beside(self, node: Node, filename: str, what: str) -> Path:
+        """Return the file that an object refers to if it lies in the recording's own folder, else raise."""
+        what = f"{self.path}: {what}"
+        with plainly(what):
+            target = Path(os.path.realpath(Path(node.file.filename).parent / filename))
+            if not target.is_relative_to(self._home):
+                raise InputError(f"{what} leads out of its folder, to {filename}: copy that file beside it")
+            if not target.is_file():
+                raise InputError(f"{what} leads to {filename}, which does not exist: copy it there")
+        return target
+
+    def _step(self, node: Node, part: str, depth: int) -> Node | None:
+        with plainly(f"{self.where(node)}: {part}"):
+            link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+            if isinstance(link, h5py.HardLink):
+                return _open(node, part)
+        if link is None:
+            return None
+        start = node
+        if isinstance(link, h5py.ExternalLink):
+            start = self.open_beside(node, link.filename, f"the external link {part} in {node.name}")
+        elif link.path.startswith("/"):
+            start = node.file
+        target = self.walk(start, link.path, depth + 1)
+        if target is None:
+            raise InputError(f"{self.where(node)}: the link {part} leads to {link.path}, which is not there")
+        return target
+
+
+def _open(group: h5py.Group, name: str) -> Node:
+    node = group[name]
+    if isinstance(node, h5py.Dataset) and node.external:
+        # HDF5 looks for raw files in the working directory, unless the first opening says otherwise.
+        del node
+        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        access.set_efile_prefix(b"${ORIGIN}")
+        node = h5py.Dataset(h5py.h5d.open(group.id, name.encode(errors="surrogateescape"), access))
+    return node
+
+
+def _first(value: Any) -> Any:
+    """Return a text or a number without its array, bytes or NumPy type."""
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _check_file(path: Path) -> None:
+    with plainly(str(path)):
+        if not path.exists():
+            raise InputError(f"{path}: no such file")
+        if path.is_dir():
+            raise InputError(
+                f"{path} is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders"
+            )
+        if not path.is_file():
+            raise InputError(f"{path} is no regular file: save what it gives in one first")
+        with path.open("rb"):
+            pass
+        if not h5py.is_hdf5(path):
+            raise InputError(
+                f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
+            )

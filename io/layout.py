@@ -1,0 +1,141 @@
+"""Our layout of a recording, and what it says beside the frames."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
+from mirrorskin.io.positions import check_phase, check_travel
+from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
+
+MARK = "mirrorskin_recording"
+STACK = "/entry/instrument/detector/data"
+DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
+# The maps of a simulation's truth, and their units.
+TRUTH_UNITS = {"height": "mm", "zenith": "rad", "azimuth": "rad", "contact": None}
+
+
+class Layout:
+    """What a file says of its stack; of a file that is not ours, nothing.
+
+    Parameters
+    ----------
+    file : Hdf5File
+    ours : bool
+        Whether the file has our layout.
+    shape : (int, int, int)
+        Frames, rows and columns of the stack.
+    """
+
+    def __init__(self, file: Hdf5File, ours: bool, shape: Shape) -> None:
+        self._file = file
+        self._ours = ours
+        self._count, self._frame = shape[0], shape[1:]
+
+    def header(
+        self, motion: Motion | None, tilt: float | None, pixel_size: tuple[float, float] | None
+    ) -> Header:
+        """Read what holds for the whole stack; what is given need not be there."""
+        own = self._text(f"{STAGE}/motion")
+        motion = motion or cast(Motion, own)
+        if motion not in MOTIONS:
+            said = f"says the motion {motion!r}" if motion else "does not say how the sensor moved"
+            raise InputError(f"{self._file.path} {said}: give --motion, one of {', '.join(MOTIONS)}")
+        # Of a vertical press the travel is no press but the positions.
+        pressed = "vertical" not in (own, motion)
+        return Header(
+            motion,
+            title=self._text("/entry/title"),
+            start_time=self._text("/entry/start_time"),
+            pixel_size=self._pixel_size() if pixel_size is None else self._above_zero(pixel_size),
+            dark=self._reference("dark"),
+            bright=self._reference("bright"),
+            press=self._scalar(f"{STAGE}/travel", "mm") if pressed else None,
+            tilt=self._scalar(f"{STAGE}/tilt", "rad", "give --tilt") if tilt is None else tilt,
+            pivot=self._pivot(),
+            zenith_gain=self._read(f"{DETECTOR}/zenith_gain", (), self._frame, unit="1/rad"),
+            zenith_offset=self._read(f"{DETECTOR}/zenith_offset", (), self._frame),
+        )
+
+    def time(self) -> Floats | None:
+        """Read the seconds of each frame, if they are known."""
+        return self._read(f"{DETECTOR}/frame_time", (self._count,), unit="s")
+
+    def travel(self, given: Floats | None) -> Floats:
+        """Read the travel of each frame of a vertical press, mm, if it is not given; check it."""
+        name = f"{STAGE}/travel"
+        values = self._positions(given, name, "mm", "give --travel-step")
+        return check_travel(values, self._count, f"{self._file.path}: {name}")
+
+    def phase(self, given: Floats | None) -> Floats:
+        """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""
+        name = f"{STAGE}/phase"
+        values = self._positions(given, name, "rad", "give --phase-step")
+        return check_phase(values, self._count, f"{self._file.path}: {name}")
+
+    def truth(self) -> Truth | None:
+        """Read what a simulation knew, if it was one."""
+        found = {field.name: self._find(f"{TRUTH}/{field.name}") for field in fields(Truth)}
+        missing = [name for name, node in found.items() if node is None]
+        if len(missing) == len(found):
+            return None
+        if missing:
+            raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
+        maps = {
+            name: self._file.read(node, self._frame, unit=TRUTH_UNITS[name]) for name, node in found.items()
+        }
+        contact = maps.pop("contact").astype(np.uint8)
+        return Truth(**{name: values.astype(np.float32) for name, values in maps.items()}, contact=contact)
+
+    def _positions(self, given: Floats | None, name: str, unit: str, remedy: str) -> Floats:
+        if given is not None:
+            return given
+        values = self._read(name, (self._count,), unit=unit, remedy=remedy)
+        if values is None:
+            raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
+        return values
+
+    def _pixel_size(self) -> tuple[float, float] | None:
+        x, y = (self._scalar(f"{DETECTOR}/{axis}_pixel_size", "mm", "give --pixel-size") for axis in "xy")
+        if x is None and y is None:
+            return None
+        if x is None or y is None:
+            raise InputError(
+                f"{self._file.path} says the size of its pixels only along one axis: give --pixel-size"
+            )
+        return self._above_zero((x, y))
+
+    def _above_zero(self, pixel_size: tuple[float, float]) -> tuple[float, float]:
+        if not all(0 < size < np.inf for size in pixel_size):
+            raise InputError(f"{self._file.path}: pixel size {pixel_size} mm: give --pixel-size, above zero")
+        return pixel_size
+
+    def _reference(self, name: str) -> NDArray[np.float32] | None:
+        remedy = f"give --{name}, or take the reference again"
+        values = self._read(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
+        return None if values is None else values.astype(np.float32)
+
+    def _pivot(self) -> tuple[float, float, float] | None:
+        values = self._read(f"{STAGE}/pivot", (3,), unit="mm")
+        return None if values is None else cast(tuple[float, float, float], tuple(values.tolist()))
+
+    def _scalar(self, name: str, unit: str, remedy: str = "") -> float | None:
+        values = self._read(name, (), (1,), unit=unit, remedy=remedy)
+        return None if values is None else float(values.reshape(()))
+
+    def _read(self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "") -> Floats | None:
+        node = self._find(name)
+        if node is None:
+            return None
+        return self._file.read(node, *shapes, unit=unit, remedy=remedy).astype(np.float64)
+
+    def _text(self, name: str) -> str:
+        node = self._find(name)
+        return "" if node is None else str(self._file.value(node))
+
+    def _find(self, name: str) -> Node | None:
+        return self._file.find(name) if self._ours else None

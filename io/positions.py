@@ -1,0 +1,68 @@
+"""Where the body was in each frame: the checks that every reader and estimator shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io.types import InputError
+
+
+def check_travel(
+    travel: ArrayLike | None, count: int, name: str, after: Sequence[float] = ()
+) -> NDArray[np.float64]:
+    """Return the travel of a vertical press as float64 if it can be used.
+
+    Parameters
+    ----------
+    travel : array_like, (count,), or None
+        Millimetres, one a frame.
+    count : int
+        Frames.
+    name : str
+        What to call it in messages.
+    after : sequence of float
+        Travel of the frame before, if any.
+
+    Raises
+    ------
+    InputError
+        It is missing, of another length, not a finite number throughout, or runs back.
+    """
+    if travel is None:
+        raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
+    values = _finite(travel, count, name)
+    whole = np.concatenate([after, values])
+    back = whole[1:] < whole[:-1]
+    if np.any(back):
+        frame = int(np.argmax(back)) + 1 - len(after)
+        raise InputError(f"{name} runs back at frame {frame}: a press only goes down; cut or reverse it")
+    return values
+
+
+def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+    """Return the phases of an axial rotation, radians, as float64 if they can be used.
+
+    Raises
+    ------
+    InputError
+        They are missing, of another length, or not finite numbers throughout.
+    """
+    if phase is None:
+        raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
+    return _finite(phase, count, name)
+
+
+def _finite(values: ArrayLike, count: int, name: str) -> NDArray[np.float64]:
+    array: NDArray[Any] = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{name} is of type {array.dtype}: numbers are needed")
+    if array.shape != (count,):
+        raise InputError(f"{name} has shape {array.shape} for {count} frames: one number a frame is needed")
+    if not np.all(np.isfinite(array)):
+        frame = int(np.argmin(np.isfinite(array)))
+        raise InputError(f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number")
+    return array.astype(np.float64)

@@ -1,0 +1,228 @@
+"""Recordings: frame stacks in HDF5, our own NeXus layout or anyone's."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, cast
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.layout import MARK, STACK, Layout
+from mirrorskin.io.plain import plainly
+from mirrorskin.io.result import MARK as RESULT_MARK
+from mirrorskin.io.storage import check_storage, describe_storage
+from mirrorskin.io.types import FRAME_DTYPES, Block, Floats, Header, InputError, Motion, Truth
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians."""
+
+    step: float
+    start: float = 0.0
+
+    def positions(self, count: int) -> Floats:
+        """Return the positions of ``count`` frames."""
+        return np.asarray(self.start + self.step * np.arange(count), np.float64)
+
+
+class Recording:
+    """A stack in a file, as a source that can be rewound; see ``open_recording``.
+
+    Attributes
+    ----------
+    path : Path
+    dataset : str
+        Name of the stack in the file.
+    name, header, shape, dtype, motion, rewindable
+        As for every ``Source``.
+    time, travel, phase : ndarray, (T,), float64, or None
+        Seconds, millimetres and radians.
+    truth : Truth or None
+        What a simulation knew.
+    storage : str
+        How the frames are stored, for people.
+    """
+
+    rewindable = True
+
+    def __init__(
+        self,
+        file: Hdf5File,
+        stack: h5py.Dataset,
+        header: Header,
+        time: Floats | None,
+        travel: Floats | None,
+        phase: Floats | None,
+        truth: Truth | None,
+    ) -> None:
+        self.path = file.path
+        self.name = str(file.path)
+        self.dataset = str(stack.name)
+        self.header = header
+        self.motion = header.motion
+        self.shape = cast(tuple[int, int, int], tuple(map(int, stack.shape)))
+        self.dtype: np.dtype[Any] = stack.dtype.newbyteorder("=")
+        self.time, self.travel, self.phase = time, travel, phase
+        self.truth = truth
+        self.storage = describe_storage(stack)
+        self._file = file
+        self._stack = stack
+        self._next = 0
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``.
+
+        Raises
+        ------
+        ValueError
+            ``out`` does not fit the frames.
+        InputError
+            The file is damaged there.
+        """
+        if out is None:
+            out = np.empty((1, *self.shape[1:]), self.dtype)
+        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
+            raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{self.shape[1:]}) {self.dtype}")
+        start = self._next
+        if start >= self.shape[0]:
+            return None
+        stop = self._whole_chunks(start, min(start + len(out), self.shape[0]))
+        frames = out[: stop - start]
+        what = f"{self.path}: frames {start} to {stop - 1} of {self.dataset} cannot be read"
+        with plainly(what, "copy it again, or record it anew"):
+            self._stack.read_direct(frames, np.s_[start:stop])
+        self._next = stop
+        part = slice(start, stop)
+        time, travel, phase = (None if v is None else v[part] for v in (self.time, self.travel, self.phase))
+        return Block(frames, start, time=time, travel=travel, phase=phase)
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self._next = 0
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file, in hexadecimal."""
+        with plainly(self.name), self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+    def _whole_chunks(self, start: int, stop: int) -> int:
+        """End a read where a chunk ends, so that none is unpacked twice."""
+        length = self._stack.chunks[0] if self._stack.chunks else 1
+        aligned = stop // length * length
+        return aligned if start < aligned and stop < self.shape[0] else stop
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    dataset: str | None = None,
+    motion: Motion | None = None,
+    travel: Steps | None = None,
+    phase: Steps | None = None,
+    tilt: float | None = None,
+    pixel_size: tuple[float, float] | None = None,
+    memory_limit: int | None = None,
+) -> Recording:
+    """Open a stack of frames in HDF5.
+
+    Parameters
+    ----------
+    path : str or Path
+    dataset : str, optional
+        Name of the stack; needed where the file is not a recording of ours and holds several.
+    motion, travel, phase, tilt, pixel_size
+        What the file does not say, or what to believe instead: positions in mm or radians, half-angle
+        in radians, mm.
+    memory_limit : int, optional
+        Bytes that a packed chunk of frames may take when it is unpacked.
+
+    Returns
+    -------
+    Recording
+        Close it, or use it in a ``with``.
+
+    Raises
+    ------
+    InputError
+        The file, the stack, or something said about it cannot be used.
+    """
+    file = Hdf5File(Path(path), memory_limit)
+    try:
+        ours = file.marked(MARK)
+        stack = _find_stack(file, dataset, ours)
+        layout = Layout(file, ours, stack.shape)
+        header = layout.header(motion, tilt, pixel_size)
+        count = stack.shape[0]
+        vertical, axial = header.motion == "vertical", header.motion == "axial"
+        return Recording(
+            file,
+            stack,
+            header,
+            time=layout.time(),
+            travel=layout.travel(_along(travel, count)) if vertical else None,
+            phase=layout.phase(_along(phase, count)) if axial else None,
+            truth=layout.truth(),
+        )
+    except BaseException:
+        file.close()
+        raise
+
+
+def _along(steps: Steps | None, count: int) -> Floats | None:
+    return None if steps is None else steps.positions(count)
+
+
+def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> h5py.Dataset:
+    """Find the stack that is meant, and refuse what is none or cannot be read."""
+    if dataset is None:
+        dataset = STACK if ours else _only_stack(file)
+    stack = file.follow(dataset, "name the stack with --dataset")
+    where = file.where(stack)
+    if not isinstance(stack, h5py.Dataset):
+        raise InputError(f"{where} is no dataset: name one with --dataset")
+    with plainly(where):
+        shape, dtype = stack.shape, stack.dtype.newbyteorder("=")
+    if shape is None or len(shape) != 3:
+        raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
+    if dtype not in FRAME_DTYPES:
+        raise InputError(f"{where} is of type {dtype}: frames are uint8, uint16 or float32; convert it first")
+    if 0 in shape[1:]:
+        raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it anew")
+    if shape[0] < 2:
+        raise InputError(f"{where} holds {shape[0]} frames: at least 2 are needed; record more")
+    check_storage(file, stack)
+    return stack
+
+
+def _only_stack(file: Hdf5File) -> str:
+    if file.marked(RESULT_MARK):
+        raise InputError(f"{file.path} is a result: give the recording that it was made from")
+    names = list(file.stacks())
+    if not names:
+        raise InputError(
+            f"{file.path} holds no stack of frames (T, H, W): if a link leads to one, name it with --dataset"
+        )
+    if len(names) > 1:
+        raise InputError(
+            f"{file.path} holds {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
+        )
+    return names[0]

@@ -1,0 +1,119 @@
+"""What a dataset claims against what its file holds, before any memory is taken for it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import hdf5plugin
+
+from mirrorskin.io.plain import plainly
+from mirrorskin.io.types import InputError
+
+if TYPE_CHECKING:
+    from mirrorskin.io.hdf5 import Hdf5File
+
+_VIRTUAL_DEEP = 4
+
+# Importing hdf5plugin is what registers bitshuffle, blosc and the others with HDF5.
+PLUGIN_FILTERS = hdf5plugin.FILTERS
+
+
+def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0) -> None:
+    """Refuse a dataset that HDF5 could not deliver, or would make up with fill values.
+
+    Parameters
+    ----------
+    file : Hdf5File
+        Knows where it may look for what is stored elsewhere.
+    dataset : h5py.Dataset
+    depth : int, optional
+        How many virtual datasets led here.
+
+    Raises
+    ------
+    InputError
+        A filter that is not installed, chunks too large to unpack, or less data than the shape says.
+    """
+    where = file.where(dataset)
+    if depth > _VIRTUAL_DEEP:
+        raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
+    with plainly(where):
+        _check_filters(dataset, where, file.memory_limit)
+        if dataset.chunks and not dataset.is_virtual:
+            claimed = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+            held, unit = dataset.id.get_num_chunks(), "chunks"
+        else:
+            claimed, unit = math.prod(dataset.shape) * dataset.dtype.itemsize, "bytes"
+            held = _bytes_held(file, dataset, depth)
+    if held < claimed:
+        raise InputError(
+            f"{where} claims {claimed} {unit} and its file holds {held}: it was cut short; copy it again"
+        )
+
+
+def describe_storage(dataset: h5py.Dataset) -> str:
+    """Tell how a dataset is stored, for people."""
+    if dataset.is_virtual:
+        return "virtual"
+    if dataset.chunks is None:
+        return "in raw files" if dataset.external else "in one piece"
+    names = [name.split(";")[0].strip() or str(code) for code, name in _filters(dataset)]
+    return f"chunks {dataset.chunks}, {', '.join(names) or 'raw'}"
+
+
+def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
+    plist = dataset.id.get_create_plist()
+    filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
+    return [(code, name.decode(errors="replace")) for code, _, _, name in filters]
+
+
+def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) -> None:
+    filters = _filters(dataset)
+    for code, name in filters:
+        if not h5py.h5z.filter_avail(code):
+            raise InputError(
+                f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed: "
+                "install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH"
+            )
+    size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    if filters and memory_limit is not None and size > memory_limit:
+        raise InputError(
+            f"{where} is packed in chunks of {size / 1e6:.0f} MB where memory is limited to "
+            f"{memory_limit / 1e6:.0f} MB: raise --memory, or repack it with h5repack in chunks of one frame"
+        )
+
+
+def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
+    if dataset.is_virtual:
+        elements = sum(_mapped(file, dataset, part, depth) for part in dataset.virtual_sources())
+        return elements * int(dataset.dtype.itemsize)
+    if dataset.external:
+        what = f"the raw storage of {dataset.name}"
+        parts = [(file.beside(dataset, name, what), offset, size) for name, offset, size in dataset.external]
+        return sum(min(size, max(0, path.stat().st_size - offset)) for path, offset, size in parts)
+    offset = dataset.id.get_offset()
+    if offset is None:  # not stored yet, or so small that it lies in its header
+        return int(dataset.id.get_storage_size())
+    return int(dataset.file.id.get_filesize() - offset)
+
+
+def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
+    """Return how many elements of a virtual dataset one of its sources holds."""
+    what = f"the virtual dataset {dataset.name}"
+    origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
+    source = file.walk(origin, part.dset_name)
+    if not isinstance(source, h5py.Dataset):
+        raise InputError(f"{file.where(dataset)} needs {part.dset_name} of {part.file_name}: it is not there")
+    check_storage(file, source, depth + 1)
+    selected = part.src_space
+    if selected.get_select_type() == h5py.h5s.SEL_ALL:
+        return min(int(part.vspace.get_select_npoints()), int(source.size))
+    if selected.is_regular_hyperslab() and any(
+        h5py.h5s.UNLIMITED in numbers for numbers in selected.get_regular_hyperslab()
+    ):
+        return int(source.size)
+    _, last = selected.get_select_bounds()
+    reaches = all(end < count for end, count in zip(last, source.shape, strict=True))
+    return int(part.vspace.get_select_npoints()) if reaches else 0

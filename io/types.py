@@ -1,0 +1,206 @@
+"""The types that every layer shares: frames on the move, where they come from, what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from types import TracebackType
+from typing import Any, Literal, Protocol, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Motion = Literal["vertical", "axial", "horizontal", "twist"]
+MOTIONS: tuple[Motion, ...] = get_args(Motion)
+FRAME_DTYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+
+Floats = NDArray[np.float64]
+ProcessValue = str | int | float | bool
+
+
+class InputError(Exception):
+    """What the user gave cannot be used; the message is one line that says why and what to do."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Some consecutive frames, and where the sensor body was in each of them.
+
+    Attributes
+    ----------
+    frames : ndarray, (n, H, W), uint8, uint16 or float32
+        Raw counts; may be a view of a buffer that the next read overwrites.
+    index : int
+        Number of the first frame in its stack.
+    time : ndarray, (n,), float64, or None
+        Seconds since the recording began.
+    travel : ndarray, (n,), float64, or None
+        Millimetres that the body has been lowered (vertical motion).
+    phase : ndarray, (n,), float64, or None
+        Radians, counter-clockwise, of the precession (axial motion).
+    origin : (int, int)
+        Row and column of the first pixel in the full picture.
+    dropped : int
+        Frames lost between the block before and this one.
+    """
+
+    frames: NDArray[Any]
+    index: int
+    time: Floats | None = None
+    travel: Floats | None = None
+    phase: Floats | None = None
+    origin: tuple[int, int] = (0, 0)
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What holds for a whole stack: everything a recording says but its frames and their positions.
+
+    Attributes
+    ----------
+    motion : {"vertical", "axial", "horizontal", "twist"}
+    title, start_time : str
+        Free text; ISO 8601.
+    pixel_size : (float, float) or None
+        Millimetres at the sheet along x and y.
+    dark, bright : ndarray, (H, W), float32, or None
+        Counts of each pixel without and with full light.
+    press : float or None
+        Millimetres of travel at which the other motions happen.
+    tilt : float or None
+        Half-angle of the precession, radians.
+    pivot : (float, float, float) or None
+        Point that the body turns about, mm, in the rest-sheet frame.
+    zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
+        Counts per radian of zenith, and counts at zenith zero.
+    """
+
+    motion: Motion
+    title: str = ""
+    start_time: str = ""
+    pixel_size: tuple[float, float] | None = None
+    dark: NDArray[np.float32] | None = None
+    bright: NDArray[np.float32] | None = None
+    press: float | None = None
+    tilt: float | None = None
+    pivot: tuple[float, float, float] | None = None
+    zenith_gain: Floats | None = None
+    zenith_offset: Floats | None = None
+
+
+class Source(Protocol):
+    """Anything frames come from: a recording, a rig of camera and stage, the digital twin.
+
+    A source is its own context manager; leaving it stops any hardware and closes any file.
+    """
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages and in a result's provenance."""
+
+    @property
+    def header(self) -> Header:
+        """What holds for all of its frames."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a sample: uint8, uint16 or float32."""
+
+    @property
+    def motion(self) -> Motion:
+        """How the body moves."""
+
+    @property
+    def rewindable(self) -> bool:
+        """Whether the frames can be read a second time."""
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames, at most ``len(out)`` of them into ``out``, or one; None at the end."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a simulation knows of its object, in the mean pose.
+
+    Attributes
+    ----------
+    height : ndarray, (H, W), float32
+        Millimetres; NaN where there is no object.
+    zenith, azimuth : ndarray, (H, W), float32
+        Radians, of the surface normal.
+    contact : ndarray, (H, W), uint8
+        1 where sheet and object touch by the end of the movement.
+    """
+
+    height: NDArray[np.float32]
+    zenith: NDArray[np.float32]
+    azimuth: NDArray[np.float32]
+    contact: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The maps of a reconstruction; one that was not computed is None.
+
+    Attributes
+    ----------
+    height, height_sigma : ndarray, (H, W), float32
+        Millimetres; NaN where there is no answer.
+    status : ndarray, (H, W), uint8
+        0 invalid input, 1 onset, 2 never light, 3 light at start.
+    x, y : ndarray, (W,) and (H,), float64
+        Millimetres of the pixel centres from the picture's centre; y runs up the picture.
+    process : mapping
+        Program, version, date, every parameter, device, source and its hash.
+    """
+
+    height: NDArray[np.float32] | None = None
+    height_sigma: NDArray[np.float32] | None = None
+    status: NDArray[np.uint8] | None = None
+    x: Floats | None = None
+    y: Floats | None = None
+    process: Mapping[str, ProcessValue] = field(default_factory=dict)
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """Return the maps that were computed, by name."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("x", "y", "process")}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Place the pixel centres in millimetres from the picture's centre.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+
+    Returns
+    -------
+    x : ndarray, (W,), float64
+        Increases to the right.
+    y : ndarray, (H,), float64
+        Runs up the picture: decreases with the row.
+    """
+    rows, columns = shape
+    x = (np.arange(columns) - (columns - 1) / 2) * pixel_size[0]
+    y = ((rows - 1) / 2 - np.arange(rows)) * pixel_size[1]
+    return np.asarray(x, np.float64), np.asarray(y, np.float64)

@@ -1,0 +1,398 @@
+import struct
+import subprocess
+import sys
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from mirrorskin.io import Header, InputError, Source, Steps, open_frames
+from mirrorskin.io.pictures import Pictures
+
+HEADER = Header("vertical", pixel_size=(0.03, 0.03))
+SHAPE = (6, 9)
+
+
+def frame(number, dtype=np.uint8):
+    """Return a frame that its number tells apart from all others."""
+    steps = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    if dtype == np.float32:
+        return (steps / 7 - number).astype(np.float32)
+    return ((steps * 11 + number * 17) * (251 if dtype == np.uint16 else 1) % np.iinfo(dtype).max).astype(
+        dtype
+    )
+
+
+def save(folder, names, dtype=np.uint8):
+    """Save a frame under each name, numbered in the order given."""
+    for number, name in enumerate(names):
+        assert cv2.imwrite(str(folder / name), frame(number, dtype))
+
+
+def drain(source, size=None):
+    """Read to the end, ``size`` frames at a time; return copies of the frames, and the blocks."""
+    room = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
+    frames, blocks = [], []
+    while (block := source.read(room)) is not None:
+        frames.append(block.frames.copy())
+        blocks.append(block)
+    return np.concatenate(frames), blocks
+
+
+def tiff(pages, order="<", big=False):
+    """Encode pages (H, W) or (H, W, samples) of uint16 as an uncompressed TIFF, the directories first."""
+    count, entry, offset = ("Q", "HHQQ", "Q") if big else ("H", "HHII", "I")
+    size = struct.calcsize("=" + count) + 10 * struct.calcsize("=" + entry) + struct.calcsize("=" + offset)
+    head = (
+        struct.pack(order + "2sHHHQ", b"", 43, 8, 0, 16) if big else struct.pack(order + "2sHI", b"", 42, 8)
+    )
+    data_at = len(head) + size * len(pages)
+    out, body = {"<": b"II", ">": b"MM"}[order] + head[2:], b""
+    for number, page in enumerate(pages):
+        rows, columns, samples = np.atleast_3d(page).shape
+        kind = 16 if big else 4
+        fields = [
+            (256, kind, columns),
+            (257, kind, rows),
+            (259, kind, 1),
+            (262, kind, 2 if samples > 2 else 1),
+        ]
+        fields += [(273, kind, data_at + len(body)), (277, kind, samples), (278, kind, rows)]
+        fields += [(279, kind, page.nbytes), (284, kind, 1)]
+        following = len(head) + size * (number + 1) if number + 1 < len(pages) else 0
+        # A short value stands at the left of its field, whatever the byte order.
+        bits = struct.pack(order + "HHQ" if big else order + "HHI", 258, 3, 1) + struct.pack(order + "H", 16)
+        bits = bits.ljust(struct.calcsize("=" + entry), b"\0")
+        entries = [struct.pack(order + entry, tag, kind, 1, value) for tag, kind, value in fields]
+        entries.insert(2, bits)
+        out += struct.pack(order + count, 10) + b"".join(entries) + struct.pack(order + offset, following)
+        body += page.astype(page.dtype.newbyteorder(order)).tobytes()
+    return out + body
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype"),
+    [("png", np.uint8), ("png", np.uint16), ("tif", np.uint8), ("TIFF", np.uint16), ("tiff", np.float32)],
+)
+def test_frames_come_back_exactly(tmp_path, suffix, dtype):
+    save(tmp_path, [f"image{k}.{suffix}" for k in range(4)], dtype)
+    source: Source = Pictures(tmp_path, HEADER)
+    frames, _ = drain(source)
+    assert (source.shape, source.dtype, source.motion) == ((4, *SHAPE), dtype, "vertical")
+    assert (source.name, source.header, source.rewindable) == (str(tmp_path), HEADER, True)
+    np.testing.assert_array_equal(frames, [frame(k, dtype) for k in range(4)])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["image0.png", "image2.png", "image10.png"],
+        ["1.png", "02.png", "003.png"],
+        ["run7_frame08_cam2.png", "run7_frame09_cam2.png", "run7_frame10_cam2.png"],
+        ["2024-05-01_9.png", "2024-05-01_10.png", "2024-05-01_11.png"],
+        ["s0.8.PNG", "s0.9.png", "s0.10.png"],
+        ["a1.png", "a2.tif", "a3.tiff"],
+    ],
+)
+def test_frames_are_in_the_order_of_their_numbers(tmp_path, names):
+    save(tmp_path, names)
+    frames, _ = drain(Pictures(tmp_path, HEADER))
+    np.testing.assert_array_equal(frames, [frame(k) for k in range(3)])
+
+
+def test_what_does_not_fit_the_pattern_is_left_out_and_named(tmp_path):
+    save(
+        tmp_path,
+        ["image0.png", "image1.png", "image_ambient.png", "._image0.png", "._image1.png", "dark7.png"],
+    )
+    (tmp_path / "LICENSE").write_text("free")
+    (tmp_path / "image3.txt").write_text("not a picture")
+    (tmp_path / "image4.png").mkdir()
+    source = Pictures(tmp_path, HEADER)
+    assert source.shape[0] == 2
+    assert source.left_out == (
+        "._image0.png",
+        "._image1.png",
+        "LICENSE",
+        "dark7.png",
+        "image3.txt",
+        "image_ambient.png",
+    )
+
+
+def test_one_numbered_picture_is_a_stack_of_one(tmp_path):
+    save(tmp_path, ["image0.png", "ambient.png"])
+    assert Pictures(tmp_path, HEADER).shape == (1, *SHAPE)
+
+
+@pytest.mark.parametrize("size", [None, 1, 3, 5, 8])
+def test_blocks_of_any_size_give_the_same_frames(tmp_path, size):
+    save(tmp_path, [f"image{k}.png" for k in range(5)])
+    travel = 0.1 * np.arange(1, 6)
+    source = Pictures(tmp_path, HEADER, travel=travel, phase=-travel)
+    frames, blocks = drain(source, size)
+    np.testing.assert_array_equal(frames, [frame(k) for k in range(5)])
+    np.testing.assert_array_equal(np.concatenate([b.travel for b in blocks]), travel)
+    np.testing.assert_array_equal(np.concatenate([b.phase for b in blocks]), -travel)
+    assert [b.index for b in blocks] == list(range(0, 5, size or 1))
+    assert {b.time for b in blocks} == {None}
+    assert {b.dropped for b in blocks} == {0}
+
+
+def test_the_frames_of_a_block_are_a_view_of_the_callers_buffer(tmp_path):
+    save(tmp_path, [f"image{k}.png" for k in range(2)])
+    room = np.full((4, *SHAPE), 99, np.uint8)
+    block = Pictures(tmp_path, HEADER).read(room)
+    assert block.frames.base is room
+    assert len(block.frames) == 2
+    assert np.all(room[2:] == 99)
+
+
+def test_after_the_end_there_is_nothing_until_rewound(tmp_path):
+    save(tmp_path, ["image3.png", "image4.png"])
+    with Pictures(tmp_path, HEADER) as source:
+        first, _ = drain(source, 2)
+        assert source.read() is None
+        source.rewind()
+        again, blocks = drain(source, 1)
+    np.testing.assert_array_equal(again, first)
+    assert blocks[0].index == 0
+
+
+@pytest.mark.parametrize(
+    "room", [np.empty((2, 9, 6), np.uint8), np.empty((2, *SHAPE), np.uint16), np.empty((0, *SHAPE), np.uint8)]
+)
+def test_a_buffer_that_does_not_fit_is_refused(tmp_path, room):
+    save(tmp_path, ["image0.png", "image1.png"])
+    with pytest.raises(ValueError, match="needed is"):
+        Pictures(tmp_path, HEADER).read(room)
+
+
+def test_no_block_spans_a_gap_and_the_next_says_how_many_were_lost(tmp_path):
+    save(tmp_path, ["image5.png", "image6.png", "image9.png", "image10.png", "image12.png"])
+    source = Pictures(tmp_path, HEADER, travel=Steps(0.5, 1.0))
+    for _ in range(2):
+        frames, blocks = drain(source, 8)
+        np.testing.assert_array_equal(frames, [frame(k) for k in range(5)])
+        assert [(b.index, len(b.frames), b.dropped) for b in blocks] == [(0, 2, 0), (2, 2, 2), (4, 1, 1)]
+        # Steps count the lost frames: the body moved on while they were lost.
+        assert np.concatenate([b.travel for b in blocks]).tolist() == [1.0, 1.5, 3.0, 3.5, 4.5]
+        source.rewind()
+
+
+@pytest.mark.parametrize("name", ["travel", "phase"])
+@pytest.mark.parametrize("values", [[0.1], [0.1, 0.2, 0.3], [[0.1, 0.2]], [0.1, np.nan]])
+def test_positions_that_do_not_fit_are_refused(tmp_path, name, values):
+    save(tmp_path, ["image0.png", "image1.png"])
+    with pytest.raises(InputError, match=f"{tmp_path}: {name} "):
+        Pictures(tmp_path, HEADER, **{name: values})
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], "no numbered PNG or TIFF"),
+        (["ambient.png"], "no numbered PNG or TIFF"),
+        (["img1.png", "img01.png"], "img01.png and img1.png have the same number"),
+        (["img1.png", "img1.tif", "img2.png"], "img1.png and img1.tif have the same number"),
+        (["a1.png", "a2.png", "b1.png", "b2.png", "b3.png"], "2 sequences, a#, b#"),
+        (["a1.png", "b1.png"], "2 sequences, a#, b#"),
+        (["f1_cam1.png", "f1_cam2.png", "f2_cam1.png", "f2_cam2.png"], "2 sequences, f1_cam#, f2_cam#"),
+    ],
+)
+def test_a_folder_without_one_clear_sequence_is_refused(tmp_path, names, message):
+    save(tmp_path, names)
+    with pytest.raises(InputError, match=message) as caught:
+        Pictures(tmp_path, HEADER)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("odd", "kind"),
+    [(np.zeros((9, 6), np.uint8), "6 x 9 uint8"), (np.zeros(SHAPE, np.uint16), "9 x 6 uint16")],
+)
+def test_a_frame_unlike_the_first_is_named(tmp_path, odd, kind):
+    save(tmp_path, ["image0.png", "image1.png"])
+    cv2.imwrite(str(tmp_path / "image2.png"), odd)
+    source = Pictures(tmp_path, HEADER)
+    with pytest.raises(InputError, match=rf"image2\.png is {kind}, but .*image0\.png is 9 x 6 uint8"):
+        drain(source, 3)
+
+
+def halved(data):
+    return data[: len(data) // 2]
+
+
+def flipped(data):
+    middle = len(data) * 2 // 3
+    return data[:middle] + bytes([data[middle] ^ 0x55]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [
+        ("png", halved),
+        ("png", flipped),
+        ("tif", halved),
+        ("png", lambda data: b""),
+        ("tif", lambda data: b""),
+        ("tif", lambda data: data[:4] + bytes(len(data) - 4)),
+        ("png", lambda data: b"hello"),
+        ("tif", lambda data: b"\xff\xd8\xff\xe0 a JPEG"),
+    ],
+)
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_damaged_picture_is_named(tmp_path, suffix, damage, number):
+    save(tmp_path, [f"image{k}.{suffix}" for k in range(3)], np.uint16)
+    file = tmp_path / f"image{number}.{suffix}"
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(InputError, match=str(file)):
+        drain(Pictures(tmp_path, HEADER))
+
+
+@pytest.mark.parametrize("path", [".", "image0.tif"])
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32, np.float64])
+def test_other_types_of_sample_are_refused(tmp_path, dtype, path):
+    cv2.imwrite(str(tmp_path / "image0.tif"), np.zeros(SHAPE, dtype))
+    with pytest.raises(InputError, match=rf"image0\.tif \(page 1\) has 1 {np.dtype(dtype)} a pixel"):
+        Pictures(tmp_path / path, HEADER)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("samples", [2, 5])
+def test_other_numbers_of_samples_are_refused(tmp_path, order, big, samples):
+    pages = [frame(0, np.uint16), np.repeat(frame(0, np.uint16)[..., np.newaxis], samples, axis=2)]
+    (tmp_path / "stack.tif").write_bytes(tiff(pages, order, big))
+    with pytest.raises(InputError, match=rf"stack\.tif \(page 2\) has {samples} uint16 a pixel"):
+        Pictures(tmp_path / "stack.tif", HEADER)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize(("suffix", "dtype"), [("png", np.uint8), ("png", np.uint16), ("tif", np.float32)])
+def test_colour_with_equal_channels_is_taken_exactly(tmp_path, suffix, dtype, channels):
+    picture = np.repeat(frame(1, dtype)[..., np.newaxis], channels, axis=2)
+    picture[..., 3:] = 7
+    cv2.imwrite(str(tmp_path / f"image0.{suffix}"), picture, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    np.testing.assert_array_equal(Pictures(tmp_path, HEADER).read().frames[0], frame(1, dtype))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.uint8, 0.51), (np.uint16, 1.5)])
+def test_true_colour_becomes_luma(tmp_path, dtype, tolerance):
+    blue, green, red = (frame(k, dtype) for k in (1, 5, 9))
+    cv2.imwrite(str(tmp_path / "image0.png"), np.dstack([blue, green, red]))
+    luma = 0.299 * red.astype(float) + 0.587 * green + 0.114 * blue
+    np.testing.assert_allclose(Pictures(tmp_path, HEADER).read().frames[0], luma, atol=tolerance)
+
+
+@pytest.mark.parametrize("size", [None, 2, 5])
+def test_the_pages_of_a_tiff_are_frames(tmp_path, size):
+    pages = [frame(k, np.uint16) for k in range(5)]
+    assert cv2.imwritemulti(str(tmp_path / "stack.tif"), pages)
+    source = Pictures(tmp_path / "stack.tif", HEADER, travel=Steps(0.1))
+    frames, _ = drain(source, size)
+    assert source.shape == (5, *SHAPE)
+    assert source.left_out == ()
+    np.testing.assert_array_equal(frames, pages)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("big", [False, True])
+def test_pages_are_counted_in_every_layout_of_tiff(tmp_path, order, big):
+    pages = [frame(k, np.uint16) for k in range(3)]
+    (tmp_path / "stack.tif").write_bytes(tiff(pages, order, big))
+    np.testing.assert_array_equal(drain(Pictures(tmp_path / "stack.tif", HEADER), 2)[0], pages)
+
+
+def test_pages_that_run_in_a_circle_are_damage(tmp_path):
+    data = bytearray(tiff([frame(0, np.uint16)]))
+    data[8 + 2 + 10 * 12 : 8 + 2 + 10 * 12 + 4] = struct.pack("<I", 8)
+    (tmp_path / "stack.tif").write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        Pictures(tmp_path / "stack.tif", HEADER)
+
+
+def test_a_tiff_without_pages_is_damage(tmp_path):
+    (tmp_path / "stack.tif").write_bytes(b"II*\0" + bytes(100))
+    with pytest.raises(InputError, match="is damaged: copy"):
+        Pictures(tmp_path / "stack.tif", HEADER)
+
+
+@pytest.mark.parametrize("far", [2**40, 2**63, 2**64 - 1])
+def test_a_page_that_lies_beyond_the_file_is_damage(tmp_path, far):
+    data = bytearray(tiff([frame(0, np.uint16)], big=True))
+    struct.pack_into("<Q", data, 8, far)
+    (tmp_path / "stack.tif").write_bytes(data)
+    with pytest.raises(InputError, match="cut off"):
+        Pictures(tmp_path / "stack.tif", HEADER)
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
+def test_a_stack_of_pages_that_is_cut_off_is_refused(tmp_path, kept):
+    cv2.imwritemulti(str(tmp_path / "stack.tif"), [frame(k, np.uint16) for k in range(5)])
+    data = (tmp_path / "stack.tif").read_bytes()
+    (tmp_path / "stack.tif").write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(InputError, match="cut off"):
+        Pictures(tmp_path / "stack.tif", HEADER)
+
+
+def test_pages_whose_samples_are_cut_off_are_named(tmp_path):
+    (tmp_path / "stack.tif").write_bytes(tiff([frame(k, np.uint16) for k in range(3)])[:-50])
+    with pytest.raises(InputError, match=r"stack\.tif \(page 3\) cannot be decoded"):
+        drain(Pictures(tmp_path / "stack.tif", HEADER), 3)
+
+
+def test_a_page_unlike_the_first_is_named(tmp_path):
+    (tmp_path / "stack.tif").write_bytes(tiff([np.zeros((4, 5), np.uint16), np.zeros((5, 4), np.uint16)]))
+    with pytest.raises(InputError, match=r"\(page 2\) is 4 x 5 uint16, but .* \(page 1\) is 5 x 4 uint16"):
+        drain(Pictures(tmp_path / "stack.tif", HEADER))
+
+
+def test_a_picture_of_several_pages_among_others_is_refused(tmp_path):
+    cv2.imwritemulti(str(tmp_path / "image0.tif"), [frame(k) for k in range(2)])
+    with pytest.raises(InputError, match=r"image0\.tif holds several pages"):
+        Pictures(tmp_path, HEADER)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("none", "no such file or folder"), ("image0.png", "name the folder")]
+)
+def test_a_path_that_is_no_stack_is_refused(tmp_path, name, message):
+    save(tmp_path, ["image0.png"])
+    with pytest.raises(InputError, match=message):
+        Pictures(tmp_path / name, HEADER)
+
+
+def test_open_frames_takes_folders_and_tiffs_as_pictures(tmp_path):
+    save(tmp_path, ["image0.tif", "image1.tif"])
+    for path in (tmp_path, str(tmp_path / "image0.tif")):
+        source = open_frames(path, HEADER, travel=Steps(0.1))
+        assert isinstance(source, Pictures)
+        assert source.read().travel.tolist() == [0.0]
+
+
+def test_decoders_print_nothing(tmp_path):
+    save(tmp_path, [f"image{k}.png" for k in range(2)])
+    data = (tmp_path / "image0.png").read_bytes()
+    body = b"iCCPx\0\0" + zlib.compress(bytes(132))
+    profile = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    (tmp_path / "image0.png").write_bytes(data[:33] + profile + data[33:])
+    (tmp_path / "image1.png").write_bytes(flipped(data))
+    (tmp_path / "stack.tif").write_bytes(tiff([frame(0, np.uint16)])[:-50])
+    program = """
+import sys
+from mirrorskin.io import Header, InputError, Steps, open_frames
+assert "cv2" not in sys.modules
+for path in sys.argv[1:]:
+    try:
+        source = open_frames(path, Header("vertical"), travel=Steps(0.1))
+        while source.read() is not None:
+            print("read")
+    except InputError:
+        print("refused")
+"""
+    arguments = [sys.executable, "-c", program, tmp_path, tmp_path / "stack.tif"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["read", "refused", "refused"]
+    assert done.stderr == ""

@@ -1,0 +1,290 @@
+"""What a recording looks like in the file, and that it is there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+from stacks import TRAVEL, MadeUp, assert_same, plot_of, random_stack, read_all, record, sphere
+
+from mirrorskin import io
+
+PHASE = np.arange(8) * np.pi / 4
+
+
+def full_header():
+    """An axial header with everything that a header can say."""
+    return io.Header(
+        "axial",
+        title="a coin, drawn and dull",
+        start_time="2026-01-02T03:04:05.678+01:00",
+        pixel_size=(0.03, 0.04),
+        dark=random_stack("float32", (5, 7), 1),
+        bright=random_stack("float32", (5, 7), 2) + np.float32(100),
+        press=0.7,
+        tilt=np.radians(2.5),
+        pivot=(0.1, -0.2, 40.0),
+        zenith_gain=np.linspace(50, 60, 35).reshape(5, 7),
+        zenith_offset=np.asarray(12.5),
+    )
+
+
+def layout(path):
+    """Return everything in a file: links, and the classes, types, shapes and attributes of objects."""
+    found = {}
+
+    def look(group):
+        for name in group:
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.SoftLink):
+                found[f"{group.name}/{name}"] = f"-> {link.path}"
+                continue
+            node = group[name]
+            attrs = {key: np.asarray(value).tolist() for key, value in node.attrs.items()}
+            if isinstance(node, h5py.Group):
+                found[node.name] = attrs
+                look(node)
+            else:
+                text = h5py.check_string_dtype(node.dtype)
+                found[node.name] = (node.shape, "text" if text else node.dtype.str[1:], attrs)
+
+    with h5py.File(path) as file:
+        found["/"] = dict(file.attrs)
+        look(file)
+    return {name.replace("//", "/"): value for name, value in found.items()}
+
+
+def test_a_vertical_recording_has_the_layout_of_the_design(tmp_path):
+    twin = sphere("uint16")
+    image, mm, rad = {"interpretation": "image", "units": "counts"}, {"units": "mm"}, {"units": "rad"}
+    instrument = "/entry/instrument"
+    assert layout(record(twin, tmp_path / "press.h5", truth=twin.truth)) == {
+        "/": {"NX_class": "NXroot", "default": "entry"},
+        "/entry": {"NX_class": "NXentry", "default": "data", "mirrorskin_recording": 1},
+        "/entry/title": ((), "text", {}),
+        "/entry/start_time": ((), "text", {}),
+        instrument: {"NX_class": "NXinstrument"},
+        f"{instrument}/detector": {"NX_class": "NXdetector"},
+        f"{instrument}/detector/data": ((8, 5, 7), "u2", image),
+        f"{instrument}/detector/x_pixel_size": ((), "f8", mm),
+        f"{instrument}/detector/y_pixel_size": ((), "f8", mm),
+        f"{instrument}/detector/frame_time": ((8,), "f8", {"units": "s"}),
+        f"{instrument}/detector/dark": ((5, 7), "f4", {"units": "counts"}),
+        f"{instrument}/detector/bright": ((5, 7), "f4", {"units": "counts"}),
+        f"{instrument}/stage": {"NX_class": "NXpositioner"},
+        f"{instrument}/stage/motion": ((), "text", {}),
+        f"{instrument}/stage/travel": ((8,), "f8", mm),
+        "/entry/data": {"NX_class": "NXdata", "signal": "frames", "axes": ["travel", ".", "."]},
+        "/entry/data/frames": f"-> {instrument}/detector/data",
+        "/entry/data/travel": f"-> {instrument}/stage/travel",
+        "/entry/truth": {"NX_class": "NXdata", "signal": "height"},
+        "/entry/truth/height": ((5, 7), "f4", mm),
+        "/entry/truth/zenith": ((5, 7), "f4", rad),
+        "/entry/truth/azimuth": ((5, 7), "f4", rad),
+        "/entry/truth/contact": ((5, 7), "u1", {}),
+    }
+
+
+def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
+    path = record(MadeUp(random_stack(), full_header(), phase=PHASE), tmp_path / "turn.h5")
+    found = layout(path)
+    stage, detector = "/entry/instrument/stage", "/entry/instrument/detector"
+    assert found["/entry/data"]["axes"] == ["phase", ".", "."]
+    assert found["/entry/data/phase"] == f"-> {stage}/phase"
+    assert {name: value for name, value in found.items() if name.startswith(f"{stage}/")} == {
+        f"{stage}/motion": ((), "text", {}),
+        f"{stage}/phase": ((8,), "f8", {"units": "rad"}),
+        f"{stage}/tilt": ((), "f8", {"units": "rad"}),
+        f"{stage}/pivot": ((3,), "f8", {"units": "mm"}),
+        f"{stage}/travel": ((), "f8", {"units": "mm"}),
+    }
+    assert found[f"{detector}/zenith_gain"] == ((5, 7), "f8", {"units": "1/rad"})
+    assert found[f"{detector}/zenith_offset"] == ((), "f8", {"units": "counts"})
+    assert f"{detector}/frame_time" not in found
+    with h5py.File(path) as file:
+        assert file["/entry/title"].asstr()[()] == "a coin, drawn and dull"
+        assert file[f"{stage}/motion"].asstr()[()] == "axial"
+
+
+@pytest.mark.parametrize("motion", ["horizontal", "twist"])
+def test_other_motions_are_plotted_along_the_time(tmp_path, motion):
+    header = io.Header(motion, press=1.5)
+    path = record(MadeUp(random_stack(), header, time=TRAVEL), tmp_path / "other.h5")
+    assert plot_of(path)[2] == ["frame_time", ".", "."]
+    with io.open_recording(path) as recording:
+        assert (recording.motion, recording.header.press) == (motion, 1.5)
+
+
+@pytest.mark.parametrize("known", [{}, {"time": TRAVEL}])
+def test_frames_without_positions_can_be_recorded(tmp_path, known):
+    path = record(MadeUp(random_stack(), io.Header("vertical"), **known), tmp_path / "still.h5")
+    _, signal, axes = plot_of(path)
+    assert axes == (["frame_time", ".", "."] if known else [])
+    np.testing.assert_array_equal(signal, random_stack())
+    with io.open_recording(path, travel=io.Steps(0.3)) as recording:
+        np.testing.assert_allclose(recording.travel, TRAVEL)
+        assert (recording.time is None) == (not known)
+
+
+def test_positions_that_are_missing_for_some_frames_are_told_when_read(tmp_path):
+    class Forgetful(MadeUp):
+        def read(self, out=None, /):
+            block = super().read(out)
+            if block is None or block.index != 5:
+                return block
+            return io.Block(block.frames, 5)
+
+    source = Forgetful(random_stack(), io.Header("vertical"), travel=TRAVEL)
+    path = record(source, tmp_path / "gap.h5")
+    with pytest.raises(io.InputError, match=r"gap\.h5: /entry/instrument/stage/travel is nan at frame 5"):
+        io.open_recording(path)
+
+
+def test_a_header_without_a_start_says_when_it_was_written(tmp_path):
+    path = record(MadeUp(random_stack(), io.Header("vertical"), travel=TRAVEL), tmp_path / "now.h5")
+    with io.open_recording(path) as recording:
+        assert np.datetime64("now") - np.datetime64(recording.header.start_time[:19]) < np.timedelta64(60, "s")
+
+
+@pytest.mark.parametrize("block", [1, 3, 8])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("compression", io.COMPRESSIONS)
+def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
+    frames, header = random_stack(dtype), full_header()
+    path = record(MadeUp(frames, header, time=TRAVEL, phase=PHASE), tmp_path / "turn.h5", compression, block)
+    with io.open_recording(path) as recording:
+        assert (recording.shape, recording.dtype, recording.motion) == (frames.shape, dtype, "axial")
+        assert_same(recording.header, header)
+        assert (recording.truth, recording.travel) == (None, None)
+        for size in (1, 3, 8, 20):
+            recording.rewind()
+            found, time, travel, phase = read_all(recording, size)
+            np.testing.assert_array_equal(found, frames)
+            np.testing.assert_array_equal(time, TRAVEL)
+            np.testing.assert_array_equal(phase, PHASE)
+            assert travel is None
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_the_twin_s_recording_is_the_twin(tmp_path, dtype):
+    twin = sphere(dtype)
+    path = record(twin, tmp_path / "press.h5", "bitshuffle", block=3, truth=twin.truth)
+    twin.rewind()
+    with io.open_recording(path) as recording:
+        for found, expected in zip(read_all(recording, 8), read_all(twin, 8), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert_same(recording.truth, twin.truth)
+        for name in ("title", "pixel_size", "motion"):
+            assert getattr(recording.header, name) == getattr(twin.header, name)
+
+
+def test_the_recorder_passes_on_what_it_writes(tmp_path):
+    frames = random_stack()
+    with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=TRAVEL), tmp_path / "a.h5") as recorder:
+        found, _, travel, _ = read_all(recorder, 3)
+    np.testing.assert_array_equal(found, frames)
+    np.testing.assert_array_equal(travel, TRAVEL)
+
+
+def test_drain_tells_how_far_it_is(tmp_path):
+    told = []
+    with io.Recorder(sphere(), tmp_path / "a.h5") as recorder:
+        recorder.drain(told.append)
+    assert told == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("compression", io.COMPRESSIONS)
+@pytest.mark.parametrize("error", [io.InputError("frame 3 is gone"), OSError(5, "the camera is gone"), KeyboardInterrupt()])
+def test_a_source_that_fails_leaves_nothing(tmp_path, compression, error):
+    old = tmp_path / "old.h5"
+    old.write_bytes(b"as it was")
+    source = MadeUp(random_stack(), io.Header("vertical"), fails=error)
+    with pytest.raises(type(error)) as caught:
+        record(source, old, compression)
+    assert caught.value is error
+    assert source.left
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"old.h5": b"as it was"}
+
+
+@pytest.mark.parametrize("announced", [7, 9])
+def test_another_number_of_frames_than_announced_leaves_nothing(tmp_path, announced):
+    source = MadeUp(random_stack(), io.Header("vertical"), announced=announced)
+    with pytest.raises(io.InputError, match=f"made up gave 8 frames and announced {announced}"):
+        record(source, tmp_path / "a.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_that_cannot_be_is_refused_before_the_source_starts(tmp_path):
+    class Hardware(MadeUp):
+        def __enter__(self):
+            raise AssertionError("moved the stage")
+
+    with pytest.raises(io.InputError, match="there is no folder"):
+        record(Hardware(random_stack(), io.Header("vertical")), tmp_path / "missing" / "a.h5")
+
+
+def test_an_unknown_compression_is_refused(tmp_path):
+    with pytest.raises(io.InputError, match="unknown compression 'zip'; known are raw, bitshuffle, blosc"):
+        io.Recorder(sphere(), tmp_path / "a.h5", "zip")
+
+
+def test_a_recorder_cannot_be_rewound(tmp_path):
+    with pytest.raises(RuntimeError, match="cannot be rewound"):
+        io.Recorder(sphere(), tmp_path / "a.h5").rewind()
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_permissions_follow_the_umask(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        path = record(sphere(), tmp_path / "a.h5")
+        assert os.umask(umask) == umask
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == mode
+
+
+def test_long_and_foreign_names_can_be_written(tmp_path):
+    for name in ("Münze für 5 Yen.h5", "\u4e94\u5186.h5", "x" * 252 + ".h5"):
+        with io.open_recording(record(sphere(), tmp_path / name)) as recording:
+            assert recording.name == str(tmp_path / name)
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from mirrorskin import io
+from stacks import MadeUp, random_stack, record
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+folder = Path(sys.argv[1])
+(folder / "old.h5").write_bytes(b"as it was")
+source = [MadeUp(random_stack("uint8", (60, 40, 50)), io.Header("vertical")) for _ in io.COMPRESSIONS]
+big = io.Result(height=np.random.default_rng(0).normal(size=(200, 200)).astype("f4"))
+work = [lambda s=s, c=c: record(s, folder / "old.h5", c) for s, c in zip(source, io.COMPRESSIONS)]
+for write in [*work, lambda: io.save_result(big, folder / "old.h5")]:
+    try:
+        write()
+    except io.InputError as error:
+        print(error)
+"""
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
+    # A limit to the size of files stands for the full disk. HDF5 used to crash at the end of the process.
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.path.dirname(sys.modules["stacks"].__file__)},
+    )
+    assert done.returncode == 0, done.stderr
+    line = f"{tmp_path}/old.h5 could not be written: File too large; make room, or choose another place with -o"
+    assert done.stdout.splitlines() == [line] * (len(io.COMPRESSIONS) + 1)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"old.h5": b"as it was"}

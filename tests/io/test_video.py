@@ -1,0 +1,271 @@
+import struct
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from mirrorskin.io import Header, InputError, Source, Steps, open_frames
+from mirrorskin.io.video import Video, _times
+
+HEADER = Header("axial", tilt=0.04)
+SHAPE = (48, 64)
+COUNT = 7
+RATE = 25.0
+
+# Named by file and codec: the largest error that the codec may make in a smooth picture.
+CODECS = {"stack.avi": ("MJPG", 6), "stack.mp4": ("mp4v", 8), "exact.avi": ("FFV1", 0)}
+
+
+def frame(number):
+    """Return a smooth frame of all 256 counts that its number tells apart from all others."""
+    ramp = np.add.outer(2 * np.arange(SHAPE[0]), 2.6 * np.arange(SHAPE[1]))
+    return np.clip(ramp + 4 * number - 10, 0, 255).astype(np.uint8)
+
+
+def encode(path, codec, count=COUNT, parameters=(), pictures=None):
+    """Write a video; return its path."""
+    code = cv2.VideoWriter_fourcc(*codec)
+    settings = list(parameters) or [cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, RATE, SHAPE[::-1], settings)
+    assert writer.isOpened()
+    for picture in pictures or map(frame, range(count)):
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+@pytest.fixture(params=CODECS)
+def video(request, tmp_path):
+    return encode(tmp_path / request.param, CODECS[request.param][0])
+
+
+@pytest.fixture
+def exact(tmp_path):
+    return encode(tmp_path / "exact.avi", "FFV1")
+
+
+def drain(source, size=None):
+    """Read to the end, ``size`` frames at a time; return copies of the frames, and the blocks."""
+    room = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
+    frames, blocks = [], []
+    while (block := source.read(room)) is not None:
+        frames.append(block.frames.copy())
+        blocks.append(block)
+    return np.concatenate(frames), blocks
+
+
+def patch(path, mark, offset, layout, *values):
+    """Overwrite numbers that stand ``offset`` bytes behind the end of a mark in a container."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, data.index(mark) + len(mark) + offset, *values)
+    path.write_bytes(data)
+
+
+def declare(avi, count):
+    """Let the header of an AVI's stream say another number of frames."""
+    patch(avi, b"strh", 36, "<I", count)
+
+
+def test_frames_are_the_luma_of_the_video(video):
+    source: Source = Video(video, HEADER)
+    frames, _ = drain(source)
+    assert (source.shape, source.dtype, source.motion) == ((COUNT, *SHAPE), np.uint8, "axial")
+    assert (source.name, source.header, source.rewindable) == (str(video), HEADER, True)
+    truth = np.stack([frame(k) for k in range(COUNT)]).astype(int)
+    assert np.abs(frames - truth).max() <= CODECS[video.name][1]
+
+
+def test_colour_becomes_luma(tmp_path):
+    blue, green, red = frame(0), frame(20), frame(40)
+    video = encode(
+        tmp_path / "colour.avi",
+        "FFV1",
+        parameters=[cv2.VIDEOWRITER_PROP_IS_COLOR, 1],
+        pictures=[np.dstack([blue, green, red])],
+    )
+    luma = 0.299 * red.astype(float) + 0.587 * green + 0.114 * blue
+    np.testing.assert_allclose(Video(video, HEADER).read().frames[0], luma, atol=0.51)
+
+
+@pytest.mark.parametrize("size", [None, 1, 3, COUNT, COUNT + 2])
+def test_blocks_of_any_size_give_the_same_frames(video, size):
+    whole, _ = drain(Video(video, HEADER), COUNT)
+    phase = np.linspace(0, 6, COUNT)
+    source = Video(video, HEADER, phase=phase, travel=phase + 1)
+    frames, blocks = drain(source, size)
+    np.testing.assert_array_equal(frames, whole)
+    np.testing.assert_array_equal(np.concatenate([b.phase for b in blocks]), phase)
+    np.testing.assert_array_equal(np.concatenate([b.travel for b in blocks]), phase + 1)
+    np.testing.assert_allclose(np.concatenate([b.time for b in blocks]), np.arange(COUNT) / RATE, atol=1e-9)
+    assert [b.index for b in blocks] == list(range(0, COUNT, size or 1))
+    assert {b.dropped for b in blocks} == {0}
+
+
+def test_the_frames_of_a_block_are_a_view_of_the_callers_buffer(exact):
+    room = np.full((COUNT + 2, *SHAPE), 99, np.uint8)
+    block = Video(exact, HEADER).read(room)
+    assert block.frames.base is room
+    assert len(block.frames) == COUNT
+    assert np.all(room[COUNT:] == 99)
+
+
+@pytest.mark.parametrize("read_before", [1, 3, COUNT])
+def test_a_video_can_be_rewound_anywhere(video, read_before):
+    with Video(video, HEADER) as source:
+        source.read(np.empty((read_before, *SHAPE), np.uint8))
+        source.rewind()
+        first, blocks = drain(source, 2)
+        assert source.read() is None
+        source.rewind()
+        again, _ = drain(source, 4)
+    assert blocks[0].index == 0
+    assert len(first) == COUNT
+    np.testing.assert_array_equal(again, first)
+
+
+@pytest.mark.parametrize(
+    "room",
+    [np.empty((2, 64, 48), np.uint8), np.empty((2, *SHAPE), np.uint16), np.empty((0, *SHAPE), np.uint8)],
+)
+def test_a_buffer_that_does_not_fit_is_refused(exact, room):
+    with pytest.raises(ValueError, match="needed is"):
+        Video(exact, HEADER).read(room)
+
+
+@pytest.mark.parametrize("name", ["travel", "phase"])
+@pytest.mark.parametrize("values", [[0.1], np.arange(COUNT + 1), np.full(COUNT, np.nan)])
+def test_positions_that_do_not_fit_are_refused(exact, name, values):
+    with pytest.raises(InputError, match=f"{exact}: {name} "):
+        Video(exact, HEADER, **{name: values})
+
+
+@pytest.mark.parametrize("declared", [0, 3])
+def test_frames_beyond_the_declared_number_count(exact, declared):
+    declare(exact, declared)
+    source = Video(exact, HEADER)
+    assert source.shape[0] == COUNT
+    assert len(drain(source)[0]) == COUNT
+
+
+def test_frames_that_are_declared_but_missing_are_damage(exact):
+    declare(exact, COUNT + 3)
+    with pytest.raises(InputError, match=rf"{exact} should have {COUNT + 3} frames, but {COUNT}"):
+        Video(exact, HEADER)
+
+
+@pytest.mark.parametrize("kept", [0.02, 0.3, 0.6, 0.9])
+def test_a_video_that_is_cut_off_is_refused(video, kept):
+    data = video.read_bytes()
+    video.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(InputError, match=str(video)):
+        Video(video, HEADER)
+
+
+def test_a_last_frame_of_which_the_end_is_missing_is_refused(tmp_path):
+    # An uncompressed frame decodes all the same when its end is missing.
+    video = encode(tmp_path / "raw.avi", "HFYU")
+    data = video.read_bytes()
+    last = data.rindex(b"00dc", 0, data.index(b"idx1"))
+    video.write_bytes(data[: last + 8 + int.from_bytes(data[last + 4 : last + 8], "little") // 2])
+    with pytest.raises(InputError, match=f"should have {COUNT} frames, but {COUNT - 1}"):
+        Video(video, HEADER)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", bytes(4096)])
+def test_what_is_no_video_is_refused(tmp_path, content):
+    file = tmp_path / "notes.avi"
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=rf"{file} cannot be opened as a video"):
+        Video(file, HEADER)
+
+
+def test_a_video_without_frames_is_refused(tmp_path):
+    video = encode(tmp_path / "empty.avi", "MJPG", count=0)
+    with pytest.raises(InputError, match=rf"{video} has no frames"):
+        Video(video, HEADER)
+
+
+@pytest.mark.parametrize("name", ["none.avi", "."])
+def test_a_path_that_is_no_file_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match="no such file"):
+        Video(tmp_path / name, HEADER)
+
+
+def test_samples_of_16_bits_are_not_cut_down(tmp_path):
+    parameters = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    pictures = [frame(k).astype(np.uint16) * 257 for k in range(3)]
+    video = encode(tmp_path / "deep.mkv", "FFV1", parameters=parameters, pictures=pictures)
+    with pytest.raises(InputError, match=rf"{video} has 16 bits a sample"):
+        Video(video, HEADER)
+
+
+def test_a_rotation_that_the_file_asks_for_is_applied(tmp_path):
+    video = encode(tmp_path / "stack.mp4", "mp4v")
+    upright, _ = drain(Video(video, HEADER))
+    one = 1 << 16
+    quarter_turn = (0, one, 0, -one, 0, 0, SHAPE[0] * one, 0, 1 << 30)
+    patch(video, b"tkhd", 40, ">9i", *quarter_turn)
+    source = Video(video, HEADER)
+    assert source.shape == (COUNT, *SHAPE[::-1])
+    np.testing.assert_array_equal(drain(source)[0], np.rot90(upright, -1, axes=(1, 2)))
+
+
+def test_a_file_that_changes_under_the_reader_is_noticed(exact):
+    source = Video(exact, HEADER)
+    encode(exact, "FFV1", count=COUNT - 2)
+    source.rewind()
+    with pytest.raises(InputError, match=f"{exact}: frame {COUNT - 2} cannot be decoded"):
+        drain(source)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "rate", "expected"),
+    [
+        ([0.0, 0.1, 0.4], 25.0, [0.0, 0.1, 0.4]),
+        ([2.0, 2.1, 2.5], 25.0, [0.0, 0.1, 0.5]),
+        ([7.0], 25.0, [0.0]),
+        ([0.0, 0.0, 0.0], 25.0, [0.0, 0.04, 0.08]),
+        ([0.0, 0.2, 0.1], 50.0, [0.0, 0.02, 0.04]),
+        ([0.0, np.nan, 0.1], 50.0, [0.0, 0.02, 0.04]),
+    ],
+)
+def test_times_are_the_files_where_they_increase_else_the_rates(stamps, rate, expected):
+    np.testing.assert_allclose(_times(np.array(stamps), rate), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf])
+def test_without_times_and_rate_there_is_no_time(rate):
+    assert _times(np.zeros(3), rate) is None
+
+
+def test_open_frames_takes_other_files_as_videos(video):
+    source = open_frames(str(video), HEADER, phase=Steps(0.5, 1.0))
+    assert isinstance(source, Video)
+    assert source.left_out == ()
+    np.testing.assert_array_equal(drain(source, COUNT)[1][0].phase, 1 + 0.5 * np.arange(COUNT))
+
+
+def test_decoders_print_nothing_and_the_environment_stays(video):
+    cut = video.with_stem("cut")
+    data = video.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    program = """
+import os, sys
+from mirrorskin.io import Header, InputError
+from mirrorskin.io.video import Video
+for path in sys.argv[1:]:
+    try:
+        with Video(path, Header("axial")) as source:
+            while source.read() is not None:
+                pass
+        print("read")
+    except InputError:
+        print("refused")
+assert not [name for name in os.environ if name.startswith("OPENCV_FFMPEG")]
+"""
+    arguments = [sys.executable, "-c", program, video, cut, __file__]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["read", "refused", "refused"]
+    assert done.stderr == ""
