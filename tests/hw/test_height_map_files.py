@@ -1,0 +1,122 @@
+"""Objects out of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import geometry
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw import Twin
+from mirrorskin.hw.twin import load_height_map, make_object
+from mirrorskin.io import InputError
+
+SHAPE = (40, 56)
+PIXEL = 0.1
+
+
+def write(path: Path, values: NDArray[Any]) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    else:
+        assert cv2.imwrite(str(path), values)
+    return path
+
+
+def hill() -> NDArray[np.float64]:
+    x, y = geometry.pixel_centres(SHAPE, PIXEL)
+    return np.exp(-((x - 0.4) ** 2) - (y + 0.3) ** 2 / 2) + 0.01 * x
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff"])
+@pytest.mark.parametrize("scale", [0.001, 0.00005])
+def test_sixteen_bit_pictures(tmp_path: Path, suffix: str, scale: float) -> None:
+    counts = np.rint((hill() + 0.1) / scale).astype(np.uint16)
+    path = write(tmp_path / f"hill{suffix}", counts)
+    thing = make_object(path, SHAPE, (PIXEL, PIXEL), scale=scale)
+    expected = (counts.astype(int) - counts.max()) * scale
+    height = thing.height(*geometry.pixel_centres(SHAPE, PIXEL))
+    np.testing.assert_allclose(height, expected, rtol=0, atol=1e-12)
+    assert thing.name == path.name
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".NPY", ".tif"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floating_point_is_millimetres_below_the_highest(tmp_path: Path, suffix: str, dtype: Any) -> None:
+    heights = hill().astype(dtype)
+    heights[3:9, 5] = np.nan
+    path = write(tmp_path / f"hill{suffix.lower()}", heights).rename(tmp_path / f"hill{suffix}")
+    found = load_height_map(path, (PIXEL, PIXEL)).heights
+    np.testing.assert_allclose(found, heights.astype(float) - np.nanmax(heights), rtol=0, atol=1e-12)
+
+
+def test_a_file_of_the_truth_presses_like_the_object_itself(tmp_path: Path) -> None:
+    travel = np.linspace(0.01, 0.97, 20)  # no pixel is met exactly
+    original = Twin(object="sphere", shape=(81, 81), pixel_size=PIXEL, travel=travel)
+    path = write(tmp_path / "ball.npy", original.truth.height)
+    copy = Twin(object=path, shape=(81, 81), pixel_size=PIXEL, travel=travel)
+    assert copy.name == "twin: ball.npy"
+    np.testing.assert_array_equal(copy.truth.height, original.truth.height)
+    np.testing.assert_array_equal(copy.truth.contact, original.truth.contact)
+    steep = original.truth.zenith < np.radians(40)
+    np.testing.assert_allclose(copy.truth.zenith[steep], original.truth.zenith[steep], atol=2e-3)
+
+
+def test_a_small_map_lies_amid_a_larger_field(tmp_path: Path) -> None:
+    path = write(tmp_path / "bump.npy", hill())
+    height = Twin(object=str(path), shape=(60, 60), pixel_size=PIXEL, travel=[1.0]).truth.height
+    np.testing.assert_allclose(height[10:50, 2:58], hill() - hill().max(), atol=1e-6)
+    assert np.isnan(height).sum() == 60 * 60 - 40 * 56
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("bytes.png", np.zeros((4, 4), np.uint8), "uint8"),
+        ("colour.png", np.zeros((4, 4, 3), np.uint16), "rows and columns"),
+        ("stack.npy", np.zeros((2, 4, 4)), "rows and columns"),
+        ("empty.npy", np.zeros((0, 4)), "rows and columns"),
+        ("whole.npy", np.zeros((4, 4), np.int64), "int64"),
+        ("nowhere.npy", np.full((4, 4), np.nan), "finite"),
+        ("deep.npy", np.array([[0.0, -np.inf]]), "finite"),
+        ("objects.npy", np.array([[None]]), "NumPy array"),
+    ],
+)
+def test_unusable_values_are_refused(tmp_path: Path, name: str, values: NDArray[Any], words: str) -> None:
+    refused(write(tmp_path / name, values), words)
+
+
+@pytest.mark.parametrize("name", ["text.npy", "text.png", "text.tiff"])
+@pytest.mark.parametrize("content", [b"", b"not a height map"])
+def test_files_that_are_not_what_they_claim(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    refused(path, "is no ")
+
+
+@pytest.mark.parametrize("name", ["missing.npy", "missing.png"])
+def test_missing_files(tmp_path: Path, name: str) -> None:
+    refused(tmp_path / name, "No such file")
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "folder.npy").mkdir()
+    refused(tmp_path / "folder.npy", "directory")
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.001, np.nan])
+def test_a_scale_must_be_positive(tmp_path: Path, scale: float) -> None:
+    path = write(tmp_path / "hill.png", np.ones((4, 4), np.uint16))
+    with pytest.raises(InputError, match="scale"):
+        load_height_map(path, (PIXEL, PIXEL), scale=scale)
+
+
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        make_object(path, SHAPE, (PIXEL, PIXEL))
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)

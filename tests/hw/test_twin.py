@@ -1,0 +1,256 @@
+"""The twin as a source: what its frames show, and that they are the same however they are read."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import Any
+
+import geometry
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw import Twin
+from mirrorskin.hw.twin import OBJECT_NAMES, HeightMap
+from mirrorskin.io import InputError, Source
+
+SHAPE = (61, 84)
+PIXEL = 0.13
+# Not on a regular grid, and no height of an object falls on one of them.
+TRAVEL = np.cumsum(np.linspace(0.05, 0.16, 25)) - 0.0137
+
+
+def make_twin(**changes: Any) -> Twin:
+    given: dict[str, Any] = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL, "travel": TRAVEL}
+    return Twin(**(given | changes))
+
+
+def read_all(source: Source, size: int | None = None) -> NDArray[Any]:
+    """Read what is left in blocks of this size, or one frame at a time into the source's own arrays."""
+    frames: list[NDArray[Any]] = []
+    while True:
+        buffer = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
+        block = source.read(buffer)
+        if block is None:
+            return np.concatenate(frames)
+        frames.append(block.frames.copy())
+
+
+@pytest.mark.parametrize("dtype", geometry.LEVELS)
+@pytest.mark.parametrize("name", geometry.SURFACES)
+def test_frames_without_noise_are_dark_until_contact_and_then_show_the_slope(name: str, dtype: str) -> None:
+    surface = geometry.SURFACES[name](SHAPE, PIXEL)
+    dark, bright = geometry.LEVELS[dtype]
+    contact = geometry.first_contact(surface.height, TRAVEL)
+    touched = np.arange(len(TRAVEL))[:, None, None] >= contact
+    expected = np.where(touched, geometry.light_level(surface.zenith, dark, bright), dark)
+
+    frames = read_all(make_twin(object=name, dtype=dtype, noise=0))
+
+    assert frames.dtype == dtype
+    assert touched.any(axis=0).mean() > 0.3  # the test sees contact
+    assert (~touched[-1]).any()  # and places without
+    rounding = 0 if dtype == "float32" else 0.5
+    np.testing.assert_allclose(frames, expected, rtol=1e-6, atol=rounding + 1e-6)
+
+
+def test_state_of_each_frame_is_that_of_the_paper() -> None:
+    surface = geometry.sphere(SHAPE, PIXEL)
+    frames = read_all(make_twin(noise=0))
+    light = frames >= 120
+    first = np.where(light.any(axis=0), light.argmax(axis=0), len(TRAVEL))
+    np.testing.assert_array_equal(first, geometry.first_light(surface, TRAVEL))
+    assert np.isin(np.unique(np.diff(light.astype(int), axis=0)), (0, 1)).all()  # once light, light
+    middle = light[:, SHAPE[0] // 2, SHAPE[1] // 2]
+    assert not middle.any()  # the crater of Fig. 5
+
+
+def test_contact_is_made_in_the_very_frame_that_reaches_the_height() -> None:
+    height = float(make_twin(object="plane").truth.height.astype(np.float64)[30, 42])
+    twin = make_twin(object="plane", travel=[-height - 1e-5, -height + 1e-5], noise=0)
+    frames = read_all(twin)
+    assert frames[0, 30, 42] == 16
+    assert frames[1, 30, 42] == 224
+
+
+def test_a_sheet_that_just_reaches_the_height_touches_and_may_wait_there() -> None:
+    heights = np.outer(np.ones(5), [0.0, -0.5, -1.0])  # 27 degrees steep
+    step = HeightMap(heights, (1.0, 1.0))
+    frames = read_all(Twin(object=step, shape=(5, 3), pixel_size=1.0, travel=[0.25, 0.5, 0.5, 0.75], noise=0))
+    np.testing.assert_array_equal(frames[:, 2, 1], [16, 224, 224, 224])
+    np.testing.assert_array_equal(frames[:, 2, 2], 16)
+
+
+@pytest.mark.parametrize("name", geometry.SURFACES)
+def test_truth_is_the_geometry(name: str) -> None:
+    surface = geometry.SURFACES[name](SHAPE, PIXEL)
+    truth = make_twin(object=name).truth
+    for found, expected in zip((truth.height, truth.zenith, truth.azimuth), surface, strict=True):
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert truth.contact.dtype == np.uint8
+    np.testing.assert_array_equal(truth.contact, -surface.height <= TRAVEL[-1])
+
+
+@pytest.mark.parametrize("name", OBJECT_NAMES)
+def test_every_object_touches_first_at_travel_zero_and_lights_up(name: str) -> None:
+    twin = make_twin(object=name, shape=(200, 200), pixel_size=0.12, noise=0)
+    assert -0.07 < np.nanmax(twin.truth.height) <= 0  # the highest pixel centre may miss the apex
+    assert np.isfinite(twin.truth.height).mean() > 0.1
+    assert (read_all(twin)[-1] > 200).any()
+
+
+@pytest.mark.parametrize("dtype", geometry.LEVELS)
+def test_header_has_the_exact_references(dtype: str) -> None:
+    twin = make_twin(dtype=dtype, noise=3.0, pixel_size=(0.1, 0.2))
+    for reference, level in zip((twin.header.dark, twin.header.bright), geometry.LEVELS[dtype], strict=True):
+        assert reference is not None
+        assert reference.dtype == np.float32
+        np.testing.assert_array_equal(reference, np.full(SHAPE, level))
+    assert twin.header.motion == twin.motion == "vertical"
+    assert twin.header.pixel_size == (0.1, 0.2)
+    assert "sphere" in twin.header.title
+    assert twin.name == "twin: sphere"
+    assert twin.shape == (len(TRAVEL), *SHAPE)
+
+
+def test_pixels_may_be_oblong() -> None:
+    height = make_twin(pixel_size=(0.05, 0.1), shape=(31, 61)).truth.height
+    np.testing.assert_allclose(height[15, 30 + 20], height[15 - 10, 30], rtol=1e-6)
+
+
+def test_blocks_say_when_and_where() -> None:
+    with make_twin() as twin:
+        starts = []
+        while (block := twin.read(np.empty((7, *SHAPE), np.uint8))) is not None:
+            number = np.arange(block.index, block.index + len(block.frames))
+            assert block.time is not None
+            assert block.travel is not None
+            np.testing.assert_allclose(block.time, number / 30)
+            np.testing.assert_array_equal(block.travel, TRAVEL[number])
+            starts.append((block.index, len(block.frames)))
+    assert starts == [(0, 7), (7, 7), (14, 7), (21, 4)]
+
+
+def test_a_read_fills_the_buffer_it_was_given() -> None:
+    buffer = np.zeros((3, *SHAPE), np.uint8)
+    block = make_twin().read(buffer)
+    assert block is not None
+    assert np.shares_memory(block.frames, buffer)
+    assert buffer.all()
+
+
+@pytest.mark.parametrize("dtype", geometry.LEVELS)
+@pytest.mark.parametrize("size", [None, 1, 7, len(TRAVEL), 100])
+def test_the_same_seed_gives_the_same_frames_however_they_are_cut(dtype: str, size: int | None) -> None:
+    whole = read_all(make_twin(dtype=dtype, seed=5), len(TRAVEL))
+    twin = make_twin(dtype=dtype, seed=5)
+    np.testing.assert_array_equal(read_all(twin, size), whole)
+    assert twin.read() is None
+    assert twin.rewindable
+    twin.rewind()
+    np.testing.assert_array_equal(read_all(twin, size), whole)
+
+
+def test_rewind_half_way_starts_again() -> None:
+    twin = make_twin()
+    whole = read_all(twin)
+    twin.rewind()
+    twin.read(np.empty((9, *SHAPE), np.uint8))
+    twin.rewind()
+    np.testing.assert_array_equal(read_all(twin), whole)
+
+
+def test_noise_differs_between_seeds_and_between_frames() -> None:
+    a, b = (read_all(make_twin(dtype="float32", seed=seed)) for seed in (0, 1))
+    clean = read_all(make_twin(dtype="float32", noise=0))
+    noise = np.concatenate([a - clean, b - clean]).reshape(2 * len(TRAVEL), -1)
+    correlation = np.corrcoef(noise) - np.eye(len(noise))
+    assert np.abs(correlation).max() < 5 / np.sqrt(noise.shape[1])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "noise", "quantisation"),
+    [("uint8", 1.5, 1 / 12), ("uint8", 4.0, 1 / 12), ("uint16", 20.0, 1 / 12), ("float32", 0.7, 0.0)],
+)
+def test_noise_is_gaussian_of_the_given_size(dtype: str, noise: float, quantisation: float) -> None:
+    clean = read_all(make_twin(dtype=dtype, noise=0)).astype(float)
+    error = read_all(make_twin(dtype=dtype, noise=noise, seed=3)) - clean
+    exact = np.isin(clean, geometry.LEVELS[dtype])  # elsewhere the clean level was rounded too
+    error = error[exact]
+    spread = np.sqrt(noise**2 + quantisation)
+    assert abs(error.mean()) < 5 * spread / np.sqrt(error.size)
+    assert error.std() == pytest.approx(spread, rel=0.02)
+    assert np.mean(np.abs(error) > 3 * noise + 0.5) == pytest.approx(0.0027, abs=0.0027)
+
+
+def test_the_default_noise_is_one_and_a_half_counts() -> None:
+    np.testing.assert_array_equal(read_all(make_twin()), read_all(make_twin(noise=1.5, seed=0)))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_integers_saturate_at_both_ends_and_never_wrap(dtype: str) -> None:
+    top = int(np.iinfo(dtype).max)
+    noise = 0.5 * top
+    level, frames = (read_all(make_twin(dtype=dtype, noise=spread)) for spread in (0.0, noise))
+    below = [NormalDist(float(mean), noise).cdf(0.5) for mean in level.flat]
+    above = [1 - NormalDist(float(mean), noise).cdf(top - 0.5) for mean in level.flat]
+    assert np.mean(frames == 0) == pytest.approx(np.mean(below), rel=0.02)
+    assert np.mean(frames == top) == pytest.approx(np.mean(above), rel=0.06)
+
+
+def test_floats_are_not_clipped() -> None:
+    frames = read_all(make_twin(dtype="float32", noise=100.0))
+    assert frames.min() < -100
+    assert frames.max() > 300
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"travel": [0.3, 0.2, 0.4]}, "travel.*frame 1"),
+        ({"travel": [0.1, np.nan, 0.4]}, "travel.*frame 1"),
+        ({"travel": [0.1, np.inf]}, "travel.*frame 1"),
+        ({"travel": [[0.1, 0.2], [0.3, 0.4]]}, "travel"),
+        ({"travel": []}, "travel"),
+        ({"travel": 1.0}, "travel"),
+        ({"pixel_size": 0}, "pixel size"),
+        ({"pixel_size": -0.1}, "pixel size"),
+        ({"pixel_size": np.nan}, "pixel size"),
+        ({"pixel_size": (0.1, 0.0)}, "pixel size"),
+        ({"pixel_size": (0.1, 0.1, 0.1)}, "pixel size"),
+        ({"shape": (0, 10)}, "shape"),
+        ({"shape": (10, -1)}, "shape"),
+        ({"shape": (10,)}, "shape"),
+        ({"noise": -1.0}, "noise"),
+        ({"noise": np.nan}, "noise"),
+        ({"seed": -1}, "seed"),
+        ({"dtype": "int16"}, "int16.*uint8, uint16, float32"),
+        ({"dtype": "float64"}, "float64"),
+        ({"dtype": "counts"}, "counts"),
+        ({"object": "teapot"}, "teapot.*sphere, coin, plane, cone"),
+        ({"object": "missing.png"}, "missing.png"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        make_twin(**changes)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "buffer",
+    [
+        np.empty((0, *SHAPE), np.uint8),
+        np.empty((2, *SHAPE), np.uint16),
+        np.empty((2, 3, 4), np.uint8),
+        np.empty(SHAPE, np.uint8),
+    ],
+)
+def test_a_buffer_that_does_not_fit_is_refused_and_costs_no_frame(buffer: NDArray[Any]) -> None:
+    twin = make_twin()
+    with pytest.raises(InputError, match="buffer"):
+        twin.read(buffer)
+    block = twin.read()
+    assert block is not None
+    assert block.index == 0
