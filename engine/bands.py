@@ -1,0 +1,156 @@
+"""Room on a device for a picture's maps and some frames: in one piece if it fits, else in bands of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
+
+
+class Band:
+    """Some rows of a picture on a device: named maps, and room for some frames.
+
+    Attributes
+    ----------
+    rows : slice
+        The rows of the picture that it holds.
+    pixels : int
+    maps : dict of Array, (rows, W)
+    frames : Array, (n, rows, W)
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        rows: slice,
+        columns: int,
+        dtype: np.dtype[Any],
+        maps: Mapping[str, DTypeLike],
+        length: int,
+    ) -> None:
+        shape = (rows.stop - rows.start, columns)
+        self.rows = rows
+        self.pixels = shape[0] * shape[1]
+        self.maps = {name: device.array(name, shape, kind) for name, kind in maps.items()}
+        self.frames = _longest(device, length, shape, dtype)
+        self._device = device
+        self._alone = True
+        self._resident = False
+
+    def yield_room(self) -> None:
+        """Leave the device to other bands whenever this one is not at work."""
+        self._alone = False
+        self._park()
+
+    def write(self, name: str, values: NDArray[Any]) -> None:
+        """Fill a map from the host."""
+        array = self.maps[name]
+        array.claim()
+        array.host[:] = values
+        if self._resident:
+            array.upload()
+
+    @contextmanager
+    def resident(self) -> Iterator[None]:
+        """Have the maps on the device for a while."""
+        if not self._resident:
+            for array in self.maps.values():
+                array.upload()
+            self._resident = True
+        yield
+        if not self._alone:
+            self._park()
+
+    def stage(self, frames: NDArray[Any]) -> Iterator[tuple[int, int]]:
+        """Bring frames to the device piece by piece, without a copy where they lie in its room already.
+
+        Parameters
+        ----------
+        frames : ndarray, (n, H, W)
+
+        Yields
+        ------
+        start, count : int
+            Which of the frames are there now.
+        """
+        room = self.frames.host
+        in_place = len(frames) <= len(room) and frames.ctypes.data == room.ctypes.data
+        step = max(1, len(frames) if in_place else len(room))
+        for start in range(0, len(frames), step):
+            part = frames[start : start + step]
+            if not in_place:
+                room[: len(part)] = part[:, self.rows]
+            self.frames.upload(len(part))
+            yield start, len(part)
+            self._device.finish()
+            self.frames.claim()
+
+    def _park(self) -> None:
+        for array in self.maps.values():
+            array.park()
+        self.frames.drop()
+        self._resident = False
+
+
+def cut_into_bands(
+    device: Device, shape: tuple[int, int], dtype: np.dtype[Any], maps: Mapping[str, DTypeLike], length: int
+) -> list[Band]:
+    """Make room for a picture: one band where the device has the memory, else as few as it takes.
+
+    Parameters
+    ----------
+    device : Device
+    shape : (int, int)
+        Rows and columns of the picture.
+    dtype : dtype
+        Type of a sample.
+    maps : mapping of str to dtype
+        The maps that are needed of each pixel.
+    length : int
+        Frames that a band should hold; fewer where they do not fit.
+
+    Raises
+    ------
+    DeviceError
+        Not even one row fits.
+    """
+    return _cut(device, slice(0, shape[0]), shape[1], dtype, maps, length)
+
+
+def _cut(
+    device: Device,
+    rows: slice,
+    columns: int,
+    dtype: np.dtype[Any],
+    maps: Mapping[str, DTypeLike],
+    length: int,
+) -> list[Band]:
+    try:
+        return [Band(device, rows, columns, dtype, maps, length)]
+    except DeviceMemoryError as error:
+        if rows.stop - rows.start == 1:
+            message = f"one row of {columns} pixels does not fit: {error}; use another device"
+            raise DeviceError(message) from error
+    middle = (rows.start + rows.stop) // 2
+    bands = []
+    for half in (slice(rows.start, middle), slice(middle, rows.stop)):
+        bands += _cut(device, half, columns, dtype, maps, length)
+        for band in bands:
+            band.yield_room()
+    return bands
+
+
+def _longest(device: Device, length: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
+    while True:
+        try:
+            return device.array("frames", (length, *shape), dtype)
+        except DeviceMemoryError:
+            if length == 1:
+                raise
+            length //= 2

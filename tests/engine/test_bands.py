@@ -1,0 +1,37 @@
+"""A picture that a device cannot hold in one piece is worked on in bands, with the same answer."""
+
+import numpy as np
+import pytest
+from presses import SPEC, assert_equal, random_press
+
+from mirrorskin.engine import OnsetSearch, find_onset
+from mirrorskin.io import Block
+from mirrorskin.kernels.errors import DeviceError
+
+FRAMES = random_press("uint8", 30, (23, 31), seed=5)
+TRAVEL = np.arange(30) * 0.1
+
+
+@pytest.mark.parametrize("limit", [40_000, 23 * 31 * 4, 23 * 31 * 4 - 1, 500, 31 * 4])
+def test_less_room_gives_the_same_answer(small_device, limit):
+    whole = find_onset(FRAMES, TRAVEL, *SPEC["uint8"], device=small_device)
+    small_device.max_allocation = max(limit, 30 * 8)  # the travel of all frames must fit too
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    for start in range(0, 30, 4):
+        part = slice(start, start + 4)
+        search.push(Block(FRAMES[part], start, travel=TRAVEL[part]))
+    assert_equal(search.result(), whole)
+    assert_equal(search.result(), whole)
+    assert (search.room is None) == (limit < 23 * 31 * 4)
+
+
+def test_the_room_shrinks_before_the_picture_is_cut(small_device):
+    small_device.max_allocation = 6 * 23 * 31
+    search = OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
+    assert 1 <= len(search.room) <= 6
+
+
+def test_one_row_that_does_not_fit_is_said_so(small_device):
+    small_device.max_allocation = 31 * 4 - 1
+    with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
+        OnsetSearch((23, 31), FRAMES.dtype, device=small_device)

@@ -1,0 +1,335 @@
+"""The onset: the kernels against their references, the references against a loop over pixels."""
+
+import numpy as np
+import pytest
+from presses import SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
+
+from mirrorskin.engine import OnsetSearch, find_onset
+from mirrorskin.io import Block, InputError
+
+DTYPES = sorted(SPEC)
+
+
+def uneven_travel(count, start=0.0):
+    return start + np.cumsum(np.random.default_rng(5).uniform(0.001, 0.2, count))
+
+
+def search_in_blocks(frames, travel, cuts, device, **options):
+    search = OnsetSearch(frames.shape[1:], frames.dtype, device=device, **options)
+    for part in np.split(np.arange(len(frames)), cuts):
+        if len(part):
+            search.push(Block(frames[part], index=int(part[0]), travel=travel[part]))
+    return search.result()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("hold", [1, 2, 3, 7, 300])
+def test_the_reference_finds_the_first_run_that_holds(dtype, hold):
+    dark, bright = SPEC[dtype]
+    frames = random_press(dtype, 25, (9, 11), seed=hold, noise=0.2)
+    found = numpy_onset(frames, np.arange(25.0), dark, bright, noise=1.0, hold=hold)
+    light = frames.astype(float) >= (dark + bright) / 2
+    expected = np.array([first_run(series, hold) for series in light.reshape(25, -1).T]).reshape(9, 11)
+    np.testing.assert_array_equal(found.frame, expected)
+    np.testing.assert_array_equal(found.status, np.select([expected == -1, expected == 0], [2, 3], 1))
+
+
+@pytest.mark.parametrize("subframe", [True, False])
+@pytest.mark.parametrize("hold", [1, 2, 5, 300])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_device_agrees_with_the_reference(device, dtype, hold, subframe):
+    frames = random_press(dtype, 40, (33, 61), seed=3)
+    dark, bright = SPEC[dtype]
+    noise = 0.008 * (bright - dark)
+    travel = uneven_travel(40, start=-1.7)
+    options = {"threshold": 0.4, "hold": hold, "subframe": subframe, "noise": noise}
+    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    assert {1, 2, 3} <= set(found.status.flat)
+    assert_within_an_ulp(found, numpy_onset(frames, travel, dark, bright, **options), travel)
+
+
+def test_a_device_agrees_without_references(device):
+    frames = random_press("uint8", 40, (33, 61), seed=8)
+    travel = uneven_travel(40)
+    found = find_onset(frames, travel, noise=1.5, device=device)
+    expected = numpy_onset(frames, travel, None, None, noise=1.5, own_dark=True)
+    assert_within_an_ulp(found, expected, travel)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_references_of_each_pixel_are_obeyed(device, dtype):
+    frames = random_press(dtype, 30, (17, 23), seed=4)
+    generator = np.random.default_rng(6)
+    dark, bright = (level * generator.uniform(0.8, 1.2, (17, 23)) for level in SPEC[dtype])
+    travel = uneven_travel(30)
+    found = find_onset(frames, travel, dark, bright, noise=0.01, device=device)
+    assert_within_an_ulp(found, numpy_onset(frames, travel, dark, bright, noise=0.01), travel)
+
+
+@pytest.mark.parametrize("cuts", [range(1, 40), range(7, 40, 7), [1, 2, 39], [20]])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("hold", [1, 2, 6])
+def test_blocks_make_no_difference(device, dtype, cuts, hold):
+    frames = random_press(dtype, 40, (19, 29), seed=1, noise=0.15)
+    travel = uneven_travel(40)
+    dark, bright = SPEC[dtype]
+    options = {"dark": dark, "bright": bright, "hold": hold, "device": device}
+    whole = search_in_blocks(frames, travel, [], **options)
+    assert_equal(search_in_blocks(frames, travel, list(cuts), **options), whole)
+
+
+def test_blocks_make_no_difference_to_a_dark_of_its_own(device):
+    frames = random_press("uint8", 40, (19, 29), seed=2)
+    travel = uneven_travel(40)
+    whole = search_in_blocks(frames, travel, [], device)
+    assert_equal(search_in_blocks(frames, travel, list(range(1, 40)), device), whole)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (37, 53), (3, 1024), (5, 411)])
+def test_odd_sizes(device, shape):
+    frames = random_press("uint8", 12, shape, seed=9)
+    travel = np.arange(12) * 0.1
+    found = find_onset(frames, travel, *SPEC["uint8"], noise=1.5, device=device)
+    assert_within_an_ulp(found, numpy_onset(frames, travel, *SPEC["uint8"], noise=1.5), travel)
+
+
+@pytest.mark.parametrize(("count", "dtype"), [(300, "uint8"), (70_000, "uint8"), (70_000, "uint16")])
+def test_long_stacks(device, count, dtype):
+    dark, bright = SPEC[dtype]
+    onset = np.array([[1, 254, 255, 256], [count - 300, count - 2, count - 1, count + 1]])
+    frames = np.where(np.arange(count)[:, None, None] >= onset, bright, dark).astype(dtype)
+    found = find_onset(frames, np.arange(count) * 1e-3, dark, bright, device=device)
+    np.testing.assert_array_equal(found.frame, np.where(onset < count, onset, -1))
+
+
+def test_a_sudden_step_lies_in_the_middle_of_its_interval(device):
+    frames = np.full((4, 1, 1), 20, np.uint8)
+    frames[2:] = 180
+    found = find_onset(frames, [0.0, 0.1, 0.4, 0.5], 20, 220, noise=1.0, device=device)
+    assert found.height[0, 0] == np.float32(-0.25)
+    assert found.sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
+
+
+def test_a_ramp_is_interpolated_exactly(device):
+    """A ramp of 16 counts a frame crosses 120 at 1.25 frames after the fifth, whatever the references."""
+    frames = (np.arange(12) * 16 + 20).astype(np.uint8)[:, None, None]
+    found = find_onset(frames, np.arange(12) * 0.1, 20, 220, noise=1.0, device=device)
+    assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
+    share = 0.25
+    assert found.sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(share, 1 - share), rel=1e-5)
+
+
+def test_without_subframe_the_height_is_equation_4_to_the_letter(device):
+    frames = random_press("uint8", 30, (9, 9), seed=2)
+    travel = np.arange(1, 31) * 0.1
+    found = find_onset(frames, travel, *SPEC["uint8"], subframe=False, device=device)
+    answered = found.status == 1
+    np.testing.assert_array_equal(found.height[answered], -travel[found.frame[answered]].astype(np.float32))
+    np.testing.assert_allclose(found.sigma[answered], 0.1 / np.sqrt(3), rtol=1e-6)
+
+
+def test_sigma_is_honest_on_ramps(device):
+    """On a ramp whose steps stand well above the noise, the mean square of error over sigma is 1."""
+    generator = np.random.default_rng(0)
+    shape, count, slope = (200, 250), 24, 24.0
+    crossing = generator.uniform(10, 14, shape)
+    number = np.arange(count)[:, None, None]
+    counts = 120 + slope * (number - crossing) + generator.normal(0, 1.5, (count, *shape))
+    frames = counts.astype(np.float32)
+    found = find_onset(frames, np.arange(count) * 0.1, 20, 220, noise=1.5, device=device)
+    error = found.height + 0.1 * crossing
+    assert np.all(found.status == 1)
+    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
+
+
+def test_sigma_is_honest_on_steps(device):
+    generator = np.random.default_rng(0)
+    crossing = generator.uniform(1, 28, (200, 250))
+    frames = np.where(np.arange(30)[:, None, None] >= crossing, 200, 20) + generator.normal(
+        0, 1.5, (30, 200, 250)
+    )
+    found = find_onset(np.rint(frames).astype(np.uint8), np.arange(30) * 0.1, 20, 220, device=device)
+    error = found.height + 0.1 * crossing
+    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
+    assert abs(np.mean(error)) < 0.001
+
+
+def test_noise_is_told_from_the_first_two_frames():
+    generator = np.random.default_rng(1)
+    for noise in (0.6, 1.5, 6.0):
+        frames = np.rint(30 + generator.normal(0, noise, (5, 200, 200))).astype(np.uint8)
+        frames[1, :, :40] = 200  # what changes in between is left out
+        found = find_onset(frames, np.arange(5.0), 20, 220)
+        assert found.noise == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
+
+
+def test_a_spike_is_no_onset_unless_the_stack_ends_on_it(device):
+    frames = np.full((9, 1, 4), 20, np.uint8)
+    frames[3, 0, 0] = 255
+    frames[8, 0, 1] = 255
+    frames[[3, 4], 0, 2] = 255
+    found = find_onset(frames, np.arange(9.0), 20, 220, device=device)
+    np.testing.assert_array_equal(found.frame, [[-1, 8, 3, -1]])
+
+
+def test_a_spike_on_the_plateau_moves_nothing(device):
+    frames = np.full((9, 1, 4), 20, np.uint8)
+    frames[4:] = 150
+    frames[4, 0, 1] = frames[5, 0, 2] = frames[6, 0, 3] = 255
+    found = find_onset(frames, np.arange(9) * 0.1, 20, 220, noise=1.5, device=device)
+    np.testing.assert_array_equal(found.height, np.full((1, 4), -0.35, np.float32))
+
+
+@pytest.mark.parametrize(("value", "status"), [(20, 2), (200, 3)])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_all_equal_frames(device, dtype, value, status):
+    frames = np.full((6, 5, 7), value, dtype)
+    found = find_onset(frames, np.arange(6.0), 20, 220, device=device)
+    assert np.all(found.status == status)
+    assert np.all(np.isnan(found.height))
+    assert np.all(np.isnan(found.sigma))
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_onset(device, broken):
+    frames = np.full((9, 1, 5), 0.1, np.float32)
+    frames[4:] = 0.9
+    frames[0, 0, 0] = frames[3, 0, 1] = frames[4, 0, 2] = frames[7, 0, 3] = broken
+    frames[5, 0, 4] = broken  # the second frame of the run: not decided yet
+    found = find_onset(frames, np.arange(9) * 0.1, 0, 1, noise=0.01, device=device)
+    np.testing.assert_array_equal(found.status, [[0, 0, 0, 1, 0]])
+    assert found.height[0, 3] == np.float32(-0.35)
+    assert np.isnan(found.height[0, [0, 1, 2, 4]]).all()
+
+
+def test_a_saturated_sample_is_light(device):
+    frames = np.full((5, 1, 2), 20, np.uint8)
+    frames[2:, 0, 0], frames[2:, 0, 1] = 255, 254
+    found = find_onset(frames, np.arange(5.0), 20, 400, threshold=0.9, device=device)
+    np.testing.assert_array_equal(found.status, [[1, 2]])
+
+
+def test_pixels_without_references_are_invalid(device):
+    frames = np.full((5, 2, 4), 20, np.uint8)
+    frames[3:] = 200
+    dark, bright = np.full((2, 4), 20.0), np.full((2, 4), 220.0)
+    bright[0, 0], dark[0, 1], bright[1, 2] = 20, np.nan, np.inf
+    found = find_onset(frames, np.arange(5.0), dark, bright, device=device)
+    np.testing.assert_array_equal(found.status, [[0, 0, 1, 1], [1, 1, 0, 1]])
+    assert found.frame[0, 0] == -1
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_level_is_the_smallest_light_sample(device, dtype, threshold):
+    dark, bright = (10, 21) if dtype != "float32" else (0.1, 0.7)
+    exact = dark + threshold * (bright - dark)
+    least = np.ceil(exact) if dtype != "float32" else np.float32(exact)
+    if float(least) < exact:
+        least = np.nextafter(np.float32(least), np.float32(np.inf))
+    below = least - 1 if dtype != "float32" else np.nextafter(least, np.float32(-np.inf))
+    frames = np.zeros((4, 1, 2), dtype)
+    frames[2:, 0, 0], frames[2:, 0, 1] = least, below
+    found = find_onset(frames, np.arange(4.0), dark, bright, threshold=threshold, noise=0.1, device=device)
+    np.testing.assert_array_equal(found.status, [[1, 2]])
+
+
+def test_results_on_the_way_change_nothing(device):
+    frames = random_press("uint8", 30, (9, 13), seed=7)
+    travel = uneven_travel(30)
+    whole = find_onset(frames, travel, 20, 220, noise=1.5, device=device)
+    search = OnsetSearch((9, 13), frames.dtype, dark=20, bright=220, noise=1.5, device=device)
+    for number in range(30):
+        search.push(Block(frames[number : number + 1], number, travel=travel[number : number + 1]))
+        part = search.result()
+        so_far = (
+            find_onset(frames[: number + 1], travel[: number + 1], 20, 220, noise=1.5, device=device)
+            if number
+            else None
+        )
+        if so_far is not None:
+            assert_equal(part, so_far)
+    assert_equal(search.result(), whole)
+
+
+def test_a_search_can_be_used_again(device):
+    first, second = (random_press("uint8", 20, (9, 13), seed=seed) for seed in (1, 2))
+    travel = uneven_travel(20)
+    search = OnsetSearch((9, 13), first.dtype, device=device)
+    search.push(Block(first, 0, travel=travel))
+    search.reset()
+    search.push(Block(second, 0, travel=travel))
+    assert_equal(search.result(), find_onset(second, travel, device=device))
+
+
+def test_frames_read_into_the_room_are_not_copied(device):
+    frames = random_press("uint8", 20, (9, 13))
+    travel = uneven_travel(20)
+    search = OnsetSearch((9, 13), frames.dtype, device=device, memory_limit=2 * 6 * 9 * 13)
+    assert search.room.shape == (6, 9, 13)
+    for start in range(0, 20, 6):
+        count = min(6, 20 - start)
+        search.room[:count] = frames[start : start + count]
+        search.push(Block(search.room[:count], start, travel=travel[start : start + count]))
+    assert_equal(search.result(), find_onset(frames, travel, device=device))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frames": np.zeros((1, 3, 3), np.uint8), "travel": [0.0]}, "at least 2 frames"),
+        ({"frames": np.zeros((5, 0, 3), np.uint8)}, "at least 2 frames"),
+        ({"frames": np.zeros((5, 3), np.uint8)}, "at least 2 frames"),
+        ({"frames": np.zeros((5, 3, 3), np.int32)}, "uint8, uint16 or float32"),
+        ({"frames": np.zeros((5, 3, 3), np.complex64)}, "uint8, uint16 or float32"),
+        ({"frames": np.zeros((5, 3, 3), np.float32), "dark": None}, "dark and bright"),
+        ({"travel": [0.0, 1.0]}, "5 frames"),
+        ({"travel": [0.0, 1.0, np.nan, 2.0, 3.0]}, "nan at frame 2"),
+        ({"travel": [0.0, 1.0, 0.5, 2.0, 3.0]}, "runs back at frame 2"),
+        ({"dark": np.zeros((2, 3))}, "the frames are 3 x 3"),
+        ({"dark": 220, "bright": 20}, "bright is not above dark"),
+        ({"bright": 20}, "bright is not above dark"),
+        ({"threshold": 1.5}, "threshold 1.5"),
+        ({"threshold": -0.1}, "threshold -0.1"),
+        ({"threshold": np.nan}, "threshold nan"),
+        ({"hold": 0}, "hold 0"),
+        ({"noise": -1.0}, "noise -1.0"),
+        ({"noise": np.inf}, "noise inf"),
+    ],
+)
+def test_bad_input_is_refused(change, words):
+    call = {"frames": np.zeros((5, 3, 3), np.uint8), "travel": np.arange(5.0), "dark": 20, "bright": 220}
+    with pytest.raises(InputError, match=words) as caught:
+        find_onset(**(call | change))
+    assert "\n" not in str(caught.value)
+
+
+def test_travel_must_not_run_back_between_blocks():
+    search = OnsetSearch((3, 3), np.dtype(np.uint8))
+    frames = np.zeros((2, 3, 3), np.uint8)
+    search.push(Block(frames, 0, travel=np.array([0.0, 1.0])))
+    with pytest.raises(InputError, match="runs back at frame 0"):
+        search.push(Block(frames, 2, travel=np.array([0.5, 2.0])))
+
+
+def test_travel_may_pause(device):
+    frames = np.full((5, 1, 1), 20, np.uint8)
+    frames[3:] = 200
+    found = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], 20, 220, noise=1.0, device=device)
+    assert found.height[0, 0] == np.float32(-0.1)
+    assert found.sigma[0, 0] == 0
+
+
+def test_one_frame_is_no_press():
+    search = OnsetSearch((3, 3), np.dtype(np.uint8))
+    search.push(Block(np.zeros((1, 3, 3), np.uint8), 0, travel=np.array([0.0])))
+    with pytest.raises(InputError, match="1 frames has no onset"):
+        search.result()
+
+
+def test_a_few_pixels_alone_are_not_taken_for_done(device):
+    """A tile of dark pixels only, in blocks, once was."""
+    frames = np.full((12, 1, 3), 20, np.uint8)
+    frames[9:] = 200
+    found = search_in_blocks(frames, np.arange(12) * 0.1, [4, 8], device, dark=20, bright=220)
+    assert np.all(found.frame == 9)
