@@ -1,0 +1,33 @@
+"""``mirrorskin devices``: what can run it."""
+
+from __future__ import annotations
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.output import print_json, print_table
+
+
+def command(as_json: options.Json = False) -> None:
+    """List the OpenCL devices of this machine."""
+    from mirrorskin.kernels.device import list_devices, open_device
+
+    chosen = open_device().info
+    devices = list_devices()
+    if as_json:
+        print_json({"devices": devices, "default": devices.index(chosen)})
+        return
+    rows = [
+        [
+            "*" if device == chosen else "",
+            str(number),
+            device.kind,
+            device.title,
+            device.driver,
+            f"{device.compute_units}",
+            f"{device.memory / 1e9:.1f} GB",
+        ]
+        for number, device in enumerate(devices)
+    ]
+    print_table(["", "number", "kind", "name", "driver", "units", "memory"], rows)
+    typer.echo("* is the default; choose another with --device NUMBER or a part of its name")

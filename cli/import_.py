@@ -1,0 +1,42 @@
+"""``mirrorskin import``: other people's frames become a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+
+def command(
+    frames: Annotated[
+        Path, typer.Argument(metavar="VIDEO-OR-FOLDER", help="AVI, MP4, or numbered PNG/TIFF pictures.")
+    ],
+    output: options.NewRecording,
+    motion: Annotated[options.MotionName, typer.Option(help="How the body moved.")],
+    travel_step: options.TravelStep = None,
+    travel_start: options.TravelStart = "0mm",
+    phase_step: options.PhaseStep = None,
+    tilt: options.Tilt = None,
+    pixel_size: options.PixelSize = None,
+    compression: options.Compression = options.CompressionName.raw,
+) -> None:
+    """Make a recording of a video or pictures."""
+    from mirrorskin import io
+    from mirrorskin.cli.positions import given
+    from mirrorskin.cli.progress import progress
+
+    known = given(motion, travel_step, travel_start, phase_step, tilt, pixel_size)
+    header = io.Header(motion.value, title=frames.stem, tilt=known["tilt"], pixel_size=known["pixel_size"])
+    source = io.open_frames(frames, header, known["travel"], known["phase"])
+    with (
+        io.Recorder(source, output, compression.value) as recorder,
+        progress("importing", source.shape[0]) as show,
+    ):
+        recorder.drain(show)
+    for name in source.left_out:
+        typer.echo(f"left out: {name}", err=True)
+    count, rows, columns = source.shape
+    typer.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")

@@ -1,0 +1,65 @@
+"""The command ``mirrorskin``: collects the commands, and turns the project's errors into one line.
+
+Nothing heavy is imported here or at the top of a command's module: ``--help`` must be quick.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from types import TracebackType
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import bench, demo, devices, import_, info, reconstruct, score, simulate
+
+app = typer.Typer(
+    name="mirrorskin",
+    help="Shape from active tactile sensors with a mirror-like skin.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def _common(
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks, and what is logged.")] = False,
+) -> None:
+    _OneLine.debug = debug
+    logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
+
+
+for module in (demo, simulate, import_, reconstruct, score, info, devices, bench):
+    app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
+
+
+class _OneLine:
+    """Print the project's own errors, and only those, as one line, and exit with their code."""
+
+    debug = False
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # The classes that carry a code are not named here: importing them takes longer than --help may.
+        code = getattr(error, "exit_code", None)
+        ours = kind is not None and kind.__module__.startswith("mirrorskin.")
+        if ours and isinstance(code, int) and not self.debug:
+            sys.stderr.write(f"mirrorskin: {' '.join(str(error).split())}\n")
+            sys.exit(code)
+
+
+def main() -> None:
+    """Run the command line."""
+    with _OneLine():
+        app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Options that several commands share, worded once."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class MotionName(StrEnum):
+    """How the sensor's body moved."""
+
+    vertical = "vertical"
+    axial = "axial"
+    horizontal = "horizontal"
+    twist = "twist"
+
+
+class CompressionName(StrEnum):
+    """How frames are packed in a recording."""
+
+    raw = "raw"
+    bitshuffle = "bitshuffle"
+    blosc = "blosc"
+    gzip = "gzip"
+    lzf = "lzf"
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print machine-readable output.")]
+Device = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
+]
+Motion = Annotated[MotionName | None, typer.Option(help="How the body moved, if the file does not say.")]
+TravelStep = Annotated[str | None, typer.Option(metavar="LENGTH", help="Travel from frame to frame: 0.1mm.")]
+TravelStart = Annotated[str, typer.Option(metavar="LENGTH", help="Travel of the first frame.")]
+PhaseStep = Annotated[str | None, typer.Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
+Tilt = Annotated[str | None, typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
+PixelSize = Annotated[
+    str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
+]
+Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]
+NewRecording = Annotated[Path, typer.Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]

@@ -1,0 +1,133 @@
+"""Quantities with units, as they are written on the command line."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from typing import Any, NamedTuple
+
+from mirrorskin.io import InputError
+
+# pint would compute what it is given; it is given the unit alone.
+_QUANTITY = re.compile(
+    r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-z\u00b5\u03bc]+|°)?\s*"
+)
+
+
+class _Kind(NamedTuple):
+    """A kind of quantity: its unit here, the one that all its units reduce to, and how to speak of it."""
+
+    unit: str
+    root: str
+    noun: str
+    example: str
+
+
+_LENGTH = _Kind("millimeter", "meter", "a length", "0.1mm")
+_ANGLE = _Kind("radian", "radian", "an angle", "2.5deg")
+_MEMORY = _Kind("byte", "bit", "an amount of memory", "512MB")
+
+
+def length(text: str, option: str = "") -> float:
+    """Read a length, as in ``0.1mm``.
+
+    Parameters
+    ----------
+    text : str
+        A number and a unit.
+    option : str, optional
+        What to call it in messages.
+
+    Returns
+    -------
+    float
+        Millimetres, of either sign.
+
+    Raises
+    ------
+    InputError
+        It is not a finite number with a unit of length.
+    """
+    return _read(text, option, _LENGTH)
+
+
+def lengths(text: str, option: str = "") -> tuple[float, float]:
+    """Read one length for both axes, or two as in ``0.03mm,0.04mm``; see ``length``.
+
+    Returns
+    -------
+    (float, float)
+        Millimetres along x and y.
+    """
+    values = [length(part, option) for part in text.split(",")]
+    if len(values) > 2:
+        raise _error(text, option, "one or two lengths are needed", "0.03mm,0.04mm")
+    return values[0], values[-1]
+
+
+def angle(text: str, option: str = "") -> float:
+    """Read an angle, as in ``2.5deg``, in radians; see ``length``."""
+    return _read(text, option, _ANGLE)
+
+
+def memory(text: str, option: str = "") -> int:
+    """Read an amount of memory, as in ``512MB`` (10^6) or ``512MiB`` (2^20), in bytes; see ``length``.
+
+    Raises
+    ------
+    InputError
+        It is not a number with a unit of memory, or less than one byte.
+    """
+    size = round(_read(text, option, _MEMORY))
+    if size < 1:
+        raise _error(text, option, "at least one byte is needed", _MEMORY.example)
+    return size
+
+
+def frame_size(text: str, option: str = "") -> tuple[int, int]:
+    """Read a picture's size in pixels, as in ``640x480``: columns and rows.
+
+    Raises
+    ------
+    InputError
+        It is not two whole numbers above zero.
+    """
+    match = re.fullmatch("([1-9][0-9]{0,8})x([1-9][0-9]{0,8})", text.strip())
+    if match is None:
+        raise _error(text, option, "pixels across and down are needed", "640x480")
+    return int(match[1]), int(match[2])
+
+
+def _read(text: str, option: str, kind: _Kind) -> float:
+    import pint  # takes a quarter of a second
+
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise _error(text, option, "a number and a unit are needed", kind.example)
+    number, symbol = match.groups()
+    if symbol is None:
+        raise _error(text, option, "a unit is needed", kind.example)
+    registry = _registry()
+    try:
+        unit = registry.Unit(symbol)
+    except (pint.UndefinedUnitError, ValueError) as error:
+        raise _error(text, option, f"{symbol} is not a known unit", kind.example) from error
+    # A pixel of a style sheet is a length, but nobody here means that one.
+    if registry.get_root_units(unit)[1] != registry.Unit(kind.root) or unit == registry.Unit("css_pixel"):
+        raise _error(text, option, f"{unit}s are not {kind.noun}", kind.example)
+    value = float(registry.convert(float(number), unit, kind.unit))
+    if not math.isfinite(value):
+        raise _error(text, option, "the number is too large", kind.example)
+    return value
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def _error(text: str, option: str, wrong: str, example: str) -> InputError:
+    return InputError(f"{' '.join((option + ' ' + text).split())}: {wrong}; write e.g. {example}")

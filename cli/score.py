@@ -1,0 +1,30 @@
+"""``mirrorskin score``: how far a result is from the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.output import print_fields, print_json
+
+
+def command(
+    result: Annotated[Path, typer.Argument(metavar="RES.h5", help="Result to score.")],
+    truth: Annotated[Path, typer.Option(metavar="REC.h5", help="Simulated recording that knows the truth.")],
+    as_json: options.Json = False,
+) -> None:
+    """Compare a result with a simulation's truth."""
+    from mirrorskin import engine, io
+
+    found = io.open_result(result)
+    with io.open_recording(truth) as recording:
+        if recording.truth is None:
+            raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
+        score = engine.score(found, recording.truth)
+    if as_json:
+        print_json(score)
+    else:
+        print_fields(score.table())

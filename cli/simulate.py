@@ -1,0 +1,65 @@
+"""``mirrorskin simulate``: a recording from the digital twin, with the truth."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+
+class SimulatedMotion(StrEnum):
+    """The movements that the twin can make."""
+
+    vertical = "vertical"
+
+
+class FrameType(StrEnum):
+    """Types of a sample."""
+
+    uint8 = "uint8"
+    uint16 = "uint16"
+    float32 = "float32"
+
+
+def command(
+    motion: Annotated[SimulatedMotion, typer.Argument(help="How the body moves.")],
+    output: options.NewRecording,
+    thing: Annotated[
+        str,
+        typer.Option("--object", metavar="NAME", help="sphere, coin, plane, cone, or a height map's file."),
+    ] = "sphere",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "480x480",
+    pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.025mm",
+    frames: Annotated[int, typer.Option(help="Frames to take.")] = 30,
+    travel_step: Annotated[str, typer.Option(metavar="LENGTH", help="Travel from frame to frame.")] = "0.1mm",
+    travel_start: Annotated[str, typer.Option(metavar="LENGTH", help="Travel of the first frame.")] = "0.1mm",
+    dtype: Annotated[FrameType, typer.Option(help="Type of a sample.")] = FrameType.uint8,
+    noise: Annotated[float, typer.Option(metavar="COUNTS", help="Standard deviation of a sample.")] = 1.5,
+    seed: Annotated[int, typer.Option(help="The same seed, the same recording.")] = 0,
+    compression: options.Compression = options.CompressionName.raw,
+) -> None:
+    """Record what the twin sees, with the truth."""
+    from mirrorskin import hw, io
+    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.quantity import frame_size, length, lengths
+
+    steps = io.Steps(length(travel_step, "--travel-step"), length(travel_start, "--travel-start"))
+    columns, rows = frame_size(size, "--size")
+    twin = hw.Twin(
+        object=thing,
+        shape=(rows, columns),
+        pixel_size=lengths(pixel_size, "--pixel-size"),
+        travel=steps.positions(frames),
+        dtype=dtype.value,
+        noise=noise,
+        seed=seed,
+    )
+    with (
+        io.Recorder(twin, output, compression.value, truth=twin.truth) as recorder,
+        progress("simulating", frames) as show,
+    ):
+        recorder.drain(show)
+    typer.echo(f"{output}: {frames} frames of {columns} x {rows}, {motion.value} motion, {twin.header.title}")

@@ -1,0 +1,182 @@
+import contextlib
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mirrorskin.cli.quantity import angle, frame_size, length, lengths, memory
+from mirrorskin.io import InputError
+
+READERS = [angle, frame_size, length, lengths, memory]
+
+
+@pytest.mark.parametrize(
+    ("text", "millimetres"),
+    [
+        ("0.1mm", 0.1),
+        (" 0.1 mm ", 0.1),
+        ("-0.1mm", -0.1),
+        ("+3mm", 3.0),
+        (".5mm", 0.5),
+        ("5.mm", 5.0),
+        ("1e-3m", 1.0),
+        ("2E1 mm", 20.0),
+        ("0.1millimeter", 0.1),
+        ("100um", 0.1),
+        ("100\u00b5m", 0.1),
+        ("100\u03bcm", 0.1),
+        ("1in", 25.4),
+        ("0mm", 0.0),
+    ],
+)
+def test_lengths_are_in_millimetres(text, millimetres):
+    assert length(text) == pytest.approx(millimetres, rel=1e-12)
+
+
+def test_millimetres_are_taken_exactly():
+    assert length("0.1mm") == 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "radians"),
+    [
+        ("2.5deg", math.radians(2.5)),
+        ("45\N{DEGREE SIGN}", math.pi / 4),
+        ("-0.1 rad", -0.1),
+        ("1turn", math.tau),
+    ],
+)
+def test_angles_are_in_radians(text, radians):
+    assert angle(text) == pytest.approx(radians, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("512MB", 512_000_000),
+        ("4.1GB", 4_100_000_000),
+        ("2GiB", 2**31),
+        ("1kB", 1000),
+        ("64 byte", 64),
+        ("16bit", 2),
+    ],
+)
+def test_memory_is_in_bytes(text, size):
+    assert memory(text) == size
+    assert isinstance(memory(text), int)
+
+
+@pytest.mark.parametrize(
+    ("text", "sizes"),
+    [("0.03mm", (0.03, 0.03)), ("0.03mm,40um", (0.03, 0.04)), ("30um , 0.04mm", (0.03, 0.04))],
+)
+def test_one_or_two_lengths(text, sizes):
+    assert lengths(text) == pytest.approx(sizes, rel=1e-12)
+
+
+def test_frame_sizes_are_columns_and_rows():
+    assert frame_size("640x480") == (640, 480)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "640", "640x", "0x480", "-1x5", "1.5x2", "640*480", "1x2x3", "9" * 99 + "x1"]
+)
+def test_frame_sizes_that_are_none(text):
+    with pytest.raises(InputError, match=r"--size.*write e\.g\. 640x480"):
+        frame_size(text, "--size")
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "message"),
+    [
+        (length, "0.1", "--o 0.1: a unit is needed; write e.g. 0.1mm"),
+        (length, "0.1s", "--o 0.1s: seconds are not a length; write e.g. 0.1mm"),
+        (length, "2deg", "--o 2deg: degrees are not a length; write e.g. 0.1mm"),
+        (length, "2px", "--o 2px: css_pixels are not a length; write e.g. 0.1mm"),
+        (length, "2pixel", "--o 2pixel: pixels are not a length; write e.g. 0.1mm"),
+        (length, "1foo", "--o 1foo: foo is not a known unit; write e.g. 0.1mm"),
+        (length, "1NAN", "--o 1NAN: NAN is not a known unit; write e.g. 0.1mm"),
+        (length, "1lambda", "--o 1lambda: lambdas are not a length; write e.g. 0.1mm"),
+        (length, "1e400mm", "--o 1e400mm: the number is too large; write e.g. 0.1mm"),
+        (length, "1e308km", "--o 1e308km: the number is too large; write e.g. 0.1mm"),
+        (angle, "45", "--o 45: a unit is needed; write e.g. 2.5deg"),
+        (angle, "0.1mm", "--o 0.1mm: millimeters are not an angle; write e.g. 2.5deg"),
+        (angle, "5percent", "--o 5percent: percents are not an angle; write e.g. 2.5deg"),
+        (angle, "5byte", "--o 5byte: bytes are not an angle; write e.g. 2.5deg"),
+        (angle, "3pi", "--o 3pi: pis are not an angle; write e.g. 2.5deg"),
+        (memory, "512", "--o 512: a unit is needed; write e.g. 512MB"),
+        (memory, "5rad", "--o 5rad: radians are not an amount of memory; write e.g. 512MB"),
+        (memory, "0MB", "--o 0MB: at least one byte is needed; write e.g. 512MB"),
+        (memory, "-1MB", "--o -1MB: at least one byte is needed; write e.g. 512MB"),
+        (lengths, "0.03mm,2", "--o 2: a unit is needed; write e.g. 0.1mm"),
+        (lengths, "1mm,2mm,3mm", "--o 1mm,2mm,3mm: one or two lengths are needed; write e.g. 0.03mm,0.04mm"),
+        (lengths, "0.1mm,", "--o: a number and a unit are needed; write e.g. 0.1mm"),
+    ],
+)
+def test_messages_name_the_option_the_value_and_an_example(read, text, message):
+    with pytest.raises(InputError) as caught:
+        read(text, "--o")
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "mm",
+        "'",
+        '"',
+        "nan mm",
+        "inf mm",
+        "-inf mm",
+        "0,1mm",
+        "5 mm mm",
+        "2*3mm",
+        "1mm**2",
+        "1mm/s",
+        "1_000mm",
+        "0x1mm",
+        "--1mm",
+        "1e mm 2",
+        "5mm\u00b2",
+        "\u22121mm",
+        "\u0663mm",
+        "(1mm)",
+        "{1mm}",
+        "1 mm # length",
+        "1__class__",
+        "__import__('os').system('exit 3')",
+        "1mm; import os",
+    ],
+)
+@pytest.mark.parametrize("read", [length, angle, memory])
+def test_what_is_not_one_number_and_one_unit_is_refused(read, text):
+    with pytest.raises(InputError, match="a number and a unit are needed; write e"):
+        read(text, "--travel-step")
+
+
+def test_messages_are_one_line():
+    with pytest.raises(InputError) as caught:
+        length("1\nmm\r\nmm", "--o")
+    assert str(caught.value) == "--o 1 mm mm: a number and a unit are needed; write e.g. 0.1mm"
+
+
+NUMBERS = st.floats().map(repr) | st.integers().map(str)
+WORDS = st.text("abcdefghiklmnoprstuvxyzABCDEGKMNPRTW\u00b5\u03bc", max_size=5) | st.text(max_size=4)
+
+
+@settings(deadline=None, max_examples=400)
+@given(st.text(max_size=12) | st.builds("{}{}".format, NUMBERS, WORDS))
+def test_any_text_is_a_finite_number_or_an_input_error(text):
+    for read in READERS:
+        with contextlib.suppress(InputError):
+            assert np.all(np.isfinite(read(text)))
+
+
+def test_pint_is_imported_only_when_needed():
+    program = "import sys, mirrorskin.cli.quantity; sys.exit('pint' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

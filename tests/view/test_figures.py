@@ -1,0 +1,34 @@
+"""Figures are drawn, and say what they need."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mirrorskin import io, view
+
+
+def result_and_truth(height):
+    x, y = io.pixel_axes(height.shape, (0.1, 0.2))
+    truth = io.Truth(height, *(np.zeros_like(height) for _ in range(2)), np.ones(height.shape, np.uint8))
+    return io.Result(height=height, x=x, y=y), truth
+
+
+@pytest.mark.parametrize("kind", ["slope", "empty"])
+def test_a_height_map_becomes_a_picture(tmp_path, kind):
+    height = np.fromfunction(lambda row, column: -0.01 * column, (20, 30)).astype(np.float32)
+    if kind == "empty":
+        height[:] = np.nan
+    view.height_figure(*result_and_truth(height), "a slope", tmp_path / "slope.png")
+    picture = cv2.imread(str(tmp_path / "slope.png"))
+    assert picture.shape[0] > 300
+    colours = len(np.unique(picture.reshape(-1, 3), axis=0))
+    assert colours > 30
+
+
+def test_a_figure_needs_heights_and_a_place_to_go(tmp_path):
+    height = np.zeros((4, 5), np.float32)
+    result, truth = result_and_truth(height)
+    with pytest.raises(io.InputError, match="heights and the pixel size"):
+        view.height_figure(io.Result(height=height), truth, "", tmp_path / "a.png")
+    with pytest.raises(io.InputError, match="cannot be written"):
+        view.height_figure(result, truth, "", tmp_path / "missing" / "a.png")

@@ -1,0 +1,5 @@
+"""Pictures for people."""
+
+from mirrorskin.view.figures import height_figure
+
+__all__ = ["height_figure"]
