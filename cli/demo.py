@@ -42,8 +42,9 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Repeat the paper's vertical experiments on the twin."""
-    from mirrorskin import io
+    from mirrorskin import io, view
 
+    view.check_drawing()
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -62,4 +62,4 @@ def command(
         progress("simulating", frames) as show,
     ):
         recorder.drain(show)
-    typer.echo(f"{output}: {frames} frames of {columns} x {rows}, {motion.value} motion, {twin.header.title}")
+    typer.echo(f"{output}: {frames} frames of {columns} x {rows}: {twin.header.title}")

@@ -1,5 +1,5 @@
 """Pictures for people."""
 
-from mirrorskin.view.figures import height_figure
+from mirrorskin.view.figures import check_drawing, height_figure
 
-__all__ = ["height_figure"]
+__all__ = ["check_drawing", "height_figure"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,15 +49,17 @@ def height_figure(result: Result, truth: Truth, title: str, path: Path) -> None:
         raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
+def check_drawing() -> None:
+    """Raise InputError if nothing can be drawn, before any work is done for a figure."""
+    if find_spec("matplotlib") is None:
+        raise InputError("figures need Matplotlib: pip install 'mirrorskin[view]'")
+
+
 def _new_figure() -> Figure:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError("figures need Matplotlib: pip install 'mirrorskin[view]'") from error
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    check_drawing()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(11, 4.6), layout="constrained")
 
 
 def _draw_map(

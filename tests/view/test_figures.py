@@ -32,3 +32,9 @@ def test_a_figure_needs_heights_and_a_place_to_go(tmp_path):
         view.height_figure(io.Result(height=height), truth, "", tmp_path / "a.png")
     with pytest.raises(io.InputError, match="cannot be written"):
         view.height_figure(result, truth, "", tmp_path / "missing" / "a.png")
+
+
+def test_without_matplotlib_the_remedy_is_named(monkeypatch):
+    monkeypatch.setattr(view.figures, "find_spec", lambda name: None)
+    with pytest.raises(io.InputError, match="pip install 'mirrorskin"):
+        view.check_drawing()
