@@ -1,0 +1,219 @@
+"""Bad input gets one clear line, exit code 2, and nothing is written."""
+
+import io as text_io
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from mirrorskin.cli import main as command_line
+
+FRAMES = np.full((6, 5, 7), 20, np.uint8)
+FRAMES[3:] = 200
+TRAVEL = np.arange(6) * 0.1
+
+
+def run(monkeypatch, *words):
+    """Run the command line in this process; return its exit code and what it said on stderr."""
+    monkeypatch.setattr(sys, "argv", ["mirrorskin", *map(str, words)])
+    monkeypatch.setattr(sys, "stdout", text_io.StringIO())
+    said = text_io.StringIO()
+    monkeypatch.setattr(sys, "stderr", said)
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    return ended.value.code, said.getvalue()
+
+
+def ours(path, **changes):
+    """Write a small recording of ours by hand, with some of its parts replaced, or left out by None."""
+    parts = {
+        "/entry/instrument/detector/data": FRAMES,
+        "/entry/instrument/stage/motion": "vertical",
+        "/entry/instrument/stage/travel": TRAVEL,
+        "/entry/instrument/detector/dark": np.full((5, 7), 20.0),
+        "/entry/instrument/detector/bright": np.full((5, 7), 220.0),
+    }
+    folders = {"motion": "stage", "travel": "stage"}
+    for name, value in changes.items():
+        parts[f"/entry/instrument/{folders.get(name, 'detector')}/{name}"] = value
+    with h5py.File(path, "w") as file:
+        file.create_group("entry").attrs["mirrorskin_recording"] = 1
+        for name, value in parts.items():
+            if value is not None:
+                file[name] = value
+
+
+def foreign(path, **datasets):
+    with h5py.File(path, "w") as file:
+        for name, value in datasets.items():
+            file[name] = value
+
+
+def cut(path, length):
+    path.write_bytes(path.read_bytes()[:length])
+
+
+def truncated(path):
+    ours(path)
+    cut(path, path.stat().st_size - 300)
+
+
+def claims_too_much(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", (10**6, 1000, 1000), "u1")
+
+
+def claims_chunks_it_lacks(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", (10**6, 1000, 1000), "u1", chunks=(1, 1000, 1000))[0] = 1
+
+
+def unknown_filter(path):
+    with h5py.File(path, "w") as file:
+        stack = file.create_dataset(
+            "frames", (2, 5, 7), "u1", chunks=(1, 5, 7), compression=32099, allow_unknown_filter=True
+        )
+        for number in range(2):
+            stack.id.write_direct_chunk((number, 0, 0), b"\0" * 35)
+
+
+def external_link(target):
+    def make(path):
+        with h5py.File(path, "w") as file:
+            file["frames"] = h5py.ExternalLink(target, "/frames")
+
+    return make
+
+
+NAN_TRAVEL = np.where(np.arange(6) == 3, np.nan, TRAVEL)
+GIVEN = ["--motion", "vertical", "--travel-step", "0.1mm"]
+TWO = {"one": FRAMES, "two": FRAMES}
+TEXT = np.array([[["a"]]] * 3, dtype="S1")
+
+# What is made, the options beside it, and what the line must say.
+CASES = {
+    "no such file": (lambda path: None, [], "no such file"),
+    "a folder": (lambda path: path.mkdir(), [], "folder"),
+    "an empty file": (lambda path: path.touch(), [], "not an HDF5 file"),
+    "not HDF5": (lambda path: path.write_text("hello\n" * 999), [], "not an HDF5 file"),
+    "truncated": (truncated, [], "truncated"),
+    "no stack": (lambda path: foreign(path, flat=FRAMES[0]), GIVEN, "no stack"),
+    "several stacks": (lambda path: foreign(path, **TWO), GIVEN, "--dataset"),
+    "a wrong name": (lambda path: foreign(path, **TWO), [*GIVEN, "--dataset", "three"], "three"),
+    "a flat one": (lambda path: foreign(path, flat=FRAMES[0]), [*GIVEN, "--dataset", "flat"], "(T, H, W)"),
+    "no frames": (lambda path: foreign(path, frames=FRAMES[:0]), GIVEN, "at least 2"),
+    "one frame": (lambda path: foreign(path, frames=FRAMES[:1]), GIVEN, "at least 2"),
+    "no rows": (lambda path: foreign(path, frames=FRAMES[:, :0]), GIVEN, "no pixels"),
+    "complex": (lambda path: foreign(path, frames=FRAMES.astype("c8")), GIVEN, "uint8, uint16 or float32"),
+    "strings": (lambda path: foreign(path, frames=TEXT), GIVEN, "uint8, uint16 or float32"),
+    "float64": (lambda path: foreign(path, frames=FRAMES.astype("f8")), GIVEN, "uint8, uint16 or float32"),
+    "travel with NaN": (lambda path: ours(path, travel=NAN_TRAVEL), [], "nan at frame 3"),
+    "travel that runs back": (
+        lambda path: ours(path, travel=TRAVEL[::-1].copy()),
+        [],
+        "runs back at frame 1",
+    ),
+    "travel missing": (lambda path: ours(path, travel=None), [], "--travel-step"),
+    "travel too short": (lambda path: ours(path, travel=TRAVEL[:5]), [], "travel"),
+    "travel not given": (lambda path: foreign(path, frames=FRAMES), GIVEN[:2], "--travel-step"),
+    "motion not given": (lambda path: foreign(path, frames=FRAMES), GIVEN[2:], "--motion"),
+    "motion unknown": (lambda path: ours(path, motion="sideways"), [], "sideways"),
+    "motion without a method": (ours, ["--motion", "twist"], "twist"),
+    "dark of another shape": (lambda path: ours(path, dark=np.zeros((5, 6))), [], "dark"),
+    "bright not above dark": (lambda path: ours(path, bright=np.full((5, 7), 10.0)), [], "not above dark"),
+    "swapped on the command line": (ours, ["--dark", "200", "--bright", "20"], "not above dark"),
+    "a threshold above 1": (ours, ["--threshold", "1.5"], "threshold 1.5"),
+    "a threshold below 0": (ours, ["--threshold", "-0.5"], "threshold -0.5"),
+    "a threshold that is no number": (ours, ["--threshold", "nan"], "threshold nan"),
+    "no hold": (ours, ["--hold", "0"], "hold 0"),
+    "a wrong unit": (ours, ["--travel-step", "0.1s"], "--travel-step"),
+    "no unit": (ours, ["--travel-step", "0.1"], "--travel-step"),
+    "a missing filter": (unknown_filter, GIVEN, "32099"),
+    "an unknown device": (ours, ["--device", "abacus"], "abacus"),
+    "a folder as output": (ours, ["-o", "."], "folder"),
+    "no folder for the output": (ours, ["-o", "no/such/folder.h5"], "no folder"),
+    "a link to nothing": (external_link("nothing.h5"), [*GIVEN, "--dataset", "frames"], "nothing.h5"),
+    "a link out of the folder": (external_link("/etc/passwd"), [*GIVEN, "--dataset", "frames"], "out of"),
+    "a claim beyond the file": (claims_too_much, GIVEN, "claims"),
+    "chunks that are not there": (claims_chunks_it_lacks, GIVEN, "claims"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_refused_in_one_line(tmp_path, monkeypatch, case):
+    make, options, words = CASES[case]
+    path = tmp_path / "bad.h5"
+    make(path)
+    before = {entry.name for entry in tmp_path.iterdir()}
+    monkeypatch.chdir(tmp_path)
+    code, said = run(monkeypatch, "reconstruct", path, *options)
+    assert code == 2, said
+    assert words in said
+    assert said.count("\n") == 1
+    assert said.startswith("mirrorskin: ")
+    assert "Traceback" not in said
+    assert {entry.name for entry in tmp_path.iterdir()} == before
+
+
+def test_the_made_up_recording_is_good_where_nothing_is_replaced(tmp_path, monkeypatch):
+    ours(tmp_path / "good.h5")
+    monkeypatch.setattr(sys, "argv", ["mirrorskin", "reconstruct", str(tmp_path / "good.h5")])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert not ended.value.code
+    assert (tmp_path / "good-result.h5").exists()
+
+
+def test_the_input_is_not_overwritten(tmp_path, monkeypatch):
+    path = tmp_path / "good.h5"
+    ours(path)
+    kept = path.read_bytes()
+    code, said = run(monkeypatch, "reconstruct", path, "-o", path)
+    assert code == 2
+    assert "is the input" in said
+    assert path.read_bytes() == kept
+
+
+def test_an_output_below_a_file_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "good.h5"
+    ours(path)
+    code, said = run(monkeypatch, "reconstruct", path, "-o", path / "result.h5")
+    assert code == 2
+    assert said.count("\n") == 1
+
+
+def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
+    claims_too_much(tmp_path / "bad.h5")
+    taken = []
+    monkeypatch.setattr(np, "empty", lambda *args, **kwargs: taken.append(args))
+    code, _ = run(monkeypatch, "reconstruct", tmp_path / "bad.h5", *GIVEN)
+    assert code == 2
+    assert not taken
+
+
+@pytest.mark.parametrize(
+    ("words", "said_of"),
+    [
+        (["simulate", "vertical", "--object", "teapot", "-o", "a.h5"], "sphere"),
+        (["simulate", "vertical", "--size", "0x4", "-o", "a.h5"], "--size"),
+        (["simulate", "vertical", "--frames", "0", "-o", "a.h5"], "frame"),
+        (["simulate", "vertical", "--noise", "-1", "-o", "a.h5"], "noise"),
+        (["simulate", "vertical", "--pixel-size", "0mm", "-o", "a.h5"], "pixel"),
+        (["simulate", "vertical", "-o", "no/such/a.h5"], "no folder"),
+        (
+            ["import", "nothing.avi", "--motion", "vertical", "--travel-step", "1mm", "-o", "a.h5"],
+            "nothing.avi",
+        ),
+        (["import", ".", "--motion", "vertical", "-o", "a.h5"], "--travel-step"),
+        (["score", "nothing.h5", "--truth", "nothing.h5"], "no such file"),
+        (["info", "nothing.h5"], "no such file"),
+    ],
+)
+def test_other_commands_refuse_too(tmp_path, monkeypatch, words, said_of):
+    monkeypatch.chdir(tmp_path)
+    code, said = run(monkeypatch, *words)
+    assert code == 2, said
+    assert said_of in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
