@@ -21,7 +21,7 @@ test: lint types
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet
-	$(BIN)/ruff format --check --quiet
+	$(BIN)/ruff format --check --diff --quiet
 
 # From tests: at the top, mypy takes our io for the standard library's.
 types: $(READY)
@@ -45,7 +45,6 @@ $(READY): pyproject.toml
 	    exit 1
 	}
 	rm -rf .venv
-	echo 'setting up .venv (once, a minute or two)'
 	if "$$python" -c 'import ensurepip, venv' 2>/dev/null; then "$$python" -m venv .venv
 	elif command -v uv >/dev/null; then uv venv --quiet --seed --python "$$python" .venv
 	elif command -v virtualenv >/dev/null; then virtualenv --quiet --python "$$python" .venv
@@ -53,6 +52,8 @@ $(READY): pyproject.toml
 	    echo "make: $$python cannot make environments; install Debian's python3-venv, or uv, or virtualenv" >&2
 	    exit 1
 	fi
+	echo 'setting up .venv (once, a minute or two)'
+	export PYTHONWARNINGS=ignore  # setuptools warns of every editable installation
 	$(PIP) install --editable '.[dev]'
 	$(BIN)/python -P -c 'from mirrorskin.kernels import pocl; pocl.verify()' 2>/dev/null || {
 	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'

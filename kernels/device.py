@@ -162,12 +162,19 @@ class Device:
         options = tuple(f"-D{key}={value}" for key, value in sorted({"TILE": self.tile, **defines}.items()))
         made, key = self._kernels.made, (file, name, options)
         if key not in made:
-            made[key] = Kernel(self, name, cl.Kernel(self._program(file, options), name))
+            made[key] = self._make_kernel(file, name, options)
         return made[key]
 
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
         self.queue.finish()
+
+    def _make_kernel(self, file: str, name: str, options: tuple[str, ...]) -> Kernel:
+        try:
+            return Kernel(self, name, cl.Kernel(self._program(file, options), name))
+        except OSError as error:
+            problem = f"pyopencl cannot write its cache ({error})"
+            raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
 
     def _program(self, file: str, options: tuple[str, ...]) -> cl.Program:
         with self._lock:

@@ -106,7 +106,8 @@ def _find_working_linker(library: Path) -> None:
 
 def _record(library: Path) -> Path:
     """Return the file that keeps the answer for this PoCL, this processor, this linker and this Python."""
-    files = [library, Path(shutil.which("ld") or os.devnull).resolve()]
+    ld = shutil.which("ld")
+    files = [library, Path(ld).resolve()] if ld else [library]
     stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     key = hashlib.sha256(repr((_SCHEME, _processor, sys.executable, stamps)).encode()).hexdigest()
     return platformdirs.user_cache_path("mirrorskin") / f"pocl-{key[:16]}"

@@ -158,3 +158,12 @@ def test_the_profile_stays_bounded(device):
     assert len(device.profile._pending) < 1024
     runs = {record.name: record.runs for record in device.profile.records()}
     assert runs["copy_all"] == 2500
+
+
+def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
+    def refuse(file, options):
+        raise PermissionError(13, "Permission denied", "/home/cache")
+
+    monkeypatch.setattr(device, "_program", refuse)
+    with pytest.raises(DeviceError, match="set XDG_CACHE_HOME"):
+        device.kernel("limits", "copy_all", ANEW=1)

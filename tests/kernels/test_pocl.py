@@ -52,9 +52,16 @@ def tries(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 @pytest.fixture
-def broken_linker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(_script(tmp_path / "broken" / "ld", "echo no luck >&2; exit 1").parent))
-    monkeypatch.setattr(linker, "find_zig", lambda: None)
+def break_linker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Leave nothing that can link."""
+
+    def hide() -> None:
+        monkeypatch.setenv(
+            "PATH", str(_script(tmp_path / "broken" / "ld", "echo no luck >&2; exit 1").parent)
+        )
+        monkeypatch.setattr(linker, "find_zig", lambda: None)
+
+    return hide
 
 
 def _kept(tmp_path: Path) -> list[str]:
@@ -87,8 +94,10 @@ def test_nothing_is_left_in_the_kernel_cache(tmp_path: Path) -> None:
     assert list((tmp_path / "cache" / "pocl" / "kcache").iterdir()) == []
 
 
-@pytest.mark.usefixtures("broken_linker")
-def test_a_process_that_cannot_link_is_one_line(tries: list[object], tmp_path: Path) -> None:
+def test_a_process_that_cannot_link_is_one_line(
+    break_linker: Callable[[], None], tries: list[object], tmp_path: Path
+) -> None:
+    break_linker()
     for number in (1, 2):
         with pytest.raises(DeviceError, match="no luck") as caught:
             pocl.verify()
@@ -99,14 +108,13 @@ def test_a_process_that_cannot_link_is_one_line(tries: list[object], tmp_path: P
     assert _kept(tmp_path) == []
 
 
-@pytest.mark.usefixtures("broken_linker")
-def test_a_good_answer_does_not_serve_another_linker(start: Callable[[], None]) -> None:
-    broken = os.environ["PATH"]
-    start()
+def test_a_good_answer_does_not_serve_another_linker(
+    start: Callable[[], None], break_linker: Callable[[], None]
+) -> None:
     pocl.verify()
     start()
-    os.environ["PATH"] = broken
-    with pytest.raises(DeviceError):
+    break_linker()
+    with pytest.raises(DeviceError, match="no luck"):
         pocl.verify()
 
 
