@@ -49,10 +49,10 @@ def command(
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.kernels.device import open_device
 
-    target = output or recording.with_name(f"{recording.stem}-result.h5")
     known = given(motion, travel_step, travel_start, phase_step, tilt, pixel_size)
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(recording, dataset=dataset, **known) as source:
+    with io.open_recording(recording, dataset=dataset, memory_limit=limit, **known) as source:
+        target = output or recording.with_name(f"{recording.stem}-result.h5")
         io.check_output(target, keep=recording)
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(

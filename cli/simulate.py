@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -46,6 +47,7 @@ def command(
     from mirrorskin.cli.progress import progress
     from mirrorskin.cli.quantity import frame_size, length, lengths
 
+    io.check_output(output, keep=Path(thing))
     steps = io.Steps(length(travel_step, "--travel-step"), length(travel_start, "--travel-start"))
     columns, rows = frame_size(size, "--size")
     twin = hw.Twin(

@@ -127,8 +127,9 @@ class Hdf5File:
             No numbers, another shape, an unknown unit, or a file that does not hold what it claims.
         """
         where, remedy = self.where(node), remedy and f": {remedy}"
-        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb":
-            raise InputError(f"{where} holds no numbers{remedy}")
+        with plainly(where):
+            if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb":
+                raise InputError(f"{where} holds no numbers{remedy}")
         if node.shape not in shapes:
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
             raise InputError(f"{where} has shape {node.shape} where {needed} is needed{remedy}")
@@ -140,9 +141,10 @@ class Hdf5File:
 
     def value(self, node: Node) -> Any:
         """Read one text or number, alone or in an array of one."""
-        with plainly(self.where(node)):
-            if node.shape not in ((), (1,)):
-                raise ValueError(f"shape {node.shape} where one value is needed")
+        where = self.where(node)
+        with plainly(where):
+            if getattr(node, "shape", None) not in ((), (1,)):
+                raise InputError(f"{where} does not hold one value: write one text or number there")
             return _first(node[()])
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
@@ -212,7 +214,7 @@ def _first(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
-        return value.decode()
+        return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -54,7 +54,7 @@ class Layout:
             pixel_size=self._pixel_size() if pixel_size is None else self._above_zero(pixel_size),
             dark=self._reference("dark"),
             bright=self._reference("bright"),
-            press=self._scalar(f"{STAGE}/travel", "mm") if pressed else None,
+            press=self._scalar(f"{STAGE}/travel", "mm", "correct it") if pressed else None,
             tilt=self._scalar(f"{STAGE}/tilt", "rad", "give --tilt") if tilt is None else tilt,
             pivot=self._pivot(),
             zenith_gain=self._read(f"{DETECTOR}/zenith_gain", (), self._frame, unit="1/rad"),
@@ -120,12 +120,18 @@ class Layout:
         return None if values is None else values.astype(np.float32)
 
     def _pivot(self) -> tuple[float, float, float] | None:
-        values = self._read(f"{STAGE}/pivot", (3,), unit="mm")
+        values = self._finite(f"{STAGE}/pivot", (3,), unit="mm")
         return None if values is None else cast(tuple[float, float, float], tuple(values.tolist()))
 
-    def _scalar(self, name: str, unit: str, remedy: str = "") -> float | None:
-        values = self._read(name, (), (1,), unit=unit, remedy=remedy)
+    def _scalar(self, name: str, unit: str, remedy: str) -> float | None:
+        values = self._finite(name, (), (1,), unit=unit, remedy=remedy)
         return None if values is None else float(values.reshape(()))
+
+    def _finite(self, name: str, *shapes: Shape, unit: str, remedy: str = "correct it") -> Floats | None:
+        values = self._read(name, *shapes, unit=unit, remedy=remedy)
+        if values is not None and not np.isfinite(values).all():
+            raise InputError(f"{self._file.path}: {name} is {values}, which is not finite: {remedy}")
+        return values
 
     def _read(self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "") -> Floats | None:
         node = self._find(name)

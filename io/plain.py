@@ -1,10 +1,9 @@
-"""What HDF5 and the system say of a file, in one line of ours."""
+"""What HDF5 and the system say of a file, in words that can be read."""
 
 from __future__ import annotations
 
 import errno
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -42,6 +41,10 @@ def reason(error: Exception) -> str:
         return os.strerror(number)
     if "truncated" in text:
         return "it is truncated: copy it again"
-    inner = re.search(r"\(([^\n]*)", text)
-    words = inner[1].removesuffix(")") if inner else text
-    return f"it is damaged ({' '.join(words.split())[:_LONGEST]})"
+    inner = text.partition("(")[2].removesuffix(")") or text
+    return f"it is damaged ({' '.join(inner.split())[:_LONGEST]}): copy it again"
+
+
+def legible(text: str) -> str:
+    """Return a text without what is no text: a file's name may be any bytes."""
+    return text.encode(errors="surrogateescape").decode(errors="replace")

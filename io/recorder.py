@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.layout import DETECTOR, MARK, STACK, STAGE, TRUTH, TRUTH_UNITS
+from mirrorskin.io.plain import legible
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
@@ -143,7 +144,7 @@ class Recorder:
 def _write_header(file: h5py.File, header: Header) -> None:
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = _group(file, "entry", "NXentry", default="data", **{MARK: 1})
-    entry["title"] = header.title
+    entry["title"] = legible(header.title)
     entry["start_time"] = header.start_time or datetime.now(UTC).isoformat(timespec="milliseconds")
     instrument = _group(entry, "instrument", "NXinstrument")
     detector = _group(instrument, "detector", "NXdetector")

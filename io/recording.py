@@ -29,7 +29,8 @@ class Steps:
 
     def positions(self, count: int) -> Floats:
         """Return the positions of ``count`` frames."""
-        return np.asarray(self.start + self.step * np.arange(count), np.float64)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
 
 class Recording:
@@ -95,8 +96,7 @@ class Recording:
             return None
         stop = self._whole_chunks(start, min(start + len(out), self.shape[0]))
         frames = out[: stop - start]
-        what = f"{self.path}: frames {start} to {stop - 1} of {self.dataset} cannot be read"
-        with plainly(what, "copy it again, or record it anew"):
+        with plainly(f"{self.path}: frames {start} to {stop - 1} of {self.dataset} cannot be read"):
             self._stack.read_direct(frames, np.s_[start:stop])
         self._next = stop
         part = slice(start, stop)

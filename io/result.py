@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.plain import legible
 from mirrorskin.io.types import InputError, Result
 
 MARK = "mirrorskin_result"
@@ -49,7 +50,7 @@ def save_result(result: Result, path: str | Path) -> None:
         process = entry.create_group("process")
         process.attrs["NX_class"] = "NXprocess"
         for name, value in result.process.items():
-            process[name] = value
+            process[name] = legible(value) if isinstance(value, str) else value
 
 
 def open_result(path: str | Path) -> Result:

@@ -77,11 +77,13 @@ def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) 
                 f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed: "
                 "install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH"
             )
+    # A frame needs room in any case, however it is packed.
+    several = filters and dataset.ndim > 2 and dataset.chunks[0] > 1
     size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
-    if filters and memory_limit is not None and size > memory_limit:
+    if several and memory_limit is not None and size > memory_limit:
         raise InputError(
-            f"{where} is packed in chunks of {size / 1e6:.0f} MB where memory is limited to "
-            f"{memory_limit / 1e6:.0f} MB: raise --memory, or repack it with h5repack in chunks of one frame"
+            f"{where} is packed in chunks of {size / 1e6:.3g} MB where memory is limited to "
+            f"{memory_limit / 1e6:.3g} MB: raise --memory, or repack it with h5repack in chunks of one frame"
         )
 
 

@@ -1,0 +1,304 @@
+"""Files that are wrong in rarer ways, and real processes: one line, exit code 2, and nothing written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+from stacks import MadeUp, random_stack, record, sphere
+
+from mirrorskin import io
+from mirrorskin.cli import main as command_line
+
+PHASE = np.arange(8) * np.pi / 4
+GIVEN = ["--motion", "vertical", "--travel-step", "0.1mm"]
+DAMAGED = bytes(range(200, 250))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Work in an empty folder inside another one."""
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.chdir(home)
+    return home
+
+
+def run(monkeypatch, capfd, *words):
+    """Run the command line in this process; return its exit code and what it said."""
+    monkeypatch.setattr(sys, "argv", ["mirrorskin", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    return ended.value.code or 0, *capfd.readouterr()
+
+
+def process(*words, **settings):
+    """Run the command line as a user does."""
+    command = [sys.executable, "-m", "mirrorskin.cli.main", *words]
+    done = subprocess.run(command, capture_output=True, check=False, **settings)
+    return done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
+
+
+def files():
+    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+
+
+def assert_refused(ended, words, before):
+    code, out, said = ended
+    assert code == 2, said
+    assert out == ""
+    assert words in said
+    assert said.startswith("mirrorskin: ")
+    assert said.count("\n") == 1
+    assert "Traceback" not in said
+    assert files() == before
+
+
+def change(name, value=None):
+    """Make a recording of the twin, a part of which is replaced, or left out."""
+
+    def make():
+        twin = sphere()
+        record(twin, Path("bad.h5"), truth=twin.truth)
+        with h5py.File("bad.h5", "r+") as file:
+            del file[f"entry/{name}"]
+            if value is not None:
+                file[f"entry/{name}"] = value
+
+    return make
+
+
+def other_motion(motion):
+    return lambda: record(MadeUp(random_stack(), io.Header(motion, tilt=0.1), phase=PHASE), Path("bad.h5"))
+
+
+def stack(**storage):
+    """Make someone else's file with a stack that is stored in some way."""
+
+    def make():
+        with h5py.File("bad.h5", "w") as file:
+            file.create_dataset("x", (8, 50, 70), "u1", **storage)[...] = 1
+
+    return make
+
+
+def damaged_chunk():
+    stack(chunks=(2, 50, 70), compression="gzip")()
+    with h5py.File("bad.h5") as file:
+        place = file["x"].id.get_chunk_info(1).byte_offset
+    data = bytearray(Path("bad.h5").read_bytes())
+    data[place : place + len(DAMAGED)] = DAMAGED
+    Path("bad.h5").write_bytes(data)
+
+
+def cut_to(length):
+    def make():
+        record(sphere(), Path("bad.h5"))
+        Path("bad.h5").write_bytes(Path("bad.h5").read_bytes()[:length])
+
+    return make
+
+
+def link(target):
+    """Make a file that leads to another, which stands outside of its folder, too."""
+
+    def make():
+        with h5py.File("../outside.h5", "w") as file:
+            file["x"] = random_stack()
+        Path("symlink.h5").symlink_to("../outside.h5")
+        with h5py.File("bad.h5", "w") as file:
+            file["x"] = target
+
+    return make
+
+
+def a_result():
+    io.save_result(io.Result(height=np.zeros((5, 7), np.float32)), "bad.h5")
+
+
+def typed(dtype):
+    def make():
+        with h5py.File("bad.h5", "w") as file:
+            file.create_dataset("x", (8, 5, 7), dtype)
+
+    return make
+
+
+DETECTOR, STAGE = "instrument/detector", "instrument/stage"
+NAMED = [*GIVEN, "--dataset", "x"]
+CASES = {
+    "axial": (other_motion("axial"), [], "axial"),
+    "horizontal": (other_motion("horizontal"), [], "horizontal"),
+    "a result": (a_result, [], "is a result: give the recording that it was made from"),
+    "no data": (change(f"{DETECTOR}/data"), [], "name the stack with --dataset"),
+    "dangling travel": (
+        change(f"{STAGE}/travel", h5py.SoftLink("/gone")),
+        [],
+        "the link travel leads to /gone",
+    ),
+    "dangling dark": (change(f"{DETECTOR}/dark", h5py.SoftLink("/gone")), [], "the link dark leads to /gone"),
+    "infinite travel": (
+        change(f"{STAGE}/travel", [*range(7), np.inf]),
+        [],
+        "inf at",
+    ),
+    "travel in words": (
+        change(f"{STAGE}/travel", ["a"] * 8),
+        [],
+        "travel holds no numbers: give --travel-step",
+    ),
+    "an incomplete truth": (change("truth/zenith"), [], "/entry/truth has no zenith"),
+    "a negative pixel": (change(f"{DETECTOR}/x_pixel_size", -1.0), [], "above zero"),
+    "a pixel that is no number": (
+        change(f"{DETECTOR}/x_pixel_size", np.nan),
+        [],
+        "not finite: give --pixel-size",
+    ),
+    "a negative pixel given": (stack(), [*GIVEN, "--pixel-size=-1mm"], "above zero"),
+    "a named group": (change(f"{STAGE}/travel"), ["--dataset", "/entry"], "/entry is no dataset"),
+    "int32": (typed("i4"), GIVEN, "int32: frames are uint8, uint16 or float32"),
+    "compound": (typed([("r", "u1"), ("g", "u1")]), GIVEN, "frames are uint8, uint16 or float32"),
+    "a damaged chunk": (damaged_chunk, GIVEN, "frames 0 to 7 of /x cannot be read"),
+    "a large chunk": (
+        stack(chunks=(8, 50, 70), **hdf5plugin.Bitshuffle()),
+        [*GIVEN, "--memory", "9kB"],
+        "h5repack",
+    ),
+    "cut in the signature": (cut_to(5), [], "is not an HDF5 file"),
+    "cut in the superblock": (cut_to(30), [], "copy it again"),
+    "cut in the metadata": (cut_to(900), [], "truncated"),
+    "cut in the data": (cut_to(-40), [], "truncated"),
+    "a link up": (link(h5py.ExternalLink("../outside.h5", "/x")), NAMED, "leads out of its folder"),
+    "a link by symlink": (link(h5py.ExternalLink("symlink.h5", "/x")), NAMED, "leads out of its folder"),
+    "a link in a circle": (link(h5py.SoftLink("/x")), NAMED, "go round in a circle"),
+    "steps back": (stack(), ["--motion", "vertical", "--travel-step=-0.1mm"], "travel runs back at frame 1"),
+    "an output that is a pipe": (
+        lambda: (stack()(), os.mkfifo("pipe")),
+        [*GIVEN, "-o", "pipe"],
+        "is no regular file",
+    ),
+    "an output with a long name": (stack(), [*GIVEN, "-o", "x" * 300], "File name too long; choose another"),
+    "an input with a long name": (lambda: None, ["x" * 300], "File name too long"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_reconstruct_refuses_in_one_line(monkeypatch, capfd, case):
+    make, options, words = CASES[case]
+    make()
+    before = files()
+    name = [] if case == "an input with a long name" else ["bad.h5"]
+    assert_refused(run(monkeypatch, capfd, "reconstruct", *name, *options), words, before)
+
+
+@pytest.mark.parametrize(
+    ("make", "words", "said"),
+    [
+        (cut_to(30), ["reconstruct", "bad.h5"], "bad.h5: it is "),
+        (
+            damaged_chunk,
+            ["reconstruct", "bad.h5", *GIVEN],
+            "bad.h5: frames 0 to 7 of /x cannot be read: it is damaged",
+        ),
+        (a_result, ["reconstruct", "bad.h5"], "bad.h5 is a result"),
+        (lambda: None, ["reconstruct", "."], ". is a folder: an HDF5 file is needed"),
+        (
+            stack(),
+            ["reconstruct", "bad.h5", *GIVEN, "-o", "bad.h5/r.h5"],
+            "there is no folder bad.h5: make it first",
+        ),
+    ],
+)
+def test_a_process_ends_with_one_line(make, words, said):
+    make()
+    before = files()
+    assert_refused(process(*words), said, before)
+
+
+@pytest.mark.parametrize(
+    ("make", "words", "said"),
+    [
+        (a_result, ["score", "bad.h5", "--truth", "bad.h5"], "bad.h5 is a result: give the recording"),
+        (
+            change("title"),
+            ["score", "bad.h5", "--truth", "bad.h5"],
+            "bad.h5 is no result: 'mirrorskin reconstruct'",
+        ),
+        (change(f"{STAGE}/motion"), ["info", "bad.h5"], "does not say how the sensor moved"),
+        (cut_to(900), ["info", "bad.h5"], "truncated"),
+        (stack(), ["import", "bad.h5", *GIVEN, "-o", "bad.h5"], "bad.h5 is the input"),
+        (stack(), ["simulate", "vertical", "--object", "bad.h5", "-o", "bad.h5"], "bad.h5 is the input"),
+    ],
+)
+def test_other_commands_refuse_in_one_line(monkeypatch, capfd, make, words, said):
+    make()
+    before = files()
+    assert_refused(run(monkeypatch, capfd, *words), said, before)
+
+
+def test_a_result_of_another_size_is_not_scored(monkeypatch, capfd):
+    twin = sphere()
+    record(twin, Path("truth.h5"), truth=twin.truth)
+    io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "bad.h5")
+    before = files()
+    assert_refused(
+        run(monkeypatch, capfd, "score", "bad.h5", "--truth", "truth.h5"), "not of one stack", before
+    )
+
+
+def test_a_recording_without_the_truth_is_not_scored(monkeypatch, capfd):
+    record(sphere(), Path("blind.h5"))
+    a_result()
+    before = files()
+    assert_refused(
+        run(monkeypatch, capfd, "score", "bad.h5", "--truth", "blind.h5"), "holds no truth", before
+    )
+
+
+def test_references_may_be_unknown_at_some_pixels(monkeypatch, capfd):
+    dark = np.full((5, 7), 16, np.float32)
+    dark[2, 3] = np.nan
+    change(f"{DETECTOR}/dark", dark)()
+    assert run(monkeypatch, capfd, "reconstruct", "bad.h5")[0] == 0
+    result = io.open_result("bad-result.h5")
+    assert result.status[2, 3] == 0
+    assert np.count_nonzero(result.status == 0) == 1
+
+
+@pytest.mark.parametrize("name", ["five yen.h5", "Münze 五円.h5"])
+def test_any_name_will_do(monkeypatch, capfd, name):
+    record(sphere(), Path(name))
+    assert run(monkeypatch, capfd, "reconstruct", name)[0] == 0
+    result = name.replace(".h5", "-result.h5")
+    assert run(monkeypatch, capfd, "info", result)[0] == 0
+    assert io.open_result(result).process["source"] == name
+
+
+def test_a_name_that_is_no_text_will_do():
+    name = Path(os.fsdecode(b"no \xff text.h5"))
+    record(sphere(), Path("plain.h5")).rename(name)
+    assert process("reconstruct", name, "-o", "result.h5")[0] == 0
+    assert io.open_result("result.h5").process["source"] == "no \ufffd text.h5"
+
+
+FULL = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+from mirrorskin.cli.main import main
+main()
+"""
+
+
+def test_a_full_disk_is_one_line():
+    # A limit to the size of files stands for the full disk.
+    command = [sys.executable, "-c", FULL, "simulate", "vertical", "--size", "70x60", "-o", "press.h5"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert_refused(
+        (done.returncode, done.stdout, done.stderr), "press.h5 could not be written: File too large", {}
+    )

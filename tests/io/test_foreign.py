@@ -1,0 +1,586 @@
+"""Other people's HDF5: every way of storing a stack is read alike; what cannot be is refused in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tracemalloc
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+from stacks import SHAPE, TRAVEL, random_stack, read_all, record, sphere
+
+from mirrorskin import io
+
+STACK = random_stack()
+GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
+UNKNOWN_FILTER = 32999
+
+
+def bare(file):
+    file["frames"] = STACK
+
+
+def in_groups(file):
+    file["scan/one/camera/frames"] = STACK
+    file["scan/one/mean"] = STACK[0]
+    file["scan/one/exposure"] = 0.1
+
+
+def big_endian(file):
+    file["x"] = STACK.astype(">u2")
+
+
+def with_user_block(file):
+    file["x"] = STACK
+
+
+def compact(file):
+    plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plist.set_layout(h5py.h5d.COMPACT)
+    space = h5py.h5s.create_simple(SHAPE)
+    h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.STD_U8LE, space, plist))[...] = STACK
+
+
+def resizable(file):
+    file.create_dataset("x", data=STACK[:3], maxshape=(None, 5, 7), chunks=(2, 3, 4)).resize(8, axis=0)
+    file["x"][3:] = STACK[3:]
+
+
+def twelve_bits(file):
+    kind = h5py.h5t.STD_U16LE.copy()
+    kind.set_precision(12)
+    h5py.Dataset(h5py.h5d.create(file.id, b"x", kind, h5py.h5s.create_simple(SHAPE)))[...] = STACK
+
+
+def virtual_in_itself(file):
+    file["parts/first"], file["parts/last"] = (
+        STACK[:3].reshape(1, *STACK[:3].shape),
+        STACK[3:].reshape(1, 5, 5, 7),
+    )
+    layout = h5py.VirtualLayout(SHAPE, "u1")
+    layout[:3] = h5py.VirtualSource(file["parts/first"])[0]
+    layout[3:] = h5py.VirtualSource(file["parts/last"])[0]
+    file.create_virtual_dataset("x", layout)
+
+
+FOUND = [bare, in_groups, big_endian, compact, resizable, twelve_bits, virtual_in_itself]
+
+
+def read(path, **given):
+    with io.open_recording(path, **GIVEN | given) as recording:
+        return read_all(recording, 3)[0]
+
+
+def refused(path, line, **given):
+    """Hold that a file is refused, in one line that matches."""
+    with (
+        pytest.raises(io.InputError, match=line) as caught,
+        io.open_recording(path, **GIVEN | given) as recording,
+    ):
+        read_all(recording, 3)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 450
+    return message
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "theirs.h5"
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("write", FOUND)
+def test_the_only_stack_of_a_file_is_found(path, write, libver):
+    with h5py.File(path, "w", libver=libver) as file:
+        write(file)
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_a_user_block_does_no_harm(path):
+    with h5py.File(path, "w", userblock_size=512) as file:
+        bare(file)
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_a_stack_of_another_s_file_is_read(path):
+    with h5py.File(path, "w") as file:
+        big_endian(file)
+    with io.open_recording(path, **GIVEN, pixel_size=(0.1, 0.1)) as recording:
+        assert (recording.shape, recording.dtype, recording.motion) == (SHAPE, np.uint16, "vertical")
+        assert recording.dtype.isnative
+        np.testing.assert_allclose(recording.travel, TRAVEL)
+        assert recording.header == io.Header("vertical", pixel_size=(0.1, 0.1))
+        assert (recording.time, recording.truth, recording.dataset) == (None, None, "/x")
+
+
+def test_of_several_stacks_one_is_named(path):
+    with h5py.File(path, "w") as file:
+        file["a/one"], file["two"] = STACK, STACK[::-1]
+    for name in ("two", "/two", "./two", "//two"):
+        np.testing.assert_array_equal(read(path, dataset=name), STACK[::-1])
+    np.testing.assert_array_equal(read(path, dataset="a/one"), STACK)
+    refused(path, r"theirs\.h5 holds 2 stacks, /a/one, /two: choose with --dataset")
+
+
+@pytest.mark.parametrize("subfolder", [".", "deep/down"])
+def test_links_inside_the_folder_are_followed(tmp_path, path, subfolder):
+    other = tmp_path / subfolder / "other.h5"
+    other.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(other, "w") as file:
+        file["there/x"] = STACK
+        file["back"] = h5py.ExternalLink(path, "/soft")
+    with h5py.File(path, "w") as file:
+        file["near"] = h5py.ExternalLink(f"{subfolder}/other.h5", "/there/x")
+        file["group"] = h5py.ExternalLink(str(other), "there")
+        file["soft"] = h5py.SoftLink("/near")
+        file.create_group("sub")["relative"] = h5py.SoftLink("./back")
+        file["sub/back"] = h5py.ExternalLink(f"{subfolder}/other.h5", "/back")
+    for name in ("near", "group/x", "soft", "sub/relative", "sub/back"):
+        np.testing.assert_array_equal(read(path, dataset=name), STACK)
+    # All of them are closed again: HDF5 would not open one for writing otherwise.
+    for each in (path, other):
+        h5py.File(each, "r+").close()
+
+
+def raw_files(path):
+    """Write a stack whose frames lie in two raw files beside it."""
+    data = b"header" + STACK.tobytes() + b"rest"
+    path.parent.joinpath("a.raw").write_bytes(data[:106])
+    path.parent.joinpath("b.raw").write_bytes(data[106:])
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", SHAPE, "u1", external=[("a.raw", 6, 100), ("b.raw", 0, 180)])
+
+
+def test_raw_files_are_read_from_beside_the_file(tmp_path, path, monkeypatch):
+    raw_files(path)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("a.raw", "b.raw"):
+        (elsewhere / name).write_bytes(bytes(300))
+    monkeypatch.chdir(elsewhere)
+    np.testing.assert_array_equal(read(path), STACK)
+    assert np.array_equal(read("../theirs.h5"), STACK)
+    with io.open_recording(path, **GIVEN) as recording:
+        assert recording.storage == "in raw files"
+
+
+def virtual(path, names, length=2, missing=0):
+    """Write a virtual stack from files of two frames each; the last file lacks some."""
+    layout = h5py.VirtualLayout(SHAPE, "u1", filename=path)
+    for k, name in enumerate(names):
+        part = STACK[length * k : length * (k + 1)]
+        kept = part[: len(part) - (missing if name == names[-1] else 0)]
+        with h5py.File(path.parent / name, "w") as file:
+            file["x"] = kept
+        layout[length * k : length * (k + 1)] = h5py.VirtualSource(name, "x", part.shape)
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("x", layout)
+
+
+def test_a_virtual_stack_is_read(path, tmp_path, monkeypatch):
+    virtual(path, [f"part{k}.h5" for k in range(4)])
+    monkeypatch.chdir(tmp_path.parent)
+    np.testing.assert_array_equal(read(path), STACK)
+    with io.open_recording(path, **GIVEN) as recording:
+        assert recording.storage == "virtual"
+
+
+def test_a_virtual_stack_that_grows_is_read(path, tmp_path):
+    growing = (None, 5, 7)
+    with h5py.File(tmp_path / "camera.h5", "w") as file:
+        file.create_dataset("x", data=STACK, maxshape=growing)
+    layout = h5py.VirtualLayout((1, 5, 7), "u1", maxshape=growing)
+    source = h5py.VirtualSource("camera.h5", "x", (1, 5, 7), maxshape=growing)
+    layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("x", layout)
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_a_virtual_stack_that_is_not_whole_is_refused(path, tmp_path):
+    names = [f"part{k}.h5" for k in range(4)]
+    virtual(path, names, missing=1)
+    refused(path, r"/x claims 280 bytes and its file holds 245: it was cut short")
+    virtual(path, names[:3])
+    refused(path, r"/x claims 280 bytes and its file holds 210: it was cut short")
+    virtual(path, names)
+    with h5py.File(tmp_path / "part2.h5", "w") as file:
+        file["y"] = STACK
+    refused(path, r"/x needs x of part2\.h5: it is not there")
+    with h5py.File(tmp_path / "part2.h5", "w") as file:
+        file.create_dataset("x", (2, 5, 7), "u1")
+    refused(path, r"part2\.h5: /x claims 70 bytes and its file holds 0: it was cut short")
+    (tmp_path / "part2.h5").unlink()
+    refused(path, r"the virtual dataset /x leads to part2\.h5, which does not exist: copy it there")
+
+
+def test_a_virtual_stack_that_selects_too_much_is_refused(path, tmp_path):
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file["x"] = STACK[:4]
+    layout = h5py.VirtualLayout(SHAPE, "u1")
+    layout[:4] = h5py.VirtualSource("part.h5", "x", SHAPE)[:4]
+    layout[4:] = h5py.VirtualSource("part.h5", "x", SHAPE)[4:]
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("x", layout)
+    refused(path, r"/x claims 280 bytes and its file holds 140: it was cut short")
+
+
+def test_a_virtual_stack_of_itself_is_refused(path):
+    layout = h5py.VirtualLayout(SHAPE, "u1")
+    layout[...] = h5py.VirtualSource("theirs.h5", "x", SHAPE)
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("x", layout)
+    refused(path, "virtual datasets are nested too deeply")
+
+
+@pytest.mark.parametrize("way", ["..", "absolute", "symlink", "by another"])
+@pytest.mark.parametrize("kind", ["link", "virtual", "raw"])
+def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
+    outside, home = tmp_path / "outside", tmp_path / "home"
+    for folder in (outside, home / "sub"):
+        folder.mkdir(parents=True)
+    with h5py.File(outside / "x.h5", "w") as file:
+        bare(file)
+    (outside / "x.raw").write_bytes(STACK.tobytes())
+    (home / "sub" / "link").symlink_to(outside)
+    names = {
+        "..": "../outside",
+        "absolute": str(outside),
+        "symlink": "sub/link",
+        "by another": "../../outside",
+    }
+    name = f"{names[way]}/x.{'raw' if kind == 'raw' else 'h5'}"
+    path = home / ("sub/theirs.h5" if way == "by another" else "theirs.h5")
+    with h5py.File(path, "w") as file:
+        if kind == "link":
+            file["x"] = h5py.ExternalLink(name, "/frames")
+        elif kind == "raw":
+            file.create_dataset("x", SHAPE, "u1", external=[(name, 0, 280)])
+        else:
+            layout = h5py.VirtualLayout(SHAPE, "u1")
+            layout[...] = h5py.VirtualSource(name, "frames", SHAPE)
+            file.create_virtual_dataset("x", layout)
+    if way == "by another":
+        with h5py.File(home / "theirs.h5", "w") as file:
+            file["x"] = h5py.ExternalLink("sub/theirs.h5", "/x")
+    refused(home / "theirs.h5", r"leads out of its folder, to .*: copy that file beside it", dataset="x")
+
+
+def test_links_that_lead_nowhere_are_refused(path, tmp_path):
+    (tmp_path / "text.h5").write_text("no HDF5")
+    (tmp_path / "loop.h5").symlink_to("loop.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        bare(file)
+    with h5py.File(path, "w") as file:
+        file["soft"] = h5py.SoftLink("/nothing/here")
+        file["gone"] = h5py.ExternalLink("gone.h5", "/x")
+        file["loop"] = h5py.ExternalLink("loop.h5", "/x")
+        file["text"] = h5py.ExternalLink("text.h5", "/x")
+        file["inside"] = h5py.ExternalLink("other.h5", "/x")
+        file["folder"] = h5py.ExternalLink(".", "/x")
+        file["long"] = h5py.ExternalLink("x" * 300, "/x")
+    refused(path, r"theirs\.h5: /: the link soft leads to /nothing/here, which is not there", dataset="soft")
+    refused(path, r"the external link gone in / leads to gone\.h5, which does not exist", dataset="gone")
+    refused(path, r"the external link loop in / leads to loop\.h5, which does not exist", dataset="loop")
+    refused(path, r"text\.h5 is not an HDF5 file", dataset="text")
+    refused(path, "the link inside leads to /x, which is not there", dataset="inside")
+    refused(path, r"the external link folder in / leads to \., which does not exist", dataset="folder")
+    refused(path, "the external link long in /: File name too long", dataset="long")
+
+
+def test_links_that_go_round_are_refused(path, tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["back"] = h5py.ExternalLink("theirs.h5", "/there")
+    with h5py.File(path, "w") as file:
+        file["self"] = h5py.SoftLink("/self")
+        file["a"], file["b"] = h5py.SoftLink("/b"), h5py.SoftLink("/a/a/a")
+        file["there"] = h5py.ExternalLink("other.h5", "/back")
+        file["again"] = h5py.ExternalLink("theirs.h5", "/again")
+    for name in ("self", "a", "b/x", "there", "again"):
+        refused(path, "links go round in a circle", dataset=name)
+
+
+def test_a_name_that_is_no_stack_is_refused(path):
+    with h5py.File(path, "w") as file:
+        file["group/x"], file["flat"], file["empty"] = STACK, STACK[0], h5py.Empty("u1")
+        file["four"], file["type"] = STACK[None], np.dtype("u1")
+    refused(path, r"there is no nothing: name the stack with --dataset", dataset="nothing")
+    refused(path, r"there is no flat/x: name", dataset="flat/x")
+    refused(path, r"/group is no dataset: name one with --dataset", dataset="group")
+    refused(path, r"/ is no dataset: name one", dataset="/")
+    refused(path, r"/type is no dataset: name one", dataset="type")
+    refused(path, r"/flat has shape \(5, 7\): a stack of frames, \(T, H, W\), is needed", dataset="flat")
+    refused(path, r"/four has shape \(1, 8, 5, 7\)", dataset="four")
+    refused(path, r"/empty has shape None", dataset="empty")
+
+
+@pytest.mark.parametrize(
+    ("shape", "line"),
+    [
+        ((0, 5, 7), "holds 0 frames: at least 2 are needed"),
+        ((1, 5, 7), "holds 1 frames: at least 2 are needed"),
+        ((8, 0, 7), "its frames have no pixels"),
+        ((8, 5, 0), "its frames have no pixels"),
+    ],
+)
+def test_a_stack_of_too_little_is_refused(path, shape, line):
+    with h5py.File(path, "w") as file:
+        file["x"] = np.zeros(shape, "u1")
+    refused(path, line)
+
+
+@pytest.mark.parametrize(
+    "dtype",
+    [
+        *("c8", "f8", "f2", "i4", "u4", "i1", "?", "S3", "V3", [("r", "u1"), ("g", "u1")]),
+        *(h5py.string_dtype(), h5py.ref_dtype, h5py.vlen_dtype("u1")),
+    ],
+    ids=str,
+)
+def test_a_type_that_frames_cannot_have_is_refused(path, dtype):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", SHAPE, dtype)
+    refused(path, r"/x is of type .*: frames are uint8, uint16 or float32; convert it first")
+
+
+def test_a_file_without_a_stack_is_refused(path):
+    with h5py.File(path, "w") as file:
+        file["flat"] = STACK[0]
+    refused(path, r"theirs\.h5 holds no stack of frames \(T, H, W\)")
+
+
+def test_a_result_is_no_recording(path):
+    io.save_result(io.Result(height=np.zeros((5, 7), np.float32)), path)
+    refused(path, r"theirs\.h5 is a result: give the recording that it was made from")
+
+
+def test_a_stack_without_motion_or_travel_is_refused(path):
+    with h5py.File(path, "w") as file:
+        bare(file)
+    refused(path, r"theirs\.h5 does not say how the sensor moved: give --motion", motion=None)
+    refused(path, r"does not say where the body was in each frame: give --travel-step", travel=None)
+    refused(path, r"does not say where .*: give --phase-step", motion="axial")
+    refused(path, r"says the motion 'up'", motion="up")
+
+
+def huge_in_one_piece(file):
+    file.create_dataset("x", (10**6, 1000, 1000), "u1")
+
+
+def huge_in_chunks(file):
+    file.create_dataset("x", (10**6, 1000, 1000), "u1", chunks=(1, 1000, 1000), compression="gzip")[3] = 1
+
+
+def huge_in_many_chunks(file):
+    file.create_dataset("x", (2**40, 2**10, 2**13), "u1", chunks=(1, 1, 1))
+
+
+def huge_in_no_raw_file(file):
+    file.create_dataset("x", (10**6, 1000, 1000), "u1", external=[("theirs.h5", 0, h5py.h5f.UNLIMITED)])
+
+
+def huge_by_a_virtual_source(file):
+    file.create_dataset("small", (8, 5), "u1")
+    layout = h5py.VirtualLayout((10**6, 1000, 1000), "u1")
+    layout[0, 0, 0] = h5py.VirtualSource(file["small"])[0, 0]
+    file["small"][...] = 1
+    file.create_virtual_dataset("x", layout)
+
+
+HUGE = [huge_in_one_piece, huge_in_chunks, huge_in_many_chunks, huge_in_no_raw_file, huge_by_a_virtual_source]
+
+
+@pytest.mark.parametrize("write", HUGE)
+def test_more_than_the_file_holds_is_refused_before_memory_is_taken(path, write):
+    with h5py.File(path, "w") as file:
+        write(file)
+    tracemalloc.start()
+    try:
+        refused(
+            path,
+            r"/x claims [0-9]+ (bytes|chunks) and its file holds [0-9]+: it was cut short; copy it again",
+        )
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_header_that_claims_more_than_the_file_is_refused(path):
+    with h5py.File(path, "w") as file:
+        bare(file)
+    few, many = (np.array([frames, 5, 7], "<u8").tobytes() for frames in (8, 10**9))
+    data = path.read_bytes()
+    assert data.count(few) == 2
+    path.write_bytes(data.replace(few, many))
+    refused(
+        path, r"/frames claims 35000000000 bytes and its file holds [0-9]+: it was cut short; copy it again"
+    )
+
+
+@pytest.mark.parametrize("name", ["stage/travel", "detector/frame_time", "detector/dark", "stage/pivot"])
+@pytest.mark.parametrize("shape", [(10**6, 10**6), (10**12,)])
+def test_numbers_beside_the_frames_take_no_memory_either(path, name, shape):
+    record(sphere(), path)
+    with h5py.File(path, "r+") as file:
+        file.pop(f"entry/instrument/{name}", None)
+        file[f"entry/instrument/{name}"] = 0
+        del file[f"entry/instrument/{name}"]
+        file.create_dataset(f"entry/instrument/{name}", shape, "f8")
+    tracemalloc.start()
+    try:
+        with pytest.raises(io.InputError, match=r"has shape .* where .* is needed"):
+            io.open_recording(path)
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_numbers_that_were_never_written_are_no_zeros(path):
+    record(sphere(), path)
+    with h5py.File(path, "r+") as file:
+        del file["entry/instrument/detector/dark"]
+        file.create_dataset("entry/instrument/detector/dark", (5, 7), "f4")
+    with pytest.raises(io.InputError, match=r"/dark claims 140 bytes and its file holds 0: it was cut short"):
+        io.open_recording(path)
+
+
+def test_a_filter_that_is_not_installed_is_named(path):
+    with h5py.File(path, "w") as file:
+        stack = file.create_dataset(
+            "x", SHAPE, "u1", chunks=(1, 5, 7), compression=UNKNOWN_FILTER, allow_unknown_filter=True
+        )
+        for k in range(8):
+            stack.id.write_direct_chunk((k, 0, 0), STACK[k].tobytes())
+    refused(
+        path,
+        r"/x is packed with filter 32999 \(unnamed\), which is not installed: install its HDF5 plugin "
+        "and name its folder in HDF5_PLUGIN_PATH",
+    )
+
+
+PACKINGS = {
+    "gzip": {"compression": "gzip"},
+    "lzf": {"compression": "lzf"},
+    "fletcher32": {"fletcher32": True},
+    "zstd": {**hdf5plugin.Zstd()},
+}
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_a_damaged_chunk_names_its_frames(path, packing):
+    with h5py.File(path, "w") as file:
+        stack = file.create_dataset(
+            "x", data=np.zeros((9, 50, 70), "u1"), chunks=(3, 50, 70), **PACKINGS[packing]
+        )
+        chunk = stack.id.get_chunk_info(1)
+    data = bytearray(path.read_bytes())
+    start = chunk.byte_offset
+    data[start : start + chunk.size] = bytes(0xA5 ^ byte for byte in data[start : start + chunk.size])
+    path.write_bytes(data)
+    with io.open_recording(path, **GIVEN) as recording:
+        room = np.empty((4, 50, 70), "u1")
+        assert recording.read(room).frames.shape == (3, 50, 70)
+        line = r"theirs\.h5: frames 3 to 5 of /x cannot be read: it is damaged .*: copy it again"
+        with pytest.raises(io.InputError, match=line) as caught:
+            recording.read(room)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_was_cut_is_refused_wherever(path):
+    record(sphere(), path, "gzip")
+    data = path.read_bytes()
+    for length in (
+        0,
+        4,
+        7,
+        8,
+        9,
+        20,
+        47,
+        48,
+        95,
+        96,
+        600,
+        2048,
+        len(data) // 2,
+        len(data) - 200,
+        len(data) - 1,
+    ):
+        path.write_bytes(data[:length])
+        line = (
+            "is not an HDF5 file"
+            if length < 8
+            else "it is truncated: copy it again|it is damaged .*: copy it again"
+        )
+        refused(path, line)
+        with pytest.raises(io.InputError, match=line):
+            io.describe(path)
+    path.write_bytes(data)
+    io.open_recording(path).close()
+
+
+def test_a_damaged_head_is_one_line(path):
+    with h5py.File(path, "w") as file:
+        bare(file)
+    data = path.read_bytes()
+    for place in (8, 9, 13, 36, 44, 64, 72, 96, 136, 680):
+        damaged = bytearray(data)
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+        refused(path, r"it is (truncated|damaged .*): copy it again")
+
+
+def test_what_is_no_file_of_frames_is_refused(tmp_path):
+    (tmp_path / "text.h5").write_text("frames")
+    (tmp_path / "loop.h5").symlink_to("loop.h5")
+    refused(tmp_path / "none.h5", r"none\.h5: no such file")
+    refused(tmp_path / "text.h5" / "below.h5", r"below\.h5: no such file")
+    refused(tmp_path / "loop.h5", r"loop\.h5: no such file")
+    refused(tmp_path / ("x" * 300), "File name too long")
+    refused(tmp_path, "is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders")
+    refused("/dev/null", "is no regular file")
+    refused(
+        tmp_path / "text.h5", "is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
+    )
+
+
+WRITER = "import h5py, sys; file = h5py.File(sys.argv[1], 'r+'); print('open', flush=True); sys.stdin.read()"
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+def test_a_file_that_is_being_written_is_refused(path, libver, monkeypatch):
+    monkeypatch.delenv("HDF5_USE_FILE_LOCKING", raising=False)
+    with h5py.File(path, "w", libver=libver) as file:
+        bare(file)
+    command = [sys.executable, "-c", WRITER, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"open\n"
+        refused(path, r"theirs\.h5: another program is writing it: wait until it is done")
+        writer.stdin.close()
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_a_file_whose_writer_died_is_refused(tmp_path, path):
+    with h5py.File(tmp_path / "open.h5", "w", libver="latest") as file:
+        bare(file)
+        file.flush()
+        path.write_bytes((tmp_path / "open.h5").read_bytes())
+    refused(
+        path, r"theirs\.h5: another program is writing it: wait until it is done \('h5clear -s' if it died\)"
+    )
+
+
+def test_another_s_file_is_described(path):
+    with h5py.File(path, "w") as file:
+        file["b/x"], file["a"], file["flat"] = STACK, STACK.astype("f8"), STACK[0]
+        file["dead"], file["text"] = h5py.SoftLink("/x"), "text"
+    assert io.describe(path) == {
+        "kind": "HDF5 file of another layout",
+        "stacks": "2",
+        "/a": "8 x 5 x 7 float64",
+        "/b/x": "8 x 5 x 7 uint8",
+    }

@@ -1,0 +1,71 @@
+"""The checks of travel and phase."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin.io import InputError, Steps, check_phase, check_travel
+
+
+@pytest.mark.parametrize(
+    "values", [[0, 1, 1, 2], (0.0, 0.5, 1, 7), np.arange(4, dtype=">u2"), np.ones(4, "f2")]
+)
+def test_travel_that_only_goes_down_is_kept(values):
+    found = check_travel(values, 4, "travel")
+    np.testing.assert_array_equal(found, np.asarray(values, float))
+    assert found.dtype == np.float64
+
+
+@pytest.mark.parametrize("values", [[3, 2, 1, 0], [-1e308, 1e308, 0, -3], [0.1, 0.1, 7, 7]])
+def test_phase_may_go_either_way(values):
+    np.testing.assert_array_equal(check_phase(values, 4, "phase"), values)
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        (None, "travel is missing: a vertical press needs the travel of each frame, in mm"),
+        ([0, 1, 2], r"travel has shape \(3,\) for 4 frames: one number a frame is needed"),
+        (1.0, r"travel has shape \(\) for 4 frames"),
+        ([[0, 1, 2, 3]], r"travel has shape \(1, 4\) for 4 frames"),
+        ([0, 1, np.nan, 3], "travel is nan at frame 2: every frame needs a finite number"),
+        ([0, 1, 2, np.inf], "travel is inf at frame 3: every frame needs a finite number"),
+        (["0", "1", "2", "3"], "travel is of type <U1: numbers are needed"),
+        ([0j, 1, 2, 3], "travel is of type complex128: numbers are needed"),
+        ([True] * 4, "travel is of type bool: numbers are needed"),
+        ([0, 2, 1, 3], "travel runs back at frame 2: a press only goes down; cut or reverse it"),
+        ([1e308, -1e308, 0, 0], "travel runs back at frame 1"),
+        (np.array([3, 2, 1, 0], np.uint8), "travel runs back at frame 1"),
+    ],
+)
+def test_travel_that_cannot_be_is_one_line(values, line):
+    with pytest.raises(InputError, match=line):
+        check_travel(values, 4, "travel")
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        (None, "phase is missing: an axial rotation needs the phase of each frame, in radians"),
+        ([0, 1], r"phase has shape \(2,\) for 4 frames"),
+        ([0, np.nan, 1, 2], "phase is nan at frame 1"),
+    ],
+)
+def test_phase_that_cannot_be_is_one_line(values, line):
+    with pytest.raises(InputError, match=line):
+        check_phase(values, 4, "phase")
+
+
+def test_a_block_goes_on_where_the_one_before_ended():
+    np.testing.assert_array_equal(check_travel([2, 3], 2, "travel", after=[2.0]), [2, 3])
+    with pytest.raises(InputError, match="travel runs back at frame 0"):
+        check_travel([1.9, 3], 2, "travel", after=[2.0])
+    with pytest.raises(InputError, match="travel runs back at frame 1"):
+        check_travel([2.1, 2], 2, "travel", after=[2.0])
+
+
+def test_steps_are_even():
+    np.testing.assert_allclose(Steps(0.1, 0.3).positions(4), [0.3, 0.4, 0.5, 0.6])
+    np.testing.assert_array_equal(Steps(2).positions(3), [0, 2, 4])
+    assert Steps(2).positions(3).dtype == np.float64

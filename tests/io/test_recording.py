@@ -1,0 +1,353 @@
+"""Reading a recording of ours: what it says, in which units, what overrides it, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+from stacks import SHAPE, TRAVEL, MadeUp, random_stack, read_all, record, sphere
+
+from mirrorskin import io
+
+DETECTOR, STAGE, TRUTH = "entry/instrument/detector", "entry/instrument/stage", "entry/truth"
+PHASE = np.arange(8) * np.pi / 4
+
+
+@pytest.fixture
+def press(tmp_path):
+    """A vertical recording of the twin."""
+    twin = sphere()
+    return record(twin, tmp_path / "press.h5", truth=twin.truth)
+
+
+@pytest.fixture
+def turn(tmp_path):
+    """An axial recording."""
+    header = io.Header(
+        "axial", press=0.7, tilt=0.04, pivot=(0.0, 0.0, 40.0), zenith_gain=np.full((5, 7), 50.0)
+    )
+    return record(MadeUp(random_stack(), header, phase=PHASE), tmp_path / "turn.h5")
+
+
+def put(path, name, value, units=None):
+    """Replace a dataset of a file."""
+    with h5py.File(path, "r+") as file:
+        if name in file:
+            del file[name]
+        if value is not None:
+            file[name] = value
+            if units is not None:
+                file[name].attrs["units"] = units
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "units", "attribute", "expected"),
+    [
+        ("travel", TRAVEL * 1e3, "um", "travel", TRAVEL),
+        ("travel", TRAVEL * 1e3, "\u00b5m", "travel", TRAVEL),
+        ("travel", TRAVEL / 1e3, "m", "travel", TRAVEL),
+        ("travel", TRAVEL / 25.4, "inch", "travel", TRAVEL),
+        ("travel", TRAVEL.astype(">f4"), None, "travel", TRAVEL),
+        ("travel", np.arange(8, dtype=">i2"), "mm", "travel", np.arange(8)),
+        ("travel", TRAVEL, np.bytes_("mm"), "travel", TRAVEL),
+        ("travel", TRAVEL, ["mm"], "travel", TRAVEL),
+        ("travel", TRAVEL, "", "travel", TRAVEL),
+    ],
+)
+def test_travel_is_turned_into_millimetres(press, name, value, units, attribute, expected):
+    put(press, f"{STAGE}/{name}", value, units)
+    with io.open_recording(press) as recording:
+        np.testing.assert_allclose(recording.travel, expected, rtol=1e-6)
+        assert recording.travel.dtype == np.float64
+
+
+def test_other_numbers_are_turned_into_our_units(turn):
+    put(turn, f"{STAGE}/phase", np.arange(8) * 45.0, "deg")
+    put(turn, f"{STAGE}/tilt", [2.5], "degree")
+    put(turn, f"{STAGE}/pivot", [0.0, 0.1, 4.0], "cm")
+    put(turn, f"{STAGE}/travel", 700.0, "um")
+    put(turn, f"{DETECTOR}/x_pixel_size", 30.0, "micrometer")
+    put(turn, f"{DETECTOR}/y_pixel_size", [0.04], "mm")
+    put(turn, f"{DETECTOR}/frame_time", np.arange(8) * 33.0, "ms")
+    put(turn, f"{DETECTOR}/zenith_gain", 2.0, "1/deg")
+    with io.open_recording(turn) as recording:
+        header = recording.header
+        np.testing.assert_allclose(recording.phase, PHASE)
+        np.testing.assert_allclose(recording.time, np.arange(8) * 0.033)
+        np.testing.assert_allclose(header.tilt, np.radians(2.5))
+        np.testing.assert_allclose(header.pivot, (0, 1, 40))
+        np.testing.assert_allclose(header.press, 0.7)
+        np.testing.assert_allclose(header.pixel_size, (0.03, 0.04))
+        np.testing.assert_allclose(header.zenith_gain, np.degrees(2.0))
+
+
+def test_the_truth_is_turned_into_our_units_and_types(press):
+    with h5py.File(press, "r+") as file:
+        height, zenith = (np.asarray(file[f"{TRUTH}/{name}"], np.float64) for name in ("height", "zenith"))
+    put(press, f"{TRUTH}/height", height * 1e3, "um")
+    put(press, f"{TRUTH}/zenith", np.degrees(zenith), "deg")
+    put(press, f"{TRUTH}/contact", np.ones((5, 7), bool))
+    with io.open_recording(press) as recording:
+        np.testing.assert_allclose(recording.truth.height, height, rtol=1e-6)
+        np.testing.assert_allclose(recording.truth.zenith, zenith, rtol=1e-6)
+        assert (recording.truth.height.dtype, recording.truth.contact.dtype) == (np.float32, np.uint8)
+
+
+def test_text_may_be_written_in_other_ways(press):
+    put(press, f"{STAGE}/motion", np.array(["vertical"], dtype="S"))
+    put(press, "entry/title", np.bytes_("M\u00fcnze".encode("latin-1")))
+    put(press, "entry/start_time", None)
+    with io.open_recording(press) as recording:
+        assert recording.motion == "vertical"
+        assert recording.header.title == "M\ufffdnze"
+        assert recording.header.start_time == ""
+
+
+def test_what_is_given_overrides_the_file(press):
+    with io.open_recording(press, travel=io.Steps(0.5, 1.0), pixel_size=(0.1, 0.2), tilt=0.3) as recording:
+        np.testing.assert_allclose(recording.travel, 1.0 + 0.5 * np.arange(8))
+        assert recording.header.pixel_size == (0.1, 0.2)
+        assert recording.header.tilt == 0.3
+    with io.open_recording(press, motion="axial", phase=io.Steps(np.pi / 4)) as recording:
+        np.testing.assert_allclose(recording.phase, PHASE)
+        assert (recording.motion, recording.travel, recording.header.press) == ("axial", None, None)
+    with io.open_recording(press, motion="horizontal") as recording:
+        assert (recording.travel, recording.phase) == (None, None)
+
+
+def test_what_is_given_need_not_be_right_in_the_file(press):
+    put(press, f"{STAGE}/travel", None)
+    put(press, f"{DETECTOR}/x_pixel_size", -1.0, "furlong/fortnight")
+    put(press, f"{STAGE}/tilt", "much")
+    put(press, f"{STAGE}/motion", None)
+    given = {"motion": "vertical", "travel": io.Steps(0.3), "pixel_size": (0.5, 0.5), "tilt": 0.1}
+    with io.open_recording(press, **given) as recording:
+        np.testing.assert_allclose(recording.travel, TRAVEL)
+
+
+def test_another_stack_of_a_recording_can_be_named(press):
+    other = random_stack("uint16", seed=3)
+    put(press, "entry/filtered", other)
+    with io.open_recording(press, dataset="entry/filtered") as recording:
+        np.testing.assert_array_equal(read_all(recording, 8)[0], other)
+        np.testing.assert_allclose(recording.travel, TRAVEL)
+        assert recording.dataset == "/entry/filtered"
+
+
+def test_the_hash_is_of_the_whole_file(press):
+    with io.open_recording(press) as recording:
+        assert recording.sha256() == hashlib.sha256(press.read_bytes()).hexdigest()
+
+
+def test_one_frame_is_read_where_no_room_is_given(press):
+    with io.open_recording(press) as recording:
+        frames = [recording.read().frames for _ in range(8)]
+        assert recording.read() is None
+    assert {frame.shape for frame in frames} == {(1, 5, 7)}
+
+
+def test_frames_are_read_into_the_room_that_is_given(press):
+    room = np.full(SHAPE, 255, np.uint8)
+    with io.open_recording(press) as recording:
+        block = recording.read(room[:3])
+        assert np.shares_memory(block.frames, room)
+        assert block.frames.shape == (3, 5, 7)
+        assert (room[3:] == 255).all()
+
+
+@pytest.mark.parametrize(("shape", "dtype"), [((2, 5, 7), "u2"), ((2, 7, 5), "u1"), ((0, 5, 7), "u1")])
+def test_room_that_does_not_fit_is_refused(press, shape, dtype):
+    with io.open_recording(press) as recording, pytest.raises(ValueError, match="needed is"):
+        recording.read(np.empty(shape, dtype))
+
+
+@pytest.mark.parametrize(("chunk", "sizes"), [(4, [2, 2, 3, 1, 3, 1, 3, 1]), (1, [3, 3, 3, 3, 3, 1])])
+def test_reads_end_where_chunks_end(tmp_path, chunk, sizes):
+    path, frames = tmp_path / "a.h5", random_stack(shape=(16, 5, 7))
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", data=frames, chunks=(chunk, 5, 7), compression="gzip")
+    with io.open_recording(path, motion="vertical", travel=io.Steps(0.1)) as recording:
+        first = recording.read(np.empty((2, 5, 7), "u1")) if chunk == 4 else None
+        room, found = np.empty((3, 5, 7), "u1"), [] if first is None else [first.frames]
+        while (block := recording.read(room)) is not None:
+            found.append(block.frames.copy())
+    np.testing.assert_array_equal(np.concatenate(found), frames)
+    assert [len(part) for part in found] == sizes
+
+
+def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
+    path = tmp_path / "lump.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", (8, 500, 700), "u1", chunks=(8, 500, 700), **hdf5plugin.Bitshuffle())
+        file["x"][...] = 0
+        file.create_dataset("plain", (8, 500, 700), "u1", chunks=(8, 500, 700))[...] = 0
+    given = {"motion": "vertical", "travel": io.Steps(0.1)}
+    line = r"lump\.h5: /x is packed in chunks of 2.8 MB where memory is limited to 1 MB: raise --memory"
+    with pytest.raises(io.InputError, match=line):
+        io.open_recording(path, dataset="x", memory_limit=1_000_000, **given)
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("single", (8, 500, 700), "u1", chunks=(1, 500, 700), compression="lzf")[...] = 0
+    io.open_recording(path, dataset="single", memory_limit=100_000, **given).close()
+    io.open_recording(path, dataset="x", memory_limit=2_800_000, **given).close()
+    io.open_recording(path, dataset="plain", memory_limit=1_000_000, **given).close()
+
+
+BAD = [
+    (f"{STAGE}/travel", TRAVEL[::-1], None, "travel runs back at frame 1"),
+    (f"{STAGE}/travel", np.where(TRAVEL > 1, np.nan, TRAVEL), None, "travel is nan at frame 4"),
+    (f"{STAGE}/travel", np.where(TRAVEL > 1, np.inf, TRAVEL), None, "travel is inf at frame 4"),
+    (
+        f"{STAGE}/travel",
+        TRAVEL[:5],
+        None,
+        r"travel has shape \(5,\) where \(8,\) is needed: give --tr",
+    ),
+    (f"{STAGE}/travel", 3.0, None, r"travel has shape \(\) where \(8,\) is needed: give --travel-step"),
+    (f"{STAGE}/travel", ["0"] * 8, None, "travel holds no numbers: give --travel-step"),
+    (f"{STAGE}/travel", None, None, "does not say where the body was in each frame: give --travel-step"),
+    (f"{STAGE}/travel", TRAVEL, "deg", "travel is in 'deg', which cannot be turned into mm"),
+    (f"{STAGE}/travel", TRAVEL, "9**9**9", r"travel is in '9\*\*9\*\*9', which cannot be turned into mm"),
+    (f"{STAGE}/travel", TRAVEL, "parsnips", "travel is in 'parsnips', which cannot be turned into mm"),
+    (f"{STAGE}/motion", None, None, "does not say how the sensor moved: give"),
+    (
+        f"{STAGE}/motion",
+        "sideways",
+        None,
+        "says the motion 'sideways': give --motion, one of vertical",
+    ),
+    (f"{STAGE}/motion", ["vertical"] * 2, None, "stage/motion does not hold one value: write"),
+    (f"{STAGE}/tilt", np.nan, None, "tilt is nan, which is not finite: give --tilt"),
+    (f"{STAGE}/pivot", [0.0, 1.0, np.inf], None, "pivot is .*, which is not finite: correct it"),
+    (f"{STAGE}/pivot", [0.0, 1.0], None, r"pivot has shape \(2,\) where \(3,\) is needed"),
+    (f"{DETECTOR}/x_pixel_size", -0.1, None, r"pixel size \(-0.1, 0.6\) mm: give --pixel-size, above zero"),
+    (f"{DETECTOR}/x_pixel_size", 0.0, None, "pixel size .* above zero"),
+    (f"{DETECTOR}/y_pixel_size", np.nan, None, "y_pixel_size is nan, which is not finite: give --pixel"),
+    (f"{DETECTOR}/y_pixel_size", 0.1, "pixel", "y_pixel_size is in 'pixel', which cannot be turned into mm"),
+    (f"{DETECTOR}/y_pixel_size", 0.1, "rad", "y_pixel_size is in 'rad', which cannot be turned into mm"),
+    (
+        f"{DETECTOR}/y_pixel_size",
+        None,
+        None,
+        "the size of its pixels only along one axis: give --pixel-size",
+    ),
+    (
+        f"{DETECTOR}/y_pixel_size",
+        np.ones((5, 7)),
+        None,
+        r"y_pixel_size has shape .* where \(\) or \(1,\) is",
+    ),
+    (
+        f"{DETECTOR}/dark",
+        np.zeros((7, 5)),
+        None,
+        r"dark has shape \(7, 5\) where \(5, 7\) is needed: give",
+    ),
+    (
+        f"{DETECTOR}/bright",
+        np.zeros(SHAPE),
+        None,
+        r"bright has shape .* is needed: give --bright",
+    ),
+    (f"{DETECTOR}/dark", np.zeros((5, 7), "S1"), None, "dark holds no numbers: give --dark, or take"),
+    (f"{DETECTOR}/frame_time", np.zeros(3), None, r"frame_time has shape \(3,\) where \(8,\) is needed"),
+    (f"{DETECTOR}/data", None, None, f"there is no /{DETECTOR}/data: name the stack with --dataset"),
+    (f"{TRUTH}/height", None, None, "/entry/truth has no height: simulate it again"),
+    (f"{TRUTH}/height", np.zeros((7, 5)), None, r"/entry/truth/height has shape \(7, 5\) where \(5, 7\) is"),
+    (
+        f"{DETECTOR}/dark",
+        h5py.SoftLink("/nowhere"),
+        None,
+        "the link dark leads to /nowhere, which is not",
+    ),
+    (
+        f"{STAGE}/travel",
+        h5py.SoftLink("../travel"),
+        None,
+        r"the link travel leads to \.\./travel, which",
+    ),
+    (
+        f"{DETECTOR}/bright",
+        h5py.ExternalLink("no.h5", "/x"),
+        None,
+        r"bright .* leads to no\.h5, which",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "units", "line"), BAD)
+def test_what_a_recording_says_wrongly_is_told(press, name, value, units, line):
+    put(press, name, value, units)
+    with pytest.raises(io.InputError, match=line) as caught:
+        io.open_recording(press)
+    message = str(caught.value)
+    assert message.startswith(str(press))
+    assert "\n" not in message
+
+
+def test_what_an_axial_recording_says_wrongly_is_told(turn):
+    put(turn, f"{STAGE}/phase", np.where(PHASE > 3, np.nan, PHASE))
+    with pytest.raises(io.InputError, match=r"turn\.h5: /entry/instrument/stage/phase is nan at frame 4"):
+        io.open_recording(turn)
+    put(turn, f"{STAGE}/phase", None)
+    with pytest.raises(io.InputError, match="does not say where the body was in each frame: give --phase"):
+        io.open_recording(turn)
+
+
+@pytest.mark.parametrize("step", [-0.1, np.nan, np.inf])
+def test_steps_that_cannot_be_are_told(press, step):
+    with pytest.raises(io.InputError, match=re.escape(f"{press}: /entry/instrument/stage/travel ")):
+        io.open_recording(press, travel=io.Steps(step))
+
+
+@pytest.mark.parametrize("pixel_size", [(0.0, 1.0), (1.0, -1.0), (np.nan, 1.0), (np.inf, 1.0)])
+def test_pixel_sizes_that_cannot_be_are_told(press, pixel_size):
+    with pytest.raises(io.InputError, match="give --pixel-size, above zero"):
+        io.open_recording(press, pixel_size=pixel_size)
+
+
+def test_references_may_be_unknown_at_some_pixels(press):
+    dark = np.full((5, 7), 16.0)
+    dark[2, 3] = np.nan
+    put(press, f"{DETECTOR}/dark", dark)
+    with io.open_recording(press) as recording:
+        np.testing.assert_array_equal(recording.header.dark, dark)
+    assert io.describe(press)["dark reference"] == "16 counts (median)"
+    put(press, f"{DETECTOR}/dark", np.full((5, 7), np.nan))
+    assert io.describe(press)["dark reference"] == "no pixel known"
+
+
+def test_a_recording_is_described(press):
+    assert {name: text for name, text in io.describe(press).items() if name != "start"} == {
+        "kind": "recording",
+        "title": "Digital twin, sphere, vertical motion",
+        "motion": "vertical",
+        "frames": "8 of 7 x 5, uint8",
+        "storage": "in one piece",
+        "pixel size": "0.5 x 0.6 mm, field 3.5 x 3 mm",
+        "travel": "0 to 2.1 mm",
+        "dark reference": "16 counts (median)",
+        "bright reference": "224 counts (median)",
+        "truth": "height, zenith, azimuth, contact",
+    }
+
+
+@pytest.mark.parametrize(
+    ("compression", "storage"),
+    [
+        ("bitshuffle", "chunks (1, 5, 7), bitshuffle"),
+        ("blosc", "chunks (1, 5, 7), blosc"),
+        ("gzip", "chunks (1, 5, 7), shuffle, deflate"),
+        ("lzf", "chunks (1, 5, 7), shuffle, lzf"),
+    ],
+)
+def test_packing_is_described(tmp_path, compression, storage):
+    header = io.Header("axial", tilt=np.radians(2.5))
+    path = record(MadeUp(random_stack(), header, phase=PHASE), tmp_path / "a.h5", compression)
+    facts = io.describe(path)
+    assert facts["storage"] == storage
+    assert (facts["tilt"], facts["phase"]) == ("2.5 deg", "0 to 315 deg")
+    assert facts["dark reference"] == facts["truth"] == "none"

@@ -1,0 +1,222 @@
+"""What a result looks like in the file, that it comes back as it was, and what is no result."""
+
+from __future__ import annotations
+
+import os
+
+import h5py
+import numpy as np
+import pytest
+from stacks import assert_same, plot_of, record, sphere
+
+from mirrorskin import io
+
+PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
+
+
+def a_result(**changes):
+    height = np.linspace(-1, 0, 35, dtype=np.float32).reshape(5, 7)
+    height[1, 2] = np.nan
+    x, y = io.pixel_axes((5, 7), (0.5, 0.6))
+    status = np.ones((5, 7), np.uint8)
+    maps = {
+        "height": height,
+        "height_sigma": height / 10,
+        "status": status,
+        "x": x,
+        "y": y,
+        "process": PROCESS,
+    }
+    return io.Result(**maps | changes)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "result.h5"
+
+
+def test_a_result_has_the_layout_of_the_design(path):
+    io.save_result(a_result(), path)
+    with h5py.File(path) as file:
+        assert dict(file.attrs) == {"NX_class": "NXroot", "default": "entry"}
+        assert dict(file["entry"].attrs) == {
+            "NX_class": "NXentry",
+            "default": "result",
+            "mirrorskin_result": 1,
+        }
+        assert list(file["entry"]) == ["process", "result"]
+        maps = file["entry/result"]
+        assert {name: np.asarray(value).tolist() for name, value in maps.attrs.items()} == {
+            "NX_class": "NXdata",
+            "signal": "height",
+            "auxiliary_signals": ["height_sigma", "status"],
+            "axes": ["y", "x"],
+        }
+        image, mm = {"interpretation": "image"}, {"units": "mm"}
+        assert {name: (node.shape, node.dtype.str[1:], dict(node.attrs)) for name, node in maps.items()} == {
+            "height": ((5, 7), "f4", image | mm),
+            "height_sigma": ((5, 7), "f4", image | mm),
+            "status": ((5, 7), "u1", image),
+            "x": ((7,), "f8", mm),
+            "y": ((5,), "f8", mm),
+        }
+        process = file["entry/process"]
+        assert process.attrs["NX_class"] == "NXprocess"
+        assert process["source"].asstr()[()] == "Münze 五円.h5"
+        assert process["threshold"][()] == 0.5
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"height_sigma": None},
+        {"x": None, "y": None},
+        {"process": {}},
+        {"height_sigma": None, "status": None},
+    ],
+)
+def test_a_result_comes_back_as_it_was(path, changes):
+    result = a_result(**changes)
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    group, signal, axes = plot_of(path)
+    assert axes == ([] if result.x is None else ["y", "x"])
+    np.testing.assert_array_equal(signal, result.height)
+    assert group.name == "/entry/result"
+
+
+def test_parameters_keep_their_types(path):
+    io.save_result(a_result(), path)
+    found = io.open_result(path).process
+    assert {name: (type(value), value) for name, value in found.items()} == {
+        name: (type(value), value) for name, value in PROCESS.items()
+    }
+
+
+def test_a_result_is_described(path):
+    io.save_result(a_result(), path)
+    facts = io.describe(path)
+    assert facts["kind"] == "result"
+    assert facts["map height"] == "5 x 7 float32"
+    assert facts["threshold"] == "0.5"
+
+
+def test_a_result_of_another_program_s_types_is_read(path):
+    io.save_result(a_result(), path)
+    with h5py.File(path, "r+") as file:
+        height = file["entry/result/height"][()]
+        del file["entry/result/height"]
+        file["entry/result/height"] = height.astype(">f8")
+    assert_same(io.open_result(path), a_result())
+
+
+def test_a_failure_leaves_the_older_result(path, monkeypatch):
+    io.save_result(a_result(), path)
+    before = path.read_bytes()
+    bad = a_result(process={"program": object()})
+    with pytest.raises(TypeError):
+        io.save_result(bad, path)
+    monkeypatch.setattr("pathlib.Path.replace", lambda *names: (_ for _ in ()).throw(OSError(28, "full")))
+    with pytest.raises(io.InputError, match=r"result\.h5 could not be written: No space left on device"):
+        io.save_result(a_result(), path)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_older_result_is_replaced(path):
+    path.write_text("something else")
+    io.save_result(a_result(), path)
+    assert_same(io.open_result(path), a_result())
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("missing/r.h5", "there is no folder .*missing: make it first"),
+        ("file/r.h5", "there is no folder .*file: make it first"),
+        ("folder", "is a folder: name a file in it"),
+        ("pipe", "is no regular file: choose another place with -o"),
+        ("x" * 300, "cannot be written: File name too long; choose another place with -o"),
+        (
+            "/proc/r.h5",
+            "/proc/r.h5 cannot be written: No such file or directory; choose another",
+        ),
+    ],
+)
+def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    before = sorted(tmp_path.iterdir())
+    for refuse in (io.check_output, lambda path: io.save_result(a_result(), path)):
+        with pytest.raises(io.InputError, match=line) as caught:
+            refuse(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_the_input_is_not_overwritten(tmp_path):
+    original, other = tmp_path / "a.h5", tmp_path / "b.h5"
+    original.touch()
+    (tmp_path / "link.h5").symlink_to("a.h5")
+    for path in (original, tmp_path / "link.h5", tmp_path / "." / "a.h5"):
+        with pytest.raises(io.InputError, match="is the input: name another output with -o"):
+            io.check_output(path, keep=original)
+    io.check_output(other, keep=original)
+    io.check_output(original, keep=other)
+
+
+def test_what_is_no_result_is_refused(tmp_path, path):
+    with pytest.raises(io.InputError, match=r"result\.h5: no such file"):
+        io.open_result(path)
+    record(sphere(), path)
+    with pytest.raises(io.InputError, match=r"result\.h5 is no result: 'mirrorskin reconstruct' makes"):
+        io.open_result(path)
+    with h5py.File(path, "w") as file:
+        file["entry"] = 1
+    with pytest.raises(io.InputError, match=r"is no result"):
+        io.open_result(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "line"),
+    [
+        ("result", None, "/entry/result holds no maps: reconstruct it again"),
+        ("result/height", np.zeros(3), "/entry/result holds no maps"),
+        (
+            "result/status",
+            np.ones((7, 5)),
+            r"/entry/result/status has shape \(7, 5\) where \(5, 7\) is needed: ",
+        ),
+        (
+            "result/x",
+            np.zeros(5),
+            r"/entry/result/x has shape \(5,\) where \(7,\) is needed: recon",
+        ),
+        (
+            "result/height_sigma",
+            np.zeros((5, 7), "S2"),
+            "/entry/result/height_sigma holds no numbers: rec",
+        ),
+        (
+            "result/height_sigma",
+            h5py.SoftLink("gone"),
+            "the link height_sigma leads to gone, which is",
+        ),
+        ("result/status", h5py.ExternalLink("../x.h5", "/x"), "leads out of its folder"),
+        ("process/hold", [1, 2], "/entry/process/hold does not hold one value"),
+        ("process/hold", h5py.SoftLink("gone"), "the link hold leads to gone, which is not there"),
+    ],
+)
+def test_a_damaged_result_is_one_line(path, name, value, line):
+    io.save_result(a_result(), path)
+    with h5py.File(path, "r+") as file:
+        del file[f"entry/{name}"]
+        if value is not None:
+            file[f"entry/{name}"] = value
+    for read in (io.open_result, io.describe):
+        with pytest.raises(io.InputError, match=line) as caught:
+            read(path)
+        assert str(caught.value).startswith(str(path))
