@@ -12,6 +12,7 @@ from mirrorskin.bench.harness import Timing, take_turns
 from mirrorskin.engine import OnsetSearch
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.errors import DeviceError
 
 _WORDS = 16  # rows of 16 bytes that an item of the limits' kernels takes for each pixel of a tile
 
@@ -57,9 +58,9 @@ def run_onset(device: Device, shape: tuple[int, int, int], dtype: np.dtype[Any],
     """
     length = int(np.prod(shape)) * dtype.itemsize
     search = OnsetSearch(shape[1:], dtype, noise=1.5, device=device, memory_limit=2 * length)
-    if search.room is None or len(search.room) < shape[0]:
-        raise RuntimeError(f"{device.info.title} has no room for {shape[0]} frames at once: use fewer")
     frames = search.room[: shape[0]]
+    if len(frames) < shape[0]:
+        raise DeviceError(f"{device.info.title} has no room for {shape[0]} frames at once: use --quick")
     _press(frames)
     limits = _Limits(device, frames)
 

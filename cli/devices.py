@@ -14,12 +14,13 @@ def command(as_json: options.Json = False) -> None:
 
     chosen = open_device().info
     devices = list_devices()
+    default = devices.index(chosen)
     if as_json:
-        print_json({"devices": devices, "default": devices.index(chosen)})
+        print_json({"devices": devices, "default": default})
         return
     rows = [
         [
-            "*" if device == chosen else "",
+            "*" if number == default else "",
             str(number),
             device.kind,
             device.title,

@@ -17,7 +17,7 @@ def command(
     output: options.NewRecording,
     motion: Annotated[options.MotionName, typer.Option(help="How the body moved.")],
     travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = "0mm",
+    travel_start: options.TravelStart = None,
     phase_step: options.PhaseStep = None,
     tilt: options.Tilt = None,
     pixel_size: options.PixelSize = None,

@@ -6,7 +6,9 @@ Nothing heavy is imported here or at the top of a command's module: ``--help`` m
 from __future__ import annotations
 
 import logging
+import signal
 import sys
+import traceback
 from types import TracebackType
 from typing import Annotated
 
@@ -14,10 +16,11 @@ import typer
 
 from mirrorskin.cli import bench, demo, devices, import_, info, reconstruct, score, simulate
 
+_INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
+
 app = typer.Typer(
     name="mirrorskin",
     help="Shape from active tactile sensors with a mirror-like skin.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -38,7 +41,7 @@ for module in (demo, simulate, import_, reconstruct, score, info, devices, bench
 
 
 class _OneLine:
-    """Print the project's own errors, and only those, as one line, and exit with their code."""
+    """Print usage errors and the project's own, and only those, as one line, and exit with their code."""
 
     debug = False
 
@@ -47,18 +50,29 @@ class _OneLine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, KeyboardInterrupt | typer.Abort):
+            sys.exit(_INTERRUPTED)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
         code = getattr(error, "exit_code", None)
+        usage = getattr(error, "format_message", None)
         ours = kind is not None and kind.__module__.startswith("mirrorskin.")
-        if ours and isinstance(code, int) and not self.debug:
-            sys.stderr.write(f"mirrorskin: {' '.join(str(error).split())}\n")
-            sys.exit(code)
+        if not isinstance(code, int) or not (ours or usage):
+            return
+        if self.debug:
+            traceback.print_exception(error)
+        message = usage() if usage else str(error)
+        sys.stderr.write(f"mirrorskin: {' '.join(message.split())}\n")
+        sys.exit(code)
 
 
 def main() -> None:
     """Run the command line."""
+    for name in ("SIGTERM", "SIGHUP"):  # as an exception, so that nothing half-written stays behind
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), lambda number, frame: sys.exit(128 + number))
+    words = sys.argv[1:] or ["--help"]
     with _OneLine():
-        app()
+        sys.exit(app(words, standalone_mode=False) or 0)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,9 @@ Device = Annotated[
 ]
 Motion = Annotated[MotionName | None, typer.Option(help="How the body moved, if the file does not say.")]
 TravelStep = Annotated[str | None, typer.Option(metavar="LENGTH", help="Travel from frame to frame: 0.1mm.")]
-TravelStart = Annotated[str, typer.Option(metavar="LENGTH", help="Travel of the first frame.")]
+TravelStart = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
+]
 PhaseStep = Annotated[str | None, typer.Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
 Tilt = Annotated[str | None, typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
 PixelSize = Annotated[

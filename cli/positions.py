@@ -23,21 +23,26 @@ class Given(TypedDict):
 def given(
     motion: MotionName | None,
     travel_step: str | None,
-    travel_start: str,
+    travel_start: str | None,
     phase_step: str | None,
     tilt: str | None,
     pixel_size: str | None,
 ) -> Given:
     """Turn the options' words into numbers, in millimetres and radians."""
     from mirrorskin.cli.quantity import angle, length, lengths
-    from mirrorskin.io import Steps
+    from mirrorskin.io import InputError, Steps
 
+    if travel_start is not None and travel_step is None:
+        raise InputError("--travel-start without --travel-step says nothing: give both")
+    travel = phase = None
+    if travel_step is not None:
+        travel = Steps(length(travel_step, "--travel-step"), length(travel_start or "0mm", "--travel-start"))
+    if phase_step is not None:
+        phase = Steps(angle(phase_step, "--phase-step"))
     return Given(
         motion=motion.value if motion else None,
-        travel=Steps(length(travel_step, "--travel-step"), length(travel_start, "--travel-start"))
-        if travel_step
-        else None,
-        phase=Steps(angle(phase_step, "--phase-step")) if phase_step else None,
-        tilt=angle(tilt, "--tilt") if tilt else None,
-        pixel_size=lengths(pixel_size, "--pixel-size") if pixel_size else None,
+        travel=travel,
+        phase=phase,
+        tilt=None if tilt is None else angle(tilt, "--tilt"),
+        pixel_size=None if pixel_size is None else lengths(pixel_size, "--pixel-size"),
     )

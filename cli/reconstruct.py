@@ -22,7 +22,7 @@ def command(
     dataset: Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")] = None,
     motion: options.Motion = None,
     travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = "0mm",
+    travel_start: options.TravelStart = None,
     phase_step: options.PhaseStep = None,
     tilt: options.Tilt = None,
     pixel_size: options.PixelSize = None,

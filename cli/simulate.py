@@ -34,7 +34,7 @@ def command(
     ] = "sphere",
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "480x480",
     pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.025mm",
-    frames: Annotated[int, typer.Option(help="Frames to take.")] = 30,
+    frames: Annotated[int, typer.Option(min=1, max=10**7, help="Frames to take.")] = 30,
     travel_step: Annotated[str, typer.Option(metavar="LENGTH", help="Travel from frame to frame.")] = "0.1mm",
     travel_start: Annotated[str, typer.Option(metavar="LENGTH", help="Travel of the first frame.")] = "0.1mm",
     dtype: Annotated[FrameType, typer.Option(help="Type of a sample.")] = FrameType.uint8,

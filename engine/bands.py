@@ -12,6 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 from mirrorskin.kernels.device import Array, Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
+_INT_MAX = np.iinfo(np.int32).max
+
 
 class Band:
     """Some rows of a picture on a device: named maps, and room for some frames.
@@ -37,9 +39,12 @@ class Band:
         shape = (rows.stop - rows.start, columns)
         self.rows = rows
         self.pixels = shape[0] * shape[1]
+        if self.pixels > _INT_MAX:
+            raise DeviceMemoryError(
+                f"kernels number pixels to {_INT_MAX}; {self.pixels} are too many at once"
+            )
         self.maps = {name: device.array(name, shape, kind) for name, kind in maps.items()}
         self.frames = _longest(device, length, shape, dtype)
-        self._device = device
         self._alone = True
         self._resident = False
 
@@ -80,7 +85,9 @@ class Band:
             Which of the frames are there now.
         """
         room = self.frames.host
-        in_place = len(frames) <= len(room) and frames.ctypes.data == room.ctypes.data
+        in_place = (
+            frames.ctypes.data == room.ctypes.data and frames.flags.c_contiguous and len(frames) <= len(room)
+        )
         step = max(1, len(frames) if in_place else len(room))
         for start in range(0, len(frames), step):
             part = frames[start : start + step]
@@ -88,7 +95,6 @@ class Band:
                 room[: len(part)] = part[:, self.rows]
             self.frames.upload(len(part))
             yield start, len(part)
-            self._device.finish()
             self.frames.claim()
 
     def _park(self) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 SAMPLES = 65536
 _CLIP = 4.0
+_MEDIAN = 0.6745  # of the magnitude of a normal variate
 _QUANTUM = 1 / np.sqrt(12)
 
 
@@ -21,7 +22,8 @@ def thin_out(frame: NDArray[Any]) -> NDArray[np.float64]:
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:
     """Estimate the standard deviation of a sample from two looks at the same pixels.
 
-    Clipping at four sigma, until it settles, leaves out the pixels that changed in between.
+    Clipping at four sigma, until it settles, leaves out the pixels that changed in between, as long as they
+    are fewer than half.
 
     Parameters
     ----------
@@ -35,11 +37,11 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
     float
         Counts.
     """
-    difference = second - first
-    difference = difference[np.isfinite(difference)]
+    usable = np.isfinite(first) & np.isfinite(second)
+    difference = second[usable] - first[usable]
     if difference.size == 0:
         return _QUANTUM if integer else 0.0
-    spread = max(np.percentile(np.abs(difference), 68.3), 1.0 if integer else 0.0)
+    spread = max(np.median(np.abs(difference)) / _MEDIAN, 1.0 if integer else 0.0)
     for _ in range(10):
         kept = difference[np.abs(difference) <= _CLIP * spread]
         if spread == (spread := float(np.sqrt(np.mean(kept**2)))):

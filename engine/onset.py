@@ -18,6 +18,7 @@ from mirrorskin.kernels.onset import DARK, INVALID
 MEMORY_LIMIT = 256_000_000
 
 _PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
+_SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
 _C_TYPES = {"u1": "uchar", "u2": "ushort", "u4": "uint", "f4": "float"}
 _INT_MAX = np.iinfo(np.int32).max
 
@@ -139,32 +140,33 @@ class OnsetSearch:
         low, high = reference_pair(dark, bright, shape, dtype)
         level, light = light_levels(low, high, check_threshold(threshold), dtype)
         self.device = open_device(device)
+        self._shape = shape
         self._dtype = dtype
-        self._hold = min(hold, _INT_MAX)
+        self._hold = hold
         self._subframe = subframe
-        self._noise = noise
+        self._given_noise = self._noise = noise
         self._own_dark = dark is None
         self._travel: list[float] = []
         self._samples: list[NDArray[np.float64]] = []
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype), length)
+        alone = len(self._bands) == 1
+        self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
         self._start = np.where(np.isnan(level), INVALID, DARK)
         self._fill(level=level, light=light, dark=low)
         self.reset()
 
     @property
-    def room(self) -> NDArray[Any] | None:
-        """Where a source may write the next frames, (n, H, W), so that they are not copied again.
-
-        None on a device that has no room for whole frames.
-        """
-        return self._bands[0].frames.host if len(self._bands) == 1 else None
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
+        return self._room
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
         self._travel.clear()
         self._samples.clear()
-        self._fill(onset=self._start)
+        self._noise = self._given_noise
+        self._fill(onset=self._start, below=np.zeros_like(self._start))
 
     def push(self, block: Block) -> None:
         """Take in the next frames.
@@ -175,17 +177,23 @@ class OnsetSearch:
             Travel is missing, or runs back.
         """
         frames, first = block.frames, len(self._travel)
+        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
+            raise InputError(
+                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
+            )
         travel = check_travel(block.travel, len(frames), "travel", after=self._travel[-1:])
         if first == 0 and self._own_dark:
             self._fill(dark=frames[0])
-        self._samples += [thin_out(frame) for frame in frames[: 2 - len(self._samples)]]
+        self._look_at_noise(frames)
         self._travel.extend(travel)
         for band in self._bands:
             self._scan(band, frames, first)
 
     def result(self) -> Onset:
         """Return the maps of the frames so far; more may follow."""
-        noise = self._noise_level()
+        noise = self._noise
+        if not self._travel or noise is None:
+            raise InputError(f"a press of {len(self._travel)} frames has no onset: at least 2 are needed")
         maps = [self._heights(band, noise) for band in self._bands]
         height, sigma, status, frame = (np.concatenate(parts) for parts in zip(*maps, strict=True))
         return Onset(height, sigma, status, np.maximum(frame, DARK), noise)
@@ -198,13 +206,18 @@ class OnsetSearch:
     def _scan(self, band: Band, frames: NDArray[Any], first: int) -> None:
         width = max(self._dtype.itemsize, np.min_scalar_type(self._hold).itemsize)
         scan = self._kernel("onset_scan", COUNT=_C_TYPES[f"u{width}"], SPAN=min(256**width - 1, _INT_MAX))
-        state = [band.maps[name] for name in ("light", "onset", "last", "before", "at", "after")]
+        state = [
+            band.maps[name] for name in ("level", "light", "onset", "below", "last", "before", "at", "after")
+        ]
+        # One frame alone tells no noise, and needs none: the first is taken for dark.
+        tolerance = _SURELY * (self._noise or 0.0)
         with band.resident():
             for start, count in band.stage(frames):
                 scan(
                     -(-band.pixels // self.device.tile),
                     band.frames,
                     *map(np.int32, (count, band.pixels, first + start, self._hold)),
+                    np.float32(tolerance),
                     *state,
                     moved=count * band.pixels * self._dtype.itemsize,
                 )
@@ -216,7 +229,7 @@ class OnsetSearch:
         travel.upload()
         dark_tolerance = _PLATEAU * noise * (np.sqrt(2) if self._own_dark else 1)
         light_tolerance = _PLATEAU * noise * np.sqrt(2)
-        known = [band.maps[name] for name in ("onset", "before", "at", "after", "level", "dark")]
+        known = [band.maps[name] for name in ("onset", "below", "before", "at", "after", "level", "dark")]
         wanted = [band.maps[name] for name in ("height", "sigma", "status")]
         with band.resident():
             self._kernel("onset_heights", COUNT="uint", SPAN=1)(
@@ -235,24 +248,22 @@ class OnsetSearch:
         sample = _C_TYPES[f"{kind}{self._dtype.itemsize}"]
         return self.device.kernel("onset", name, FRAME=sample, FLOATS=int(kind == "f"), **defines)
 
-    def _noise_level(self) -> float:
-        if self._noise is not None:
-            return self._noise
-        if len(self._samples) < 2:
-            raise InputError(f"a press of {len(self._travel)} frames has no onset: at least 2 are needed")
-        return estimate_noise(self._samples[0], self._samples[1], self._dtype.kind == "u")
+    def _look_at_noise(self, frames: NDArray[Any]) -> None:
+        self._samples += [thin_out(frame) for frame in frames[: 2 - len(self._samples)]]
+        if self._noise is None and len(self._samples) == 2:
+            self._noise = estimate_noise(self._samples[0], self._samples[1], self._dtype.kind == "u")
 
 
 def _maps(dtype: np.dtype[Any]) -> dict[str, DTypeLike]:
     samples = dict.fromkeys(("light", "last", "before", "at", "after"), dtype)
     floats = dict.fromkeys(("level", "dark", "height", "sigma"), np.float32)
-    return {"onset": np.int32, "status": np.uint8, **samples, **floats}
+    return {"onset": np.int32, "below": np.int32, "status": np.uint8, **samples, **floats}
 
 
 def _check(dtype: np.dtype[Any], hold: int, noise: float | None) -> None:
     if dtype not in FRAME_DTYPES:
         raise InputError(f"frames of type {dtype}: uint8, uint16 or float32 are needed")
-    if hold < 1:
-        raise InputError(f"hold {hold}: at least 1 frame is needed")
+    if not 1 <= hold <= _INT_MAX:
+        raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
     if noise is not None and not 0 <= noise < np.inf:
         raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -22,8 +23,8 @@ class Estimator(Protocol):
     """What the loop feeds: it takes in blocks, and offers room to read them into."""
 
     @property
-    def room(self) -> NDArray[np.generic] | None:
-        """Where the next frames may be written, or None."""
+    def room(self) -> NDArray[np.generic]:
+        """Where the next frames may be written, (n, H, W)."""
 
     def push(self, block: Block) -> None:
         """Take in the next frames."""
@@ -101,7 +102,7 @@ def reconstruct(
         subframe=subframe,
         noise=noise,
         device=device,
-        memory_limit=memory_limit,
+        memory_limit=min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize),
     )
     feed(source, search, progress)
     onset = search.result()

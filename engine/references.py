@@ -11,6 +11,8 @@ from mirrorskin.io import InputError
 
 Floats = NDArray[np.float64]
 
+_ROUNDING = 1e-12
+
 
 def check_threshold(threshold: float) -> float:
     """Return the threshold if it is a share between dark and bright, else raise InputError."""
@@ -78,7 +80,8 @@ def light_levels(
     light : ndarray, (H, W), dtype
         Smallest sample that is light. A saturated sample is always light.
     """
-    exact = dark + threshold * (bright - dark)
+    # A threshold such as 0.55 is not exact in binary: counts that reach it but for rounding are light.
+    exact = dark + (threshold - _ROUNDING) * (bright - dark)
     level = exact.astype(np.float32)
     level = np.where(level < exact, np.nextafter(level, np.float32(np.inf)), level)
     if dtype.kind == "f":

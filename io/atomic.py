@@ -24,7 +24,7 @@ def check_output(path: Path, keep: Path | None = None) -> None:
     path : Path
         File to write.
     keep : Path, optional
-        The input, which must not be overwritten.
+        The input, a file or a folder of files, which must not be overwritten.
 
     Raises
     ------
@@ -39,8 +39,8 @@ def check_output(path: Path, keep: Path | None = None) -> None:
         if path.exists():
             if not path.is_file():
                 raise InputError(f"{path} is no regular file: choose another place with -o")
-            if keep is not None and keep.exists() and path.samefile(keep):
-                raise InputError(f"{path} is the input: name another output with -o")
+            if keep is not None and keep.exists() and (path.samefile(keep) or path.parent.samefile(keep)):
+                raise InputError(f"{path} is the input, or part of it: name another output with -o")
         with tempfile.TemporaryFile(dir=path.parent):
             pass
 

@@ -43,5 +43,9 @@ def open_frames(
     for motion, name, positions in (("vertical", "travel", travel), ("axial", "phase", phase)):
         if header.motion == motion and positions is None:
             raise InputError(f"{path}: frames of {motion} motion need their {name}: give --{name}-step")
+        if header.motion != motion and positions is not None:
+            raise InputError(
+                f"{path}: frames of {header.motion} motion have no {name}: leave --{name}-step out"
+            )
     pictures = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
     return (Pictures if pictures else Video)(path, header, travel, phase)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import os
 import re
 import threading
@@ -26,6 +27,7 @@ from mirrorskin.kernels.profile import Profile
 DeviceKind = Literal["gpu", "cpu", "other"]
 
 _log = logging.getLogger("mirrorskin.kernels")
+_opening = threading.Lock()
 _PAGE = 4096
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 _NO_ROOM = {
@@ -92,7 +94,8 @@ def open_device(choice: str | Device | None = None) -> Device:
     """
     if isinstance(choice, Device):
         return choice
-    return _open(_choose(choice))
+    with _opening:
+        return _open(_choose(choice))
 
 
 class Device:
@@ -206,7 +209,7 @@ class Array:
         self._shared = device.info.shares_memory
         self._mapped: cl.MemoryMap | None = None
         self._buffer: cl.Buffer | None = None
-        nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+        nbytes = math.prod(shape) * dtype.itemsize
         if nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, nbytes))
         try:
@@ -236,16 +239,14 @@ class Array:
             self._allocate()
         if not self._shared:
             part = self.host[:rows]
-            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
-            self._device.profile.watch("upload", self.name, event, part.nbytes)
+            self._copy("upload", self.buffer, part)
 
     def download(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote, in the host's array."""
         if self._shared:
             self.claim()
         else:
-            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
-            self._device.profile.watch("download", self.name, event, self.host.nbytes)
+            self._copy("download", self.host, self.buffer)
         return self.host
 
     def park(self) -> None:
@@ -269,6 +270,13 @@ class Array:
             self._mapped.release()
             self._mapped = None
         return self._buffer
+
+    def _copy(self, kind: Literal["upload", "download"], target: Any, source: Any) -> None:
+        event = cl.enqueue_copy(self._device.queue, target, source)
+        event.wait()  # a waiting event would keep the host's array alive
+        seconds = (event.profile.end - event.profile.start) * 1e-9
+        nbytes = source.nbytes if kind == "upload" else target.nbytes
+        self._device.profile.add(kind, self.name, seconds, nbytes)
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
@@ -403,7 +411,7 @@ def _open(device: cl.Device) -> Device:
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Zeros that start on a page, so that a device sharing the memory need not copy them."""
-    nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    nbytes = math.prod(shape) * dtype.itemsize
     raw = np.zeros(nbytes + _PAGE, np.uint8)
     start = -raw.ctypes.data % _PAGE
     return raw[start : start + nbytes].view(dtype).reshape(shape)
@@ -411,8 +419,8 @@ def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:
     return (
-        f"{device.info.title} has no room for {name} ({nbytes / 1e6:.1f} MB; "
-        f"one buffer holds at most {device.max_allocation / 1e6:.1f} MB)"
+        f"{device.info.title} has no room for {name} ({nbytes} bytes; "
+        f"one buffer holds at most {device.max_allocation})"
     )
 
 

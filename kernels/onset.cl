@@ -22,14 +22,15 @@
 
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int first, const int hold,
-    __global const FRAME *restrict light, __global int *restrict onset, __global FRAME *restrict last,
+    const float tolerance, __global const float *restrict level, __global const FRAME *restrict light,
+    __global int *restrict onset, __global int *restrict below, __global FRAME *restrict last,
     __global FRAME *restrict before, __global FRAME *restrict at, __global FRAME *restrict after)
 {
     const int base = get_global_id(0) * TILE;
     if (base >= pixels) return;
     const int width = min(TILE, pixels - base);
 
-    FRAME level[TILE];
+    FRAME least[TILE];
     COUNT wanted[TILE];  // light frames still missing from a run that holds; 0: the pixel is decided
     COUNT open[TILE];    // frames of this span that left the pixel undecided
     COUNT broken[TILE];
@@ -39,11 +40,11 @@ __kernel void onset_scan(
     for (int p = 0; p < width; ++p) {
         const int start = onset[base + p];
         const int run = start < 0 ? 0 : min(first - start, hold);
-        level[p] = light[base + p];
+        least[p] = light[base + p];
         wanted[p] = start == INVALID ? 0 : hold - run;
         broken[p] = 0;
         waited[p] = 0;
-        busy |= start == DARK || (start >= 0 && start + max(hold, 3) > first);
+        busy |= start == DARK || (start >= 0 && max(hold, 3) > first - start);
     }
     if (!busy) return;  // every pixel is decided and has its samples: nothing to read
 
@@ -55,7 +56,7 @@ __kernel void onset_scan(
             for (int p = 0; p < width; ++p) {
                 const FRAME sample = frame[p];
                 const COUNT left = wanted[p];
-                const COUNT next = sample >= level[p] ? (COUNT)(left - 1) : (COUNT)hold;
+                const COUNT next = sample >= least[p] ? (COUNT)(left - 1) : (COUNT)hold;
 #if FLOATS
                 broken[p] |= (left != 0) & !USABLE(sample);
 #endif
@@ -75,7 +76,7 @@ __kernel void onset_scan(
             start = INVALID;
         else if (wanted[p] != 0)
             start = wanted[p] == (COUNT)hold ? DARK : end - (hold - (int)wanted[p]);
-        else if (known != INVALID && (known < 0 || known + hold > first))
+        else if (known != INVALID && (known < 0 || hold > first - known))
             start = first + waited[p] - hold + 1;
         onset[pixel] = start;
 
@@ -88,6 +89,13 @@ __kernel void onset_scan(
             after[pixel] = samples[(size_t)(start + 1 - first) * pixels];
         if (start >= 0 && start + 2 >= first && start + 2 < end)
             after[pixel] = LESSER(after[pixel], samples[(size_t)(start + 2 - first) * pixels]);
+        // Back from the frame before the run to the last one that was surely dark; most often that one is it.
+        int dark = (start >= 0 ? start : end) - 1;
+        const int decided = known == INVALID || (known >= 0 && hold <= first - known);
+        while (!decided && dark >= max(first, 1)
+               && !(samples[(size_t)(dark - first) * pixels] <= level[pixel] - tolerance))
+            --dark;
+        if (!decided && dark >= max(first, 1)) below[pixel] = dark;
         last[pixel] = samples[(size_t)(count - 1) * pixels];
     }
 }
@@ -130,8 +138,8 @@ float2 pair_quotient(const float2 a, const float2 b)
 }
 
 __kernel void onset_heights(
-    const int pixels, const int count, __global const int *restrict onset, __global const FRAME *restrict before,
-    __global const FRAME *restrict at, __global const FRAME *restrict after, __global const float *restrict level,
+    const int pixels, const int count, __global const int *restrict onset, __global const int *restrict below,
+    __global const FRAME *restrict before, __global const FRAME *restrict at, __global const FRAME *restrict after, __global const float *restrict level,
     __global const float *restrict dark, __global const float2 *restrict travel, const float dark_tolerance,
     const float light_tolerance, const float noise, const int subframe, __global float *restrict height,
     __global float *restrict sigma, __global uchar *restrict status)
@@ -154,13 +162,14 @@ __kernel void onset_heights(
         const float2 crossed = pair_quotient(two_sum(fmin(level[p], high), -low), step);
         const float rest = 1 - crossed.x;
         const float known = width.x * noise * sqrt(crossed.x * crossed.x + rest * rest) / step.x;
-        const float guessed = 0.5f * width.x / sqrt(3.0f);
+        // Then the crossing lies anywhere since the pixel was surely dark.
+        const int hovered = step.x <= light_tolerance || (start - 2 - below[p]) * step.x > 2.5f * light_tolerance;
+        const float interval = hovered ? pair_sum(travel[start], -travel[below[p]]).x : width.x;
+        const float guessed = 0.5f * interval / sqrt(3.0f);
         float2 share = crossed;
         sigma[p] = from_dark || to_light ? sqrt(known * known + guessed * guessed) : known;
-        if (from_dark && to_light) {
-            share = (float2)(0.5f, 0);
-            sigma[p] = guessed;
-        }
+        if (from_dark && to_light) share = (float2)(0.5f, 0);
+        if ((from_dark && to_light) || hovered) sigma[p] = guessed;
         if (!subframe) {
             share = (float2)(1, 0);
             sigma[p] = 2 * guessed;

@@ -21,8 +21,11 @@ def onset_scan(
     frames: NDArray[Any],
     first: int,
     hold: int,
+    tolerance: float,
+    level: NDArray[np.float32],
     light: NDArray[Any],
     onset: NDArray[np.int32],
+    below: NDArray[np.int32],
     last: NDArray[Any],
     before: NDArray[Any],
     at: NDArray[Any],
@@ -38,10 +41,16 @@ def onset_scan(
         Number of the block's first frame in the stack.
     hold : int
         Light frames in a row that make an onset.
+    tolerance : float
+        Counts by which a sample must miss the level to be surely dark.
+    level : ndarray, (P,), float32
+        Counts at which a pixel turns light.
     light : ndarray, (P,), as frames
         Smallest sample that is light.
     onset : ndarray, (P,), int32
         Frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no number.
+    below : ndarray, (P,), int32
+        Last frame before the run that was surely dark; the first frame is taken for dark.
     last : ndarray, (P,), as frames
         The sample before the block.
     before, at, after : ndarray, (P,), as frames
@@ -56,6 +65,8 @@ def onset_scan(
         before[begins] = last[begins]
         at[begins] = frame[begins]
         onset[undecided & ~is_light] = DARK
+        if number > 0:
+            below[undecided & (frame <= level - np.float32(tolerance))] = number
         onset[undecided & ~np.isfinite(frame)] = INVALID
 
         next_to = onset == number - 1
@@ -68,6 +79,7 @@ def onset_scan(
 
 def onset_heights(
     onset: NDArray[np.int32],
+    below: NDArray[np.int32],
     before: NDArray[Any],
     at: NDArray[Any],
     after: NDArray[Any],
@@ -86,12 +98,15 @@ def onset_heights(
     half-width over sqrt(3) the standard deviation. Elsewhere the samples tell where the level was
     crossed, as well as the noise allows if the change was under way in both of them; a sample on a plateau
     does not tell when the change began or ended, so with one of them there the interval's share is added.
+    A pixel may also hover about its level and cross it when noise says so: its step is within the noise, or
+    it was near the level for longer than its step would take. It may have crossed at any time since the last
+    frame in which it was surely dark.
     Without `subframe` the height is that of the paper's equation 4, at the onset itself, which is wrong by
     half a step on average.
 
     Parameters
     ----------
-    onset, before, at, after : ndarray, (P,)
+    onset, below, before, at, after : ndarray, (P,)
         As ``onset_scan`` leaves them; the kernel is told ``P`` and the number of frames before them.
     level : ndarray, (P,), float32
         Counts at which a pixel turns light.
@@ -125,11 +140,13 @@ def onset_heights(
     from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
     sudden, under_way = from_dark & to_light, ~(from_dark | to_light)
 
-    crossed = (np.minimum(level[found], high) - low) / (high - low)
-    known = width * noise * np.hypot(crossed, 1 - crossed) / (high - low)
-    guessed = width / 2 / np.sqrt(3)
+    step = high - low
+    crossed = (np.minimum(level[found], high) - low) / step
+    known = width * noise * np.hypot(crossed, 1 - crossed) / step
+    hovered = (step <= light_tolerance) | ((start - 2 - below[found]) * step > 2.5 * light_tolerance)
+    guessed = np.where(hovered, travel[start] - travel[below[found]], width) / 2 / np.sqrt(3)
     share = np.where(sudden, 0.5, crossed) if subframe else np.ones_like(width)
-    spread = np.select([sudden, under_way], [guessed, known], np.hypot(known, guessed))
+    spread = np.select([sudden | hovered, under_way], [guessed, known], np.hypot(known, guessed))
 
     height[found] = -(travel[start - 1] + width * share)
     sigma[found] = spread if subframe else 2 * guessed

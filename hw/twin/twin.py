@@ -16,6 +16,8 @@ from mirrorskin.hw.twin.surface import Object, zenith_azimuth
 from mirrorskin.io import check_travel
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Truth, pixel_axes
 
+_PIXELS_MAX = 200_000_000
+
 
 class Twin:
     """The sensor, simulated in vertical motion: a `mirrorskin.io.Source` that knows the truth.
@@ -157,6 +159,8 @@ class Twin:
 def _check_shape(shape: tuple[int, int]) -> tuple[int, int]:
     if len(shape) != 2 or min(shape) < 1:
         raise InputError(f"shape {tuple(shape)} cannot be: give rows and columns, 1 or more of each")
+    if shape[0] * shape[1] > _PIXELS_MAX:
+        raise InputError(f"shape {tuple(shape)} is too large: {_PIXELS_MAX} pixels are the most")
     return int(shape[0]), int(shape[1])
 
 

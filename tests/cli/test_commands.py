@@ -1,9 +1,12 @@
 """The commands, run as a user runs them."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -105,3 +108,99 @@ def test_the_benchmark_agrees_with_its_peers_before_it_times():
     for rows in cases.values():
         assert {row["name"] for row in rows} >= {"read limit", "copy limit", "onset scan", "NumPy"}
         assert all(row["timing"]["median"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--dark", "30"], "dark", 30.0),
+        (["--bright", "200"], "bright", 200.0),
+        (["--noise", "4"], "noise", 4.0),
+        (["--travel-step", "0.2mm", "--travel-start", "5mm"], "motion", None),
+    ],
+)
+def test_what_is_given_is_used(folder, words, name, value):
+    told = json.loads(mirrorskin("reconstruct", "sphere.h5", "-o", "g.h5", *words, "--json", cwd=folder))
+    if value is None:
+        assert told["summary"]["highest"] < -5
+    else:
+        assert told["process"][name] == value
+
+
+def test_the_seed_and_the_noise_reach_the_twin(tmp_path):
+    stacks = []
+    for number, words in enumerate((["--seed", "1"], ["--seed", "1"], ["--seed", "2"], ["--noise", "0"])):
+        path = tmp_path / f"{number}.h5"
+        mirrorskin("simulate", "vertical", *SMALL, "--frames", "2", "-o", path, *words)
+        with io.open_recording(path) as recording:
+            stacks.append(recording.read(np.empty(recording.shape, np.uint8)).frames)
+    assert np.array_equal(stacks[0], stacks[1])
+    assert not np.array_equal(stacks[0], stacks[2])
+    assert len(np.unique(stacks[3])) <= 40
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--bogus"], "--bogus"),
+        (["simulate", "axial", "-o", "a.h5"], "axial"),
+        (["reconstruct"], "REC.h5"),
+        (["nonsense"], "nonsense"),
+        (["reconstruct", "a.h5", "--travel-start", "1mm"], "--travel-step"),
+        (
+            [
+                "import",
+                ".",
+                "-o",
+                "a.h5",
+                "--motion",
+                "axial",
+                "--phase-step",
+                "45deg",
+                "--travel-step",
+                "1mm",
+            ],
+            "travel",
+        ),
+    ],
+)
+def test_a_wrong_call_is_one_line(tmp_path, words, said):
+    run = subprocess.run(
+        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert run.returncode == 2
+    assert said in run.stderr
+    assert run.stderr.count("\n") == 1
+
+
+def test_debug_shows_where_and_keeps_the_exit_code(tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "mirrorskin.cli.main", "--debug", "info", "nothing.h5"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert run.returncode == 2
+    assert "Traceback" in run.stderr
+
+
+def test_a_terminated_simulation_leaves_nothing(tmp_path):
+    words = ["simulate", "vertical", "--size", "1500x1500", "--frames", "5000", "-o", "a.h5"]
+    child = subprocess.Popen([sys.executable, "-m", "mirrorskin.cli.main", *words], cwd=tmp_path)
+    while not list(tmp_path.iterdir()):
+        assert child.poll() is None
+        time.sleep(0.01)
+    child.terminate()
+    assert child.wait(timeout=60) == 128 + signal.SIGTERM
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_import_does_not_overwrite_its_own_pictures(tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"frame{number}.png"), np.full((8, 9), 9, np.uint8))
+    words = ["import", ".", "-o", "frame1.png", "--motion", "vertical", "--travel-step", "1mm"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert run.returncode == 2
+    assert "is the input" in run.stderr

@@ -22,7 +22,7 @@ def test_less_room_gives_the_same_answer(small_device, limit):
         search.push(Block(FRAMES[part], start, travel=TRAVEL[part]))
     assert_equal(search.result(), whole)
     assert_equal(search.result(), whole)
-    assert (search.room is None) == (limit < 23 * 31 * 4)
+    assert (len(search._bands) > 1) == (limit < 23 * 31 * 4)
 
 
 def test_the_room_shrinks_before_the_picture_is_cut(small_device):
@@ -35,3 +35,33 @@ def test_one_row_that_does_not_fit_is_said_so(small_device):
     small_device.max_allocation = 31 * 4 - 1
     with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
         OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
+
+
+def test_bands_leave_the_device_to_each_other(small_device):
+    small_device.max_allocation = 500
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    search.push(Block(FRAMES, 0, travel=TRAVEL))
+    search.result()
+    arrays = [array for band in search._bands for array in (*band.maps.values(), band.frames)]
+    on_device = [array._buffer is not None for array in arrays]
+    assert all(on_device) if small_device.info.shares_memory else not any(on_device)
+
+
+def test_frames_in_the_room_are_not_copied(device):
+    search = OnsetSearch((23, 31), FRAMES.dtype, device=device)
+    search.room[:30] = FRAMES
+    band = search._bands[0]
+    pieces = list(band.stage(search.room[:30]))
+    assert pieces == [(0, 30)]
+    every_other = search.room[:30:2]
+    list(band.stage(every_other))
+    np.testing.assert_array_equal(search.room[:15], FRAMES[::2])
+
+
+def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
+    small_device.max_allocation = 500
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    search.room[:30] = FRAMES
+    search.push(Block(search.room[:30], 0, travel=TRAVEL))
+    small_device.max_allocation = 10**9
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=small_device))

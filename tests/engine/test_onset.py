@@ -293,6 +293,7 @@ def test_frames_read_into_the_room_are_not_copied(device):
         ({"threshold": -0.1}, "threshold -0.1"),
         ({"threshold": np.nan}, "threshold nan"),
         ({"hold": 0}, "hold 0"),
+        ({"hold": 2**31}, "hold 2147483648"),
         ({"noise": -1.0}, "noise -1.0"),
         ({"noise": np.inf}, "noise inf"),
     ],
@@ -333,3 +334,52 @@ def test_a_few_pixels_alone_are_not_taken_for_done(device):
     frames[9:] = 200
     found = search_in_blocks(frames, np.arange(12) * 0.1, [4, 8], device, dark=20, bright=220)
     assert np.all(found.frame == 9)
+
+
+@pytest.mark.parametrize("hold", [2**31 - 1, 2**31 - 2, 70_000])
+def test_a_hold_longer_than_any_stack_waits_for_the_end(device, hold):
+    frames = np.full((9, 1, 1), 20, np.uint8)
+    frames[2:5] = 200
+    options = {"dark": 20, "bright": 220, "hold": hold, "device": device}
+    assert (
+        search_in_blocks(frames, np.arange(9.0), [4], device=device, dark=20, bright=220, hold=hold).frame
+        == -1
+    )
+    assert find_onset(frames[:5], np.arange(5.0), **options).frame == 2
+
+
+def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device):
+    """Light since frame 3, but so faintly that noise decides when it passes for light."""
+    generator = np.random.default_rng(3)
+    counts = np.where(np.arange(40)[:, None, None] >= 3, 119.5, 20) + generator.normal(0, 1.5, (40, 50, 60))
+    found = find_onset(
+        np.rint(counts).astype(np.uint8), np.arange(40) * 0.1, 20, 220, noise=1.5, device=device
+    )
+    error = found.height + 0.25
+    late = (found.status == 1) & (found.frame > 10)
+    assert late.sum() > 100
+    assert np.max(np.abs(error[late] / found.sigma[late])) < 4
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.zeros((2, 9, 5), np.uint8),
+        np.zeros((2, 1, 1), np.uint8),
+        np.zeros((2, 4, 5), np.uint16),
+        np.zeros((0, 4, 5), np.uint8),
+    ],
+)
+def test_a_block_of_other_frames_is_refused(frames):
+    search = OnsetSearch((4, 5), np.dtype(np.uint8))
+    with pytest.raises(InputError, match="expected uint8"):
+        search.push(Block(frames, 0, travel=np.arange(len(frames)) * 0.1))
+
+
+def test_thresholds_that_binary_cannot_hold_are_met():
+    """0.55 of the way from 0 to 100 is 55 counts, though 0.55 * 100 is a little more."""
+    for percent in range(1, 100):
+        frames = np.zeros((4, 1, 2), np.uint8)
+        frames[2:, 0] = percent, percent - 1
+        found = find_onset(frames, np.arange(4.0), 0, 100, threshold=percent / 100, noise=0.5)
+        np.testing.assert_array_equal(found.status, [[1, 2]], err_msg=str(percent))

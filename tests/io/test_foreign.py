@@ -416,9 +416,8 @@ def test_a_header_that_claims_more_than_the_file_is_refused(path):
     data = path.read_bytes()
     assert data.count(few) == 2
     path.write_bytes(data.replace(few, many))
-    refused(
-        path, r"/frames claims 35000000000 bytes and its file holds [0-9]+: it was cut short; copy it again"
-    )
+    # New versions of HDF5 compare this claim with the file's own sizes themselves.
+    refused(path, r"/frames claims 35000000000 bytes .*; copy it again|it is damaged .*: copy it again")
 
 
 @pytest.mark.parametrize("name", ["stage/travel", "detector/frame_time", "detector/dark", "stage/pivot"])

@@ -278,6 +278,7 @@ for write in [*work, lambda: io.save_result(big, folder / "old.h5")]:
         write()
     except io.InputError as error:
         print(error)
+assert source[0].frames_read < 60, "went on after the disk was full"
 """
 
 

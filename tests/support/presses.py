@@ -32,13 +32,24 @@ def numpy_onset(frames, travel, dark, bright, noise, threshold=0.5, hold=2, subf
     low, high = reference_pair(dark, bright, shape, dtype)
     level, light = (part.reshape(-1) for part in light_levels(low, high, threshold, dtype))
     flat = frames.reshape(len(frames), -1)
+    below = np.zeros(level.size, np.int32)
     onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
     last, before, at, after = (np.zeros(level.size, dtype) for _ in range(4))
-    reference.onset_scan(flat, 0, hold, light, onset, last, before, at, after)
+    reference.onset_scan(flat, 0, hold, 6 * noise, level, light, onset, below, last, before, at, after)
     plateau = flat[0].astype(np.float32) if own_dark else low.reshape(-1).astype(np.float32)
     tolerances = (3 * noise * (np.sqrt(2) if own_dark else 1), 3 * noise * np.sqrt(2))
     height, sigma, status = reference.onset_heights(
-        onset, before, at, after, level, plateau, np.asarray(travel, float), *tolerances, noise, subframe
+        onset,
+        below,
+        before,
+        at,
+        after,
+        level,
+        plateau,
+        np.asarray(travel, float),
+        *tolerances,
+        noise,
+        subframe,
     )
     maps = (height, sigma, status, np.maximum(onset, reference.DARK))
     return Onset(*(values.reshape(shape) for values in maps), noise)

@@ -38,15 +38,17 @@ class MadeUp:
         self.shape = (announced or len(frames), *frames.shape[1:])
         self.dtype = frames.dtype
         self.left = False
-        self._fails, self._series, self._next = fails, series, 0
+        self._fails, self._series, self.frames_read = fails, series, 0
 
     def read(self, out=None, /):
-        part = slice(self._next, min(self._next + (1 if out is None else len(out)), len(self.frames)))
+        part = slice(
+            self.frames_read, min(self.frames_read + (1 if out is None else len(out)), len(self.frames))
+        )
         if self._fails is not None and part.stop > 3:
             raise self._fails
         if part.start == len(self.frames):
             return None
-        self._next = part.stop
+        self.frames_read = part.stop
         return io.Block(self.frames[part], part.start, **{n: v[part] for n, v in self._series.items()})
 
     def __enter__(self):

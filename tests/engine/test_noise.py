@@ -1,0 +1,42 @@
+"""The noise is told from two looks at the same pixels, whatever else happens between them."""
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.noise import SAMPLES, estimate_noise, thin_out
+
+RANDOM = np.random.default_rng(0)
+
+
+def two_looks(noise, changed=0.0, count=60_000):
+    first, second = (30 + RANDOM.normal(0, noise, count) for _ in range(2))
+    second[: int(changed * count)] += 100 * noise
+    return first, second
+
+
+@pytest.mark.parametrize("changed", [0.0, 0.1, 0.45])
+@pytest.mark.parametrize("noise", [0.01, 1.5, 20.0])
+def test_the_noise_is_found_among_changes(noise, changed):
+    assert estimate_noise(*two_looks(noise, changed), integer=False) == pytest.approx(noise, rel=0.05)
+
+
+def test_rounding_is_the_least_noise_of_whole_numbers():
+    still = np.full(100, 7.0)
+    assert estimate_noise(still, still, integer=True) == pytest.approx(1 / np.sqrt(12))
+    assert estimate_noise(still, still, integer=False) == 0
+
+
+def test_samples_that_are_no_numbers_are_left_out():
+    first, second = two_looks(1.5)
+    first[::3], second[::5], first[::7], second[::7] = np.nan, np.inf, np.inf, np.inf
+    assert estimate_noise(first, second, integer=False) == pytest.approx(1.5, rel=0.05)
+    nothing = np.full(9, np.nan)
+    assert estimate_noise(nothing, nothing, integer=False) == 0
+
+
+def test_samples_are_taken_from_all_over_the_frame():
+    frame = np.arange(10 * SAMPLES, dtype=np.float32).reshape(10, SAMPLES)
+    samples = thin_out(frame)
+    assert SAMPLES <= len(samples) < 2 * SAMPLES
+    assert samples[-1] > 0.99 * frame.max()
+    assert len(thin_out(frame[:1, :9])) == 9
