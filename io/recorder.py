@@ -31,6 +31,8 @@ _SERIES = {
 # What the frames are plotted along, if it is known; else along the time.
 _AXES: dict[Motion, str] = {"vertical": "travel", "axial": "phase"}
 
+_BLOCK = 16_000_000  # bytes of frames that are drained at a time
+
 
 class Recorder:
     """Pass on the frames of a source, and write them to a recording as they go by.
@@ -117,7 +119,9 @@ class Recorder:
 
     def drain(self, progress: Callable[[int], None]) -> None:
         """Write all frames, for their recording alone; ``progress`` is told how many there are so far."""
-        while self.read() is not None:
+        length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
+        room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
+        while self.read(room) is not None:
             progress(self._count)
 
     def _finish(

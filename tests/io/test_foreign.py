@@ -7,7 +7,6 @@ import sys
 import tracemalloc
 
 import h5py
-import hdf5plugin
 import numpy as np
 import pytest
 from stacks import SHAPE, TRAVEL, random_stack, read_all, record, sphere
@@ -465,7 +464,6 @@ PACKINGS = {
     "gzip": {"compression": "gzip"},
     "lzf": {"compression": "lzf"},
     "fletcher32": {"fletcher32": True},
-    "zstd": {**hdf5plugin.Zstd()},
 }
 
 
