@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -193,11 +194,12 @@ def test_the_recorder_passes_on_what_it_writes(tmp_path):
     np.testing.assert_array_equal(travel, TRAVEL)
 
 
-def test_drain_tells_how_far_it_is(tmp_path):
+def test_drain_goes_block_by_block_and_tells_how_far_it_is(tmp_path, monkeypatch):
     told = []
-    with io.Recorder(sphere(), tmp_path / "a.h5") as recorder:
-        recorder.drain(told.append)
-    assert told == [1, 2, 3, 4, 5, 6, 7, 8]
+    monkeypatch.setattr("mirrorskin.io.recorder._BLOCK", 3 * math.prod(sphere().shape[1:]))
+    with io.Recorder(sphere(), tmp_path / "a.h5") as writer:
+        writer.drain(told.append)
+    assert told == [3, 6, 8]
 
 
 @pytest.mark.parametrize("compression", io.COMPRESSIONS)
