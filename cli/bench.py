@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.output import print_json, print_table
+
+if TYPE_CHECKING:
+    from mirrorskin.bench import Row
 
 
 def command(
@@ -28,22 +31,32 @@ def command(
         for dtype in ("uint8", "uint16")
     }
     if as_json:
-        print_json({"device": opened.info, "cases": cases})
+        told = {title: [_told(row, rows[0]) for row in rows] for title, rows in cases.items()}
+        print_json({"device": opened.info, "cases": told})
         return
     typer.echo(opened.info.title)
     for title, rows in cases.items():
-        limit = rows[0].bandwidth
         typer.echo(f"\n{title}")
-        print_table(
-            ["work", "median", "quartiles", "bandwidth", "of the read limit"],
-            [
-                [
-                    row.name,
-                    f"{1e3 * row.timing.median:.1f} ms",
-                    f"{1e3 * row.timing.lower:.1f} to {1e3 * row.timing.upper:.1f}",
-                    f"{row.bandwidth / 1e9:.2f} GB/s",
-                    f"{100 * row.bandwidth / limit:.0f} %",
-                ]
-                for row in rows
-            ],
-        )
+        head = ["work", "median", "quartiles", "bandwidth", "of the read limit"]
+        print_table(head, [_cells(row, rows[0]) for row in rows])
+
+
+def _told(row: Row, limit: Row) -> dict[str, object]:
+    share = row.bandwidth / limit.bandwidth
+    return {
+        "name": row.name,
+        "timing": row.timing,
+        "bytes": row.bytes,
+        "bandwidth": row.bandwidth,
+        "share": share,
+    }
+
+
+def _cells(row: Row, limit: Row) -> list[str]:
+    return [
+        row.name,
+        f"{1e3 * row.timing.median:.1f} ms",
+        f"{1e3 * row.timing.lower:.1f} to {1e3 * row.timing.upper:.1f}",
+        f"{row.bandwidth / 1e9:.2f} GB/s",
+        f"{100 * row.bandwidth / limit.bandwidth:.0f} %",
+    ]

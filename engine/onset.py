@@ -102,6 +102,7 @@ def find_onset(
         subframe=subframe,
         noise=noise,
         device=device,
+        memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
     search.push(Block(frames, index=0, travel=positions))
     return search.result()
@@ -125,7 +126,7 @@ class OnsetSearch:
     def __init__(
         self,
         shape: tuple[int, int],
-        dtype: np.dtype[Any],
+        dtype: DTypeLike,
         *,
         dark: ArrayLike | None = None,
         bright: ArrayLike | None = None,
@@ -136,6 +137,7 @@ class OnsetSearch:
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
+        dtype = np.dtype(dtype)
         _check(dtype, hold, noise)
         low, high = reference_pair(dark, bright, shape, dtype)
         level, light = light_levels(low, high, check_threshold(threshold), dtype)

@@ -108,6 +108,7 @@ def test_the_benchmark_agrees_with_its_peers_before_it_times():
     for rows in cases.values():
         assert {row["name"] for row in rows} >= {"read limit", "copy limit", "onset scan", "NumPy"}
         assert all(row["timing"]["median"] > 0 for row in rows)
+        assert rows[0]["share"] == 1
 
 
 @pytest.mark.parametrize(

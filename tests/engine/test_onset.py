@@ -383,3 +383,9 @@ def test_thresholds_that_binary_cannot_hold_are_met():
         frames[2:, 0] = percent, percent - 1
         found = find_onset(frames, np.arange(4.0), 0, 100, threshold=percent / 100, noise=0.5)
         np.testing.assert_array_equal(found.status, [[1, 2]], err_msg=str(percent))
+
+
+def test_types_may_be_given_as_numpy_knows_them():
+    search = OnsetSearch((4, 5), np.uint16)
+    search.push(Block(np.zeros((2, 4, 5), np.uint16), 0, travel=np.arange(2.0)))
+    assert np.all(search.result().status == 2)
