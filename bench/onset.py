@@ -14,7 +14,8 @@ from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 
-_WORDS = 16  # rows of 16 bytes that an item of the limits' kernels takes for each pixel of a tile
+_WORD = 64  # bytes that the limits' kernels read at once
+_EACH = 4  # words that an item of theirs takes for each pixel of a tile
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,24 +95,28 @@ class _Limits:
 
     def __init__(self, device: Device, frames: NDArray[Any]) -> None:
         self._device = device
-        self._count = frames.nbytes // 16
-        self._items = -(-self._count // (_WORDS * device.tile))
-        self._source = device.array("source", (self._count, 4), np.uint32)
-        self._target = device.array("target", (self._count, 4), np.uint32)
-        self._sums = device.array("sums", (self._items,), np.uint32)
-        self._source.host[:] = (
-            frames.reshape(-1)[: 16 * self._count // frames.itemsize].view(np.uint32).reshape(-1, 4)
+        words = (
+            frames.reshape(-1)
+            .view(np.uint8)[: frames.nbytes // _WORD * _WORD]
+            .view(np.uint32)
+            .reshape(-1, 16)
         )
+        self._count = len(words)
+        self._items = -(-self._count // (_EACH * device.tile))
+        self._source = device.array("source", words.shape, np.uint32)
+        self._target = device.array("target", words.shape, np.uint32)
+        self._sums = device.array("sums", (self._items,), np.uint32)
+        self._source.host[:] = words
         self._source.upload()
 
     def read(self) -> None:
         kernel = self._device.kernel("limits", "read_all")
-        kernel(self._items, self._source, np.int32(self._count), self._sums, moved=16 * self._count)
+        kernel(self._items, self._source, np.int32(self._count), self._sums, moved=_WORD * self._count)
         self._device.finish()
 
     def copy(self) -> None:
         kernel = self._device.kernel("limits", "copy_all")
-        kernel(self._items, self._source, np.int32(self._count), self._target, moved=32 * self._count)
+        kernel(self._items, self._source, np.int32(self._count), self._target, moved=2 * _WORD * self._count)
         self._device.finish()
 
 

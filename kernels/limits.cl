@@ -1,14 +1,14 @@
 // What memory can give: the least that any kernel does. Specification: limits.py.
 
-#define WORDS (16 * TILE)  // of 16 bytes, an item
+#define WORDS (4 * TILE)  // of 64 bytes, an item
 
-__kernel void read_all(__global const uint4 *restrict words, const int count, __global uint *restrict sums)
+__kernel void read_all(__global const uint16 *restrict words, const int count, __global uint *restrict sums)
 {
     const int base = get_global_id(0) * WORDS;
     if (base >= count) return;
     const int end = min(count, base + WORDS);
     // Independent sums, or each addition would wait for the one before it.
-    uint4 a = (uint4)(0), b = a, c = a, d = a;
+    uint16 a = (uint16)(0), b = a, c = a, d = a;
     int i = base;
     for (; i + 4 <= end; i += 4) {
         a += words[i];
@@ -18,10 +18,12 @@ __kernel void read_all(__global const uint4 *restrict words, const int count, __
     }
     for (; i < end; ++i) a += words[i];
     a += b + c + d;
-    sums[get_global_id(0)] = a.x + a.y + a.z + a.w;
+    const uint8 eight = a.lo + a.hi;
+    const uint4 four = eight.lo + eight.hi;
+    sums[get_global_id(0)] = four.x + four.y + four.z + four.w;
 }
 
-__kernel void copy_all(__global const uint4 *restrict words, const int count, __global uint4 *restrict target)
+__kernel void copy_all(__global const uint16 *restrict words, const int count, __global uint16 *restrict target)
 {
     const int base = get_global_id(0) * WORDS;
     const int end = min(count, base + WORDS);

@@ -11,7 +11,7 @@ def read_all(words: NDArray[np.uint32], each: int) -> NDArray[np.uint32]:
 
     Parameters
     ----------
-    words : ndarray, (n, 4), uint32
+    words : ndarray, (n, 16), uint32
     each : int
         Rows that one work-item reads.
 

@@ -67,12 +67,12 @@ def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
 
 @pytest.mark.parametrize("count", [1, 15, 16, 4099, 50_000])
 def test_the_limits_kernels_do_what_their_references_do(device, count):
-    words = np.random.default_rng(0).integers(0, 2**32, (count, 4), np.uint32)
-    each = 16 * device.tile
+    words = np.random.default_rng(0).integers(0, 2**32, (count, 16), np.uint32)
+    each = 4 * device.tile
     items = -(-count // each)
     source, target = (
-        device.array("source", (count, 4), np.uint32),
-        device.array("target", (count, 4), np.uint32),
+        device.array("source", (count, 16), np.uint32),
+        device.array("target", (count, 16), np.uint32),
     )
     sums = device.array("sums", (items,), np.uint32)
     source.host[:] = words
@@ -133,14 +133,14 @@ def test_the_hosts_own_lack_of_memory_is_told_apart(small_device):
 
 def test_the_profile_tells_what_was_run(device):
     device.profile.clear()
-    source, target = (device.array(name, (64, 4), np.uint32) for name in ("source", "target"))
+    source, target = (device.array(name, (64, 16), np.uint32) for name in ("source", "target"))
     source.upload()
     for _ in range(3):
-        device.kernel("limits", "copy_all")(4, source, np.int32(64), target, moved=2048)
+        device.kernel("limits", "copy_all")(4, source, np.int32(64), target, moved=8192)
     target.download()
     records = {(record.kind, record.name): record for record in device.profile.records()}
     kernel = records["kernel", "copy_all"]
-    assert (kernel.runs, kernel.bytes) == (3, 3 * 2048)
+    assert (kernel.runs, kernel.bytes) == (3, 3 * 8192)
     assert 0 < kernel.fastest <= kernel.seconds
     assert kernel.bandwidth == pytest.approx(kernel.bytes / kernel.seconds)
     copied = not device.info.shares_memory
@@ -150,7 +150,7 @@ def test_the_profile_tells_what_was_run(device):
 
 def test_the_profile_stays_bounded(device):
     device.profile.clear()
-    array = device.array("source", (1, 4), np.uint32)
+    array = device.array("source", (1, 16), np.uint32)
     array.upload()
     kernel = device.kernel("limits", "copy_all")
     for _ in range(2500):
