@@ -36,17 +36,27 @@ def height_figure(result: Result, truth: Truth, title: str, path: Path) -> None:
     InputError
         Matplotlib is not installed, the result has no heights or axes, or the file cannot be written.
     """
-    if result.height is None or result.x is None or result.y is None:
-        raise InputError("a figure needs heights and the pixel size")
-    figure = _new_figure()
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.35])
-    _draw_map(left, result.height, result.x, result.y)
-    _draw_cut(right, result.height, truth.height, result.x)
+    figure = _draw(result, truth)
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
     try:
         figure.savefig(path, dpi=110)
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _draw(result: Result, truth: Truth) -> Figure:
+    height, x, y = result.height, result.x, result.y
+    if height is None or x is None or y is None or min(height.shape) < 2:
+        raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")
+    if truth.height.shape != height.shape:
+        raise InputError(
+            f"the result is {height.shape} pixels, the truth {truth.height.shape}: not of one stack"
+        )
+    figure = _new_figure()
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.35])
+    _draw_map(left, height, x, y)
+    _draw_cut(right, height, truth.height, x)
+    return figure
 
 
 def check_drawing() -> None:

@@ -27,3 +27,10 @@ def test_nothing_is_timed_when_the_maps_differ(device, monkeypatch):
     monkeypatch.setattr(onset, "_numpy_onset", lambda frames: np.zeros(frames.shape[1:], np.int32))
     with pytest.raises(RuntimeError, match="do not agree"):
         run_onset(device, (5, 9, 7), np.dtype(np.uint8), rounds=1)
+
+
+def test_the_spread_is_the_quartiles(monkeypatch):
+    ticks = iter(np.repeat(np.cumsum([0, *range(9)]), 2)[1:])
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
+    timing = take_turns({"a": lambda: None}, rounds=9)["a"]
+    assert (timing.lower, timing.median, timing.upper) == (2, 4, 6)

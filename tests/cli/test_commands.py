@@ -205,3 +205,15 @@ def test_an_import_does_not_overwrite_its_own_pictures(tmp_path):
     )
     assert run.returncode == 2
     assert "is the input" in run.stderr
+
+
+def test_an_import_names_what_it_left_out(tmp_path):
+    for name in ("frame0", "frame1", "ambient"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((8, 9), 9, np.uint8))
+    words = ["import", ".", "-o", "press.h5", "--motion", "vertical", "--travel-step", "1mm"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert run.returncode == 0
+    assert run.stderr.splitlines() == ["left out: ambient.png"]
+    assert run.stdout == "press.h5: 2 frames of 9 x 8, uint8, vertical motion\n"

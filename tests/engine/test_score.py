@@ -43,3 +43,15 @@ def test_what_cannot_be_compared_is_refused():
         engine.score(io.Result(), truth)
     with pytest.raises(io.InputError, match="not of one stack"):
         engine.score(io.Result(height=np.zeros((2, 3), np.float32)), truth)
+
+
+def test_the_far_end_is_the_99th_percentile():
+    height = np.arange(1, 102, dtype=np.float32).reshape(1, 101)
+    sigma = np.where(height > 50, 0, height).astype(np.float32)  # of a sigma of 0 no ratio can be told
+    truth = truth_of(np.zeros_like(height), np.zeros_like(height))
+    score = engine.score(io.Result(height=height, height_sigma=sigma), truth)
+    assert score.p99 == pytest.approx(100)
+    assert score.chi_square == pytest.approx(1)
+    assert np.isnan(score.coverage)
+    summary = engine.summarise(io.Result(height=height))
+    assert (summary.lowest, summary.highest, summary.answered) == (1, 101, 101)
