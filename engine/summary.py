@@ -37,5 +37,5 @@ def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have a height, and tell how far the heights reach."""
     height = np.empty(0) if result.height is None else result.height
     heights = height[np.isfinite(height)]
-    reach = (float(heights.min()), float(heights.max())) if heights.size else (np.nan, np.nan)
+    reach = (float(np.min(heights)), float(np.max(heights))) if heights.size else (np.nan, np.nan)
     return Summary(height.size, heights.size, *reach)

@@ -20,7 +20,8 @@ def read_all(words: NDArray[np.uint32], each: int) -> NDArray[np.uint32]:
     ndarray, (ceil(n / each),), uint32
     """
     starts = np.arange(0, len(words), each)
-    return np.add.reduceat(words.sum(axis=1, dtype=np.uint32), starts, dtype=np.uint32)
+    sums: NDArray[np.uint32] = np.add.reduceat(words.sum(axis=1, dtype=np.uint32), starts, dtype=np.uint32)
+    return sums
 
 
 def copy_all(words: NDArray[np.uint32]) -> NDArray[np.uint32]:

@@ -63,7 +63,7 @@ class Coin:
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return z in mm of coin and table; finite everywhere."""
         r = np.hypot(x, y)
-        inset = np.maximum.reduce([r - _RIM_FOOT, _gear(x, y), _ear(x, y), _water(x, y), _writing(x, y)])
+        inset = np.max([r - _RIM_FOOT, _gear(x, y), _ear(x, y), _water(x, y), _writing(x, y)], axis=0)
         face = np.clip(math.tan(RELIEF_ZENITH) * inset, 0.0, RELIEF) - RELIEF
         flank = math.tan(FLANK_ZENITH) * np.minimum(RADIUS - r, r - HOLE_RADIUS)
         coin: Floats = np.minimum(face, flank)
@@ -127,7 +127,7 @@ def _writing(x: Floats, y: Floats) -> Floats:
         for glyph, centre_x, centre_y in _WRITING
         for stroke in glyph
     ]
-    inset: Floats = np.maximum.reduce(insets)
+    inset: Floats = np.max(insets, axis=0)
     return inset
 
 
