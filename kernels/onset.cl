@@ -139,7 +139,8 @@ float2 pair_quotient(const float2 a, const float2 b)
 
 __kernel void onset_heights(
     const int pixels, const int count, __global const int *restrict onset, __global const int *restrict below,
-    __global const FRAME *restrict before, __global const FRAME *restrict at, __global const FRAME *restrict after, __global const float *restrict level,
+    __global const FRAME *restrict before, __global const FRAME *restrict at,
+    __global const FRAME *restrict after, __global const float *restrict level,
     __global const float *restrict dark, __global const float2 *restrict travel, const float dark_tolerance,
     const float light_tolerance, const float noise, const int subframe, __global float *restrict height,
     __global float *restrict sigma, __global uchar *restrict status)
@@ -162,7 +163,7 @@ __kernel void onset_heights(
         const float2 crossed = pair_quotient(two_sum(fmin(level[p], high), -low), step);
         const float rest = 1 - crossed.x;
         const float known = width.x * noise * sqrt(crossed.x * crossed.x + rest * rest) / step.x;
-        // Then the crossing lies anywhere since the pixel was surely dark.
+        // Near its level for longer than its step takes, it may have crossed at any time since it was dark.
         const int hovered = step.x <= light_tolerance || (start - 2 - below[p]) * step.x > 2.5f * light_tolerance;
         const float interval = hovered ? pair_sum(travel[start], -travel[below[p]]).x : width.x;
         const float guessed = 0.5f * interval / sqrt(3.0f);
