@@ -92,9 +92,11 @@ __kernel void onset_scan(
         // Back from the frame before the run to the last one that was surely dark; most often that one is it.
         int dark = (start >= 0 ? start : end) - 1;
         const int decided = known == INVALID || (known >= 0 && hold <= first - known);
-        while (!decided && dark >= max(first, 1)
-               && !(samples[(size_t)(dark - first) * pixels] <= level[pixel] - tolerance))
+        while (!decided && dark >= max(first, 1)) {
+            const FRAME sample = samples[(size_t)(dark - first) * pixels];
+            if (sample < least[p] && sample <= level[pixel] - tolerance) break;
             --dark;
+        }
         if (!decided && dark >= max(first, 1)) below[pixel] = dark;
         last[pixel] = samples[(size_t)(count - 1) * pixels];
     }

@@ -66,7 +66,7 @@ def onset_scan(
         at[begins] = frame[begins]
         onset[undecided & ~is_light] = DARK
         if number > 0:
-            below[undecided & (frame <= level - np.float32(tolerance))] = number
+            below[undecided & ~is_light & (frame <= level - np.float32(tolerance))] = number
         onset[undecided & ~np.isfinite(frame)] = INVALID
 
         next_to = onset == number - 1

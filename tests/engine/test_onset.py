@@ -389,3 +389,15 @@ def test_types_may_be_given_as_numpy_knows_them():
     search = OnsetSearch((4, 5), np.uint16)
     search.push(Block(np.zeros((2, 4, 5), np.uint16), 0, travel=np.arange(2.0)))
     assert np.all(search.result().status == 2)
+
+
+def test_a_saturated_sample_below_its_level_is_not_taken_for_dark(device):
+    """Bright is beyond the range: 255 is light there, though it misses the level by far."""
+    frames = np.full((6, 1, 2), 20, np.uint8)
+    frames[2:, 0, 0], frames[4:, 0, 1] = 255, 255
+    frames[2, 0, 1] = 255
+    options = {"threshold": 1.0, "noise": 0.3}
+    found = find_onset(frames, np.arange(6) * 0.1, 20, 300, device=device, **options)
+    assert_within_an_ulp(found, numpy_onset(frames, np.arange(6) * 0.1, 20, 300, **options), np.arange(6))
+    np.testing.assert_array_equal(found.frame, [[2, 4]])
+    assert np.all(found.sigma > 0)
