@@ -126,30 +126,23 @@ def cut_into_bands(
     DeviceError
         Not even one row fits.
     """
-    return _cut(device, slice(0, shape[0]), shape[1], dtype, maps, length)
 
+    def cut(rows: slice) -> list[Band]:
+        try:
+            return [Band(device, rows, shape[1], dtype, maps, length)]
+        except DeviceMemoryError as error:
+            if rows.stop - rows.start == 1:
+                message = f"one row of {shape[1]} pixels does not fit: {error}; use another device"
+                raise DeviceError(message) from error
+        middle = (rows.start + rows.stop) // 2
+        bands = []
+        for half in (slice(rows.start, middle), slice(middle, rows.stop)):
+            bands += cut(half)
+            for band in bands:
+                band.yield_room()
+        return bands
 
-def _cut(
-    device: Device,
-    rows: slice,
-    columns: int,
-    dtype: np.dtype[Any],
-    maps: Mapping[str, DTypeLike],
-    length: int,
-) -> list[Band]:
-    try:
-        return [Band(device, rows, columns, dtype, maps, length)]
-    except DeviceMemoryError as error:
-        if rows.stop - rows.start == 1:
-            message = f"one row of {columns} pixels does not fit: {error}; use another device"
-            raise DeviceError(message) from error
-    middle = (rows.start + rows.stop) // 2
-    bands = []
-    for half in (slice(rows.start, middle), slice(middle, rows.stop)):
-        bands += _cut(device, half, columns, dtype, maps, length)
-        for band in bands:
-            band.yield_room()
-    return bands
+    return cut(slice(0, shape[0]))
 
 
 def _longest(device: Device, length: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.storage import check_storage
-from mirrorskin.io.types import InputError
+from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.units import factor
 
 Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
@@ -22,7 +21,7 @@ Shape = tuple[int, ...]
 _LINKS_DEEP = 16
 
 
-class Hdf5File:
+class Hdf5File(Closing):
     """An HDF5 file to read, and the files in its own folder that it refers to.
 
     Parameters
@@ -53,14 +52,6 @@ class Hdf5File:
         """Close the file and those it refers to."""
         for file in self._files.values():
             file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.close()
 
     def where(self, node: Node) -> str:
         """Return the file and the name of an object, for messages."""

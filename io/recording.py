@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -17,7 +17,7 @@ from mirrorskin.io.layout import MARK, STACK, Layout
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.storage import check_storage, describe_storage
-from mirrorskin.io.types import FRAME_DTYPES, Block, Floats, Header, InputError, Motion, Truth
+from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Steps:
             return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
 
-class Recording:
+class Recording(Closing):
     """A stack in a file, as a source that can be rewound; see ``open_recording``.
 
     Attributes
@@ -116,14 +116,6 @@ class Recording:
         """Close the file."""
         self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.close()
-
     def _whole_chunks(self, start: int, stop: int) -> int:
         """End a read where a chunk ends, so that none is unpacked twice."""
         length = self._stack.chunks[0] if self._stack.chunks else 1
@@ -165,15 +157,15 @@ def open_recording(
     InputError
         The file, the stack, or something said about it cannot be used.
     """
-    file = Hdf5File(Path(path), memory_limit)
-    try:
+    with ExitStack() as opening:
+        file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
         stack = _find_stack(file, dataset, ours)
         layout = Layout(file, ours, stack.shape)
         header = layout.header(motion, tilt, pixel_size)
         count = stack.shape[0]
         vertical, axial = header.motion == "vertical", header.motion == "axial"
-        return Recording(
+        recording = Recording(
             file,
             stack,
             header,
@@ -182,9 +174,8 @@ def open_recording(
             phase=layout.phase(_along(phase, count)) if axial else None,
             truth=layout.truth(),
         )
-    except BaseException:
-        file.close()
-        raise
+        opening.pop_all()  # from here on the recording closes its file
+    return recording
 
 
 def _along(steps: Steps | None, count: int) -> Floats | None:

@@ -5,18 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.positions import check_phase, check_travel
 from mirrorskin.io.recording import Steps
-from mirrorskin.io.types import Block, Floats, Header
+from mirrorskin.io.types import Block, Closing, Floats, Header
 
 
-class FrameSequence(ABC):
+class FrameSequence(Closing, ABC):
     """A source of other people's frames, read in order and rewindable.
 
     Parameters
@@ -109,17 +108,6 @@ class FrameSequence(ABC):
     def rewind(self) -> None:
         """Go back to the first frame."""
         self._next = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:  # noqa: B027
-        """Close what is open; pictures hold nothing open."""
 
     @abstractmethod
     def _fill(self, start: int, out: NDArray[Any]) -> None:

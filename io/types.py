@@ -91,6 +91,21 @@ class Header:
     zenith_offset: Floats | None = None
 
 
+class Closing:
+    """A context manager that closes itself when it is left."""
+
+    def close(self) -> None:
+        """Close what is open; by default there is nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+
 class Source(Protocol):
     """Anything frames come from: a recording, a rig of camera and stage, the digital twin.
 

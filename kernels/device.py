@@ -239,14 +239,16 @@ class Array:
             self._allocate()
         if not self._shared:
             part = self.host[:rows]
-            self._copy("upload", self.buffer, part)
+            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
+            self._device.profile.wait("upload", self.name, event, part.nbytes)
 
     def download(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote, in the host's array."""
         if self._shared:
             self.claim()
         else:
-            self._copy("download", self.host, self.buffer)
+            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
+            self._device.profile.wait("download", self.name, event, self.host.nbytes)
         return self.host
 
     def park(self) -> None:
@@ -270,13 +272,6 @@ class Array:
             self._mapped.release()
             self._mapped = None
         return self._buffer
-
-    def _copy(self, kind: Literal["upload", "download"], target: Any, source: Any) -> None:
-        event = cl.enqueue_copy(self._device.queue, target, source)
-        event.wait()  # a waiting event would keep the host's array alive
-        seconds = (event.profile.end - event.profile.start) * 1e-9
-        nbytes = source.nbytes if kind == "upload" else target.nbytes
-        self._device.profile.add(kind, self.name, seconds, nbytes)
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE

@@ -55,6 +55,11 @@ class Profile:
         with self._lock:
             self._add(kind, name, seconds, nbytes)
 
+    def wait(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
+        """Wait for the run that ``event`` ends, and count it; a pending copy would keep its array alive."""
+        with self._lock:
+            self._finish(kind, name, event, nbytes)
+
     def watch(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         """Count the run that ``event`` ends, once it is over."""
         with self._lock:
@@ -76,9 +81,12 @@ class Profile:
 
     def _settle(self) -> None:
         for kind, name, event, nbytes in self._pending:
-            event.wait()
-            self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
+            self._finish(kind, name, event, nbytes)
         self._pending.clear()
+
+    def _finish(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
+        event.wait()
+        self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
         record = self._records.setdefault((kind, name), Record(kind, name))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -14,12 +13,12 @@ from mirrorskin.hw.twin.objects import make_object
 from mirrorskin.hw.twin.optics import uniform_response
 from mirrorskin.hw.twin.surface import Object, zenith_azimuth
 from mirrorskin.io import check_travel
-from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Truth, pixel_axes
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Motion, Truth, pixel_axes
 
 _PIXELS_MAX = 200_000_000
 
 
-class Twin:
+class Twin(Closing):
     """The sensor, simulated in vertical motion: a `mirrorskin.io.Source` that knows the truth.
 
     The sheet conforms to the object (eq. 1 of the paper): a pixel is in contact in frame k when
@@ -143,13 +142,6 @@ class Twin:
         self._next = first + len(frames)
         time = np.arange(first, self._next) / FRAME_RATE
         return Block(frames, index=first, time=time, travel=self._travel[first : self._next])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None: ...
 
     def _counts(self, zenith: Floats) -> NDArray[np.float32]:
         share = np.nan_to_num(uniform_response(zenith))
