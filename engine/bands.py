@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels.device import Array, Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 _INT_MAX = np.iinfo(np.int32).max
+
+
+_LINE = 64  # bytes of the longest word that a kernel loads at once
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """Several maps in one array, each padded to whole words of the frames' samples."""
+
+    count: int
+    dtype: DTypeLike
 
 
 class Band:
@@ -23,7 +35,9 @@ class Band:
     rows : slice
         The rows of the picture that it holds.
     pixels : int
-    maps : dict of Array, (rows, W)
+    stride : int
+        Pixels from plane to plane.
+    maps : dict of Array, (rows, W), or (count, stride) where planes were asked for
     frames : Array, (n, rows, W)
     """
 
@@ -33,17 +47,25 @@ class Band:
         rows: slice,
         columns: int,
         dtype: np.dtype[Any],
-        maps: Mapping[str, DTypeLike],
+        maps: Mapping[str, DTypeLike | Planes],
         length: int,
     ) -> None:
         shape = (rows.stop - rows.start, columns)
         self.rows = rows
         self.pixels = shape[0] * shape[1]
+        word = _LINE // dtype.itemsize
+        self.stride = -(-self.pixels // word) * word
         if self.pixels > _INT_MAX:
             raise DeviceMemoryError(
                 f"kernels number pixels to {_INT_MAX}; {self.pixels} are too many at once"
             )
-        self.maps = {name: device.array(name, shape, kind) for name, kind in maps.items()}
+        self._shape = shape
+        self.maps = {
+            name: device.array(name, (kind.count, self.stride), kind.dtype)
+            if isinstance(kind, Planes)
+            else device.array(name, shape, kind)
+            for name, kind in maps.items()
+        }
         self.frames = _longest(device, length, shape, dtype)
         self._alone = True
         self._resident = False
@@ -53,13 +75,24 @@ class Band:
         self._alone = False
         self._park()
 
-    def write(self, name: str, values: NDArray[Any]) -> None:
-        """Fill a map from the host."""
+    def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
+        """Fill a map, or one of several planes, from the host."""
         array = self.maps[name]
-        array.claim()
-        array.host[:] = values
+        if plane is None:
+            array.claim()
+            array.host[:] = values
+        else:
+            if self._resident:
+                array.download()  # the other planes
+            array.claim()
+            self.plane(name, plane)[:] = values
         if self._resident:
             array.upload()
+
+    def plane(self, name: str, plane: int) -> NDArray[Any]:
+        """Return one of several planes, (rows, W), as the host sees it."""
+        found: NDArray[Any] = self.maps[name].host[plane, : self.pixels].reshape(self._shape)
+        return found
 
     @contextmanager
     def resident(self) -> Iterator[None]:
@@ -105,7 +138,11 @@ class Band:
 
 
 def cut_into_bands(
-    device: Device, shape: tuple[int, int], dtype: np.dtype[Any], maps: Mapping[str, DTypeLike], length: int
+    device: Device,
+    shape: tuple[int, int],
+    dtype: np.dtype[Any],
+    maps: Mapping[str, DTypeLike | Planes],
+    length: int,
 ) -> list[Band]:
     """Make room for a picture: one band where the device has the memory, else as few as it takes.
 
@@ -116,7 +153,7 @@ def cut_into_bands(
         Rows and columns of the picture.
     dtype : dtype
         Type of a sample.
-    maps : mapping of str to dtype
+    maps : mapping of str to dtype or Planes
         The maps that are needed of each pixel.
     length : int
         Frames that a band should hold; fewer where they do not fit.

@@ -1,40 +1,44 @@
-"""Height from a vertical press: the travel at which each pixel turns light (paper, section 3)."""
+"""Height from a vertical press: the travel at which a pixel turns light, or dark again (paper, section 3)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, cut_into_bands
-from mirrorskin.engine.noise import estimate_noise, thin_out
-from mirrorskin.engine.references import check_threshold, light_levels, reference_pair
-from mirrorskin.io import FRAME_DTYPES, Block, InputError, check_travel
-from mirrorskin.kernels.device import Device, Kernel, open_device
-from mirrorskin.kernels.onset import DARK, INVALID
+from mirrorskin.engine.bands import Band, Planes, cut_into_bands
+from mirrorskin.engine.fitting import fit
+from mirrorskin.engine.references import check_threshold, reference_maps
+from mirrorskin.engine.samples import C_TYPES, Noise, check_dtype
+from mirrorskin.io import Block, InputError, check_travel
+from mirrorskin.kernels.device import Array, Device, open_device
+from mirrorskin.kernels.onset import DARK, complement
 
+Event = Literal["onset", "release"]
+EVENTS: tuple[Event, ...] = get_args(Event)
 MEMORY_LIMIT = 256_000_000
 
-_PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
 _SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
-_C_TYPES = {"u1": "uchar", "u2": "ushort", "u4": "uint", "f4": "float"}
+_ROUNDING = 1e-12  # a threshold such as 0.55 is not exact: counts that reach it but for rounding are light
 _INT_MAX = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """Where and when a press turned the pixels light.
+    """Where and when a press turned the pixels light, or a release dark again.
 
     Attributes
     ----------
     height, sigma : ndarray, (H, W), float32
         Millimetres, and the standard deviation of the height; NaN unless status is 1.
     status : ndarray, (H, W), uint8
-        0 invalid input, 1 onset, 2 never light, 3 light at start.
+        0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
+        2 dark at start, 3 light to the end.
     frame : ndarray, (H, W), int32
-        Number of the first light frame; -1 unless status is 1 or 3.
+        Number of the first light frame, of a release of the first dark one; -1 without one.
     noise : float
         Standard deviation of a sample that was reckoned with, counts.
     """
@@ -55,26 +59,31 @@ def find_onset(
     hold: int = 2,
     subframe: bool = True,
     noise: float | None = None,
+    event: Event = "onset",
     device: str | Device | None = None,
 ) -> Onset:
-    """Find the onset of the light state in a stack that fits in memory.
+    """Find the onset of the light state, or its end, in a stack that fits in memory.
 
     Parameters
     ----------
     frames : ndarray, (T, H, W), uint8, uint16 or float32
-        Raw counts of a vertical press.
+        Raw counts of a vertical press, or of a release.
     travel : array_like, (T,)
-        Millimetres that the body has been lowered, one a frame, never decreasing.
+        Millimetres that the body has been lowered, one a frame: never decreasing in a press, never increasing
+        in a release.
     dark, bright : array_like, scalar or (H, W), optional
         Counts without and with full light; by default the range of the frames' type.
     threshold : float
         Share of the way from dark to bright at which a pixel is light.
     hold : int
-        Light frames in a row that make an onset, so that a spike of noise makes none.
+        Light frames in a row that make an onset, dark ones that make a release, so that a spike of noise
+        makes none.
     subframe : bool
         Look inside the interval before the onset; False gives the paper's equation 4 to the letter.
     noise : float, optional
         Standard deviation of a sample in counts; by default told from the first two frames.
+    event : {"onset", "release"}
+        Whether to look for the light state's begin or its end.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -91,7 +100,6 @@ def find_onset(
     """
     if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) with at least 2 frames is needed")
-    positions = check_travel(np.asarray(travel), len(frames), "travel")
     search = OnsetSearch(
         (frames.shape[1], frames.shape[2]),
         frames.dtype,
@@ -101,10 +109,11 @@ def find_onset(
         hold=hold,
         subframe=subframe,
         noise=noise,
+        event=event,
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
-    search.push(Block(frames, index=0, travel=positions))
+    search.push(Block(frames, index=0, travel=np.asarray(travel)))
     return search.result()
 
 
@@ -117,7 +126,7 @@ class OnsetSearch:
         Rows and columns of a frame.
     dtype : dtype
         uint8, uint16 or float32.
-    dark, bright, threshold, hold, subframe, noise, device
+    dark, bright, threshold, hold, subframe, noise, event, device
         As for ``find_onset``.
     memory_limit : int
         Bytes of host memory for frames on the move; half of it is the room for one block.
@@ -134,28 +143,44 @@ class OnsetSearch:
         hold: int = 2,
         subframe: bool = True,
         noise: float | None = None,
+        event: Event = "onset",
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
         dtype = np.dtype(dtype)
-        _check(dtype, hold, noise)
-        low, high = reference_pair(dark, bright, shape, dtype)
-        level, light = light_levels(low, high, check_threshold(threshold), dtype)
+        check_dtype(dtype)
+        _check(hold, event)
+        low, high = reference_maps(dark, bright, shape, dtype)
         self.device = open_device(device)
+        fit(self.device, _trial)
         self._shape = shape
         self._dtype = dtype
-        self._hold = hold
+        self._release = event == "release"
         self._subframe = subframe
-        self._given_noise = self._noise = noise
-        self._own_dark = dark is None
-        self._travel: list[float] = []
-        self._samples: list[NDArray[np.float64]] = []
+        self._noise = Noise(noise, dtype.kind == "u")
+        # The plateau that a run comes from: no reference tells how light a pixel was before its release.
+        self._own_dark = self._release or dark is None
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype), length)
+        self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype, subframe), length)
         alone = len(self._bands) == 1
         self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
-        self._start = np.where(np.isnan(level), INVALID, DARK)
-        self._fill(level=level, light=light, dark=low)
+        self._macros: dict[str, str | int] = {
+            "FRAME": C_TYPES[f"{dtype.kind}{dtype.itemsize}"],
+            "BITS": 8 * dtype.itemsize,
+            "HOLD": hold,
+            "SAMPLES": int(subframe),
+            "RELEASE": int(self._release),
+        }
+        self._travel = _Travel(self.device)
+        self._sure_at: float | None = None
+        share = check_threshold(threshold) - _ROUNDING
+        for band in self._bands:
+            band.write("levels", high[band.rows] if high.ndim else high, plane=0)
+            band.write("levels", low[band.rows] if low.ndim else low, plane=1)
+            parts = float(np.float32(share)), share - float(np.float32(share))
+            with band.resident():
+                size = band.pixels, band.stride
+                self._launch(band, "onset_levels", *size, *parts, "levels", "marks", "closed")
         self.reset()
 
     @property
@@ -166,9 +191,7 @@ class OnsetSearch:
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
         self._travel.clear()
-        self._samples.clear()
-        self._noise = self._given_noise
-        self._fill(onset=self._start, below=np.zeros_like(self._start))
+        self._noise.reset()
 
     def push(self, block: Block) -> None:
         """Take in the next frames.
@@ -178,94 +201,179 @@ class OnsetSearch:
         mirrorskin.io.InputError
             Travel is missing, or runs back.
         """
-        frames, first = block.frames, len(self._travel)
+        frames, first = block.frames, self._travel.count
         if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
             raise InputError(
                 f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
             )
-        travel = check_travel(block.travel, len(frames), "travel", after=self._travel[-1:])
-        if first == 0 and self._own_dark:
-            self._fill(dark=frames[0])
-        self._look_at_noise(frames)
+        so_far = self._travel.latest
+        travel = check_travel(block.travel, len(frames), "travel", after=so_far, falls=self._release)
+        self._noise.look(frames)
         self._travel.extend(travel)
         for band in self._bands:
+            if self._subframe:
+                self._prepare(band, frames[0] if first == 0 else None)
             self._scan(band, frames, first)
+        self._sure_at = self._noise.value
 
     def result(self) -> Onset:
         """Return the maps of the frames so far; more may follow."""
-        noise = self._noise
-        if not self._travel or noise is None:
-            raise InputError(f"a press of {len(self._travel)} frames has no onset: at least 2 are needed")
-        maps = [self._heights(band, noise) for band in self._bands]
+        noise = self._noise.value
+        if noise is None or self._travel.count == 0:
+            raise InputError(f"a press of {self._travel.count} frames has no onset: at least 2 are needed")
+        maps = [self._answer(band, noise) for band in self._bands]
         height, sigma, status, frame = (np.concatenate(parts) for parts in zip(*maps, strict=True))
         return Onset(height, sigma, status, np.maximum(frame, DARK), noise)
 
-    def _fill(self, **maps: NDArray[Any]) -> None:
-        for band in self._bands:
-            for name, values in maps.items():
-                band.write(name, values[band.rows])
+    def _prepare(self, band: Band, first: NDArray[Any] | None) -> None:
+        """Tell a band what is known of the plateaus: the first frame, and the noise once it is known."""
+        if first is not None and self._own_dark:
+            plateau = complement(first) if self._release else first
+            band.write("levels", plateau[band.rows], plane=1)
+        noise = self._noise.value
+        if noise is not None and noise != self._sure_at:
+            with band.resident():
+                self._launch(band, "onset_sure", band.stride, _SURELY * noise, "levels", "marks")
 
     def _scan(self, band: Band, frames: NDArray[Any], first: int) -> None:
-        width = max(self._dtype.itemsize, np.min_scalar_type(self._hold).itemsize)
-        scan = self._kernel("onset_scan", COUNT=_C_TYPES[f"u{width}"], SPAN=min(256**width - 1, _INT_MAX))
-        state = [
-            band.maps[name] for name in ("level", "light", "onset", "below", "last", "before", "at", "after")
-        ]
-        # One frame alone tells no noise, and needs none: the first is taken for dark.
-        tolerance = _SURELY * (self._noise or 0.0)
+        # One frame alone tells no noise, and needs none: it is taken for dark.
+        look = self._look(self._noise.value or 0.0)
+        arguments: list[str | float | Array] = ["marks", "closed", "busy", "times"]
+        if self._subframe:
+            arguments = [*arguments, "levels", *self._travel.arguments, *look, "samples", "answers", "status"]
+        aligned = band.pixels * self._dtype.itemsize % (4 * self.device.shape.lanes) == 0
         with band.resident():
             for start, count in band.stage(frames):
-                scan(
-                    -(-band.pixels // self.device.tile),
-                    band.frames,
-                    *map(np.int32, (count, band.pixels, first + start, self._hold)),
-                    np.float32(tolerance),
-                    *state,
-                    moved=count * band.pixels * self._dtype.itemsize,
+                part = count, band.pixels, band.stride, first + start
+                self._launch(
+                    band, "onset_scan", band.frames, *part, *arguments, frames=count, aligned=aligned
                 )
 
-    def _heights(self, band: Band, noise: float) -> list[NDArray[Any]]:
-        travel = self.device.array("travel", (len(self._travel), 2), np.float32)
-        travel.host[:, 0] = self._travel
-        travel.host[:, 1] = np.array(self._travel) - travel.host[:, 0]
-        travel.upload()
-        dark_tolerance = _PLATEAU * noise * (np.sqrt(2) if self._own_dark else 1)
-        light_tolerance = _PLATEAU * noise * np.sqrt(2)
-        known = [band.maps[name] for name in ("onset", "below", "before", "at", "after", "level", "dark")]
-        wanted = [band.maps[name] for name in ("height", "sigma", "status")]
+    def _answer(self, band: Band, noise: float) -> list[NDArray[Any]]:
+        """Return height, sigma, status and frame of a band's rows as if no frame followed."""
+        known = [band.stride, "times", *self._travel.arguments, "answers", "status"]
+        if self._subframe:
+            known = [self._travel.count, *known, "busy", "samples", "marks", "levels", *self._look(noise)]
+        planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
         with band.resident():
-            self._kernel("onset_heights", COUNT="uint", SPAN=1)(
-                -(-band.pixels // self.device.tile),
-                *map(np.int32, (band.pixels, len(self._travel))),
-                *(*known, travel),
-                *map(np.float32, (dark_tolerance, light_tolerance, noise)),
-                np.int32(self._subframe),
-                *wanted,
-                moved=sum(array.host.nbytes for array in (*known, *wanted)),
-            )
-            return [array.download().copy() for array in (*wanted, band.maps["onset"])]
+            self._launch(band, "onset_heights", *known, *([0] if self._subframe else []))
+            for name in ("answers", "status", "times"):
+                band.maps[name].download()
+            maps = [band.plane(*plane).copy() for plane in planes]
+            if self._subframe:  # what is not final is taken back
+                self._launch(band, "onset_heights", *known, 1)
+        return maps
 
-    def _kernel(self, name: str, **defines: str | int) -> Kernel:
-        kind = self._dtype.kind
-        sample = _C_TYPES[f"{kind}{self._dtype.itemsize}"]
-        return self.device.kernel("onset", name, FRAME=sample, FLOATS=int(kind == "f"), **defines)
+    def _look(self, noise: float) -> tuple[float, int]:
+        return noise, int(self._own_dark)
 
-    def _look_at_noise(self, frames: NDArray[Any]) -> None:
-        self._samples += [thin_out(frame) for frame in frames[: 2 - len(self._samples)]]
-        if self._noise is None and len(self._samples) == 2:
-            self._noise = estimate_noise(self._samples[0], self._samples[1], self._dtype.kind == "u")
+    def _launch(
+        self,
+        band: Band,
+        name: str,
+        *arguments: str | float | Array,
+        frames: int = 0,
+        aligned: bool = True,
+    ) -> None:
+        """Run a kernel over a band, or over so many frames of it; its maps are told by their names."""
+        values: list[Array | np.generic] = []
+        for argument in arguments:
+            if isinstance(argument, str):
+                values.append(band.maps[argument])
+            elif isinstance(argument, Array):
+                values.append(argument)
+            else:
+                values.append(np.float32(argument) if isinstance(argument, float) else np.int32(argument))
+        maps = sum(value.host.nbytes for value in values if isinstance(value, Array))
+        moved = frames * band.pixels * self._dtype.itemsize or maps
+        kernel = self.device.kernel("onset", name, **self._macros, ALIGNED=int(aligned))
+        shape = self.device.shape
+        words = band.stride * self._dtype.itemsize // (4 * shape.lanes)
+        kernel(-(-words // shape.words), *values, moved=moved)
 
 
-def _maps(dtype: np.dtype[Any]) -> dict[str, DTypeLike]:
-    samples = dict.fromkeys(("light", "last", "before", "at", "after"), dtype)
-    floats = dict.fromkeys(("level", "dark", "height", "sigma"), np.float32)
-    return {"onset": np.int32, "below": np.int32, "status": np.uint8, **samples, **floats}
+class _Travel:
+    """The travel of all frames so far, as the kernels look it up."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._table = device.array("travel", (3, 64), np.float32)
+        self.clear()
+
+    @property
+    def arguments(self) -> tuple[Array, int]:
+        """The planes of the table, and their length."""
+        return self._table, self._table.host.shape[1]
+
+    @property
+    def latest(self) -> list[float]:
+        """The travel of the last frame, if there is one."""
+        return self._values[-1:]
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self._values: list[float] = []
+
+    @property
+    def count(self) -> int:
+        """Frames so far."""
+        return len(self._values)
+
+    def extend(self, travel: NDArray[np.float64]) -> None:
+        """Add the next frames: their travel, the step to each, and the travel since the first frame."""
+        old = len(self._values)
+        steps = np.diff(travel, prepend=self._values[-1] if old else travel[0])
+        self._values.extend(travel.tolist())
+        self._make_room()
+        self._table.claim()
+        self._table.host[:, old : len(self._values)] = travel, steps, travel - self._values[0]
+        self._table.upload()
+
+    def _make_room(self) -> None:
+        room = self._table.host.shape[1]
+        if len(self._values) <= room:
+            return
+        known = self._table
+        known.claim()
+        self._table = self._device.array("travel", (3, 2 * len(self._values)), np.float32)
+        self._table.host[:, :room] = known.host
 
 
-def _check(dtype: np.dtype[Any], hold: int, noise: float | None) -> None:
-    if dtype not in FRAME_DTYPES:
-        raise InputError(f"frames of type {dtype}: uint8, uint16 or float32 are needed")
+def _trial(device: Device) -> Callable[[], None]:
+    """Make a press ready that shows which shape a device likes: a front that passes all pixels."""
+    count, shape = 32, (512, 1024)
+    search = OnsetSearch(
+        shape, np.uint8, noise=1.0, device=device, memory_limit=2 * count * shape[0] * shape[1]
+    )
+    front = np.linspace(1, count, shape[0])[:, np.newaxis]
+    for number, frame in enumerate(search.room[:count]):
+        frame[:] = np.where(front <= number, 200, 20)
+    press = Block(search.room[:count], 0, travel=np.arange(count, dtype=np.float64))
+
+    def run() -> None:
+        search.reset()
+        search.push(press)
+        device.finish()
+
+    return run
+
+
+def _maps(dtype: np.dtype[Any], subframe: bool) -> dict[str, Planes]:
+    kept = {"samples": Planes(4, dtype)} if subframe else {}
+    return {
+        "levels": Planes(2, np.float32),
+        "marks": Planes(2, dtype),
+        "closed": Planes(2, f"u{dtype.itemsize}"),
+        "busy": Planes(1, np.uint8),
+        "times": Planes(2, np.int32),
+        "answers": Planes(2, np.float32),
+        "status": Planes(1, np.uint8),
+        **kept,
+    }
+
+
+def _check(hold: int, event: str) -> None:
     if not 1 <= hold <= _INT_MAX:
         raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
-    if noise is not None and not 0 <= noise < np.inf:
-        raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
+    if event not in EVENTS:
+        raise InputError(f"unknown event {event!r}; known are {', '.join(EVENTS)}")

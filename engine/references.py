@@ -11,8 +11,6 @@ from mirrorskin.io import InputError
 
 Floats = NDArray[np.float64]
 
-_ROUNDING = 1e-12
-
 
 def check_threshold(threshold: float) -> float:
     """Return the threshold if it is a share between dark and bright, else raise InputError."""
@@ -21,9 +19,9 @@ def check_threshold(threshold: float) -> float:
     return threshold
 
 
-def reference_pair(
+def reference_maps(
     dark: ArrayLike | None, bright: ArrayLike | None, shape: tuple[int, int], dtype: np.dtype[Any]
-) -> tuple[Floats, Floats]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Check the references and fill in what is missing from the range of the frames' type.
 
     Parameters
@@ -37,8 +35,7 @@ def reference_pair(
 
     Returns
     -------
-    dark, bright : ndarray, (H, W), float64
-        NaN where bright is not above dark: such a pixel, dead or hot, can answer nothing.
+    dark, bright : ndarray, scalar or (H, W), float32
 
     Raises
     ------
@@ -51,50 +48,39 @@ def reference_pair(
     top = 0 if dtype.kind == "f" else np.iinfo(dtype).max
     low = _as_map("dark", 0 if dark is None else dark, shape)
     high = _as_map("bright", top if bright is None else bright, shape)
-    with np.errstate(invalid="ignore"):
-        usable = np.isfinite(low) & np.isfinite(high) & (high > low)
+    usable = _usable(low, high)
     if 2 * np.count_nonzero(usable) <= usable.size:
         share = 100 * (1 - np.count_nonzero(usable) / usable.size)
         raise InputError(f"bright is not above dark at {share:.3g} % of the pixels: are they swapped?")
-    return np.where(usable, low, np.nan), np.where(usable, high, np.nan)
+    return low, high
 
 
-def light_levels(
-    dark: Floats, bright: Floats, threshold: float, dtype: np.dtype[Any]
-) -> tuple[NDArray[np.float32], NDArray[Any]]:
-    """Turn a share of the way from dark to bright into counts, once, before the first frame.
+def reference_pair(
+    dark: ArrayLike | None, bright: ArrayLike | None, shape: tuple[int, int], dtype: np.dtype[Any]
+) -> tuple[Floats, Floats]:
+    """Do as ``reference_maps``, and return maps (H, W), float64, for all pixels.
 
-    Parameters
-    ----------
-    dark, bright : ndarray, (H, W), float64
-        Counts; NaN where a pixel has no references.
-    threshold : float
-        Share of the way at which a pixel counts as light.
-    dtype : dtype
-        Type of a sample.
-
-    Returns
-    -------
-    level : ndarray, (H, W), float32
-        Counts, the smallest float32 that reaches the threshold; NaN without references.
-    light : ndarray, (H, W), dtype
-        Smallest sample that is light. A saturated sample is always light.
+    Both are NaN where bright is not above dark: such a pixel, dead or hot, can answer nothing.
     """
-    # A threshold such as 0.55 is not exact in binary: counts that reach it but for rounding are light.
-    exact = dark + (threshold - _ROUNDING) * (bright - dark)
-    level = exact.astype(np.float32)
-    level = np.where(level < exact, np.nextafter(level, np.float32(np.inf)), level)
-    if dtype.kind == "f":
-        return level, level.astype(dtype)
-    top = np.iinfo(dtype).max
-    return level, np.ceil(np.nan_to_num(level, nan=top)).clip(0, top).astype(dtype)
+    low, high = reference_maps(dark, bright, shape, dtype)
+    usable = _usable(low, high)
+    dark_map, bright_map = (
+        np.broadcast_to(np.where(usable, part.astype(np.float64), np.nan), shape) for part in (low, high)
+    )
+    return dark_map, bright_map
 
 
-def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> Floats:
-    array = np.asarray(values, np.float64)
+def _usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        usable: NDArray[np.bool_] = np.isfinite(dark) & np.isfinite(bright) & (bright > dark)
+    return usable
+
+
+def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
+    array = np.asarray(values, np.float32)
     if array.shape not in ((), shape):
         raise InputError(
             f"{name} reference has shape {array.shape}, the frames are {shape[0]} x {shape[1]}: "
             "give one number or a map of the frames' size"
         )
-    return np.broadcast_to(array, shape)
+    return array

@@ -12,9 +12,9 @@ from mirrorskin.io.types import InputError
 
 
 def check_travel(
-    travel: ArrayLike | None, count: int, name: str, after: Sequence[float] = ()
+    travel: ArrayLike | None, count: int, name: str, after: Sequence[float] = (), falls: bool = False
 ) -> NDArray[np.float64]:
-    """Return the travel of a vertical press as float64 if it can be used.
+    """Return the travel of a vertical press, or of a release, as float64 if it can be used.
 
     Parameters
     ----------
@@ -26,20 +26,40 @@ def check_travel(
         What to call it in messages.
     after : sequence of float
         Travel of the frame before, if any.
+    falls : bool
+        Whether the body is lifted, as for a release.
 
     Raises
     ------
     InputError
         It is missing, of another length, not a finite number throughout, or runs back.
     """
-    if travel is None:
-        raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
-    values = _finite(travel, count, name)
+    values = _known(travel, count, name)
     whole = np.concatenate([after, values])
-    back = whole[1:] < whole[:-1]
+    back = whole[1:] > whole[:-1] if falls else whole[1:] < whole[:-1]
     if np.any(back):
         frame = int(np.argmax(back)) + 1 - len(after)
-        raise InputError(f"{name} runs back at frame {frame}: a press only goes down; cut or reverse it")
+        rule = "a release only goes up" if falls else "a press only goes down"
+        raise InputError(f"{name} runs back at frame {frame}: {rule}; cut or reverse it")
+    return values
+
+
+def check_stroke(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+    """Return the travel of a press, of a release, or of one after the other, as float64 if it can be used.
+
+    It rises to its greatest value, where it may rest, and falls from there on; either way may be missing.
+    Parameters and errors are those of ``check_travel``.
+    """
+    values = _known(travel, count, name)
+    deepest = np.flatnonzero(values == np.max(values, initial=-np.inf))
+    frame = np.arange(1, count)
+    up, down = values[1:] < values[:-1], values[1:] > values[:-1]
+    back = (up & (frame <= deepest[-1:])) | (down & (frame > deepest[:1]))
+    if np.any(back):
+        raise InputError(
+            f"{name} runs back at frame {int(np.argmax(back)) + 1}: a press goes down and its release up, "
+            "once; cut it"
+        )
     return values
 
 
@@ -54,6 +74,12 @@ def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.fl
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
     return _finite(phase, count, name)
+
+
+def _known(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+    if travel is None:
+        raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
+    return _finite(travel, count, name)
 
 
 def _finite(values: ArrayLike, count: int, name: str) -> NDArray[np.float64]:

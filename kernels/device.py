@@ -23,12 +23,14 @@ from numpy.typing import DTypeLike, NDArray
 from mirrorskin.kernels import pocl
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
 from mirrorskin.kernels.profile import Profile
+from mirrorskin.kernels.shape import BESIDE, CORE
 
 DeviceKind = Literal["gpu", "cpu", "other"]
 
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _PAGE = 4096
+_SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 _NO_ROOM = {
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
@@ -110,9 +112,10 @@ class Device:
         What was run on it so far.
     max_allocation : int
         Bytes that one array may take.
-    tile : int
-        Pixels that one work-item should handle: many where an item is a core's loop, one where it is
-        a lane.
+    shape : Shape
+        How work is cut for it: a guess, until someone has measured what suits it.
+    measured : bool
+        Whether someone has.
     """
 
     def __init__(self, device: cl.Device) -> None:
@@ -121,8 +124,8 @@ class Device:
             pocl.verify()
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
-        self.tile = 1024 if self.info.kind == "cpu" else 1
-        self._group = 1 if self.info.kind == "cpu" else 128
+        self.shape = CORE if self.info.kind == "cpu" else BESIDE
+        self.measured = False
         self.context = cl.Context([device])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
@@ -155,15 +158,16 @@ class Device:
         file, name : str
             The file in ``mirrorskin.kernels`` without its ending, and the function in it.
         **defines : str or int
-            Macros to set; ``TILE`` is always set to the device's.
+            Macros to set; ``LANES``, ``WORDS`` and ``TILE`` are those of the device's shape otherwise.
 
         Raises
         ------
         DeviceError
             It does not compile; the message quotes the line.
         """
-        options = tuple(f"-D{key}={value}" for key, value in sorted({"TILE": self.tile, **defines}.items()))
-        made, key = self._kernels.made, (file, name, options)
+        cut = {"LANES": self.shape.lanes, "WORDS": self.shape.words, "TILE": self.shape.tile}
+        options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
+        made, key = self._kernels.made, (file, name, options, self.shape.group)
         if key not in made:
             made[key] = self._make_kernel(file, name, options)
         return made[key]
@@ -174,7 +178,7 @@ class Device:
 
     def _make_kernel(self, file: str, name: str, options: tuple[str, ...]) -> Kernel:
         try:
-            return Kernel(self, name, cl.Kernel(self._program(file, options), name))
+            return Kernel(self, name, cl.Kernel(self._program(file, options), name), self.shape.group)
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
@@ -213,11 +217,17 @@ class Array:
         if nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, nbytes))
         try:
-            self.host = _aligned(shape, dtype)
+            self._memory = _aligned(nbytes + _SLACK)
+            self.host = self._memory[:nbytes].view(dtype).reshape(shape)
         except MemoryError as error:
             raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
         self._allocate()
         self.claim()
+
+    def __del__(self) -> None:
+        # A kernel may still be at work in this memory.
+        if self._shared and self._buffer is not None:
+            self._device.finish()
 
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
@@ -278,10 +288,10 @@ class Array:
         try:
             if self._shared:
                 self._buffer = cl.Buffer(
-                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self.host
+                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
                 )
             else:
-                self._buffer = cl.Buffer(self._device.context, flags, size=self.host.nbytes)
+                self._buffer = cl.Buffer(self._device.context, flags, size=self._memory.nbytes)
                 # Drivers allocate at first use; asking for it here makes a lack of memory show here.
                 undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
                 cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
@@ -294,10 +304,11 @@ class Array:
 class Kernel:
     """A compiled kernel, ready to run over so many items."""
 
-    def __init__(self, device: Device, name: str, kernel: cl.Kernel) -> None:
+    def __init__(self, device: Device, name: str, kernel: cl.Kernel, group: int) -> None:
         self.name = name
         self._device = device
         self._kernel = kernel
+        self._group = group
 
     def __call__(self, items: int, *args: Array | np.generic, moved: int) -> None:
         """Put one run on the device's queue.
@@ -311,7 +322,7 @@ class Kernel:
         moved : int
             Bytes that it must read and write, for the profile.
         """
-        group = self._device._group
+        group = self._group
         size = -(-items // group) * group
         values = [arg.buffer if isinstance(arg, Array) else arg for arg in args]
         event = self._kernel(self._device.queue, (size,), (group,), *values)
@@ -322,7 +333,7 @@ class _ThreadKernels(threading.local):
     """Each thread's own kernel objects: setting the arguments of one is not thread-safe."""
 
     def __init__(self) -> None:
-        self.made: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
+        self.made: dict[tuple[str, str, tuple[str, ...], int], Kernel] = {}
 
 
 def _find() -> list[cl.Device]:
@@ -404,12 +415,11 @@ def _open(device: cl.Device) -> Device:
     return Device(device)
 
 
-def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+def _aligned(nbytes: int) -> NDArray[np.uint8]:
     """Zeros that start on a page, so that a device sharing the memory need not copy them."""
-    nbytes = math.prod(shape) * dtype.itemsize
     raw = np.zeros(nbytes + _PAGE, np.uint8)
     start = -raw.ctypes.data % _PAGE
-    return raw[start : start + nbytes].view(dtype).reshape(shape)
+    return raw[start : start + nbytes]
 
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:

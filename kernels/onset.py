@@ -3,7 +3,10 @@
 A pixel is light in a frame when its sample is at least its light level. Its onset is the first frame of
 the first run of light frames that lasts for `hold` frames, or until the stack ends. The scan goes through
 a stack block by block and keeps, per pixel, the start of the present or the decided run and the samples
-around it; the heights follow from those.
+around it; the heights follow from those. The kernel does both at once: it answers for a pixel as soon as no
+further frame can change its answer.
+
+The end of the light state is the onset of the dark one: the same on samples and levels that are complemented.
 """
 
 from __future__ import annotations
@@ -16,14 +19,82 @@ from numpy.typing import NDArray
 DARK = -1
 INVALID = -2
 
+_PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
+
+
+def complement(samples: NDArray[Any]) -> NDArray[Any]:
+    """Exchange dark and light: the distance to the type's largest number, or the negative of a float."""
+    return -samples if samples.dtype.kind == "f" else ~samples
+
+
+def onset_levels(
+    bright: NDArray[np.float32],
+    dark: NDArray[np.float32],
+    threshold: float,
+    dtype: np.dtype[Any],
+    release: bool = False,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]:
+    """Turn a share of the way from dark to bright into counts.
+
+    Parameters
+    ----------
+    bright, dark : ndarray, (P,), float32
+        Counts with full light and without.
+    threshold : float
+        Share at which a pixel counts as light; the kernel is told it as the sum of two floats.
+    dtype : dtype
+        Type of a sample.
+    release : bool
+        Whether to complement the answers.
+
+    Returns
+    -------
+    level : ndarray, (P,), float32
+        The smallest float32 that reaches the threshold; NaN where bright is not above dark.
+    plateau : ndarray, (P,), float32
+        Counts without light; with light, complemented, for a release.
+    light : ndarray, (P,), dtype
+        Smallest sample that is light; saturated ones always are. For a release, the smallest complemented
+        sample that is not.
+    """
+    low, high = dark.astype(np.float64), bright.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        usable = (high > low) & np.isfinite(high) & np.isfinite(low)
+        exact = np.where(usable, low + threshold * (high - low), np.nan)
+    level = exact.astype(np.float32)
+    level = np.where(level < exact, np.nextafter(level, np.float32(np.inf)), level)
+    if dtype.kind == "f":
+        if release:
+            return -level, -bright, np.nextafter(-level, np.float32(np.inf))
+        return level, dark, level
+    top = np.iinfo(dtype).max
+    light = np.ceil(np.nan_to_num(level, nan=top)).clip(0, top).astype(dtype)
+    if release:
+        level = np.where(light > 0, np.float32(top) - level, np.float32(np.nan))
+        return level, np.float32(top) - bright, complement(light) + dtype.type(1)
+    return level, dark, light
+
+
+def onset_sure(level: NDArray[np.float32], light: NDArray[Any], tolerance: float) -> NDArray[Any]:
+    """Return the smallest samples, (P,), that miss the level by less than the tolerance, counts.
+
+    Below them a sample is surely dark. They are never above `light`, and `light` itself where the level is
+    beyond the range of the type.
+    """
+    sure = np.nan_to_num(level) - np.float32(tolerance)
+    if light.dtype.kind == "f":
+        return np.asarray(np.minimum(np.nextafter(sure, np.float32(np.inf)), light))
+    top = np.iinfo(light.dtype).max
+    above = np.where(level < 0, light, np.floor(sure + 1.0).clip(0, top))
+    return np.asarray(np.minimum(above, light), light.dtype)
+
 
 def onset_scan(
     frames: NDArray[Any],
     first: int,
     hold: int,
-    tolerance: float,
-    level: NDArray[np.float32],
     light: NDArray[Any],
+    sure: NDArray[Any],
     onset: NDArray[np.int32],
     below: NDArray[np.int32],
     last: NDArray[Any],
@@ -36,21 +107,18 @@ def onset_scan(
     Parameters
     ----------
     frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples; the kernel is told ``n`` and ``P`` after it.
+        Samples.
     first : int
         Number of the block's first frame in the stack.
     hold : int
         Light frames in a row that make an onset.
-    tolerance : float
-        Counts by which a sample must miss the level to be surely dark.
-    level : ndarray, (P,), float32
-        Counts at which a pixel turns light.
-    light : ndarray, (P,), as frames
-        Smallest sample that is light.
+    light, sure : ndarray, (P,), as frames
+        Smallest sample that is light, and smallest that is not surely dark.
     onset : ndarray, (P,), int32
         Frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no number.
     below : ndarray, (P,), int32
-        Last frame before the run that was surely dark; the first frame is taken for dark.
+        Last frame before the run that was surely dark; the first frame is taken for dark. The kernel keeps it
+        only where it is not the last frame before the run.
     last : ndarray, (P,), as frames
         The sample before the block.
     before, at, after : ndarray, (P,), as frames
@@ -66,7 +134,7 @@ def onset_scan(
         at[begins] = frame[begins]
         onset[undecided & ~is_light] = DARK
         if number > 0:
-            below[undecided & ~is_light & (frame <= level - np.float32(tolerance))] = number
+            below[undecided & (frame < sure)] = number
         onset[undecided & ~np.isfinite(frame)] = INVALID
 
         next_to = onset == number - 1
@@ -86,9 +154,8 @@ def onset_heights(
     level: NDArray[np.float32],
     dark: NDArray[np.float32],
     travel: NDArray[np.float64],
-    dark_tolerance: float,
-    light_tolerance: float,
     noise: float,
+    own_dark: bool,
     subframe: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
     """Turn onsets into heights.
@@ -102,22 +169,22 @@ def onset_heights(
     it was near the level for longer than its step would take. It may have crossed at any time since the last
     frame in which it was surely dark.
     Without `subframe` the height is that of the paper's equation 4, at the onset itself, which is wrong by
-    half a step on average.
+    half a step on average and by up to a whole one.
 
     Parameters
     ----------
     onset, below, before, at, after : ndarray, (P,)
-        As ``onset_scan`` leaves them; the kernel is told ``P`` and the number of frames before them.
+        As ``onset_scan`` leaves them.
     level : ndarray, (P,), float32
         Counts at which a pixel turns light.
     dark : ndarray, (P,), float32
         Counts of the dark plateau.
     travel : ndarray, (T,), float64
-        Millimetres, one a frame; the kernel takes each as the sum of two floats.
-    dark_tolerance, light_tolerance : float
-        Counts by which a sample on a plateau may differ from it.
+        Millimetres, one a frame.
     noise : float
         Standard deviation of a sample, counts.
+    own_dark : bool
+        Whether the dark plateau is a sample itself, and so as noisy as one.
     subframe : bool
         Whether to look inside the interval.
 
@@ -133,21 +200,24 @@ def onset_heights(
     sigma = np.full(onset.shape, np.nan)
     found = status == 1
     start = onset[found]
+    width = travel[start] - travel[start - 1]
+    if not subframe:
+        height[found], sigma[found] = -travel[start], np.abs(width) / np.sqrt(3)
+        return height, sigma, status
+
     low, high = before[found].astype(np.float64), at[found].astype(np.float64)
     settled = np.where(start + 1 < len(travel), after[found], high)
-    width = travel[start] - travel[start - 1]
-
+    light_tolerance = _PLATEAU * np.sqrt(2) * noise
+    dark_tolerance = light_tolerance if own_dark else _PLATEAU * noise
     from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
     sudden, under_way = from_dark & to_light, ~(from_dark | to_light)
 
     step = high - low
-    crossed = (np.minimum(level[found], high) - low) / step
-    known = width * noise * np.hypot(crossed, 1 - crossed) / step
+    crossed = (np.clip(level[found], low, high) - low) / step
+    known = np.abs(width) * noise * np.hypot(crossed, 1 - crossed) / step
     hovered = (step <= light_tolerance) | ((start - 2 - below[found]) * step > 2.5 * light_tolerance)
-    guessed = np.where(hovered, travel[start] - travel[below[found]], width) / 2 / np.sqrt(3)
-    share = np.where(sudden, 0.5, crossed) if subframe else np.ones_like(width)
-    spread = np.select([sudden | hovered, under_way], [guessed, known], np.hypot(known, guessed))
-
-    height[found] = -(travel[start - 1] + width * share)
-    sigma[found] = spread if subframe else 2 * guessed
+    interval = np.abs(np.where(hovered, travel[start] - travel[below[found]], width))
+    guessed = interval / 2 / np.sqrt(3)
+    height[found] = -(travel[start - 1] + width * np.where(sudden, 0.5, crossed))
+    sigma[found] = np.select([sudden | hovered, under_way], [guessed, known], np.hypot(known, guessed))
     return height, sigma, status

@@ -6,7 +6,6 @@ What stands in its way is put right or told here, before PoCL can end the proces
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import importlib.util
 import logging
 import os
@@ -21,6 +20,7 @@ import platformdirs
 
 from mirrorskin.kernels import linker, processor
 from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.remember import keep, recall
 
 _log = logging.getLogger("mirrorskin.kernels")
 
@@ -92,8 +92,8 @@ def find_library() -> Path | None:
 
 
 def _find_working_linker(library: Path) -> None:
-    record = _record(library)
-    known = _recall(record)
+    circumstances = _circumstances(library)
+    known = recall("pocl", circumstances)
     if known == "system" or (known == "ziglang" and linker.provide()):
         return
     answer, problem = "system", _probe()
@@ -101,33 +101,15 @@ def _find_working_linker(library: Path) -> None:
         answer, problem = "ziglang", _probe()
     if problem is not None:
         raise DeviceError(problem)
-    _keep(record, answer)
+    keep("pocl", circumstances, answer)
 
 
-def _record(library: Path) -> Path:
-    """Return the file that keeps the answer for this PoCL, this processor, this linker and this Python."""
+def _circumstances(library: Path) -> object:
+    """Return what the answer depends on: this PoCL, this processor, this linker and this Python."""
     ld = shutil.which("ld")
     files = [library, Path(ld).resolve()] if ld else [library]
     stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    key = hashlib.sha256(repr((_SCHEME, _processor, sys.executable, stamps)).encode()).hexdigest()
-    return platformdirs.user_cache_path("mirrorskin") / f"pocl-{key[:16]}"
-
-
-def _recall(record: Path) -> str | None:
-    try:
-        return record.read_text(encoding="utf-8")
-    except OSError:
-        return None
-
-
-def _keep(record: Path, answer: str) -> None:
-    partial = record.with_suffix(f".{os.getpid()}")
-    try:
-        record.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(answer, encoding="utf-8")
-        partial.replace(record)
-    except OSError as error:
-        _log.info("PoCL will be tried again next time: %s", error)
+    return _SCHEME, _processor, sys.executable, stamps
 
 
 def _probe() -> str | None:

@@ -8,17 +8,30 @@ import pytest
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device, list_devices
+from mirrorskin.kernels.shape import BESIDE, CORE
 
 FOUND = list_devices()
 if not FOUND:
     raise RuntimeError("no OpenCL device found: the tests need one; 'make test' brings PoCL")
 
-# A device that shares the host's memory can also be treated as one that does not, and a core as a lane.
+# Any device can be given work in either shape; and one that shares the host's memory can also be treated as
+# one that does not.
+SHAPES = {"core": CORE, "beside": BESIDE}
 WAYS = [
-    (number, shared, tile)
+    (number, shared, shape)
     for number, info in enumerate(FOUND)
-    for shared, tile in ([(True, 1024), (False, 1)] if info.shares_memory else [(False, 1)])
+    for shared, shape in [(info.shares_memory, "core"), (False, "beside")]
 ]
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "device: runs on each OpenCL device")
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if "device" in item.fixturenames:
+            item.add_marker("device")
 
 
 @pytest.fixture(
@@ -27,11 +40,11 @@ WAYS = [
     ids=[f"{FOUND[n].kind}{n}-{'shared' if s else 'copied'}-{t}" for n, s, t in WAYS],
 )
 def device(request):
-    """Every OpenCL device; each that shares the host's memory once more with copies and single pixels."""
-    number, shared, tile = request.param
+    """Every OpenCL device, in either shape of work; memory is shared where it can be."""
+    number, shared, shape = request.param
     opened = Device(device_layer._find()[number])
     opened.info = dataclasses.replace(opened.info, shares_memory=shared)
-    opened.tile = tile
+    opened.shape, opened.measured = SHAPES[shape], True
     return opened
 
 

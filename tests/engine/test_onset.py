@@ -177,7 +177,7 @@ def test_a_spike_on_the_plateau_moves_nothing(device):
     frames[4:] = 150
     frames[4, 0, 1] = frames[5, 0, 2] = frames[6, 0, 3] = 255
     found = find_onset(frames, np.arange(9) * 0.1, 20, 220, noise=1.5, device=device)
-    np.testing.assert_array_equal(found.height, np.full((1, 4), -0.35, np.float32))
+    np.testing.assert_allclose(found.height, np.full((1, 4), -0.35), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("value", "status"), [(20, 2), (200, 3)])
@@ -198,7 +198,7 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_onset(device, broke
     frames[5, 0, 4] = broken  # the second frame of the run: not decided yet
     found = find_onset(frames, np.arange(9) * 0.1, 0, 1, noise=0.01, device=device)
     np.testing.assert_array_equal(found.status, [[0, 0, 0, 1, 0]])
-    assert found.height[0, 3] == np.float32(-0.35)
+    assert found.height[0, 3] == pytest.approx(-0.35)
     assert np.isnan(found.height[0, [0, 1, 2, 4]]).all()
 
 
@@ -222,7 +222,7 @@ def test_pixels_without_references_are_invalid(device):
 @pytest.mark.parametrize("threshold", [0.0, 0.25, 0.5, 1.0])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_the_level_is_the_smallest_light_sample(device, dtype, threshold):
-    dark, bright = (10, 21) if dtype != "float32" else (0.1, 0.7)
+    dark, bright = (10, 21) if dtype != "float32" else map(float, np.float32([0.1, 0.7]))
     exact = dark + threshold * (bright - dark)
     least = np.ceil(exact) if dtype != "float32" else np.float32(exact)
     if float(least) < exact:
@@ -401,3 +401,134 @@ def test_a_saturated_sample_below_its_level_is_not_taken_for_dark(device):
     assert_within_an_ulp(found, numpy_onset(frames, np.arange(6) * 0.1, 20, 300, **options), np.arange(6))
     np.testing.assert_array_equal(found.frame, [[2, 4]])
     assert np.all(found.sigma > 0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("hold", [31, 32, 33, 64, 100])
+def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold):
+    """Runs of about `hold` light frames, broken now and then: where they begin and end is chance."""
+    generator = np.random.default_rng([hold, DTYPES.index(dtype)])
+    dark, bright = SPEC[dtype]
+    share = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 43))
+    light = generator.random((150, 3, 43)) < share
+    light[:: hold - 1, :, ::8] = light[-1, :, ::4] = False  # or else there is a run in every pixel
+    frames = np.where(light, bright, dark).astype(dtype)
+    options = {"hold": hold, "noise": 0.01 * (bright - dark)}
+    travel = uneven_travel(150)
+    expected = numpy_onset(frames, travel, dark, bright, **options)
+    assert {1, 2, 3} <= set(expected.status.flat)
+    runs = np.array([first_run(series, hold) for series in light.reshape(150, -1).T]).reshape(3, 43)
+    np.testing.assert_array_equal(expected.frame, runs)
+    for cuts in ([], [1], [32, 64, 96, 128], *(np.unique(generator.integers(1, 150, n)) for n in (3, 9, 40))):
+        found = search_in_blocks(
+            frames, travel, list(cuts), device=device, dark=dark, bright=bright, **options
+        )
+        assert_within_an_ulp(found, expected, travel)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("noise", [1.5, None])
+def test_pictures_of_any_width(device, dtype, noise):
+    """Frames that begin anywhere in a word, and words that only partly lie in the picture."""
+    dark, bright = SPEC[dtype]
+    travel = uneven_travel(40)
+    for width in range(1, 131):
+        frames = random_press(dtype, 40, (1 + width % 3, width), seed=width)
+        found = find_onset(frames, travel, dark, bright, noise=noise, device=device)
+        expected = numpy_onset(frames, travel, dark, bright, noise=found.noise)
+        assert noise in (None, found.noise)
+        assert_within_an_ulp(found, expected, travel)
+
+
+@pytest.mark.parametrize("hold", [1, 2])
+@pytest.mark.parametrize("level", [1, 2, 128, 255, 256, 32768, 65535])
+def test_the_whole_range_of_uint16(device, level, hold):
+    edges = [0, 1, 2, 127, 128, 254, 255, 256, 257, 32767, 32768, 32769, 65279, 65280, 65534, 65535]
+    frames = np.random.default_rng(level).choice(edges, (70, 7, 37)).astype(np.uint16)
+    options = {"threshold": 1.0, "hold": hold, "noise": 0.5}
+    travel = np.arange(70) / 64
+    found = find_onset(frames, travel, 0, level, device=device, **options)
+    assert_within_an_ulp(found, numpy_onset(frames, travel, 0, level, **options), travel)
+
+
+ODD_FLOATS = [0, -0.0, 1e-45, -1e-45, 1e-39, -1e-39, 1e-38, 0.5, 1, -1, 255, 65535, 3e38, -3e38]
+
+
+@pytest.mark.parametrize("hold", [1, 2])
+@pytest.mark.parametrize("level", [1e-39, 1e-38, 0.5, 65535.0, 1e30])
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_whole_range_of_float32(device, level, hold, broken):
+    """Which samples are light, at least: differences between the largest are beyond a float."""
+    generator = np.random.default_rng(int(hold + broken))
+    frames = generator.choice(np.float32(ODD_FLOATS), (70, 7, 37)).astype(np.float32)
+    if broken:
+        struck = generator.random(frames.shape) < 0.03
+        frames[struck] = generator.choice(np.float32([np.nan, np.inf, -np.inf]), np.count_nonzero(struck))
+    options = {"threshold": 1.0, "hold": hold, "noise": 0.0}
+    travel = np.arange(70) / 64
+    for subframe in (True, False):
+        found = find_onset(frames, travel, 0, level, device=device, subframe=subframe, **options)
+        with np.errstate(all="ignore"):
+            expected = numpy_onset(frames, travel, 0, level, subframe=subframe, **options)
+        np.testing.assert_array_equal(found.status, expected.status)
+        np.testing.assert_array_equal(found.frame, expected.frame)
+    assert_within_an_ulp(found, expected, travel)
+
+
+@pytest.mark.parametrize("level", [0.0, -0.0])
+def test_a_negative_zero_is_a_zero(device, level):
+    frames = np.full((4, 1, 2), -1, np.float32)
+    frames[2:] = 0.0, -0.0
+    found = find_onset(frames, np.arange(4.0), -1, level, threshold=1.0, noise=0.0, device=device)
+    np.testing.assert_array_equal(found.frame, [[2, 2]])
+
+
+# What kernels are built for: few enough that building them takes no time worth saving.
+BUILDS = [
+    ("uint8", 1, "onset"),
+    ("uint8", 2, "release"),
+    ("uint8", 35, "onset"),
+    ("uint16", 2, "onset"),
+    ("uint16", 5, "release"),
+    ("float32", 2, "onset"),
+    ("float32", 3, "release"),
+]
+
+
+@pytest.mark.parametrize(("dtype", "hold", "event"), BUILDS)
+@pytest.mark.parametrize("subframe", [True, False])
+def test_tiny_stacks_of_all_kinds(device, dtype, hold, event, subframe):
+    """Levels, references, noise, sizes, cuts and broken samples by chance, against the reference."""
+    generator = np.random.default_rng([DTYPES.index(dtype), hold, subframe])
+    for turn in range(12):
+        count = int(generator.integers(2, 90))
+        shape = tuple(generator.integers(1, [4, 40]))
+        frames = random_press(dtype, count, shape, seed=turn, noise=generator.choice([0.0, 0.02, 0.3]))
+        if dtype == "float32":
+            frames[generator.random(frames.shape) < 0.002] = np.nan
+        travel = np.sort(generator.choice(np.arange(99) / 32, count))
+        if event == "release":
+            frames, travel = frames[::-1].copy(), travel[::-1].copy()
+        dark, bright = SPEC[dtype]
+        if generator.random() < 0.5:
+            dark, bright = (part * generator.uniform(0.7, 1.3, shape) for part in (dark, bright))
+        if dtype != "float32":
+            dark = None if generator.random() < 0.2 else dark
+            bright = None if generator.random() < 0.2 else bright
+        options = {
+            "threshold": float(generator.choice([0, 0.2, 0.5, 0.9, 1])),
+            "hold": hold,
+            "subframe": subframe,
+            "event": event,
+            "noise": generator.choice([None, 0.0, 0.01, 1.5, 40.0]),
+        }
+        cuts = np.unique(generator.integers(1, count, generator.integers(0, 6)))
+        found = search_in_blocks(
+            frames, travel, list(cuts), device=device, dark=dark, bright=bright, **options
+        )
+        own = event == "release" or dark is None
+        with np.errstate(invalid="ignore", divide="ignore"):
+            expected = numpy_onset(
+                frames, travel, dark, bright, **(options | {"noise": found.noise}), own_dark=own
+            )
+        assert_within_an_ulp(found, expected, travel)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mirrorskin.engine.onset import Onset
-from mirrorskin.engine.references import light_levels, reference_pair
+from mirrorskin.engine.references import reference_maps
 from mirrorskin.kernels import onset as reference
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
@@ -26,18 +26,32 @@ def random_press(dtype, frames, shape, seed=0, noise=0.008):
     return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
 
 
-def numpy_onset(frames, travel, dark, bright, noise, threshold=0.5, hold=2, subframe=True, own_dark=False):
+def numpy_onset(
+    frames,
+    travel,
+    dark,
+    bright,
+    noise,
+    threshold=0.5,
+    hold=2,
+    subframe=True,
+    own_dark=False,
+    event="onset",
+):
     """Run the kernels' NumPy references over a stack, in one block."""
-    shape, dtype = frames.shape[1:], frames.dtype
-    low, high = reference_pair(dark, bright, shape, dtype)
-    level, light = (part.reshape(-1) for part in light_levels(low, high, threshold, dtype))
+    shape, dtype, release = frames.shape[1:], frames.dtype, event == "release"
+    low, high = (
+        np.broadcast_to(part, shape).reshape(-1) for part in reference_maps(dark, bright, shape, dtype)
+    )
+    level, plateau, light = reference.onset_levels(high, low, threshold - 1e-12, dtype, release)
+    sure = reference.onset_sure(level, light, 6 * noise)
     flat = frames.reshape(len(frames), -1)
+    flat = reference.complement(flat) if release else flat
     below = np.zeros(level.size, np.int32)
     onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
     last, before, at, after = (np.zeros(level.size, dtype) for _ in range(4))
-    reference.onset_scan(flat, 0, hold, 6 * noise, level, light, onset, below, last, before, at, after)
-    plateau = flat[0].astype(np.float32) if own_dark else low.reshape(-1).astype(np.float32)
-    tolerances = (3 * noise * (np.sqrt(2) if own_dark else 1), 3 * noise * np.sqrt(2))
+    reference.onset_scan(flat, 0, hold, light, sure, onset, below, last, before, at, after)
+    plateau = flat[0].astype(np.float32) if own_dark else plateau
     height, sigma, status = reference.onset_heights(
         onset,
         below,
@@ -47,10 +61,12 @@ def numpy_onset(frames, travel, dark, bright, noise, threshold=0.5, hold=2, subf
         level,
         plateau,
         np.asarray(travel, float),
-        *tolerances,
         noise,
+        own_dark,
         subframe,
     )
+    if release:
+        status = np.array([0, 1, 3, 2], np.uint8)[status]
     maps = (height, sigma, status, np.maximum(onset, reference.DARK))
     return Onset(*(values.reshape(shape) for values in maps), noise)
 
@@ -77,7 +93,10 @@ def assert_within_an_ulp(found, expected, travel):
     answered = expected.status == 1
     np.testing.assert_array_equal(np.isnan(found.height), ~answered)
     exact = expected.height[answered]
-    # Near zero a height is the difference of travels, known to no less than their float64 rounding.
-    ulp = np.spacing(np.abs(exact).astype(np.float32)) + 1e-12 * np.max(np.abs(travel))
-    assert np.all(np.abs(found.height[answered] - exact) <= ulp)
+    # A travel and a share of a step, each known to half an ulp, and their sum.
+    travel = np.asarray(travel, float)
+    ulp = np.spacing(np.abs(exact).astype(np.float32)) + np.spacing(
+        np.float32(np.max(np.abs(np.diff(travel))))
+    )
+    assert np.all(np.abs(found.height[answered] - exact) <= 2 * ulp)
     np.testing.assert_allclose(found.sigma[answered], expected.sigma[answered], rtol=1e-5, atol=1e-9)

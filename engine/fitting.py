@@ -1,0 +1,79 @@
+"""Which shape of work a device likes: measured once on each, and remembered."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.remember import keep, recall
+from mirrorskin.kernels.shape import SHAPES, Shape
+
+Run = Callable[[], None]
+
+_ROUNDS = 5
+_lock = threading.RLock()
+_log = logging.getLogger("mirrorskin.engine")
+
+
+def fit(device: Device, prepare: Callable[[Device], Run]) -> None:
+    """Give a device the shape in which it does a trial fastest, unless it has been measured before.
+
+    Parameters
+    ----------
+    device : Device
+    prepare : callable
+        Makes the trial ready for a device in its present shape; what it returns does the work and waits.
+
+    Raises
+    ------
+    mirrorskin.kernels.errors.DeviceError
+        The trial runs in no shape.
+    """
+    with _lock:
+        if device.measured:
+            return
+        info = device.info
+        circumstances = info.title, info.driver, info.compute_units, SHAPES, version("mirrorskin")
+        known = recall("shape", circumstances)
+        device.measured = True
+        if known is not None and known.isdecimal() and int(known) < len(SHAPES):
+            device.shape = SHAPES[int(known)]
+            return
+        try:
+            device.shape = _fastest(device, prepare)
+        except DeviceError:
+            device.measured = False
+            raise
+        keep("shape", circumstances, str(SHAPES.index(device.shape)))
+        _log.info("%s is fastest with %s", info.title, device.shape)
+
+
+def _fastest(device: Device, prepare: Callable[[Device], Run]) -> Shape:
+    seconds: dict[Shape, float] = {}
+    problem = None
+    for shape in SHAPES:
+        device.shape = shape
+        try:
+            seconds[shape] = _time(prepare(device))
+        except DeviceError as error:
+            _log.info("%s does not run with %s: %s", device.info.title, shape, error)
+            problem = error
+    if problem is not None and not seconds:
+        raise problem
+    return min(seconds, key=lambda shape: seconds[shape])
+
+
+def _time(run: Run) -> float:
+    """Return the seconds of the fastest of several rounds, after one that does not count."""
+    run()
+    rounds = []
+    for _ in range(_ROUNDS):
+        start = time.perf_counter()
+        run()
+        rounds.append(time.perf_counter() - start)
+    return min(rounds)

@@ -1,0 +1,111 @@
+"""Which shape of work a device gets: the fastest, measured once."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine import OnsetSearch, fitting
+from mirrorskin.engine.onset import _trial
+from mirrorskin.io import Block
+from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.shape import BESIDE, CORE
+
+
+def fake_device():
+    info = SimpleNamespace(title="Fake: device", driver="1", compute_units=2)
+    return SimpleNamespace(info=info, shape=CORE, measured=False)
+
+
+@pytest.fixture
+def memory(monkeypatch):
+    """Stand in for the cache folder."""
+    kept = {}
+    monkeypatch.setattr(fitting, "recall", lambda topic, key: kept.get((topic, key)))
+    monkeypatch.setattr(fitting, "keep", lambda topic, key, answer: kept.__setitem__((topic, key), answer))
+    return kept
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Let runs take the time they say."""
+    now = SimpleNamespace(seconds=0.0)
+    monkeypatch.setattr(fitting, "time", SimpleNamespace(perf_counter=lambda: now.seconds))
+    return now
+
+
+def trial(clock, seconds):
+    """A trial that takes so long in each shape; None where it cannot run."""
+    prepared = []
+
+    def prepare(device):
+        takes = seconds[device.shape]
+        prepared.append(device.shape)
+        if takes is None:
+            raise DeviceError(f"no kernel with {device.shape.lanes} lanes")
+        return lambda: setattr(clock, "seconds", clock.seconds + takes)
+
+    return prepare, prepared
+
+
+@pytest.mark.parametrize(
+    ("seconds", "best"),
+    [({CORE: 1, BESIDE: 2}, CORE), ({CORE: 2, BESIDE: 1}, BESIDE), ({CORE: None, BESIDE: 9}, BESIDE)],
+)
+def test_the_fastest_shape_is_taken_and_remembered(memory, clock, seconds, best):
+    prepare, prepared = trial(clock, seconds)
+    first, second = fake_device(), fake_device()
+    for device in (first, first, second):
+        fitting.fit(device, prepare)
+        assert device.shape is best
+        assert device.measured
+    assert len(prepared) == 2
+
+
+def test_another_driver_is_measured_anew(memory, clock):
+    prepare, prepared = trial(clock, {CORE: 1, BESIDE: 2})
+    fitting.fit(fake_device(), prepare)
+    other = fake_device()
+    other.info.driver = "2"
+    fitting.fit(other, prepare)
+    assert len(prepared) == 4
+
+
+def test_what_is_remembered_wrongly_is_measured_anew(memory, clock):
+    prepare, _ = trial(clock, {CORE: 2, BESIDE: 1})
+    fitting.fit(fake_device(), prepare)
+    for nonsense in ("", "7", "-1", "a shape"):
+        memory.update(dict.fromkeys(memory, nonsense))
+        device = fake_device()
+        fitting.fit(device, prepare)
+        assert device.shape is BESIDE
+
+
+def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
+    prepare, _ = trial(clock, {CORE: None, BESIDE: None})
+    device = fake_device()
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="no kernel with 4 lanes"):
+            fitting.fit(device, prepare)
+    assert not memory
+
+
+def test_the_trial_runs_in_every_shape(device, monkeypatch):
+    for shape in (CORE, BESIDE):
+        monkeypatch.setattr(device, "shape", shape)
+        device.profile.clear()
+        _trial(device)()
+        assert "onset_scan" in [record.name for record in device.profile.records()]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_both_shapes_give_the_same(device, monkeypatch, dtype):
+    frames = np.random.default_rng(0).integers(0, 256, (70, 13, 29)).astype(dtype)
+    found = []
+    for shape in (CORE, BESIDE):
+        monkeypatch.setattr(device, "shape", shape)
+        search = OnsetSearch((13, 29), dtype, dark=10, bright=200, hold=3, noise=8.0, device=device)
+        search.push(Block(frames, 0, travel=np.arange(70.0)))
+        found.append(search.result())
+    for name in ("height", "sigma", "status", "frame"):
+        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
