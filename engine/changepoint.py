@@ -1,0 +1,332 @@
+"""Height from a vertical press or release: the change-point of each pixel's brightness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from mirrorskin.engine.bands import Band, cut_into_bands
+from mirrorskin.engine.onset import EVENTS, MEMORY_LIMIT, Event, Onset
+from mirrorskin.engine.references import reference_pair
+from mirrorskin.engine.samples import C_TYPES, Noise, check_dtype, travel_pairs
+from mirrorskin.io import Block, InputError, check_travel
+from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
+from mirrorskin.kernels.device import Array, Device, Kernel, open_device
+
+_EVIDENCE = 12.0  # log of how much likelier the samples must be with a change than without
+_RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
+
+
+def find_change_point(
+    frames: NDArray[Any],
+    travel: ArrayLike,
+    dark: ArrayLike | None = None,
+    bright: ArrayLike | None = None,
+    threshold: float = 0.5,
+    hold: int = 2,
+    noise: float | None = None,
+    event: Event = "onset",
+    device: str | Device | None = None,
+) -> Onset:
+    """Find the change from dark to light, or back, in a stack that fits in memory.
+
+    Parameters
+    ----------
+    frames : ndarray, (T, H, W), uint8, uint16 or float32
+        Raw counts of a vertical press, or of a release.
+    travel : array_like, (T,)
+        Millimetres that the body has been lowered, one a frame: never decreasing in a press, never increasing
+        in a release.
+    dark, bright : array_like, scalar or (H, W), optional
+        Counts without and with full light. With one of them missing, both are taken from each pixel's own
+        samples before and after the change.
+    threshold : float
+        Share of the way from dark to bright whose crossing is looked for.
+    hold : int
+        Fully light frames, or dark ones of a release, that it takes to make sure of a change, 1 to 12.
+    noise : float, optional
+        Standard deviation of a sample in counts; by default told from the first two frames.
+    event : {"onset", "release"}
+        Whether to look for the light state's begin or its end.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Returns
+    -------
+    Onset
+        Its ``frame`` is the first frame after the most likely change.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Frames, travel, references or parameters that cannot be used.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one that cannot hold a single row.
+    """
+    if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
+        raise InputError(f"frames have shape {frames.shape}: (T, H, W) with at least 2 frames is needed")
+    search = ChangePointSearch(
+        (frames.shape[1], frames.shape[2]),
+        frames.dtype,
+        dark=dark,
+        bright=bright,
+        threshold=threshold,
+        hold=hold,
+        noise=noise,
+        event=event,
+        device=device,
+        memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
+    )
+    block = Block(frames, index=0, travel=np.asarray(travel))
+    search.push(block)
+    if search.passes == 2:
+        search.rewind()
+        search.push(block)
+    return search.result()
+
+
+class ChangePointSearch:
+    """Find the change from dark to light, or back, in frames that come block by block, however they are cut.
+
+    With known levels one pass is enough, and ``result`` may be asked for at any time. With unknown ones all
+    frames are pushed twice, with ``rewind`` in between.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : dtype
+        uint8, uint16 or float32.
+    dark, bright, threshold, hold, noise, event, device
+        As for ``find_change_point``.
+    memory_limit : int
+        Bytes of host memory for frames on the move; half of it is the room for one block.
+
+    Attributes
+    ----------
+    device : Device
+    passes : int
+        How often the frames are needed: 1, or 2 where a level is unknown.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+        *,
+        dark: ArrayLike | None = None,
+        bright: ArrayLike | None = None,
+        threshold: float = 0.5,
+        hold: int = 2,
+        noise: float | None = None,
+        event: Event = "onset",
+        device: str | Device | None = None,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> None:
+        dtype = np.dtype(dtype)
+        check_dtype(dtype)
+        _check(threshold, hold, event)
+        self._noise = Noise(noise, dtype.kind == "u")
+        self.passes = 2 if dark is None or bright is None else 1
+        references = reference_pair(dark, bright, shape, dtype) if self.passes == 1 else None
+        self.device = open_device(device)
+        self._shape, self._dtype = shape, dtype
+        self._hold = hold
+        # A release is a change as well, from bright to dark: its first level is the bright one.
+        self._release = event == "release"
+        self._level = 1 - threshold if self._release else threshold
+        self._travel: list[float] = []
+        length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
+        self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype, self.passes), length)
+        alone = len(self._bands) == 1
+        self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
+        self._start = np.zeros(shape, np.int32)
+        if references is not None:
+            first, second = reversed(references) if self._release else references
+            self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
+            self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
+        self.reset()
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
+        return self._room
+
+    def reset(self) -> None:
+        """Forget the frames so far, and be ready for another press with the same references."""
+        self._travel.clear()
+        self._noise.reset()
+        self._weight: Array | None = None
+        zeros = np.zeros(self._shape, np.int32)
+        self._fill(start=self._start, excess=zeros, below=zeros, since=zeros)
+        if self.passes == 2:
+            self._fill(total=zeros, total_rest=zeros)
+
+    def rewind(self) -> None:
+        """Be ready for the same frames once more, when unknown levels need a second pass.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Fewer than two frames came in the first pass.
+        """
+        count = len(self._travel)
+        self._noise_of(count)
+        self._travel.clear()
+        split = np.arange(1.0, count)
+        self._weight = self.device.array("weight", (count + 1,), np.float32)
+        self._weight.host[1:-1] = self._sign / np.sqrt(split * (count - split))
+        self._weight.upload()
+        for band in self._bands:
+            with band.resident():
+                total, rest = (band.maps[name].download() for name in ("total", "total_rest"))
+                mean = (total.astype(np.float64) + rest) / count
+            band.write("mean", mean)
+            band.write("mean_rest", mean - mean.astype(np.float32))
+            band.write("start", np.where(np.isfinite(mean), 0, INVALID))
+            for name in ("total", "total_rest", "score"):
+                band.write(name, np.zeros_like(mean))
+
+    def push(self, block: Block) -> None:
+        """Take in the next frames.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Travel is missing, or runs back; or there are more frames in the second pass than in the first.
+        """
+        frames, first = block.frames, len(self._travel)
+        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
+            raise InputError(
+                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
+            )
+        so_far = self._travel[-1:]
+        travel = check_travel(block.travel, len(frames), "travel", after=so_far, falls=self._release)
+        if self._weight is not None and first + len(frames) >= len(self._weight.host):
+            raise InputError("there are more frames in the second pass than in the first: give the same ones")
+        self._noise.look(frames)
+        self._travel.extend(travel)
+        for band in self._bands:
+            with band.resident():
+                for start, count in band.stage(frames):
+                    self._take(band, count, first + start)
+
+    def result(self) -> Onset:
+        """Return the maps of the frames so far.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            There are fewer than two frames, or the second pass over them is missing.
+        """
+        count = len(self._travel)
+        noise = self._noise_of(count)
+        if self.passes == 2 and (self._weight is None or count + 1 != len(self._weight.host)):
+            raise InputError("a change between unknown levels needs all frames twice: give dark and bright")
+        maps = [self._heights(band, noise) for band in self._bands]
+        height, sigma, status, frame = (np.concatenate(parts) for parts in zip(*maps, strict=True))
+        answered = (status == 1) | (status == 3)
+        status = _RELEASED[status] if self._release else status
+        return Onset(height, sigma, status, np.where(answered, frame, np.int32(-1)), noise)
+
+    def _noise_of(self, count: int) -> float:
+        if count < 2 or self._noise.value is None:
+            raise InputError(f"a press of {count} frames has no change-point: at least 2 are needed")
+        return self._noise.value
+
+    def _fill(self, **maps: NDArray[Any]) -> None:
+        for band in self._bands:
+            for name, values in maps.items():
+                band.write(name, values[band.rows])
+
+    def _take(self, band: Band, count: int, first: int) -> None:
+        """Let the kernel of this pass go through the frames that the band holds."""
+        block = np.int32(count), np.int32(band.pixels)
+        if self.passes == 1:
+            level = round(self._level * UNIT)
+            evidence = np.int32(level), np.int32(self._hold * (UNIT - level)), self._quiet()
+            state = "dark gain start excess below ring"
+            self._run("changepoint_scan", band, *block, np.int32(first), *evidence, state)
+        elif self._weight is None:
+            self._run("changepoint_sum", band, *block, "total total_rest")
+        else:
+            state = "total total_rest start since score ring"
+            arguments = np.int32(first), "mean mean_rest", self._weight, state
+            self._run("changepoint_split", band, *block, *arguments)
+
+    def _run(self, name: str, band: Band, count: np.int32, *arguments: str | Array | np.generic) -> None:
+        """Launch a kernel on the frames that the band holds; its maps are told by their names."""
+        values: list[Array | np.generic] = []
+        for argument in arguments:
+            values += [band.maps[n] for n in argument.split()] if isinstance(argument, str) else [argument]
+        moved = int(count) * band.pixels * self._dtype.itemsize
+        self._kernel(name)(self._items(band), band.frames, count, *values, moved=moved)
+
+    def _heights(self, band: Band, noise: float) -> list[NDArray[Any]]:
+        if self.passes == 2:
+            self._settle(band, noise)
+        travel = travel_pairs(self.device, self._travel)
+        known = [band.maps[name] for name in ("start", "excess", "below", "since", "dark", "gain", "ring")]
+        wanted = [band.maps[name] for name in ("height", "sigma", "status")]
+        with band.resident():
+            self._kernel("changepoint_heights")(
+                self._items(band),
+                *map(np.int32, (band.pixels, len(self._travel))),
+                *(*known, travel),
+                *(np.float32(noise), self._quiet(), np.float32(self._level), np.int32(self.passes == 2)),
+                *wanted,
+                moved=sum(array.host.nbytes for array in (*known, *wanted)),
+            )
+            return [array.download().copy() for array in (*wanted, band.maps["start"])]
+
+    def _settle(self, band: Band, noise: float) -> None:
+        """Turn the best splits into levels, and tell those that noise alone would not make."""
+        count = len(self._travel)
+        with band.resident():
+            score, mean, start = (
+                band.maps[name].download().astype(np.float64) for name in ("score", "mean", "start")
+            )
+        changed = score**2 * count / 2 > (_EVIDENCE + np.log(count)) * noise**2
+        split = np.where(changed, start, 1)
+        rest = np.sqrt((count - split) / split)
+        score *= self._sign
+        dark = np.where(changed, mean - score * rest, 0)
+        gain = 1 / np.where(changed, score * (rest + 1 / rest), 1)
+        excess = np.where(changed, DECIDED, 0)
+        for name, values in (("excess", excess), ("below", start), ("dark", dark), ("gain", gain)):
+            band.write(name, values)
+
+    @property
+    def _sign(self) -> int:
+        return -1 if self._release else 1
+
+    def _quiet(self) -> np.float32:
+        """Square counts of excess that noise alone would make; a first frame alone decides nothing."""
+        return np.float32(_EVIDENCE * (self._noise.value or 0.0) ** 2)
+
+    def _items(self, band: Band) -> int:
+        return int(-(-band.pixels // self.device.shape.tile))
+
+    def _kernel(self, name: str) -> Kernel:
+        kind, size = self._dtype.kind, self._dtype.itemsize
+        top = {} if kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}
+        return self.device.kernel("changepoint", name, FRAME=C_TYPES[f"{kind}{size}"], **top)
+
+
+def _maps(dtype: np.dtype[Any], passes: int) -> dict[str, DTypeLike]:
+    whole = dict.fromkeys(("start", "excess", "below", "since"), np.int32)
+    floats = dict.fromkeys(("dark", "gain", "height", "sigma"), np.float32)
+    twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
+    ring = np.dtype((np.void, SLOTS * dtype.itemsize))
+    return {"ring": ring, "status": np.uint8, **whole, **floats, **(twice if passes == 2 else {})}
+
+
+def _check(threshold: float, hold: int, event: str) -> None:
+    if event not in EVENTS:
+        raise InputError(f"unknown event {event!r}; known are {', '.join(EVENTS)}")
+    if not 0 < threshold < 1:
+        raise InputError(f"threshold {threshold}: a change-point needs a share between 0 and 1, such as 0.5")
+    if not 1 <= hold <= REACH:
+        raise InputError(f"hold {hold}: a change-point needs a number of frames from 1 to {REACH}")

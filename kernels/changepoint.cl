@@ -1,0 +1,388 @@
+// The change-point of a pixel's brightness, and the height that it tells. Specification: changepoint.py.
+//
+// FRAME   type of a sample
+// TOP     what a saturated sample holds; samples that can be NaN have none
+// TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#define INVALID -2
+#define DECIDED INT_MAX
+
+#define REACH 12
+#define SLOTS (2 * REACH + 1)
+#define UNIT 1048576.0f
+#define STEP 4096.0f
+
+#define STRAIGHT 0.005f
+#define SPIKE 8
+#define DOUBT 2
+#define SPREAD 0.3f
+#define SINGLE (1 / 3.0f)
+#define RAMP (1 / 5.0f)
+
+// Hypotheses that the samples miss by so many square sigmas more than the best weigh nothing beside it.
+#define NEGLIGIBLE 40
+
+#ifdef TOP
+#define USABLE(sample) 1
+#define SATURATED(sample) ((sample) == TOP)
+#else
+#define USABLE(sample) (fabs(sample) <= MAXFLOAT)
+#define SATURATED(sample) 0
+#endif
+
+float share_of(const FRAME sample, const float dark, const float gain)
+{
+    const float share = ((float)sample - dark) * gain, light = gain < 0 ? 0 : 1;
+    return (SATURATED(sample) & ((share - light) * gain < 0)) ? light : share;
+}
+
+// Round to even, in a way that vectorises: past 2^23 a float holds whole numbers only. For less than 2^22.
+int round_even(const float value)
+{
+    return as_int(value + 12582912.0f) - as_int(12582912.0f);
+}
+
+int excess_of_noise(const float quiet, const float gain)
+{
+    return convert_int_rte(fmin(quiet * gain * gain, 1000.0f) * UNIT);
+}
+
+__kernel void changepoint_scan(
+    __global const FRAME *restrict frames, const int count, const int pixels, const int first,
+    const int level, const int least, const float quiet, __global const float *restrict dark,
+    __global const float *restrict gain, __global int *restrict start, __global int *restrict excess,
+    __global int *restrict below, __global FRAME *restrict ring)
+{
+    const int base = get_global_id(0) * TILE;
+    if (base >= pixels) return;
+    const int width = min(TILE, pixels - base);
+
+    int change[TILE], sum[TILE], alarm[TILE], dim[TILE], broken[TILE];
+    float low[TILE], rate[TILE];
+
+    int busy = 0;
+    for (int p = 0; p < width; ++p) {
+        change[p] = start[base + p];
+        dim[p] = below[base + p];
+        low[p] = dark[base + p];
+        rate[p] = gain[base + p];
+        alarm[p] = max(least, excess_of_noise(quiet, rate[p]));
+        broken[p] = change[p] == INVALID;
+        sum[p] = broken[p] ? DECIDED : excess[base + p];
+        busy |= !broken[p] & (sum[p] != DECIDED || first - change[p] <= REACH);
+    }
+    if (!busy) return;  // every pixel is decided and has its samples: nothing to read
+
+    for (int t = 0; t < count; ++t) {
+        const int number = first + t;
+        __global const FRAME *restrict frame = frames + (size_t)t * pixels + base;
+        __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels + base;
+        for (int p = 0; p < width; ++p) {
+            const FRAME sample = frame[p];
+            const int undecided = sum[p] != DECIDED;
+            const float share = share_of(sample, low[p], rate[p]);
+            const int units = round_even((share < 0 ? 0 : share > 1 ? 1 : share) * UNIT);
+            const int more = undecided ? sum[p] + units - level : 0;
+            const int grown = more > 0 ? more : 0;
+            change[p] = (undecided & (grown == 0)) ? number + 1 : change[p];
+            dim[p] = (undecided & (2 * units < level)) ? number : dim[p];
+            const int lasts = (grown > 0) & (number - change[p] >= REACH);
+            const int certain = ((grown >= alarm[p]) | lasts) & (number > 0);
+            sum[p] = (!undecided | certain) ? DECIDED : grown;
+
+            const int taken = number - change[p] <= REACH;
+            slot[p] = taken ? sample : slot[p];
+            broken[p] |= taken & !USABLE(sample);
+        }
+    }
+
+    for (int p = 0; p < width; ++p) {
+        start[base + p] = broken[p] ? INVALID : change[p];
+        excess[base + p] = sum[p];
+        below[base + p] = dim[p];
+    }
+}
+
+// Sums are held as two floats, so that they are as good as in float64 without it (Knuth, TAOCP 2, 4.2.2).
+
+float2 add(const float2 sum, const float2 more)
+{
+    const float high = sum.x + more.x;
+    const float part = high - sum.x;
+    const float low = ((sum.x - (high - part)) + (more.x - part)) + (sum.y + more.y);
+    const float whole = high + low;
+    return (float2)(whole, low - (whole - high));
+}
+
+__kernel void changepoint_sum(
+    __global const FRAME *restrict frames, const int count, const int pixels, __global float *restrict total,
+    __global float *restrict total_rest)
+{
+    const int base = get_global_id(0) * TILE;
+    const int end = min(pixels, base + TILE);
+    for (int t = 0; t < count; ++t) {
+        __global const FRAME *restrict frame = frames + (size_t)t * pixels;
+        for (int p = base; p < end; ++p) {
+            const float2 sum = add((float2)(total[p], total_rest[p]), (float2)((float)frame[p], 0));
+            total[p] = sum.x;
+            total_rest[p] = sum.y;
+        }
+    }
+}
+
+__kernel void changepoint_split(
+    __global const FRAME *restrict frames, const int count, const int pixels, const int first,
+    __global const float *restrict mean, __global const float *restrict mean_rest,
+    __global const float *restrict weight, __global float *restrict total,
+    __global float *restrict total_rest, __global int *restrict start, __global int *restrict since,
+    __global float *restrict score, __global FRAME *restrict ring)
+{
+    const int base = get_global_id(0) * TILE;
+    const int end = min(pixels, base + TILE);
+    for (int t = 0; t < count; ++t) {
+        const int number = first + t;
+        __global const FRAME *restrict frame = frames + (size_t)t * pixels;
+        __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels;
+        for (int p = base; p < end; ++p) {
+            const FRAME sample = frame[p];
+            const float2 deviation = add((float2)((float)sample, 0), (float2)(-mean[p], -mean_rest[p]));
+            const float2 sum = add((float2)(total[p], total_rest[p]), deviation);
+            total[p] = sum.x;
+            total_rest[p] = sum.y;
+
+            const float found = -sum.x * weight[number + 1];
+            const int better = found > score[p];
+            since[p] = (better & (number - start[p] > REACH)) ? number : since[p];
+            start[p] = better ? number + 1 : start[p];
+            score[p] = better ? found : score[p];
+            slot[p] = number - start[p] <= REACH ? sample : slot[p];
+        }
+    }
+}
+
+// Samples about a change, as running sums over whole steps: nothing is rounded.
+typedef struct {
+    int low, high;  // which of the slots there are: [low, high)
+    int values[SLOTS + 1], moments[SLOTS + 1], squares[SLOTS + 1];
+} samples_t;
+
+// What a hypothesis says: how much the samples miss it, how likely it is before they are seen, when the level
+// was crossed in frames from the start, and the variance of that.
+typedef struct {
+    float misfit, prior, crossing, variance;
+} answer_t;
+
+typedef struct {
+    float noise, level;
+    int own;
+} query_t;
+
+// A pixel's own levels, the one between them whose crossing is looked for, and its variance.
+typedef struct {
+    float dark, light, wanted, unsure;
+} levels_t;
+
+#define IMPOSSIBLE ((answer_t){INFINITY, 1, 0, 0})
+
+// One sample under way between two on the levels: how long the ramp lasts is not seen.
+answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise)
+{
+    const float above = (samples->values[begin + 1] - samples->values[begin]) / STEP - levels.dark;
+    const float rise = fmax(levels.light - levels.dark, 0.1f), share = clamp(above / rise, 0.0f, 1.0f);
+    const float longest = 1 / fmax(share, 1 - share);
+    const float shift = longest * ((levels.wanted - levels.dark) / rise - share);
+    const float known = 2 / 3.0f * longest * noise / rise, missed = above - share * rise;
+    answer_t answer;
+    answer.misfit = missed * missed;
+    answer.prior = SINGLE * sqrt(2 * M_PI_F) * noise;
+    answer.crossing = begin - REACH + 2 / 3.0f * shift;
+    answer.variance = known * known + shift * shift / 18;
+    return answer;
+}
+
+// A straight line through the samples under way. It should meet the levels where they begin and end: by what
+// it misses them there, it misses the samples. The crossing lies on it.
+answer_t ramp(
+    const samples_t *samples, const int begin, const int length, const levels_t levels, const float noise,
+    const float enough)
+{
+    const int end = begin + length, first = begin - REACH;
+    const long value = samples->values[end] - samples->values[begin];
+    const long moment = samples->moments[end] - samples->moments[begin];
+    const long square = samples->squares[end] - samples->squares[begin];
+    const long places = (long)length * (2 * first + length - 1) / 2;
+    const long spread = (long)length * length * (length * length - 1) / 12;
+    const long slope = length * moment - places * value;
+    const long rest = (length * square - value * value) * spread - slope * slope;
+    const float misfit = (float)rest / ((float)spread * length) / (STEP * STEP);
+    if (misfit > enough || slope * 1000 <= spread * (long)STEP) return IMPOSSIBLE;
+
+    const float duration = (float)spread / (float)slope * STEP;
+    const float middle = first + 0.5f * (length - 1), mean = (float)value / (STEP * length);
+    const float leaves = middle + (levels.dark - mean) * duration;
+    const float arrives = middle + (levels.light - mean) * duration;
+    const float early = begin > samples->low ? first - 1 - leaves : 0;
+    const float late = end < samples->high ? arrives - first - length : 0;
+    const float away = fmax(fmax(early, leaves - first), 0.0f);
+    const float back = fmax(fmax(late, first + length - 1 - arrives), 0.0f);
+    const float reach = 0.5f * (length + 1), off = clamp((levels.wanted - mean) * duration, -reach, reach);
+    answer_t answer;
+    answer.misfit = misfit + (away * away + back * back) / (duration * duration);
+    answer.prior = RAMP * 2 * M_PI_F * noise * noise * sqrt(12.0f) * duration / length;
+    answer.crossing = middle + off;
+    const float apart = off * off * length / (float)spread;
+    const float variance = noise * noise * (1.0f / length + apart) + levels.unsure;
+    answer.variance = fmin(variance * duration * duration, reach * reach / 3);
+    return answer;
+}
+
+answer_t hypothesis(
+    const samples_t *samples, const query_t query, const int begin, const int length, const float enough)
+{
+    const int end = begin + length;
+    const int before = begin - samples->low, after = samples->high - end;
+    const float noise = query.noise, slack = (noise / SPREAD) * (noise / SPREAD);
+
+    const int low_sum = samples->values[begin] - samples->values[samples->low];
+    const int lack = after * (int)STEP - (samples->values[samples->high] - samples->values[end]);
+    const int low_square = samples->squares[begin] - samples->squares[samples->low];
+    const int high_square = samples->squares[samples->high] - samples->squares[end];
+    const int lack_square = high_square + (int)STEP * (2 * lack - after * (int)STEP);
+    const float dark = low_sum / STEP / (before + slack), missing = lack / STEP / (after + slack);
+    const float misfit = low_square / (STEP * STEP) - low_sum / STEP * dark
+        + lack_square / (STEP * STEP) - lack / STEP * missing;
+    if (misfit > enough) return IMPOSSIBLE;
+
+    levels_t levels = {dark, 1 - missing, query.level, 0};
+    if (query.own) {
+        const float low_part = (1 - query.level) * noise, high_part = query.level * noise;
+        levels.wanted = dark + query.level * (levels.light - dark);
+        levels.unsure = low_part * low_part / (before + slack) + high_part * high_part / (after + slack);
+    }
+    answer_t answer = {0, 1, begin - REACH - 0.5f, 1 / 12.0f};
+    if (length == 1) answer = single(samples, begin, levels, noise);
+    if (length > 1) answer = ramp(samples, begin, length, levels, noise, enough - misfit);
+    answer.misfit += misfit;
+    return answer;
+}
+
+// Mean and variance of what all hypotheses say, each by its weight, and the least misfit in square sigmas.
+// The sums are kept relative to the likeliest.
+float3 weigh(const samples_t *samples, const query_t query)
+{
+    const float scale = 1 / (query.noise * query.noise);
+    float best = INFINITY, enough = INFINITY, weight = 0, mean = 0, square = 0;
+    for (int length = 0; length <= SLOTS; ++length) {
+        const int least = length < 2;  // these need a sample on either level
+        for (int begin = samples->low + least; begin + length <= samples->high - least; ++begin) {
+            const answer_t answer = hypothesis(samples, query, begin, length, enough);
+            const float cost = answer.misfit * scale;
+            if (cost > best + NEGLIGIBLE) continue;
+            const float lesser = exp(-0.5f * fabs(cost - best));
+            const float kept = cost < best ? lesser : 1, share = answer.prior * (cost < best ? 1 : lesser);
+            const float sum = weight * kept + share, gap = answer.crossing - mean;
+            square = square * kept + share * answer.variance + gap * gap * share * (weight * kept) / sum;
+            mean += gap * share / sum;
+            weight = sum;
+            best = fmin(best, cost);
+            enough = (best + NEGLIGIBLE) / scale;
+        }
+    }
+    return (float3)(mean, square / weight, best);
+}
+
+// The same without the misfit, and with a variance that owns up to it.
+float2 estimate(const samples_t *samples, query_t query)
+{
+    const float3 found = weigh(samples, query);
+    const int freedom = max(samples->high - samples->low - 4, 1);
+    if (found.z <= DOUBT * freedom) return found.xy;
+    // Samples that no hypothesis fits are noisier than was said, or change in another way.
+    query.noise *= sqrt(found.z / freedom);
+    const float3 again = weigh(samples, query);
+    const float moved = again.x - found.x;
+    return (float2)(found.x, again.y + moved * moved);
+}
+
+void gather(
+    samples_t *samples, const int pixel, const int pixels, const int count, const int start, const int since,
+    const float dark, const float gain, const float noise, __global const FRAME *restrict ring)
+{
+    samples->low = max(since, start - REACH) - (start - REACH);
+    samples->high = min(count, start + REACH + 1) - (start - REACH);
+    int values[SLOTS];
+    for (int i = samples->low; i < samples->high; ++i) {
+        const int number = start - REACH + i;
+        const float share = share_of(ring[(size_t)(number % SLOTS) * pixels + pixel], dark, gain);
+        values[i] = convert_int_rte(clamp(share, -1.0f, 2.0f) * STEP);
+    }
+    const int limit = convert_int_rte(SPIKE * noise * STEP);
+    samples->values[0] = samples->moments[0] = samples->squares[0] = 0;
+    for (int i = 0; i < SLOTS; ++i) {
+        int value = i >= samples->low && i < samples->high ? values[i] : 0;
+        if (i > samples->low && i < samples->high - 1) {
+            const int low = min(values[i - 1], values[i + 1]), high = max(values[i - 1], values[i + 1]);
+            value = value > high + limit ? high : value < low - limit ? low : value;
+        }
+        samples->values[i + 1] = samples->values[i] + value;
+        samples->moments[i + 1] = samples->moments[i] + (i - REACH) * value;
+        samples->squares[i + 1] = samples->squares[i] + value * value;
+    }
+}
+
+// Whether the samples do not rise at the change, within the noise.
+int is_flat(const samples_t *samples, const float noise)
+{
+    const int before = REACH - samples->low, after = samples->high - REACH;
+    const float dark = (samples->values[REACH] - samples->values[samples->low]) / STEP / before;
+    const float light = (samples->values[samples->high] - samples->values[REACH]) / STEP / after;
+    return light - dark < 6 * noise * sqrt(1.0f / before + 1.0f / after);
+}
+
+// Travel between frames, and beyond the ends as it was there, as the sum of two floats; the frame is told
+// from the start, which keeps its last bits.
+float2 travel_at(
+    __global const float2 *restrict travel, const int count, const int start, const float crossing)
+{
+    const int frame = clamp(start + (int)floor(crossing), 0, count - 2);
+    const float2 step = travel[frame + 1] - travel[frame];
+    const float share = crossing - (frame - start);
+    return (float2)(travel[frame].x, travel[frame].y + share * (step.x + step.y));
+}
+
+__kernel void changepoint_heights(
+    const int pixels, const int count, __global const int *restrict start,
+    __global const int *restrict excess, __global const int *restrict below,
+    __global const int *restrict since, __global const float *restrict dark,
+    __global const float *restrict gain, __global const FRAME *restrict ring,
+    __global const float2 *restrict travel, const float noise, const float quiet, const float level,
+    const int own, __global float *restrict height, __global float *restrict sigma,
+    __global uchar *restrict status)
+{
+    const int base = get_global_id(0) * TILE;
+    const int end = min(pixels, base + TILE);
+    for (int p = base; p < end; ++p) {
+        const int never = excess[p] <= excess_of_noise(quiet, gain[p]);
+        height[p] = NAN;
+        sigma[p] = NAN;
+        status[p] = start[p] == INVALID ? 0 : never ? 2 : start[p] == 0 ? 3 : 1;
+        if (status[p] != 1) continue;
+
+        const float spread = fmax(noise * fabs(gain[p]), STRAIGHT);
+        samples_t samples;
+        gather(&samples, p, pixels, count, start[p], since[p], dark[p], gain[p], spread, ring);
+        const float dim = start[p] - below[p];
+        const int hovered = dim > REACH && is_flat(&samples, spread);
+        const float2 crossing = hovered ? (float2)(-dim / 2, dim * dim / 12)
+                                        : estimate(&samples, (query_t){spread, level, own});
+        const float middle = clamp(crossing.x, (float)-start[p], (float)(count - 1 - start[p]));
+        const float deviation = sqrt(crossing.y);
+        const float2 at = travel_at(travel, count, start[p], middle);
+        const float2 late = travel_at(travel, count, start[p], middle + deviation);
+        const float2 early = travel_at(travel, count, start[p], middle - deviation);
+        height[p] = -(at.x + at.y);
+        sigma[p] = 0.5f * fabs((late.x - early.x) + (late.y - early.y));
+    }
+}

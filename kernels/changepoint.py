@@ -1,0 +1,429 @@
+"""The change-point of a pixel's brightness: what ``changepoint.cl`` computes, in plain NumPy.
+
+Brightness goes from a dark to a light level once, suddenly or along a ramp. Where both levels are known,
+`changepoint_scan` finds the change in one pass (Page, Biometrika 41, 1954). Where they are not,
+`changepoint_sum` and `changepoint_split` find it in two (Hinkley, Biometrika 57, 1970). Both keep the samples
+around the change, from which `changepoint_heights` tells when the level was crossed.
+
+The way from light to dark is the same one with a gain below zero: what is said of dark and light here is then
+true of light and dark, and shares are of the way from light to dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+INVALID = -2
+DECIDED = np.iinfo(np.int32).max
+
+REACH = 12  # frames that are kept before and after the change
+SLOTS = 2 * REACH + 1
+UNIT = 1 << 20  # of the scan: what one fully light frame counts
+STEP = 1 << 12  # of the heights: the way from dark to bright
+
+STRAIGHT = 0.005  # of the way from dark to bright: no transition is a straight ramp to better than that
+SPIKE = 8  # sigmas by which no sample exceeds both of its neighbours
+DOUBT = 2  # times the expected misfit that the best hypothesis may have
+SPREAD = 0.3  # of that way: by so much a pixel's own levels may differ from those given
+SINGLE, RAMP = 1 / 3, 1 / 5  # prior odds, against a sudden change, of one frame under way and of a ramp
+
+
+def changepoint_scan(
+    frames: NDArray[Any],
+    first: int,
+    level: int,
+    least: int,
+    quiet: np.float32,
+    dark: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    start: NDArray[np.int32],
+    excess: NDArray[np.int32],
+    below: NDArray[np.int32],
+    ring: NDArray[Any],
+) -> None:
+    """Go through a block of frames for a change between known levels; the maps are changed in place.
+
+    Page's form of the cumulative sum: the excess over the level is added up and never falls below zero; the
+    change lies after the frame in which it last was zero, which is its most likely place. All is counted in
+    whole units, so that neither the length of a stack nor a device's rounding makes a difference.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8, uint16 or float32
+        Samples; the kernel is told ``n`` and ``P`` after it.
+    first : int
+        Number of the block's first frame in the stack.
+    level : int
+        Units, of ``UNIT`` from dark to bright, at which a pixel is light.
+    least : int
+        Units of excess that decide a change; so does an excess that lasts for ``REACH`` frames.
+    quiet : float32
+        Square counts; times the square of the gain, the excess that noise makes up.
+    dark, gain : ndarray, (P,), float32
+        Counts without light, and one over the counts from dark to bright; of a release, counts with full
+        light, and one over the counts from there to dark.
+    start : ndarray, (P,), int32
+        First frame after the change; ``INVALID`` after a sample that is no number.
+    excess : ndarray, (P,), int32
+        Units so far; ``DECIDED`` once the change is certain.
+    below : ndarray, (P,), int32
+        Last frame in which the sample was nearer to dark than to the level.
+    ring : ndarray, (SLOTS, P), as frames
+        Samples of the frames around the change, each at its number modulo ``SLOTS``.
+    """
+    alarm = np.maximum(least, excess_of_noise(quiet, gain))
+    for number, frame in enumerate(frames, start=first):
+        excess[start == INVALID] = DECIDED
+        undecided = excess != DECIDED
+        share = np.clip(_share(frame, dark, gain), 0, 1)
+        units = np.rint(np.nan_to_num(share) * np.float32(UNIT)).astype(np.int64)
+        grown = np.maximum(excess + units - level, 0)
+        start[undecided & (grown == 0)] = number + 1
+        below[undecided & (2 * units < level)] = number
+        certain = (grown >= alarm) | ((grown > 0) & (number - start >= REACH))
+        excess[undecided] = np.where(certain & (number > 0), DECIDED, grown)[undecided]
+
+        taken = number - start <= REACH
+        ring[number % SLOTS, taken] = frame[taken]
+        start[taken & ~np.isfinite(frame)] = INVALID
+
+
+def changepoint_sum(frames: NDArray[Any], total: Floats) -> None:
+    """Add up a block of frames.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8, uint16 or float32
+        Samples; the kernel is told ``n`` and ``P`` after it.
+    total : ndarray, (P,), float64
+        Counts so far, changed in place; the kernel holds it as the sum of two floats.
+    """
+    for frame in frames:
+        total += frame
+
+
+def changepoint_split(
+    frames: NDArray[Any],
+    first: int,
+    mean: Floats,
+    weight: NDArray[np.float32],
+    total: Floats,
+    start: NDArray[np.int32],
+    since: NDArray[np.int32],
+    score: NDArray[np.float32],
+    ring: NDArray[Any],
+) -> None:
+    """Go through a block of frames for a change between unknown levels; the maps are changed in place.
+
+    Splitting T frames into k and T - k explains D^2 T / (k (T - k)) of the square deviations, with D the sum
+    of the first k deviations from the mean. The k that explains most is the most likely change; D must be
+    negative, that is, the second level be the higher one, or positive for a release.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8, uint16 or float32
+        Samples; the kernel is told ``n`` and ``P`` after it.
+    first : int
+        Number of the block's first frame in the stack.
+    mean : ndarray, (P,), float64
+        Counts, of all frames; the kernel takes it as the sum of two floats.
+    weight : ndarray, (T + 1,), float32
+        1 / sqrt(k (T - k)) for each k, or its negative if the second level should be the lower one; 0 at
+        both ends.
+    total : ndarray, (P,), float64
+        Sum of the deviations so far, counts; the kernel holds it as the sum of two floats.
+    start : ndarray, (P,), int32
+        First frame after the best split so far.
+    since : ndarray, (P,), int32
+        Frame from which on the ring lacks none.
+    score : ndarray, (P,), float32
+        -D times the weight, of the best split.
+    ring : ndarray, (SLOTS, P), as frames
+        Samples of the frames around it, each at its number modulo ``SLOTS``.
+    """
+    for number, frame in enumerate(frames, start=first):
+        total += frame - mean
+        found = -total.astype(np.float32) * weight[number + 1]
+        better = found > score
+        since[better & (number - start > REACH)] = number
+        start[better] = number + 1
+        score[better] = found[better]
+        taken = number - start <= REACH
+        ring[number % SLOTS, taken] = frame[taken]
+
+
+def changepoint_heights(
+    start: NDArray[np.int32],
+    excess: NDArray[np.int32],
+    below: NDArray[np.int32],
+    since: NDArray[np.int32],
+    dark: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    ring: NDArray[Any],
+    travel: Floats,
+    noise: float,
+    quiet: np.float32,
+    level: float,
+    own: bool,
+) -> tuple[Floats, Floats, NDArray[np.uint8]]:
+    """Turn changes into heights, from the samples around them.
+
+    Each hypothesis says which of these samples lie on the dark level, which are under way, and which lie on
+    the light level. The levels may differ from those given; the samples under way lie on a straight line
+    that meets both levels between the frames where it should. Each tells when the level was crossed, and how
+    likely the samples are. The answer is the mean over all hypotheses, and the standard deviation that of
+    the answers they give: the Bayes estimate, whose mean square error is the least.
+    A pixel may also hover about its level, and noise say when it passes: where the samples do not rise, the
+    change may be anywhere since the last frame that was nearer to dark.
+
+    Parameters
+    ----------
+    start, excess, below, dark, gain, ring : ndarray, (P,) or (SLOTS, P)
+        As ``changepoint_scan`` leaves them; the kernel is told ``P`` and the number of frames before them.
+    since : ndarray, (P,), int32
+        Frame from which on the ring lacks none.
+    travel : ndarray, (T,), float64
+        Millimetres, one a frame; the kernel takes each as the sum of two floats.
+    noise : float
+        Standard deviation of a sample, counts.
+    quiet : float32
+        As for ``changepoint_scan``.
+    level : float
+        Share of the way from dark to bright whose crossing is looked for.
+    own : bool
+        Whether that is the way between the pixel's own levels instead.
+
+    Returns
+    -------
+    height, sigma : ndarray, (P,), float64
+        Millimetres, NaN where there is no onset.
+    status : ndarray, (P,), uint8
+        0 invalid input, 1 onset, 2 never light, 3 light at start.
+    """
+    never = excess <= excess_of_noise(quiet, gain)
+    status = np.select([start == INVALID, never, start == 0], [0, 2, 3], 1).astype(np.uint8)
+    height, sigma = np.full((2, start.size), np.nan)
+    found = np.flatnonzero(status == 1)
+    if found.size:
+        spread = np.maximum(noise * np.abs(gain[found].astype(np.float64)), STRAIGHT)
+        values, there = _gather(
+            start[found], since[found], ring[:, found], dark[found], gain[found], len(travel)
+        )
+        samples = _add_up(_without_spikes(values, there, np.rint(SPIKE * spread * STEP)), there)
+        dim = start[found] - below[found]
+        hovered = (dim > REACH) & _flat(samples, spread)
+        crossing, deviation, misfit = _weigh(samples, spread, level, own)
+        # Samples that no hypothesis fits are noisier than was said, or change in another way.
+        odd = misfit > DOUBT * samples.freedom
+        spread = np.where(odd, spread * np.sqrt(misfit / samples.freedom), spread)
+        again = _weigh(samples, spread, level, own)
+        deviation = np.where(odd, np.hypot(again[1], again[0] - crossing), deviation)
+        crossing, deviation = np.where(hovered, (-dim / 2, dim / np.sqrt(12)), (crossing, deviation))
+        crossing = np.clip(crossing + start[found], 0, len(travel) - 1)
+        height[found] = -_travel_at(travel, crossing)
+        late, early = (_travel_at(travel, crossing + side * deviation) for side in (1, -1))
+        sigma[found] = np.abs(late - early) / 2
+    return height, sigma, status
+
+
+def excess_of_noise(quiet: np.float32, gain: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return the units of excess that are nothing but noise; the kernel does this in passing."""
+    share = np.minimum(quiet * gain * gain, np.float32(1000))
+    return np.asarray(np.rint(share * np.float32(UNIT)), np.int32)
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Samples about each change: running sums, (SLOTS + 1, P), and which there are, [low, high)."""
+
+    low: NDArray[np.intp]
+    high: NDArray[np.intp]
+    values: Floats
+    moments: Floats
+    squares: Floats
+
+    @property
+    def freedom(self) -> NDArray[np.intp]:
+        """Samples less the numbers that a ramp takes from them."""
+        return np.asarray(np.maximum(self.high - self.low - 4, 1), np.intp)
+
+    def total(self, start: NDArray[np.intp] | int, stop: NDArray[np.intp] | int) -> tuple[Floats, Floats]:
+        """Return the sum of the values, and of their squares, of the slots from start to stop."""
+        every = np.arange(self.low.size)
+        values, squares = (part[stop, every] - part[start, every] for part in (self.values, self.squares))
+        return values, squares
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Each pixel's own levels, the one between them whose crossing is looked for, and its variance."""
+
+    dark: Floats
+    light: Floats
+    wanted: Floats
+    unsure: Floats
+
+
+def _share(frame: NDArray[Any], dark: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the share of the way from dark to bright; a saturated sample is light."""
+    share = (frame.astype(np.float32) - dark) * gain
+    if frame.dtype.kind == "f":
+        return share
+    light = np.where(gain < 0, np.minimum(share, np.float32(0)), np.maximum(share, np.float32(1)))
+    return np.where(frame == np.iinfo(frame.dtype).max, light, share)
+
+
+def _gather(
+    start: NDArray[np.int32],
+    since: NDArray[np.int32],
+    ring: NDArray[Any],
+    dark: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    count: int,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the samples about each change, (SLOTS, P), in whole steps, and which of them there are."""
+    number = start + np.arange(-REACH, REACH + 1)[:, np.newaxis]
+    there = (number >= since) & (number < count) & (number >= 0)
+    share = np.clip(_share(np.take_along_axis(ring, number % SLOTS, 0), dark, gain), -1, 2)
+    return np.where(there, np.rint(share * np.float32(STEP)), 0.0), there
+
+
+def _without_spikes(values: Floats, there: NDArray[np.bool_], limit: Floats) -> Floats:
+    """Put a sample that stands out from both of its neighbours level with the nearer one."""
+    calm = values.copy()
+    inner = there[:-2] & there[2:]
+    sides = np.stack([values[:-2], values[2:]])
+    low, high = sides.min(axis=0), sides.max(axis=0)
+    middle = values[1:-1]
+    calm[1:-1] = np.where(inner & (middle > high + limit), high, middle)
+    calm[1:-1] = np.where(inner & (middle < low - limit), low, calm[1:-1])
+    return calm
+
+
+def _add_up(values: Floats, there: NDArray[np.bool_]) -> _Samples:
+    place = np.arange(-REACH, REACH + 1)[:, np.newaxis]
+    shares = values / STEP
+    low = np.argmax(there, axis=0)
+    sums = (np.cumsum(part, axis=0) for part in (shares, place * shares, shares**2))
+    return _Samples(low, low + np.sum(there, axis=0), *(np.pad(part, ((1, 0), (0, 0))) for part in sums))
+
+
+def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
+    """Tell where the samples do not rise at the change, within the noise."""
+    before, after = REACH - samples.low, samples.high - REACH
+    dark = samples.total(samples.low, REACH)[0] / before
+    light = samples.total(REACH, samples.high)[0] / after
+    return np.asarray(light - dark < 6 * noise * np.sqrt(1 / before + 1 / after))
+
+
+def _hypotheses(
+    samples: _Samples, noise: Floats, level: float, own: bool
+) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
+    """Yield of each its misfit, its prior, the crossing in frames from the start, and its variance."""
+    for length in range(SLOTS + 1):
+        for begin in range(SLOTS - length + 1):
+            yield _hypothesis(samples, noise, level, own, begin, length)
+
+
+def _hypothesis(
+    samples: _Samples, noise: Floats, level: float, own: bool, begin: int, length: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    end = begin + length
+    before, after = begin - samples.low, samples.high - end
+    fits = (before >= 0) & (after >= 0)
+    if length < 2:
+        fits &= (before > 0) & (after > 0)
+    slack = np.where(fits, (noise / SPREAD) ** 2, 1e9)
+    low_sum, low_square = samples.total(samples.low, begin)
+    high_sum, high_square = samples.total(end, samples.high)
+    lack = after - high_sum
+    dark, light = low_sum / (before + slack), 1 - lack / (after + slack)
+    misfit = low_square - low_sum * dark + high_square - after + 2 * lack - lack * (1 - light)
+
+    levels = _Levels(dark, light, np.full_like(dark, level), np.zeros_like(dark))
+    if own:
+        unsure = noise**2 * ((1 - level) ** 2 / (before + slack) + level**2 / (after + slack))
+        levels = _Levels(dark, light, dark + level * (light - dark), unsure)
+    if length == 0:
+        shape = np.ones_like(noise)
+        missed, prior, crossing, variance = 0 * shape, shape, (begin - REACH - 0.5) * shape, shape / 12
+    elif length == 1:
+        missed, prior, crossing, variance = _single(samples, begin, levels, noise)
+    else:
+        missed, prior, crossing, variance = _ramp(samples, begin, length, levels, noise)
+    return np.where(fits, misfit + missed, np.inf), prior, crossing, variance
+
+
+def _single(
+    samples: _Samples, begin: int, levels: _Levels, noise: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """One sample under way between two on the levels: how long the ramp lasts is not seen.
+
+    It lasts at most 1 / max(share, 1 - share) frames, or a neighbour were under way too; and the longer it
+    is, the likelier it is to be met: on average it is two thirds of that, with a variance of an eighteenth.
+    """
+    above = samples.total(begin, begin + 1)[0] - levels.dark
+    rise = np.maximum(levels.light - levels.dark, 0.1)
+    share = np.clip(above / rise, 0, 1)
+    longest = 1 / np.maximum(share, 1 - share)
+    shift = longest * ((levels.wanted - levels.dark) / rise - share)
+    variance = (2 / 3 * longest * noise / rise) ** 2 + shift**2 / 18
+    prior = SINGLE * np.sqrt(2 * np.pi) * noise
+    return (above - share * rise) ** 2, prior, begin - REACH + 2 / 3 * shift, variance
+
+
+def _ramp(
+    samples: _Samples, begin: int, length: int, levels: _Levels, noise: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Draw a straight line through the samples under way.
+
+    It should meet the levels where they begin and end: by what it misses them there, it misses the samples.
+    The crossing lies on it.
+    """
+    first, last = begin - REACH, begin - REACH + length - 1
+    middle, spread = (first + last) / 2, length * (length**2 - 1) / 12
+    value, square = samples.total(begin, begin + length)
+    moment = samples.moments[begin + length] - samples.moments[begin]
+    slope = (moment - middle * value) / spread
+    rises = slope > 1e-3
+    duration = 1 / np.where(rises, slope, 1)
+    crossing, leaves, arrives = (
+        middle + (part - value / length) * duration for part in (levels.wanted, levels.dark, levels.light)
+    )
+    early = np.where(begin > samples.low, first - 1 - leaves, 0)
+    late = np.where(begin + length < samples.high, arrives - last - 1, 0)
+    away = np.maximum(np.maximum(early, leaves - first), 0)
+    back = np.maximum(np.maximum(late, last - arrives), 0)
+
+    missed = np.maximum(square - value**2 / length - slope**2 * spread, 0) + (away**2 + back**2) / duration**2
+    prior = RAMP * 2 * np.pi * noise**2 * np.sqrt(12) * duration / length
+    reach = (length + 1) / 2
+    off = np.clip(crossing - middle, -reach, reach)
+    variance = duration**2 * (noise**2 * (1 / length + off**2 / spread) + levels.unsure)
+    return np.where(rises, missed, np.inf), prior, middle + off, np.minimum(variance, reach**2 / 3)
+
+
+def _travel_at(travel: Floats, frame: Floats) -> Floats:
+    """Return the travel between frames, and beyond the ends as it was there."""
+    before = np.clip(np.floor(frame).astype(np.intp), 0, len(travel) - 2)
+    return np.asarray(travel[before] + (frame - before) * (travel[before + 1] - travel[before]))
+
+
+def _weigh(samples: _Samples, noise: Floats, level: float, own: bool) -> tuple[Floats, Floats, Floats]:
+    """Return mean and standard deviation of what all hypotheses say, and the least misfit, square sigmas."""
+    answers = zip(*_hypotheses(samples, noise, level, own), strict=True)
+    misfit, prior, crossing, variance = (np.array(part) for part in answers)
+    misfit /= noise**2
+    best = misfit.min(axis=0)
+    weight = prior * np.exp((best - misfit) / 2)
+    weight /= weight.sum(axis=0)
+    mean = np.sum(weight * crossing, axis=0)
+    spread = np.sum(weight * (variance + (crossing - mean) ** 2), axis=0)
+    return mean, np.sqrt(spread), best
