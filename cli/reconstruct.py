@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,20 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.output import print_json
+
+
+class EventName(StrEnum):
+    """What to look for."""
+
+    onset = "onset"
+    release = "release"
+
+
+class MethodName(StrEnum):
+    """What tells a height."""
+
+    threshold = "threshold"
+    change_point = "change-point"
 
 
 def command(
@@ -30,10 +45,16 @@ def command(
         float | None, typer.Option(metavar="COUNTS", help="Without light; else the file's.")
     ] = None,
     bright: Annotated[float | None, typer.Option(metavar="COUNTS", help="With full light.")] = None,
+    event: Annotated[
+        EventName, typer.Option(help="Dark to light on the way down, or light to dark on the way up.")
+    ] = EventName.onset,
+    method: Annotated[
+        MethodName, typer.Option(help="First crossing of the threshold, or most likely change.")
+    ] = MethodName.threshold,
     threshold: Annotated[
         float, typer.Option(help="Share of the way from dark to bright that is light.")
     ] = 0.5,
-    hold: Annotated[int, typer.Option(help="Light frames in a row that make an onset.")] = 2,
+    hold: Annotated[int, typer.Option(help="Frames in a row that make the event.")] = 2,
     subframe: Annotated[bool, typer.Option(help="Look between frames; without it, eq. 4 as printed.")] = True,
     noise: Annotated[
         float | None, typer.Option(metavar="COUNTS", help="Standard deviation; else told from two frames.")
@@ -57,6 +78,8 @@ def command(
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 source,
+                event=event.value,
+                method=method.value,
                 threshold=threshold,
                 hold=hold,
                 subframe=subframe,

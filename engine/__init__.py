@@ -1,8 +1,22 @@
 """The estimators: what turns frames into maps."""
 
+from mirrorskin.engine.changepoint import ChangePointSearch, find_change_point
 from mirrorskin.engine.onset import Onset, OnsetSearch, find_onset
-from mirrorskin.engine.reconstruct import reconstruct
+from mirrorskin.engine.reconstruct import METHODS, Method, reconstruct
 from mirrorskin.engine.score import Score, score
 from mirrorskin.engine.summary import Summary, summarise
 
-__all__ = ["Onset", "OnsetSearch", "Score", "Summary", "find_onset", "reconstruct", "score", "summarise"]
+__all__ = [
+    "METHODS",
+    "ChangePointSearch",
+    "Method",
+    "Onset",
+    "OnsetSearch",
+    "Score",
+    "Summary",
+    "find_change_point",
+    "find_onset",
+    "reconstruct",
+    "score",
+    "summarise",
+]

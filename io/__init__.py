@@ -3,7 +3,7 @@
 from mirrorskin.io.atomic import check_output
 from mirrorskin.io.describe import describe
 from mirrorskin.io.frames import open_frames
-from mirrorskin.io.positions import check_phase, check_travel
+from mirrorskin.io.positions import check_phase, check_stroke, check_travel
 from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
 from mirrorskin.io.recording import Recording, Steps, open_recording
 from mirrorskin.io.result import open_result, save_result
@@ -39,6 +39,7 @@ __all__ = [
     "Truth",
     "check_output",
     "check_phase",
+    "check_stroke",
     "check_travel",
     "describe",
     "open_frames",

@@ -71,7 +71,10 @@ def _median(reference: NDArray[np.float32]) -> str:
 
 
 def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str, str]:
-    return {} if values is None else {name: f"{values[0]:g} to {values[-1]:g} {unit}"}
+    if values is None:
+        return {}
+    turn = [np.max(values)] if np.max(values) > max(values[0], values[-1]) else []
+    return {name: f"{' to '.join(f'{value:g}' for value in (values[0], *turn, values[-1]))} {unit}"}
 
 
 def _result(result: Result) -> dict[str, str]:

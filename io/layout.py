@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
-from mirrorskin.io.positions import check_phase, check_travel
+from mirrorskin.io.positions import check_phase, check_stroke
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
 MARK = "mirrorskin_recording"
@@ -66,10 +66,10 @@ class Layout:
         return self._read(f"{DETECTOR}/frame_time", (self._count,), unit="s")
 
     def travel(self, given: Floats | None) -> Floats:
-        """Read the travel of each frame of a vertical press, mm, if it is not given; check it."""
+        """Read the travel of each frame of a vertical motion, mm, if it is not given; check it."""
         name = f"{STAGE}/travel"
         values = self._positions(given, name, "mm", "give --travel-step")
-        return check_travel(values, self._count, f"{self._file.path}: {name}")
+        return check_stroke(values, self._count, f"{self._file.path}: {name}")
 
     def phase(self, given: Floats | None) -> Floats:
         """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""

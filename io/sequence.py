@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.positions import check_phase, check_travel
+from mirrorskin.io.positions import check_phase, check_stroke
 from mirrorskin.io.recording import Steps
 from mirrorskin.io.types import Block, Closing, Floats, Header
 
@@ -63,7 +63,7 @@ class FrameSequence(Closing, ABC):
         self._lost = lost or [0] * shape[0]
         self._time = time
         travel, phase = self._along(travel), self._along(phase)
-        self._travel = None if travel is None else check_travel(travel, shape[0], f"{name}: travel")
+        self.travel = None if travel is None else check_stroke(travel, shape[0], f"{name}: travel")
         self._phase = None if phase is None else check_phase(phase, shape[0], f"{name}: phase")
         self._next = 0
 
@@ -101,7 +101,7 @@ class FrameSequence(Closing, ABC):
         self._fill(start, frames)
         self._next = stop
         time, travel, phase = (
-            v if v is None else v[start:stop] for v in (self._time, self._travel, self._phase)
+            v if v is None else v[start:stop] for v in (self._time, self.travel, self._phase)
         )
         return Block(frames, start, time, travel, phase, dropped=self._lost[start])
 

@@ -160,7 +160,7 @@ class Truth:
     zenith, azimuth : ndarray, (H, W), float32
         Radians, of the surface normal.
     contact : ndarray, (H, W), uint8
-        1 where sheet and object touch by the end of the movement.
+        1 where sheet and object touch at some time of the movement.
     """
 
     height: NDArray[np.float32]
@@ -178,7 +178,8 @@ class Result:
     height, height_sigma : ndarray, (H, W), float32
         Millimetres; NaN where there is no answer.
     status : ndarray, (H, W), uint8
-        0 invalid input, 1 onset, 2 never light, 3 light at start.
+        0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
+        2 dark at start, 3 light to the end.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
     process : mapping

@@ -12,7 +12,7 @@ from mirrorskin.hw.twin.camera import FRAME_RATE, Camera, frame_dtype
 from mirrorskin.hw.twin.objects import make_object
 from mirrorskin.hw.twin.optics import uniform_response
 from mirrorskin.hw.twin.surface import Object, zenith_azimuth
-from mirrorskin.io import check_travel
+from mirrorskin.io import check_stroke
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Motion, Truth, pixel_axes
 
 _PIXELS_MAX = 200_000_000
@@ -22,7 +22,7 @@ class Twin(Closing):
     """The sensor, simulated in vertical motion: a `mirrorskin.io.Source` that knows the truth.
 
     The sheet conforms to the object (eq. 1 of the paper): a pixel is in contact in frame k when
-    ``travel[k] >= -height``. There it takes the object's slope and shows
+    ``travel[k] >= -height``, on its way down as on its way up. There it takes the object's slope and shows
     ``dark + (bright - dark) g(zenith)``, with g from `uniform_response`; elsewhere it is flat and dark.
     The camera adds noise and quantises.
 
@@ -35,7 +35,8 @@ class Twin(Closing):
     pixel_size : float or (float, float)
         Millimetres at the sheet along x and y.
     travel : array_like, (T,)
-        Millimetres that the body has been lowered in each frame; never runs back.
+        Millimetres that the body has been lowered in each frame: of a press, of a release, or of one after
+        the other.
     dtype : dtype_like
         uint8 (levels 16 to 224), uint16 (256 to 3584) or float32 (16 to 224).
     noise : float
@@ -48,7 +49,8 @@ class Twin(Closing):
     header : Header
         Its ``dark`` and ``bright`` are the camera's exact levels, free of noise.
     truth : Truth
-        The object as it is; ``azimuth`` is NaN where the surface is level, ``contact`` is the last frame's.
+        The object as it is; ``azimuth`` is NaN where the surface is level, ``contact`` is that at the
+        greatest travel.
 
     Raises
     ------
@@ -72,8 +74,8 @@ class Twin(Closing):
     ) -> None:
         field = _check_shape(shape)
         pixel = _check_pixel_size(pixel_size)
-        self._travel = check_travel(travel, np.size(travel), "travel")
-        if len(self._travel) == 0:
+        self.travel = check_stroke(travel, np.size(travel), "travel")
+        if len(self.travel) == 0:
             raise InputError("travel is empty: give the position of at least one frame, in mm")
         self._camera = Camera(frame_dtype(dtype), noise, seed)
         thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
@@ -81,13 +83,12 @@ class Twin(Closing):
         x, y = np.meshgrid(*pixel_axes(field, pixel))
         height = thing.height(x, y)
         zenith, azimuth = zenith_azimuth(*thing.slope(x, y))
-        # NaN sorts last: where there is no object the first frame in contact is one past the end.
-        self._first_contact = np.searchsorted(self._travel, -height).astype(np.int32)
+        self._reached_at = -height  # NaN where there is no object, which no travel reaches
         self._light = self._counts(zenith)
         self._next = 0
 
         self.name = f"twin: {thing.name}"
-        self.shape = (len(self._travel), *field)
+        self.shape = (len(self.travel), *field)
         self.dtype = self._camera.dtype
         self.header = Header(
             motion=self.motion,
@@ -100,7 +101,7 @@ class Twin(Closing):
             height=height.astype(np.float32),
             zenith=zenith.astype(np.float32),
             azimuth=azimuth.astype(np.float32),
-            contact=(self._first_contact < len(self._travel)).astype(np.uint8),
+            contact=(self.travel.max() >= self._reached_at).astype(np.uint8),
         )
 
     def rewind(self) -> None:
@@ -137,11 +138,12 @@ class Twin(Closing):
         if len(frames) == 0:
             return None
         for k, frame in enumerate(frames, start=first):
-            counts = np.where(self._first_contact <= k, self._light, np.float32(self._camera.dark))
+            touches = self.travel[k] >= self._reached_at
+            counts = np.where(touches, self._light, np.float32(self._camera.dark))
             self._camera.expose(counts, k, frame)
         self._next = first + len(frames)
         time = np.arange(first, self._next) / FRAME_RATE
-        return Block(frames, index=first, time=time, travel=self._travel[first : self._next])
+        return Block(frames, index=first, time=time, travel=self.travel[first : self._next])
 
     def _counts(self, zenith: Floats) -> NDArray[np.float32]:
         share = np.nan_to_num(uniform_response(zenith))

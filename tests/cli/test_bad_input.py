@@ -177,7 +177,7 @@ CASES = {
     "a link up": (link(h5py.ExternalLink("../outside.h5", "/x")), NAMED, "leads out of its folder"),
     "a link by symlink": (link(h5py.ExternalLink("symlink.h5", "/x")), NAMED, "leads out of its folder"),
     "a link in a circle": (link(h5py.SoftLink("/x")), NAMED, "go round in a circle"),
-    "steps back": (stack(), ["--motion", "vertical", "--travel-step=-0.1mm"], "travel runs back at frame 1"),
+    "steps back": (stack(), ["--motion", "vertical", "--travel-step=-0.1mm"], "give event release"),
     "an output that is a pipe": (
         lambda: (stack()(), os.mkfifo("pipe")),
         [*GIVEN, "-o", "pipe"],

@@ -254,3 +254,20 @@ def test_a_buffer_that_does_not_fit_is_refused_and_costs_no_frame(buffer: NDArra
     block = twin.read()
     assert block is not None
     assert block.index == 0
+
+
+def test_a_release_is_the_press_backwards() -> None:
+    for name in geometry.SURFACES:
+        down, up = make_twin(object=name, noise=0), make_twin(object=name, noise=0, travel=TRAVEL[::-1])
+        np.testing.assert_array_equal(read_all(up), read_all(down)[::-1])
+        for part in ("height", "zenith", "azimuth", "contact"):
+            np.testing.assert_array_equal(getattr(up.truth, part), getattr(down.truth, part))
+
+
+def test_a_press_and_its_release_are_one_after_the_other() -> None:
+    stroke = np.concatenate([TRAVEL, TRAVEL[-2::-1]])
+    both, press = make_twin(travel=stroke, noise=0), make_twin(noise=0)
+    frames = read_all(press)
+    np.testing.assert_array_equal(read_all(both), np.concatenate([frames, frames[-2::-1]]))
+    np.testing.assert_array_equal(both.truth.contact, press.truth.contact)
+    np.testing.assert_array_equal(both.travel, stroke)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.io import InputError, Steps, check_phase, check_travel
+from mirrorskin.io import InputError, Steps, check_phase, check_stroke, check_travel
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,52 @@ def test_phase_may_go_either_way(values):
 def test_travel_that_cannot_be_is_one_line(values, line):
     with pytest.raises(InputError, match=line):
         check_travel(values, 4, "travel")
+
+
+@pytest.mark.parametrize("values", [[3, 2, 2, 0], (1.0, 1, 0.5, -7), np.array([9, 9, 9, 9], np.uint8)])
+def test_travel_of_a_release_only_goes_up(values):
+    np.testing.assert_array_equal(check_travel(values, 4, "travel", falls=True), values)
+    with pytest.raises(InputError, match="travel runs back at frame 2: a release only goes up"):
+        check_travel([3, 2, 2.1, 0], 4, "travel", falls=True)
+    with pytest.raises(InputError, match="travel runs back at frame 0"):
+        check_travel(values, 4, "travel", after=[values[0] - 1.0], falls=True)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [0, 1, 2, 3],
+        [3, 2, 2, -1],
+        [0, 2, 2, 1],
+        [0, 0, 3, 0],
+        [5, 5, 5, 5],
+        [-3, -1, -1, -2],
+        np.array([0, 200, 7, 7], np.uint8),
+    ],
+)
+def test_a_stroke_is_a_press_a_release_or_both(values):
+    found = check_stroke(values, 4, "travel")
+    np.testing.assert_array_equal(found, np.asarray(values, float))
+    assert found.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        (None, "travel is missing: a vertical press needs the travel of each frame, in mm"),
+        ([0, 1, np.nan, 3], "travel is nan at frame 2"),
+        ([0, 2, 1, 3], "travel runs back at frame 2: a press goes down and its release up, once; cut it"),
+        ([2, 1, 2, 1], "travel runs back at frame 1"),
+        ([3, 1, 2, 1], "travel runs back at frame 2"),
+        ([3, 1, 1, 2], "travel runs back at frame 3"),
+        ([1, 3, 2, 3], "travel runs back at frame 2"),
+        (np.array([3, 0, 0, 1], np.uint8), "travel runs back at frame 3"),
+    ],
+)
+def test_a_stroke_that_cannot_be_is_one_line(values, line):
+    with pytest.raises(InputError, match=line) as caught:
+        check_stroke(values, 4, "travel")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -197,7 +197,7 @@ def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
 
 
 BAD = [
-    (f"{STAGE}/travel", TRAVEL[::-1], None, "travel runs back at frame 1"),
+    (f"{STAGE}/travel", np.abs(TRAVEL - 1), None, "travel runs back at frame 1"),
     (f"{STAGE}/travel", np.where(TRAVEL > 1, np.nan, TRAVEL), None, "travel is nan at frame 4"),
     (f"{STAGE}/travel", np.where(TRAVEL > 1, np.inf, TRAVEL), None, "travel is inf at frame 4"),
     (
@@ -297,7 +297,7 @@ def test_what_an_axial_recording_says_wrongly_is_told(turn):
         io.open_recording(turn)
 
 
-@pytest.mark.parametrize("step", [-0.1, np.nan, np.inf])
+@pytest.mark.parametrize("step", [np.nan, np.inf])
 def test_steps_that_cannot_be_are_told(press, step):
     with pytest.raises(io.InputError, match=re.escape(f"{press}: /entry/instrument/stage/travel ")):
         io.open_recording(press, travel=io.Steps(step))
