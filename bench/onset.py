@@ -1,143 +1,155 @@
-"""Onset against the limit of memory and against NumPy, on the same frames in memory."""
+"""The onset of the light state: the engine against the limits and against peers, on one stack in memory."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Timing, take_turns
+from mirrorskin.bench.harness import Work, take_turns
+from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.memory import check_memory
+from mirrorskin.bench.peers import Peer, References, find_peers
+from mirrorskin.bench.results import Case, Row
+from mirrorskin.bench.same import check_frames, check_heights
+from mirrorskin.bench.stacks import LEVELS, StackName, fill, noise_of, references
 from mirrorskin.engine import OnsetSearch
+from mirrorskin.engine.noise import estimate_noise, thin_out
+from mirrorskin.engine.references import reference_maps
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.onset import onset_levels
 
-_WORD = 64  # bytes that the limits' kernels read at once
-_EACH = 4  # words that an item of theirs takes for each pixel of a tile
+OURS = "mirrorskin"
+
+_THRESHOLD = 0.5
+_MAPS = 64  # bytes a pixel for all maps
+_LARGE = 10**9  # bytes of frames from which no peer may take as much again
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One work of a case.
+class OnsetCase:
+    """A stack and what is asked of it.
 
     Attributes
     ----------
     name : str
-    timing : Timing
-    bytes : int
-        That it must move.
-    """
-
-    name: str
-    timing: Timing
-    bytes: int
-
-    @property
-    def bandwidth(self) -> float:
-        """Bytes per second."""
-        return self.bytes / self.timing.median
-
-
-def run_onset(device: Device, shape: tuple[int, int, int], dtype: np.dtype[Any], rounds: int) -> list[Row]:
-    """Time the onset scan, the limits and NumPy on one stack; their maps must be equal first.
-
-    Parameters
-    ----------
-    device : Device
     shape : (int, int, int)
         Frames, rows and columns.
     dtype : dtype
-        uint8 or uint16.
-    rounds : int
-
-    Returns
-    -------
-    list of Row
-        The read limit first.
+    full : bool
+        The full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
+        compared. Else one threshold for all pixels, and the numbers of the frames (equation 4).
+    hold : int
+    stack : {"press", "random"}
     """
-    length = int(np.prod(shape)) * dtype.itemsize
-    search = OnsetSearch(shape[1:], dtype, noise=1.5, device=device, memory_limit=2 * length)
-    frames = search.room[: shape[0]]
-    if len(frames) < shape[0]:
-        raise DeviceError(f"{device.info.title} has no room for {shape[0]} frames at once: use --quick")
-    _press(frames)
-    limits = _Limits(device, frames)
 
-    def scan() -> None:
+    name: str
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    full: bool
+    hold: int
+    stack: StackName
+
+    @property
+    def title(self) -> str:
+        """What is measured, in one line."""
+        what = "full default" if self.full else f"frame of the onset, one threshold, hold {self.hold}"
+        return f"{what}; {' x '.join(map(str, self.shape))} {self.dtype.name}, {self.stack}"
+
+    @property
+    def bytes(self) -> int:
+        """Of the frames."""
+        return int(np.prod(self.shape)) * self.dtype.itemsize
+
+    def options(self) -> dict[str, Any]:
+        """Return what `OnsetSearch` is told."""
+        if self.full:
+            dark, bright = references(self.shape[1:], self.dtype)
+            return {"dark": dark, "bright": bright}
+        low, high = LEVELS[self.dtype.name]
+        noise = noise_of(self.dtype)
+        return {"dark": low, "bright": high, "hold": self.hold, "subframe": False, "noise": noise}
+
+    def known(self) -> References:
+        """Return what peers are told: the same, prepared in the same way."""
+        shape = self.shape[1:] if self.full else ()
+        options = self.options()
+        dark, bright = reference_maps(options["dark"], options["bright"], shape, self.dtype)  # type: ignore[arg-type]
+        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, self.dtype)
+        return References(np.asarray(level), np.asarray(light), plateau)
+
+
+def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
+    """Time the onset, the limits and the peers on one stack; their maps must be the same first.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        There is not enough memory.
+    DeviceError
+        The device has no room for the stack at once.
+    DisagreementError
+        A peer returned other maps.
+    """
+    check_memory(case.name, 2 * case.bytes + _MAPS * case.shape[1] * case.shape[2])
+    search = OnsetSearch(
+        case.shape[1:], case.dtype, **case.options(), device=device, memory_limit=2 * case.bytes
+    )
+    frames = search.room[: case.shape[0]]
+    if len(frames) < case.shape[0]:
+        raise DeviceError(f"{device.info.title} has no room for {case.shape[0]} frames at once: use --quick")
+    fill(frames, case.stack)
+    travel = np.arange(len(frames), dtype=np.float64) * 0.05
+    limits = Limits(device, frames)
+    ours = _our_works(search, Block(frames, 0, travel=travel))
+    theirs, absent = _peer_works(case, frames, travel)
+
+    def check(results: dict[str, Any]) -> None:
+        for name in theirs:
+            (check_heights if case.full else check_frames)(name, results[OURS], results[name])
+
+    works = {**limits.works(), **ours, **theirs}
+    measured = take_turns(works, rounds, device.profile, check)
+    rows = [Row(name, measured[name], case.bytes, len(frames)) for name in (*ours, *theirs)]
+    return Case(case.name, case.title, limits.rows(measured) + rows, absent)
+
+
+def _our_works(search: OnsetSearch, block: Block) -> dict[str, Work]:
+    def push() -> None:
         search.reset()
-        search.push(Block(frames, 0, travel=np.arange(shape[0], dtype=np.float64)))
-        device.finish()
+        search.push(block)
+        search.device.finish()
 
-    def scan_and_heights() -> None:
-        scan()
-        search.result()
+    def whole() -> object:
+        search.reset()
+        search.push(block)
+        return search.result()
 
-    scan()
-    if not np.array_equal(search.result().frame, _numpy_onset(frames)):
-        raise RuntimeError("the kernel and NumPy do not agree: nothing to time")
-    works = {
-        "read limit": limits.read,
-        "copy limit": limits.copy,
-        "onset scan": scan,
-        "onset scan and heights": scan_and_heights,
-        "NumPy": lambda: _discard(_numpy_onset(frames)),
-    }
-    timings = take_turns(works, rounds)
-    return [
-        Row(name, timing, length * (2 if name == "copy limit" else 1)) for name, timing in timings.items()
-    ]
+    return {f"{OURS}, push only": push, OURS: whole}
 
 
-class _Limits:
-    """The limits' kernels on as many bytes as the frames have."""
+def _peer_works(
+    case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]
+) -> tuple[dict[str, Work], dict[str, str]]:
+    peers, absent = find_peers()
+    known = case.known()
 
-    def __init__(self, device: Device, frames: NDArray[Any]) -> None:
-        self._device = device
-        words = (
-            frames.reshape(-1)
-            .view(np.uint8)[: frames.nbytes // _WORD * _WORD]
-            .view(np.uint32)
-            .reshape(-1, 16)
-        )
-        self._count = len(words)
-        self._items = -(-self._count // (_EACH * device.tile))
-        self._source = device.array("source", words.shape, np.uint32)
-        self._target = device.array("target", words.shape, np.uint32)
-        self._sums = device.array("sums", (self._items,), np.uint32)
-        self._source.host[:] = words
-        self._source.upload()
+    def heights(peer: Peer) -> object:
+        assert peer.heights is not None
+        noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), case.dtype.kind == "u")
+        return peer.heights(frames, travel, known, noise)
 
-    def read(self) -> None:
-        kernel = self._device.kernel("limits", "read_all")
-        kernel(self._items, self._source, np.int32(self._count), self._sums, moved=_WORD * self._count)
-        self._device.finish()
-
-    def copy(self) -> None:
-        kernel = self._device.kernel("limits", "copy_all")
-        kernel(self._items, self._source, np.int32(self._count), self._target, moved=2 * _WORD * self._count)
-        self._device.finish()
-
-
-def _press(frames: NDArray[Any]) -> None:
-    """Fill a stack with pixels that turn light at seeded random frames, some never."""
-    generator = np.random.default_rng(0)
-    count = len(frames)
-    onset = generator.integers(1, count + count // 8, frames.shape[1:])
-    texture = generator.integers(10, 40, frames.shape[1:]).astype(frames.dtype)
-    for number, frame in enumerate(frames):
-        frame[:] = texture + np.where(onset <= number, np.iinfo(frames.dtype).max // 4 * 3, 0).astype(
-            frames.dtype
-        )
-
-
-def _numpy_onset(frames: NDArray[Any]) -> NDArray[np.int32]:
-    """Find the same map as the scan with `hold` 2: the first of two light frames in a row, or the last."""
-    light = frames >= (int(np.iinfo(frames.dtype).max) + 1) // 2
-    light[:-1] &= light[1:]
-    return np.where(light.any(axis=0), light.argmax(axis=0), -1).astype(np.int32)
-
-
-def _discard(_: object) -> None:
-    """Take a value and do nothing with it."""
+    works: dict[str, Work] = {}
+    for peer in peers:
+        if peer.whole_stack and case.bytes >= _LARGE:
+            absent[peer.name] = "takes as much memory again"
+        elif not case.full:
+            works[peer.name] = partial(peer.first_light, frames, known.light, case.hold)
+        elif peer.heights is not None:
+            works[peer.name] = partial(heights, peer)
+    return works, absent

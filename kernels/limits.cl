@@ -1,31 +1,49 @@
 // What memory can give: the least that any kernel does. Specification: limits.py.
+//
+// LANES   4-byte numbers of a word, which is one load: 4 or 16
+// WORDS   words of one work-item
+// STRIDE  work-items that lie side by side: 1 where an item is a core's loop and reads on without a gap; a
+//         work-group where an item is a lane, so that neighbours read neighbouring words
 
-#define WORDS (4 * TILE)  // of 64 bytes, an item
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+typedef JOIN(uint, LANES) WORD;
 
-__kernel void read_all(__global const uint16 *restrict words, const int count, __global uint *restrict sums)
+// An item's words are this one and each STRIDE-th after it.
+long first_word(void)
 {
-    const int base = get_global_id(0) * WORDS;
-    if (base >= count) return;
-    const int end = min(count, base + WORDS);
-    // Independent sums, or each addition would wait for the one before it.
-    uint16 a = (uint16)(0), b = a, c = a, d = a;
-    int i = base;
-    for (; i + 4 <= end; i += 4) {
-        a += words[i];
-        b += words[i + 1];
-        c += words[i + 2];
-        d += words[i + 3];
-    }
-    for (; i < end; ++i) a += words[i];
-    a += b + c + d;
-    const uint8 eight = a.lo + a.hi;
-    const uint4 four = eight.lo + eight.hi;
-    sums[get_global_id(0)] = four.x + four.y + four.z + four.w;
+    const long item = get_global_id(0);
+    return item / STRIDE * STRIDE * WORDS + item % STRIDE;
 }
 
-__kernel void copy_all(__global const uint16 *restrict words, const int count, __global uint16 *restrict target)
+__kernel void read_all(__global const WORD *restrict words, const int count, __global WORD *restrict sums)
 {
-    const int base = get_global_id(0) * WORDS;
-    const int end = min(count, base + WORDS);
-    for (int i = base; i < end; ++i) target[i] = words[i];
+    const long first = first_word();
+    if (first >= count) return;
+    const long end = min((long)count, first + STRIDE * WORDS);
+    // Independent sums, or each addition would wait for the one before it.
+    WORD a = 0, b = 0, c = 0, d = 0;
+    long i = first;
+    for (; i + 3 * STRIDE < end; i += 4 * STRIDE) {
+        a += words[i];
+        b += words[i + STRIDE];
+        c += words[i + 2 * STRIDE];
+        d += words[i + 3 * STRIDE];
+    }
+    for (; i < end; i += STRIDE) a += words[i];
+    sums[get_global_id(0)] = a + b + c + d;
+}
+
+__kernel void copy_all(__global WORD *words, const int count)
+{
+    const long first = first_word();
+    const long end = min((long)count, first + STRIDE * WORDS);
+    for (long i = first; i < end; i += STRIDE) words[count + i] = words[i];
+}
+
+__kernel void triad_all(__global WORD *words, const int count, const uint scale)
+{
+    const long first = first_word();
+    const long end = min((long)count, first + STRIDE * WORDS);
+    for (long i = first; i < end; i += STRIDE) words[2L * count + i] = words[i] + scale * words[count + i];
 }

@@ -6,24 +6,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def read_all(words: NDArray[np.uint32], each: int) -> NDArray[np.uint32]:
+def read_all(words: NDArray[np.uint32], each: int, stride: int) -> NDArray[np.uint32]:
     """Read everything once, and add it up modulo 2^32 so that no read can be left out.
 
     Parameters
     ----------
-    words : ndarray, (n, 16), uint32
+    words : ndarray, (n, lanes), uint32
+        The kernel is told ``n`` after it.
     each : int
-        Rows that one work-item reads.
+        Words that one work-item reads, every ``stride``-th of a block of ``stride * each``.
+    stride : int
 
     Returns
     -------
-    ndarray, (ceil(n / each),), uint32
+    ndarray, (items, lanes), uint32
+        One sum for each item of all blocks; ``items`` is a multiple of ``stride``.
     """
-    starts = np.arange(0, len(words), each)
-    sums: NDArray[np.uint32] = np.add.reduceat(words.sum(axis=1, dtype=np.uint32), starts, dtype=np.uint32)
-    return sums
+    missing = -len(words) % (stride * each)
+    blocks = np.concatenate([words, np.zeros((missing, words.shape[1]), np.uint32)])
+    sums = blocks.reshape(-1, each, stride, words.shape[1]).sum(axis=1, dtype=np.uint32)
+    return np.asarray(sums.reshape(-1, words.shape[1]))
 
 
-def copy_all(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Read everything once and write it elsewhere."""
-    return words.copy()
+def copy_all(words: NDArray[np.uint32], count: int) -> None:
+    """Copy the first ``count`` words over the next ones, in place."""
+    words[count : 2 * count] = words[:count]
+
+
+def triad_all(words: NDArray[np.uint32], count: int, scale: int) -> None:
+    """Add two runs of ``count`` words, the second one scaled, into the run after them; modulo 2^32."""
+    words[2 * count : 3 * count] = words[:count] + np.uint32(scale) * words[count : 2 * count]

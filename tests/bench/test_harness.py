@@ -1,36 +1,94 @@
-"""The harness: turns, medians, and no timing of what does not agree."""
+"""The harness: turns, medians, the device's account, and no timing of what is wrong."""
 
 import numpy as np
 import pytest
 
-from mirrorskin.bench import onset, run_onset, take_turns
+from mirrorskin.bench import harness
+from mirrorskin.bench.harness import take_turns
+from mirrorskin.kernels.profile import Profile
+
+
+class Clock:
+    """A clock that stands still unless a work or a pause moves it."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        monkeypatch.setattr(harness.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(harness.time, "sleep", self.move)
+
+    def move(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    return Clock(monkeypatch)
 
 
 def test_works_take_turns_after_a_warm_up():
     calls = []
-    timings = take_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, rounds=3)
+    works = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
+    measured = take_turns(works, 3, Profile())
     assert calls == ["a", "b"] * 4
-    for timing in timings.values():
-        assert timing.rounds == 3
-        assert 0 <= timing.lower <= timing.median <= timing.upper
+    assert {name: one.wall.rounds for name, one in measured.items()} == {"a": 3, "b": 3}
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
-def test_the_onset_case_runs_on_every_device(device, dtype):
-    rows = run_onset(device, (5, 33, 47), np.dtype(dtype), rounds=1)
-    assert rows[0].name == "read limit"
-    moved = 5 * 33 * 47 * np.dtype(dtype).itemsize
-    assert {row.bytes for row in rows} == {moved, 2 * moved}
+def test_the_spread_is_the_quartiles_and_the_first_call_is_told_apart(clock):
+    seconds = iter([100, *np.random.default_rng(0).permutation(9)])
+    one = take_turns({"a": lambda: clock.move(next(seconds))}, 9, Profile())["a"]
+    # Nine turns, of 0 to 8 seconds, are not all taken: ten seconds of patience end them.
+    assert one.first == 100
+    assert 3 <= one.wall.rounds < 9
+    few = iter([100, 0, 1, 2, 3, 4, *[0] * 4])
+    one = take_turns({"a": lambda: clock.move(next(few) / 10)}, 5, Profile())["a"]
+    assert (one.wall.lower, one.wall.median, one.wall.upper) == pytest.approx((0.1, 0.2, 0.3))
 
 
-def test_nothing_is_timed_when_the_maps_differ(device, monkeypatch):
-    monkeypatch.setattr(onset, "_numpy_onset", lambda frames: np.zeros(frames.shape[1:], np.int32))
-    with pytest.raises(RuntimeError, match="do not agree"):
-        run_onset(device, (5, 9, 7), np.dtype(np.uint8), rounds=1)
+def test_a_slow_work_leaves_its_turns_to_the_others(clock):
+    works = {"slow": lambda: clock.move(60), "quick": lambda: clock.move(0.1)}
+    measured = take_turns(works, 15, Profile())
+    assert measured["slow"].wall.rounds == 3
+    assert measured["quick"].wall.rounds == 15
 
 
-def test_the_spread_is_the_quartiles(monkeypatch):
-    ticks = iter(np.repeat(np.cumsum([0, *range(9)]), 2)[1:])
-    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
-    timing = take_turns({"a": lambda: None}, rounds=9)["a"]
-    assert (timing.lower, timing.median, timing.upper) == (2, 4, 6)
+def test_nothing_is_timed_before_the_check():
+    calls = []
+
+    def check(results):
+        assert results == {"a": 1, "b": 2}
+        raise RuntimeError("wrong")
+
+    works = {"a": lambda: calls.append("a") or 1, "b": lambda: calls.append("b") or 2}
+    with pytest.raises(RuntimeError, match="wrong"):
+        take_turns(works, 3, Profile(), check)
+    assert calls == ["a", "b"]
+
+
+def test_the_devices_account_is_told_by_kind_and_by_kernel(clock):
+    profile = Profile()
+    profile.add("kernel", "before", 99.0)
+    turns = iter([1, 2, 3, 4])
+
+    def work():
+        turn = next(turns)
+        if turn == 1:
+            profile.add("compile", "file", 0.5)
+        profile.add("upload", "frames", 0.01 * turn)
+        for name in ("scan", "heights", "heights"):
+            profile.add("kernel", name, 0.1 * turn)
+        clock.move(turn)
+
+    one = take_turns({"a": work}, 3, profile)["a"]
+    assert one.compile == 0.5
+    assert one.kernels == pytest.approx({"scan": 0.3, "heights": 0.6})
+    assert set(one.device) == {"upload", "kernel"}
+    assert one.kernel == pytest.approx(0.9)
+    assert one.transfer == pytest.approx(0.03)
+    assert one.wall.median == 3
+
+
+def test_a_work_without_a_device_has_no_account_of_it(clock):
+    one = take_turns({"a": lambda: clock.move(1)}, 3, Profile())["a"]
+    assert one.device == {}
+    assert np.isnan(one.kernel)
+    assert one.transfer == 0

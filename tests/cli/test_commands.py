@@ -103,12 +103,22 @@ def test_the_demo_draws_its_figures(tmp_path):
     assert made == {f"{thing}{ending}" for thing in things for ending in (".h5", ".png", "-result.h5")}
 
 
-def test_the_benchmark_agrees_with_its_peers_before_it_times():
-    cases = json.loads(mirrorskin("bench", "--quick", "--json"))["cases"]
-    for rows in cases.values():
-        assert {row["name"] for row in rows} >= {"read limit", "copy limit", "onset scan", "NumPy"}
-        assert all(row["timing"]["median"] > 0 for row in rows)
-        assert rows[0]["share"] == 1
+def test_the_benchmark_agrees_with_its_peers_and_writes_json_and_a_page(tmp_path):
+    told = json.loads(mirrorskin("bench", "--quick", "--json", "-o", tmp_path / "run.json"))
+    assert told == json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    assert {"date", "commit", "device", "processor", "threads", "versions"} <= set(told)
+    for case in told["cases"]:
+        assert all(row["wall"]["median"] > 0 for row in case["rows"])
+        assert case["rows"][0]["share"] == 1
+        assert f"## {case['name']}: " in (tmp_path / "run.md").read_text(encoding="utf-8")
+
+
+def test_the_benchmarks_table_fits_a_hundred_columns():
+    table = mirrorskin("bench", "--quick", "--case", "full-float32", "--case", "live").splitlines()
+    assert max(map(len, table)) <= 100
+    works = [line.split("  ")[0] for line in table]
+    assert works.count("read limit") == 2
+    assert {"mirrorskin", "NumPy", "OpenCV", "mirrorskin, full default"} <= set(works)
 
 
 @pytest.mark.parametrize(

@@ -110,10 +110,21 @@ CASES = {
     "float64": (lambda path: foreign(path, frames=FRAMES.astype("f8")), GIVEN, "uint8, uint16 or float32"),
     "travel with NaN": (lambda path: ours(path, travel=NAN_TRAVEL), [], "nan at frame 3"),
     "travel that runs back": (
-        lambda path: ours(path, travel=TRAVEL[::-1].copy()),
+        lambda path: ours(path, travel=np.abs(TRAVEL - 0.2)),
         [],
         "runs back at frame 1",
     ),
+    "a release for a press": (
+        lambda path: ours(path, travel=TRAVEL[::-1].copy()),
+        [],
+        "bad.h5: travel only falls: that is a release; give event release",
+    ),
+    "a press for a release": (
+        ours,
+        ["--event", "release"],
+        "bad.h5: travel only rises: that is a press; give event onset",
+    ),
+    "an unknown event": (ours, ["--event", "slip"], "slip"),
     "travel missing": (lambda path: ours(path, travel=None), [], "--travel-step"),
     "travel too short": (lambda path: ours(path, travel=TRAVEL[:5]), [], "travel"),
     "travel not given": (lambda path: foreign(path, frames=FRAMES), GIVEN[:2], "--travel-step"),
@@ -208,6 +219,9 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
         (["import", ".", "--motion", "vertical", "-o", "a.h5"], "--travel-step"),
         (["score", "nothing.h5", "--truth", "nothing.h5"], "no such file"),
         (["info", "nothing.h5"], "no such file"),
+        (["bench", "--case", "what"], "there is equation4-uint8"),
+        (["bench", "-o", "run.txt"], "ends in .json"),
+        (["bench", "-o", "no/such/run.json"], "no folder"),
     ],
 )
 def test_other_commands_refuse_too(tmp_path, monkeypatch, words, said_of):

@@ -1,0 +1,96 @@
+"""The limits of a device's memory: as many bytes as a case's frames, read, copied and combined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.bench.harness import Measured, Work
+from mirrorskin.bench.results import Row
+from mirrorskin.kernels.device import Array, Device
+
+_SCALE = 3
+_RUNS = {"read": 1, "copy": 2, "triad": 3}  # runs of words that a kernel touches
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """How a limit's kernel is cut; the macros of ``limits.cl``."""
+
+    lanes: int
+    words: int
+    stride: int
+
+    def items(self, count: int) -> int:
+        """Return the work-items that ``count`` words take."""
+        return -(-count // (self.words * self.stride)) * self.stride
+
+
+CORES = (Shape(16, 256, 1), Shape(16, 1024, 1), Shape(16, 4096, 1))
+LANES = (Shape(4, 16, 128), Shape(4, 64, 128), Shape(4, 256, 128))
+
+
+class Limits:
+    """The limits' kernels, on a copy of a case's frames.
+
+    Each is run in several shapes, because which one a memory likes best differs between machines; the best
+    of the same run is the limit.
+
+    Parameters
+    ----------
+    device : Device
+    frames : ndarray, any shape and type
+        In C order.
+    """
+
+    def __init__(self, device: Device, frames: NDArray[Any]) -> None:
+        numbers = frames.nbytes // 4
+        self._device = device
+        self._shapes = CORES if device.info.kind == "cpu" else LANES
+        self._data = device.array("limits", (numbers,), np.uint32)
+        self._data.host[:] = frames.reshape(-1).view(np.uint8)[: 4 * numbers].view(np.uint32)
+        self._data.upload()
+        room = max(shape.lanes * shape.items(numbers // shape.lanes) for shape in self._shapes)
+        self._sums = device.array("sums", (room,), np.uint32)
+        self._sums.upload()
+
+    def works(self) -> dict[str, Work]:
+        """Return the works to be timed."""
+        return {
+            _name(limit, shape): partial(self._run, limit, shape) for limit in _RUNS for shape in self._shapes
+        }
+
+    def rows(self, measured: Mapping[str, Measured]) -> list[Row]:
+        """Return read, copy and triad limit, each in the shape that was the quickest."""
+        rows = []
+        for limit in _RUNS:
+            best = min(self._shapes, key=lambda shape: measured[_name(limit, shape)].wall.median)
+            rows.append(Row(f"{limit} limit", measured[_name(limit, best)], self._moved(limit, best)))
+        return rows
+
+    def _run(self, limit: str, shape: Shape) -> None:
+        macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
+        kernel = self._device.kernel("limits", f"{limit}_all", **macros)
+        count, moved = self._count(limit, shape), self._moved(limit, shape)
+        others: dict[str, list[Array | np.uint32]] = {
+            "read": [self._sums],
+            "copy": [],
+            "triad": [np.uint32(_SCALE)],
+        }
+        kernel(shape.items(count), self._data, np.int32(count), *others[limit], moved=moved)
+        self._device.finish()
+
+    def _count(self, limit: str, shape: Shape) -> int:
+        return len(self._data.host) // shape.lanes // _RUNS[limit]
+
+    def _moved(self, limit: str, shape: Shape) -> int:
+        return 4 * shape.lanes * self._count(limit, shape) * _RUNS[limit]
+
+
+def _name(limit: str, shape: Shape) -> str:
+    return f"{limit} limit, {shape.words} words of {shape.lanes}"

@@ -1,0 +1,69 @@
+"""What a benchmark found, and how it is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mirrorskin.bench.harness import Measured
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One work of a case.
+
+    Attributes
+    ----------
+    name : str
+    measured : Measured
+    bytes : int
+        That a turn must move: for the onset the frames, each once, and nothing else.
+    frames : int
+        That a turn handles; 0 where it handles no frames.
+    """
+
+    name: str
+    measured: Measured
+    bytes: int
+    frames: int = 0
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames per second by the host's clock."""
+        return self.frames / self.measured.wall.median
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second by the host's clock."""
+        return self.bytes / self.measured.wall.median
+
+    @property
+    def kernel_bandwidth(self) -> float:
+        """Bytes per second by the device's account of its kernels; NaN where none ran."""
+        return self.bytes / self.measured.kernel
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """All works on one stack.
+
+    Attributes
+    ----------
+    name, title : str
+    rows : list of Row
+        The read limit first.
+    absent : dict of str
+        Peers that were not run, and why.
+    """
+
+    name: str
+    title: str
+    rows: list[Row]
+    absent: dict[str, str]
+
+    def share(self, row: Row) -> float:
+        """Return a work's bandwidth as a share of the read limit's, both by the host's clock."""
+        return row.bandwidth / self.rows[0].bandwidth
+
+    def kernel_share(self, row: Row) -> float:
+        """Return the same share by the device's account of its kernels; NaN where none ran."""
+        return row.kernel_bandwidth / self.rows[0].kernel_bandwidth

@@ -1,0 +1,103 @@
+"""All cases, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from mirrorskin.bench.live import run_live
+from mirrorskin.bench.onset import OnsetCase, run_onset
+from mirrorskin.bench.results import Case
+from mirrorskin.bench.stacks import StackName
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import Device
+
+_HD, _MEMORY, _LIVE = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640)
+_QUICK = (12, 48, 64)
+_ROUNDS = 15
+
+
+def _case(
+    name: str,
+    shape: tuple[int, int, int] = _HD,
+    dtype: str = "uint8",
+    stack: StackName = "random",
+    full: bool = False,
+    hold: int = 1,
+) -> OnsetCase:
+    return OnsetCase(name, shape, np.dtype(dtype), full, hold, stack)
+
+
+def _pushed(name: str, stack: StackName) -> dict[str, OnsetCase]:
+    return {
+        "mirrorskin, equation 4": _case(name, _LIVE, stack=stack),
+        "mirrorskin, full default": _case(name, _LIVE, stack=stack, full=True),
+    }
+
+
+_ONSET = [
+    _case("equation4-uint8"),
+    _case("equation4-uint16", dtype="uint16"),
+    _case("equation4-float32", dtype="float32"),
+    _case("equation4-memory", _MEMORY),
+    _case("hold2-uint8", hold=2),
+    _case("full-uint8", full=True, stack="press"),
+    _case("full-uint16", dtype="uint16", full=True, stack="press"),
+    _case("full-float32", dtype="float32", full=True, stack="press"),
+    _case("full-memory", _MEMORY, full=True, stack="press"),
+    _case("full-random", full=True),
+]
+_PUSHED = {
+    "live": _pushed("live", "press"),
+    "live-random": _pushed("live-random", "random"),
+}
+
+NAMES = (*(case.name for case in _ONSET), *_PUSHED)
+
+
+def run_suite(
+    device: Device,
+    names: Iterable[str] = NAMES,
+    quick: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[Case]:
+    """Run cases in their order.
+
+    Parameters
+    ----------
+    device : Device
+    names : iterable of str
+        Of `NAMES`.
+    quick : bool
+        Small stacks and one round: that all works agree is checked, the times mean nothing.
+    progress : callable
+        Is told how many cases are done.
+
+    Raises
+    ------
+    InputError
+        No case has such a name, or there is not enough memory for one.
+    DisagreementError
+        Works that should return the same maps do not.
+    """
+    wanted = set(names)
+    if unknown := wanted - set(NAMES):
+        raise InputError(f"case {min(unknown)!r}: no such case; there is {', '.join(NAMES)}")
+    cases = []
+    for name in NAMES:
+        if name in wanted:
+            cases.append(_run(name, device, quick))
+            progress(len(cases))
+    return cases
+
+
+def _run(name: str, device: Device, quick: bool) -> Case:
+    def sized(case: OnsetCase) -> OnsetCase:
+        return replace(case, shape=_QUICK) if quick else case
+
+    rounds = 1 if quick else _ROUNDS
+    if name in _PUSHED:
+        return run_live({row: sized(case) for row, case in _PUSHED[name].items()}, device, rounds)
+    return run_onset(sized(next(case for case in _ONSET if case.name == name)), device, rounds)

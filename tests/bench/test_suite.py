@@ -1,0 +1,114 @@
+"""The cases: all agree on every device, and nothing is timed where they do not."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mirrorskin.bench import NAMES, as_data, as_markdown, as_rows, memory, onset, run_suite
+from mirrorskin.bench.peers import Peer, numpy_
+from mirrorskin.bench.same import DisagreementError
+from mirrorskin.io import InputError
+from mirrorskin.kernels.errors import DeviceError
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_case_agrees_on_every_device(device, name):
+    (case,) = run_suite(device, [name], quick=True)
+    names = [row.name for row in case.rows]
+    assert names[:3] == ["read limit", "copy limit", "triad limit"]
+    assert case.name == name
+    assert case.share(case.rows[0]) == case.kernel_share(case.rows[0]) == 1
+    if not name.startswith("live"):
+        assert {"mirrorskin", "mirrorskin, push only", "NumPy", "OpenCV"} <= set(names)
+    for row in case.rows:
+        limit = "limit" in row.name
+        frame = 48 * 64 * {"uint16": 2, "float32": 4}.get(name.split("-")[-1], 1)
+        assert row.bytes == pytest.approx(
+            frame if limit and name.startswith("live") else 12 * frame, rel=0.02
+        )
+        assert row.frames == (0 if limit else 12)
+        assert ("kernel" in row.measured.device) == (limit or "mirrorskin" in row.name)
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "spoil"),
+    [
+        ("equation4-uint8", "frame", {"first_light": lambda frames, light, hold: 7}),
+        ("full-uint8", "status", {"status": 9}),
+        ("full-uint8", "height", {"height": np.float32(1e-6)}),
+        ("full-uint8", "sigma", {"sigma": np.float32(np.nan)}),
+    ],
+)
+def test_a_peer_that_differs_is_named_and_nothing_is_timed(device, monkeypatch, name, word, spoil):
+    def first_light(frames, light, hold):
+        found = numpy_.first_light(frames, light, hold)
+        found[3, 5] += 1
+        return found
+
+    def heights(*given):
+        maps = numpy_.heights(*given)
+        row, column = np.argwhere(maps.status == 1)[0]
+        getattr(maps, word)[row, column] += spoil[word]
+        return maps
+
+    timed = []
+    monkeypatch.setattr(onset, "find_peers", lambda: ([Peer("Odd one", first_light, heights)], {}))
+    monkeypatch.setattr("mirrorskin.bench.harness._measured", lambda *given: timed.append(given))
+    with pytest.raises(
+        DisagreementError, match=f"Odd one differs from mirrorskin in the {word} of 1 of 3072 pixels"
+    ):
+        run_suite(device, [name], quick=True)
+    assert not timed
+
+
+def test_a_peer_that_takes_too_much_memory_is_named(device, monkeypatch):
+    monkeypatch.setattr(onset, "_LARGE", 1)
+    (case,) = run_suite(device, ["equation4-uint8"], quick=True)
+    assert case.absent["NumPy argmax"] == "takes as much memory again"
+    assert "NumPy argmax" not in {row.name for row in case.rows}
+
+
+def test_a_case_without_enough_memory_is_refused(device, monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: 5000)
+    with pytest.raises(InputError, match=r"case full-memory needs 0.0 GB .* close other programs"):
+        run_suite(device, ["full-memory"], quick=True)
+
+
+def test_free_memory_is_told_in_bytes_or_not_at_all(monkeypatch, tmp_path):
+    told = memory.free_memory()
+    assert told is None or 10**7 < told < 10**14
+    monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "no such file")
+    assert memory.free_memory() is None
+    memory.check_memory("any", 10**18)
+
+
+def test_a_device_without_room_for_the_stack_is_refused(small_device):
+    small_device.max_allocation = 12 * 48 * 64 - 1
+    with pytest.raises(DeviceError, match="has no room for 12 frames at once"):
+        run_suite(small_device, ["equation4-uint8"], quick=True)
+
+
+def test_an_unknown_case_is_refused_and_the_known_ones_are_listed(device):
+    with pytest.raises(InputError, match="case 'what': no such case; there is equation4-uint8, "):
+        run_suite(device, ["live", "what"])
+
+
+def test_progress_is_told_case_by_case(device):
+    done = []
+    run_suite(device, ["live", "hold2-uint8"], quick=True, progress=done.append)
+    assert done == [1, 2]
+
+
+def test_a_run_becomes_json_and_a_page(device):
+    data = as_data(device, run_suite(device, ["equation4-uint8", "live"], quick=True), quick=True)
+    assert json.loads(json.dumps(data, allow_nan=False)) == data
+    assert data["versions"]["numpy"] == np.__version__
+    assert data["commit"] is None or len(data["commit"].removesuffix("-dirty")) == 40
+    page = as_markdown(data)
+    assert page.startswith(f"# {device.info.title} (driver {device.info.driver})")
+    for case in data["cases"]:
+        assert f"## {case['name']}: {case['title']}\n\n| work | ms |" in page
+        for cells in as_rows(case):
+            assert f"| {' | '.join(cells)} |" in page
+            assert len(cells) == 9

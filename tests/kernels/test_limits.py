@@ -1,0 +1,53 @@
+"""The limits' kernels against their references, in every shape that is tried on a device."""
+
+import numpy as np
+import pytest
+
+from mirrorskin.bench.limits import CORES, LANES
+from mirrorskin.kernels import limits
+
+SHAPES = pytest.mark.parametrize("shape", [*CORES, *LANES], ids=str)
+
+
+def run(device, name, shape, words, count, *rest):
+    """Run a kernel in place on a copy of some words; return them, and the sums."""
+    data = device.array("words", words.shape, np.uint32)
+    sums = device.array("sums", (shape.items(count), shape.lanes), np.uint32)
+    data.host[:], sums.host[:] = words, 0
+    data.upload()
+    sums.upload()
+    macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
+    last = [sums] if name == "read_all" else []
+    kernel = device.kernel("limits", name, **macros)
+    kernel(shape.items(count), data, np.int32(count), *last, *rest, moved=words.nbytes)
+    return data.download(), sums.download()
+
+
+def random_words(count, shape):
+    return np.random.default_rng(count).integers(0, 2**32, (count, shape.lanes), np.uint32)
+
+
+@SHAPES
+@pytest.mark.parametrize("count", [1, 3, 127, 4099, 70_000])
+def test_reading_adds_up_all_words(device, shape, count):
+    words = random_words(count, shape)
+    _, sums = run(device, "read_all", shape, words, count)
+    np.testing.assert_array_equal(sums, limits.read_all(words, shape.words, shape.stride))
+    np.testing.assert_array_equal(sums.sum(axis=0, dtype=np.uint32), words.sum(axis=0, dtype=np.uint32))
+
+
+@SHAPES
+@pytest.mark.parametrize("count", [1, 130, 9001])
+def test_copy_and_triad_touch_only_their_target(device, shape, count):
+    words = random_words(3 * count + 5, shape)
+    for name, rest in (("copy_all", []), ("triad_all", [np.uint32(2**31 + 3)])):
+        expected = words.copy()
+        getattr(limits, name)(expected, count, *rest)
+        found, _ = run(device, name, shape, words, count, *rest)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_the_triad_is_a_sum_with_a_scaled_part():
+    words = np.array([[1], [2], [10], [2**31], [0], [0], [7]], np.uint32)
+    limits.triad_all(words, 2, 3)
+    np.testing.assert_array_equal(words[4:, 0], [31, 2 + 2**31, 7])
