@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, cut_into_bands
-from mirrorskin.engine.onset import EVENTS, MEMORY_LIMIT, Event, Onset
+from mirrorskin.engine.bands import Band
 from mirrorskin.engine.references import reference_pair
-from mirrorskin.engine.samples import C_TYPES, Noise, check_dtype, travel_pairs
-from mirrorskin.io import Block, InputError, check_travel
+from mirrorskin.engine.samples import C_TYPES, travel_pairs
+from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
+from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import Array, Device, Kernel, open_device
 
@@ -65,10 +65,8 @@ def find_change_point(
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
     """
-    if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
-        raise InputError(f"frames have shape {frames.shape}: (T, H, W) with at least 2 frames is needed")
     search = ChangePointSearch(
-        (frames.shape[1], frames.shape[2]),
+        check_stack(frames),
         frames.dtype,
         dark=dark,
         bright=bright,
@@ -87,7 +85,7 @@ def find_change_point(
     return search.result()
 
 
-class ChangePointSearch:
+class ChangePointSearch(Search):
     """Find the change from dark to light, or back, in frames that come block by block, however they are cut.
 
     With known levels one pass is enough, and ``result`` may be asked for at any time. With unknown ones all
@@ -125,34 +123,22 @@ class ChangePointSearch:
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
+        _check(threshold, hold)
         dtype = np.dtype(dtype)
-        check_dtype(dtype)
-        _check(threshold, hold, event)
-        self._noise = Noise(noise, dtype.kind == "u")
         self.passes = 2 if dark is None or bright is None else 1
+        maps, opened = _maps(dtype, self.passes), open_device(device)
+        super().__init__(shape, dtype, maps, noise, event, opened, memory_limit)
         references = reference_pair(dark, bright, shape, dtype) if self.passes == 1 else None
-        self.device = open_device(device)
-        self._shape, self._dtype = shape, dtype
         self._hold = hold
         # A release is a change as well, from bright to dark: its first level is the bright one.
-        self._release = event == "release"
         self._level = 1 - threshold if self._release else threshold
         self._travel: list[float] = []
-        length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype, self.passes), length)
-        alone = len(self._bands) == 1
-        self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
         self._start = np.zeros(shape, np.int32)
         if references is not None:
             first, second = reversed(references) if self._release else references
             self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
         self.reset()
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
-        return self._room
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
@@ -198,15 +184,9 @@ class ChangePointSearch:
             Travel is missing, or runs back; or there are more frames in the second pass than in the first.
         """
         frames, first = block.frames, len(self._travel)
-        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
-            raise InputError(
-                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
-            )
-        so_far = self._travel[-1:]
-        travel = check_travel(block.travel, len(frames), "travel", after=so_far, falls=self._release)
         if self._weight is not None and first + len(frames) >= len(self._weight.host):
             raise InputError("there are more frames in the second pass than in the first: give the same ones")
-        self._noise.look(frames)
+        travel = self._check(block, self._travel)
         self._travel.extend(travel)
         for band in self._bands:
             with band.resident():
@@ -323,9 +303,7 @@ def _maps(dtype: np.dtype[Any], passes: int) -> dict[str, DTypeLike]:
     return {"ring": ring, "status": np.uint8, **whole, **floats, **(twice if passes == 2 else {})}
 
 
-def _check(threshold: float, hold: int, event: str) -> None:
-    if event not in EVENTS:
-        raise InputError(f"unknown event {event!r}; known are {', '.join(EVENTS)}")
+def _check(threshold: float, hold: int) -> None:
     if not 0 < threshold < 1:
         raise InputError(f"threshold {threshold}: a change-point needs a share between 0 and 1, such as 0.5")
     if not 1 <= hold <= REACH:

@@ -3,51 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, Planes, cut_into_bands
+from mirrorskin.engine.bands import Band, Planes
 from mirrorskin.engine.fitting import fit
 from mirrorskin.engine.references import check_threshold, reference_maps
-from mirrorskin.engine.samples import C_TYPES, Noise, check_dtype
-from mirrorskin.io import Block, InputError, check_travel
+from mirrorskin.engine.samples import C_TYPES
+from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
+from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.device import Array, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
-
-Event = Literal["onset", "release"]
-EVENTS: tuple[Event, ...] = get_args(Event)
-MEMORY_LIMIT = 256_000_000
 
 _SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
 _ROUNDING = 1e-12  # a threshold such as 0.55 is not exact: counts that reach it but for rounding are light
 _INT_MAX = np.iinfo(np.int32).max
-
-
-@dataclass(frozen=True, slots=True)
-class Onset:
-    """Where and when a press turned the pixels light, or a release dark again.
-
-    Attributes
-    ----------
-    height, sigma : ndarray, (H, W), float32
-        Millimetres, and the standard deviation of the height; NaN unless status is 1.
-    status : ndarray, (H, W), uint8
-        0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
-        2 dark at start, 3 light to the end.
-    frame : ndarray, (H, W), int32
-        Number of the first light frame, of a release of the first dark one; -1 without one.
-    noise : float
-        Standard deviation of a sample that was reckoned with, counts.
-    """
-
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    status: NDArray[np.uint8]
-    frame: NDArray[np.int32]
-    noise: float
 
 
 def find_onset(
@@ -98,10 +70,8 @@ def find_onset(
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
     """
-    if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
-        raise InputError(f"frames have shape {frames.shape}: (T, H, W) with at least 2 frames is needed")
     search = OnsetSearch(
-        (frames.shape[1], frames.shape[2]),
+        check_stack(frames),
         frames.dtype,
         dark=dark,
         bright=bright,
@@ -117,7 +87,7 @@ def find_onset(
     return search.result()
 
 
-class OnsetSearch:
+class OnsetSearch(Search):
     """Find the onset in frames that come block by block, however they are cut.
 
     Parameters
@@ -147,23 +117,15 @@ class OnsetSearch:
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
-        dtype = np.dtype(dtype)
-        check_dtype(dtype)
-        _check(hold, event)
+        if not 1 <= hold <= _INT_MAX:
+            raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
+        dtype, opened = np.dtype(dtype), open_device(device)
+        fit(opened, _trial)
+        super().__init__(shape, dtype, _maps(dtype, subframe), noise, event, opened, memory_limit)
         low, high = reference_maps(dark, bright, shape, dtype)
-        self.device = open_device(device)
-        fit(self.device, _trial)
-        self._shape = shape
-        self._dtype = dtype
-        self._release = event == "release"
         self._subframe = subframe
-        self._noise = Noise(noise, dtype.kind == "u")
         # The plateau that a run comes from: no reference tells how light a pixel was before its release.
         self._own_dark = self._release or dark is None
-        length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, dtype, _maps(dtype, subframe), length)
-        alone = len(self._bands) == 1
-        self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
         self._macros: dict[str, str | int] = {
             "FRAME": C_TYPES[f"{dtype.kind}{dtype.itemsize}"],
             "BITS": 8 * dtype.itemsize,
@@ -183,11 +145,6 @@ class OnsetSearch:
                 self._launch(band, "onset_levels", *size, *parts, "levels", "marks", "closed")
         self.reset()
 
-    @property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
-        return self._room
-
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
         self._travel.clear()
@@ -202,13 +159,7 @@ class OnsetSearch:
             Travel is missing, or runs back.
         """
         frames, first = block.frames, self._travel.count
-        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
-            raise InputError(
-                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
-            )
-        so_far = self._travel.latest
-        travel = check_travel(block.travel, len(frames), "travel", after=so_far, falls=self._release)
-        self._noise.look(frames)
+        travel = self._check(block, self._travel.latest)
         self._travel.extend(travel)
         for band in self._bands:
             if self._subframe:
@@ -370,10 +321,3 @@ def _maps(dtype: np.dtype[Any], subframe: bool) -> dict[str, Planes]:
         "status": Planes(1, np.uint8),
         **kept,
     }
-
-
-def _check(hold: int, event: str) -> None:
-    if not 1 <= hold <= _INT_MAX:
-        raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
-    if event not in EVENTS:
-        raise InputError(f"unknown event {event!r}; known are {', '.join(EVENTS)}")

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.changepoint import ChangePointSearch
-from mirrorskin.engine.onset import MEMORY_LIMIT, Event, OnsetSearch
+from mirrorskin.engine.onset import OnsetSearch
+from mirrorskin.engine.search import MEMORY_LIMIT, Event
 from mirrorskin.io import Block, InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
 
