@@ -27,11 +27,6 @@ class Row:
     frames: int = 0
 
     @property
-    def frame_rate(self) -> float:
-        """Frames per second by the host's clock."""
-        return self.frames / self.measured.wall.median
-
-    @property
     def bandwidth(self) -> float:
         """Bytes per second by the host's clock."""
         return self.bytes / self.measured.wall.median

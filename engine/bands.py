@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.kernels.device import Array, Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
-_INT_MAX = np.iinfo(np.int32).max
+_MOST_PIXELS = 2**30  # kernels number those of two planes with an int
 
 
 _LINE = 64  # bytes of the longest word that a kernel loads at once
@@ -55,9 +55,9 @@ class Band:
         self.pixels = shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride = -(-self.pixels // word) * word
-        if self.pixels > _INT_MAX:
+        if self.stride > _MOST_PIXELS:
             raise DeviceMemoryError(
-                f"kernels number pixels to {_INT_MAX}; {self.pixels} are too many at once"
+                f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
         self._shape = shape
         self.maps = {

@@ -17,9 +17,11 @@ from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.device import Array, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
+_PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
 _SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
 _ROUNDING = 1e-12  # a threshold such as 0.55 is not exact: counts that reach it but for rounding are light
 _INT_MAX = np.iinfo(np.int32).max
+_LONGEST = 2**30  # no stack is as long, and sums with frames' numbers stay in range
 
 
 def find_onset(
@@ -129,7 +131,7 @@ class OnsetSearch(Search):
         self._macros: dict[str, str | int] = {
             "FRAME": C_TYPES[f"{dtype.kind}{dtype.itemsize}"],
             "BITS": 8 * dtype.itemsize,
-            "HOLD": hold,
+            "HOLD": min(hold, _LONGEST),
             "SAMPLES": int(subframe),
             "RELEASE": int(self._release),
         }
@@ -204,7 +206,7 @@ class OnsetSearch(Search):
         """Return height, sigma, status and frame of a band's rows as if no frame followed."""
         known = [band.stride, "times", *self._travel.arguments, "answers", "status"]
         if self._subframe:
-            known = [self._travel.count, *known, "busy", "samples", "marks", "levels", *self._look(noise)]
+            known = [self._travel.count, *known, "busy", "samples", "levels", *self._look(noise)]
         planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
         with band.resident():
             self._launch(band, "onset_heights", *known, *([0] if self._subframe else []))
@@ -215,8 +217,10 @@ class OnsetSearch(Search):
                 self._launch(band, "onset_heights", *known, 1)
         return maps
 
-    def _look(self, noise: float) -> tuple[float, int]:
-        return noise, int(self._own_dark)
+    def _look(self, noise: float) -> tuple[float, float, float]:
+        """Return the noise, and what a sample may differ from the dark and the light plateau it sits on."""
+        light = _PLATEAU * np.sqrt(2) * noise  # from the plateau, which is a sample itself
+        return noise, light if self._own_dark else _PLATEAU * noise, light
 
     def _launch(
         self,
@@ -274,19 +278,20 @@ class _Travel:
         """Add the next frames: their travel, the step to each, and the travel since the first frame."""
         old = len(self._values)
         steps = np.diff(travel, prepend=self._values[-1] if old else travel[0])
+        count = old + len(travel)
+        self._make_room(count)
         self._values.extend(travel.tolist())
-        self._make_room()
         self._table.claim()
-        self._table.host[:, old : len(self._values)] = travel, steps, travel - self._values[0]
+        self._table.host[:, old:count] = travel, steps, travel - self._values[0]
         self._table.upload()
 
-    def _make_room(self) -> None:
+    def _make_room(self, count: int) -> None:
         room = self._table.host.shape[1]
-        if len(self._values) <= room:
+        if count <= room:
             return
         known = self._table
         known.claim()
-        self._table = self._device.array("travel", (3, 2 * len(self._values)), np.float32)
+        self._table = self._device.array("travel", (3, 2 * count), np.float32)
         self._table.host[:, :room] = known.host
 
 

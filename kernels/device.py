@@ -325,7 +325,10 @@ class Kernel:
         group = self._group
         size = -(-items // group) * group
         values = [arg.buffer if isinstance(arg, Array) else arg for arg in args]
-        event = self._kernel(self._device.queue, (size,), (group,), *values)
+        try:
+            event = self._kernel(self._device.queue, (size,), (group,), *values)
+        except cl.Error as error:
+            raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
         self._device.profile.watch("kernel", self.name, event, moved)
 
 

@@ -18,7 +18,8 @@
 // marks    the smallest sample that is light; the smallest that is not surely dark
 // closed   all bits of a pixel set once its onset is decided; the same for pixels that never get one
 // busy     of each word: whether a run is open, or the samples around it are not complete
-// times    frame at which the run began; the last frame that was surely dark, where the next one was not
+// times    frame at which the run began; the last surely dark frame before a run that is not complete, or before now
+//          where the last sample is not surely dark
 // samples  the last sample; those before, at and after the onset of a run that is not complete
 // answers  height; sigma
 // status   0 invalid input, 1 onset, 2 never light, 3 light at start (RELEASE: 2 dark at start, 3 light to the end)
@@ -31,7 +32,6 @@
 
 #define SPAN 32   // frames whose answers fit into one integer
 #define GROUP 8   // frames that are compared at once
-#define PLATEAU 3.0f  // sigmas by which a sample may differ from the plateau that it sits on
 #define NEEDED (!SAMPLES || HOLD > 3 ? HOLD : 3)  // frames from an onset on, after which nothing about it can change
 
 #define JOIN_(a, b) a##b
@@ -321,13 +321,11 @@ int last_dark(__global const FRAME *series, const int from, const int pixels, co
     return t >= (now == 0) ? now + t : now == 0 ? 0 : SEE(last) < sure ? now - 1 : known;
 }
 
-// Height and variance of a pixel: onset.py explains them. Products instead of choices, so that it becomes vector code.
+// Height and variance of a pixel: onset.py explains them. All is computed, then chosen, so that it becomes vector code.
 float2 answer(const Around *around, const int i, const float from, const float step, const float level,
-              const float dark, const float noise, const int own_dark)
+              const float dark, const float noise, const float dark_tolerance, const float light_tolerance)
 {
     const float low = around->before[i], high = around->at[i], rise = high - low, steepness = 1 / rise;
-    const float light_tolerance = PLATEAU * M_SQRT2_F * noise;
-    const float dark_tolerance = own_dark ? light_tolerance : PLATEAU * noise;
     const int from_dark = low <= dark + dark_tolerance, to_light = high >= around->after[i] - light_tolerance;
     const int hovered = (rise <= light_tolerance) | ((around->waited[i] - 2) * rise > 2.5f * light_tolerance);
     const int sudden = from_dark & to_light, guess = from_dark | to_light | hovered, look = !(sudden | hovered);
@@ -336,7 +334,7 @@ float2 answer(const Around *around, const int i, const float from, const float s
     const float share = sudden ? 0.5f : crossed;
     const float slope = step * noise * steepness, width = step + (hovered ? around->doubt[i] : 0);
     const float known = slope * slope * (crossed * crossed + rest * rest), guessed = width * width / 12;
-    return (float2)(-(from + step * share), known * look + guessed * guess);
+    return (float2)(-(from + step * share), (look ? known : 0) + (guess ? guessed : 0));
 }
 #endif
 
@@ -347,8 +345,8 @@ __kernel void onset_scan(
     __global int *restrict times
 #if SAMPLES
     , __global const float *restrict levels, __global const float *restrict travel, const int room,
-    const float noise, const int own_dark, __global FRAME *restrict samples, __global float *restrict answers,
-    __global uchar *restrict status
+    const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
+    __global float *restrict answers, __global uchar *restrict status
 #endif
     )
 {
@@ -420,6 +418,7 @@ __kernel void onset_scan(
                 for (int i = 0; i < PIXELS; ++i) {
                     times[p + i] = shut.pixel[i] ? INVALID : DARK;
 #if SAMPLES
+                    times[stride + p + i] = 0;
                     answers[p + i] = answers[stride + p + i] = NAN;
                     status[p + i] = shut.pixel[i] ? 0 : NEVER;
 #endif
@@ -489,7 +488,8 @@ __kernel void onset_scan(
                         const int begin = times[p + i], frame = begin < 1 ? 1 : begin;
                         const int done = (begin >= 0) & (now - begin < NEEDED) & (end - begin >= NEEDED), known = done & (begin > 0);
                         const float2 found = answer(&around, i, travel[frame - 1], travel[room + frame], levels[p + i],
-                                                    levels[stride + p + i], noise, own_dark);
+                                                    levels[stride + p + i], noise, dark_tolerance,
+                                                    light_tolerance);
                         const float height = answers[p + i], sigma = answers[stride + p + i];
                         const uchar was = status[p + i];
                         answers[p + i] = known ? found.x : height;
@@ -529,8 +529,8 @@ __kernel void onset_scan(
 __kernel void onset_heights(
     const int count, const int stride, __global const int *restrict times, __global const float *restrict travel,
     const int room, __global float *restrict answers, __global uchar *restrict status,
-    __global const uchar *restrict busy, __global const FRAME *restrict samples, __global const FRAME *restrict marks,
-    __global const float *restrict levels, const float noise, const int own_dark, const int undo)
+    __global const uchar *restrict busy, __global const FRAME *restrict samples, __global const float *restrict levels,
+    const float noise, const float dark_tolerance, const float light_tolerance, const int undo)
 {
     const int base = get_global_id(0) * WORDS, width = min(WORDS, stride / PIXELS - base);
     for (int w = 0; w < width; ++w) {
@@ -542,13 +542,12 @@ __kernel void onset_heights(
             if (begin < 0 || count - begin >= NEEDED) continue;
             around.before[i] = samples[stride + p + i];
             around.at[i] = samples[2 * (size_t)stride + p + i];
-            around.after[i] = begin + 1 < count ? samples[3 * (size_t)stride + p + i] : around.at[i];
-            const int frame = begin < 1 ? 1 : begin, sudden = begin < 1 || around.before[i] < marks[stride + p + i];
-            const int dark = sudden ? frame - 1 : times[stride + p + i];
+            around.after[i] = samples[3 * (size_t)stride + p + i];
+            const int frame = begin < 1 ? 1 : begin, dark = begin < 1 ? 0 : times[stride + p + i];
             around.waited[i] = frame - dark;
             around.doubt[i] = travel[2 * room + frame - 1] - travel[2 * room + dark];
             const float2 found = answer(&around, i, travel[frame - 1], travel[room + frame], levels[p + i],
-                                        levels[stride + p + i], noise, own_dark);
+                                        levels[stride + p + i], noise, dark_tolerance, light_tolerance);
             const int known = begin > 0 && !undo;
             answers[p + i] = known ? found.x : NAN;
             answers[stride + p + i] = known ? root(found.y) : NAN;

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 DARK = -1
 INVALID = -2
 
-_PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
-
 
 def complement(samples: NDArray[Any]) -> NDArray[Any]:
     """Exchange dark and light: the distance to the type's largest number, or the negative of a float."""
@@ -155,7 +153,8 @@ def onset_heights(
     dark: NDArray[np.float32],
     travel: NDArray[np.float64],
     noise: float,
-    own_dark: bool,
+    dark_tolerance: float,
+    light_tolerance: float,
     subframe: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
     """Turn onsets into heights.
@@ -183,8 +182,8 @@ def onset_heights(
         Millimetres, one a frame.
     noise : float
         Standard deviation of a sample, counts.
-    own_dark : bool
-        Whether the dark plateau is a sample itself, and so as noisy as one.
+    dark_tolerance, light_tolerance : float
+        Counts by which a sample on a plateau may differ from it.
     subframe : bool
         Whether to look inside the interval.
 
@@ -207,8 +206,6 @@ def onset_heights(
 
     low, high = before[found].astype(np.float64), at[found].astype(np.float64)
     settled = np.where(start + 1 < len(travel), after[found], high)
-    light_tolerance = _PLATEAU * np.sqrt(2) * noise
-    dark_tolerance = light_tolerance if own_dark else _PLATEAU * noise
     from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
     sudden, under_way = from_dark & to_light, ~(from_dark | to_light)
 

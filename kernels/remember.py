@@ -16,7 +16,7 @@ def recall(topic: str, circumstances: object) -> str | None:
     """Return what was kept of a topic under these circumstances, told apart by their ``repr``."""
     try:
         return _record(topic, circumstances).read_text(encoding="utf-8")
-    except OSError:
+    except (OSError, ValueError):  # none, or damaged
         return None
 
 

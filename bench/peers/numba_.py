@@ -144,7 +144,7 @@ def _answer(frames, pixel, start, travel, level, light, dark, noise):  # type: i
 
     low, high = np.float64(frames[start - 1, pixel]), np.float64(frames[start, pixel])
     last = len(frames) - 1
-    after = min(frames[min(start + 1, last), pixel], frames[min(start + 2, last), pixel])
+    after = np.fmin(frames[min(start + 1, last), pixel], frames[min(start + 2, last), pixel])
     sudden_step = PLATEAU * noise * math.sqrt(2)
     from_dark, to_light = low <= dark + PLATEAU * noise, high >= after - sudden_step
 

@@ -44,7 +44,7 @@ def heights_of(
     low, high = (frames[start - 1 + k, row, column].astype(np.float64) for k in (0, 1))
     last = len(frames) - 1
     after = frames[np.minimum(start + 1, last), row, column]
-    after = np.minimum(after, frames[np.minimum(start + 2, last), row, column])
+    after = np.fmin(after, frames[np.minimum(start + 2, last), row, column])
 
     sudden_step = PLATEAU * noise * np.sqrt(2)
     step = high - low

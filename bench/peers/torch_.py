@@ -79,7 +79,7 @@ def _answer(
     """Return height and sigma of pixels with an onset."""
     last = len(travel) - 1
     low, high = samples.at(start - 1).double(), samples.at(start).double()
-    after = torch.minimum(samples.at((start + 1).clamp_(max=last)), samples.at((start + 2).clamp_(max=last)))
+    after = torch.fmin(samples.at((start + 1).clamp_(max=last)), samples.at((start + 2).clamp_(max=last)))
     begin, end = travel[start - 1], travel[start]
     width, step = end - begin, high - low
 

@@ -532,3 +532,26 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, event, subframe):
                 frames, travel, dark, bright, **(options | {"noise": found.noise}), own_dark=own
             )
         assert_within_an_ulp(found, expected, travel)
+
+
+def test_nothing_is_left_of_the_press_before(device):
+    """A run that is open from the first frame on once took the last surely dark frame of another press."""
+    before = np.full((40, 1, 1), 117, np.uint8)
+    before[:30] = 20
+    frames = np.full((12, 1, 1), 117, np.uint8)
+    frames[[0, 1]], frames[6:] = 200, 124
+    travel = np.arange(40) * 0.1
+    search = OnsetSearch((1, 1), np.uint8, dark=20, bright=220, hold=5, noise=1.5, device=device)
+    search.push(Block(before, 0, travel=travel))
+    search.reset()
+    for part in (slice(0, 2), slice(2, 12)):
+        search.push(Block(frames[part], part.start, travel=travel[part]))
+    expected = numpy_onset(frames, travel[:12], 20, 220, noise=1.5, hold=5)
+    assert_within_an_ulp(search.result(), expected, travel[:12])
+
+
+def test_a_hold_without_end_lets_no_broken_sample_pass(device):
+    frames = np.full((9, 1, 1), 0.1, np.float32)
+    frames[2:], frames[4] = 0.9, np.inf
+    found = find_onset(frames, np.arange(9.0), 0, 1, noise=0.01, hold=2**31 - 1, device=device)
+    assert found.status[0, 0] == 0

@@ -62,7 +62,8 @@ def numpy_onset(
         plateau,
         np.asarray(travel, float),
         noise,
-        own_dark,
+        3 * noise * (np.sqrt(2) if own_dark else 1),
+        3 * noise * np.sqrt(2),
         subframe,
     )
     if release:
