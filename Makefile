@@ -1,10 +1,10 @@
-# make [demo|test|lint|types|bench|clean]; each sets up what it needs in .venv first.
+# make [demo|test|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test lint types bench clean
+.PHONY: demo test lint types bench portability clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -30,6 +30,9 @@ types: $(READY)
 
 bench: $(READY)
 	@$(BIN)/mirrorskin bench
+
+portability: $(READY)
+	@$(BIN)/python tests/support/portability.py
 
 clean:
 	@rm -rf .venv build dist *.egg-info .hypothesis .import_linter_cache

@@ -1,0 +1,178 @@
+"""Run the device tests on OpenCL implementations other than the embedded one: ``make portability``.
+
+Each runs in a process of its own that sees no other device (docs/decisions/0009-other-opencl.md).
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from faults import FAULTS, NEVER_SET
+
+ROOT = Path(__file__).resolve().parents[2]
+ROW = "{:<18} {:<16} {:<24} {}"
+
+
+OCLGRIND = "usr/lib/oclgrind/liboclgrind-rt-icd.so"
+# It keeps records of all memory at each launch: with its usual 128 MB a launch takes a second.
+LITTLE_MEMORY = {"OCLGRIND_GLOBAL_MEM_SIZE": "8000000"}
+
+# Tests that need many pixels because they judge statistics: hours in an interpreter.
+STATISTICS = "honest or cost_little or longer_than or never_gets or hovers or noise_alone or as_good_as"
+# Tests on few pixels that still reach all kernels and types.
+SMALL = "odd_sizes or references_of_each_pixel or used_again or is_light or touch_only or (reading and 127)"
+
+
+@dataclass(frozen=True)
+class Check:
+    """An OpenCL implementation as Debian has it, what it is told, and the tests that it is given."""
+
+    name: str
+    package: str
+    library: str  # a pattern below /
+    tests: str = ""  # of those marked "device", as pytest's -k has it
+    faults: tuple[str, ...] = ()  # that it must report
+    told: Mapping[str, str] = field(default_factory=dict)
+
+    def find(self) -> Path | None:
+        return next(iter(sorted(Path("/").glob(self.library))), None)
+
+
+CHECKS = (
+    Check("PoCL", "pocl-opencl-icd", "usr/lib/*/libpocl.so.2"),
+    Check(
+        "Oclgrind: races",
+        "oclgrind",
+        OCLGRIND,
+        tests=f"not ({STATISTICS})",
+        faults=tuple(name for name in FAULTS if name != NEVER_SET),
+        told={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
+    ),
+    Check(
+        "Oclgrind: unset",
+        "oclgrind",
+        OCLGRIND,
+        tests=SMALL,
+        faults=(NEVER_SET,),
+        # Of optimised kernels it does not know all instructions, and crashes on some.
+        told={"OCLGRIND_UNINITIALIZED": "1", "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable", **LITTLE_MEMORY},
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of one check; ``details`` say what is wrong, and are empty where nothing is."""
+
+    version: str
+    tests: str
+    reports: str
+    details: tuple[str, ...] = ()
+
+
+def main() -> int:
+    """Print one row a check; 0 where all is well, 1 where not, 2 where a package is missing."""
+    missing = sorted({check.package for check in CHECKS if check.find() is None})
+    if missing:
+        print(f"make portability: install Debian's {' and '.join(missing)} first", file=sys.stderr)
+        return 2
+    print(ROW.format("implementation", "version", "tests", "reports"), flush=True)
+    details: list[str] = []
+    for check in CHECKS:
+        finding = examine(check)
+        print(ROW.format(check.name, finding.version, finding.tests, finding.reports), flush=True)
+        details += finding.details
+    print(*details, sep="\n", end="\n" * bool(details), file=sys.stderr)
+    return 1 if details else 0
+
+
+def examine(check: Check) -> Finding:
+    """See that it is sound, that it reports what it should, and what the device tests make of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = environment_for(check, Path(folder))
+        log = Path(environment["OCLGRIND_LOG"])
+        child = run_kernel(environment)
+        if child.returncode != 0 or reports_in(log):
+            return Finding("?", "-", "-", ("a sound kernel fails:", child.stderr, read(log)))
+        missed = missed_faults(check.faults, environment, log)
+        if missed:
+            return Finding(child.stdout.strip(), "-", "-", (f"not reported: {', '.join(missed)}",))
+        tests, details = run_tests(check.tests, environment, Path(folder, "tests.xml"))
+        reports = reports_in(log)
+        if reports:
+            details += (read(log),)
+        shown = str(len(reports)) if check.faults else "-"
+        return Finding(child.stdout.strip(), tests, shown, details)
+
+
+def environment_for(check: Check, folder: Path) -> dict[str, str]:
+    """Return an environment in which there is one implementation, and nothing compiled yet."""
+    hidden = ("PYOPENCL_CTX", "POCL_CACHE_DIR")
+    kept = {name: value for name, value in os.environ.items() if name not in hidden}
+    ours = {
+        "OCL_ICD_VENDORS": str(check.find()),
+        "OCLGRIND_LOG": str(folder / "reports"),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+    }
+    return {**kept, **ours, **check.told}
+
+
+def missed_faults(faults: Iterable[str], environment: Mapping[str, str], log: Path) -> list[str]:
+    """Return which of the faults are not reported: a check that lets one pass proves nothing."""
+    missed = []
+    for name in faults:
+        run_kernel(environment, name)
+        if not any(report.startswith(FAULTS[name][1]) for report in reports_in(log)):
+            missed.append(name)
+        log.unlink(missing_ok=True)
+    return missed
+
+
+def run_kernel(environment: Mapping[str, str], *fault: str) -> subprocess.CompletedProcess[str]:
+    """Run the sound kernel of ``faults.py``, or one with a fault, in a child process."""
+    command = [sys.executable, str(Path(__file__).with_name("faults.py")), *fault]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+
+def run_tests(which: str, environment: Mapping[str, str], record: Path) -> tuple[str, tuple[str, ...]]:
+    """Run some of the tests marked ``device``; return how many pass, and what pytest says if not all do."""
+    options = ["-m", "device", "-k", which, "-q", "-p", "no:cacheprovider", f"--junitxml={record}"]
+    command = [sys.executable, "-P", "-m", "pytest", *options]
+    child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    if not record.exists():
+        return f"ended with {child.returncode}", (child.stdout, child.stderr)
+    tests, passed = count_tests(record)
+    details = () if child.returncode == 0 and passed == tests > 0 else (child.stdout, child.stderr)
+    return f"{passed} of {tests} passed", details
+
+
+def count_tests(record: Path) -> tuple[int, int]:
+    """Return how many tests pytest's XML tells of, and how many of them passed."""
+    suites = ET.parse(record).getroot().iter("testsuite")
+    numbers = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    for suite in suites:
+        for name in numbers:
+            numbers[name] += int(suite.get(name, 0))
+    tests = numbers.pop("tests")
+    return tests, tests - sum(numbers.values())
+
+
+def reports_in(log: Path) -> list[str]:
+    """Return the first line of each of Oclgrind's reports; what belongs to one is indented."""
+    return [line for line in read(log).splitlines() if line and not line[0].isspace()]
+
+
+def read(log: Path) -> str:
+    """Return a log's text; Oclgrind makes no log until it has something to say."""
+    return log.read_text(errors="replace") if log.exists() else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
