@@ -14,8 +14,6 @@ from mirrorskin.kernels.device import Array, Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 _MOST_PIXELS = 2**30  # kernels number those of two planes with an int
-
-
 _LINE = 64  # bytes of the longest word that a kernel loads at once
 
 
@@ -78,14 +76,11 @@ class Band:
     def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
         """Fill a map, or one of several planes, from the host."""
         array = self.maps[name]
-        if plane is None:
-            array.claim()
-            array.host[:] = values
-        else:
-            if self._resident:
-                array.download()  # the other planes
-            array.claim()
-            self.plane(name, plane)[:] = values
+        if plane is not None and self._resident:
+            array.download()  # the other planes
+        array.claim()
+        target = array.host if plane is None else self.plane(name, plane)
+        target[:] = values
         if self._resident:
             array.upload()
 

@@ -186,7 +186,7 @@ class ChangePointSearch(Search):
         frames, first = block.frames, len(self._travel)
         if self._weight is not None and first + len(frames) >= len(self._weight.host):
             raise InputError("there are more frames in the second pass than in the first: give the same ones")
-        travel = self._check(block, self._travel)
+        travel = self._accept(block, self._travel)
         self._travel.extend(travel)
         for band in self._bands:
             with band.resident():

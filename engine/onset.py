@@ -161,7 +161,7 @@ class OnsetSearch(Search):
             Travel is missing, or runs back.
         """
         frames, first = block.frames, self._travel.count
-        travel = self._check(block, self._travel.latest)
+        travel = self._accept(block, self._travel.latest)
         self._travel.extend(travel)
         for band in self._bands:
             if self._subframe:

@@ -11,7 +11,7 @@ from mirrorskin.engine.noise import estimate_noise, thin_out
 from mirrorskin.io import FRAME_DTYPES, InputError
 from mirrorskin.kernels.device import Array, Device
 
-C_TYPES = {"u1": "uchar", "u2": "ushort", "u4": "uint", "f4": "float"}
+C_TYPES = {"u1": "uchar", "u2": "ushort", "f4": "float"}
 
 
 class Noise:
@@ -39,8 +39,10 @@ class Noise:
 
     def look(self, frames: NDArray[Any]) -> None:
         """See the next frames, (n, H, W); only the first two of all count."""
+        if self.value is not None:
+            return
         self._seen += [thin_out(frame) for frame in frames[: 2 - len(self._seen)]]
-        if self.value is None and len(self._seen) == 2:
+        if len(self._seen) == 2:
             self.value = estimate_noise(self._seen[0], self._seen[1], self._integer)
 
 

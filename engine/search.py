@@ -94,8 +94,8 @@ class Search:
         """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
         return self._room
 
-    def _check(self, block: Block, so_far: Sequence[float]) -> NDArray[np.float64]:
-        """Return the travel of a block's frames, if they are such as can follow the travel so far."""
+    def _accept(self, block: Block, so_far: Sequence[float]) -> NDArray[np.float64]:
+        """Look at a block before it is taken in: return its travel, if it can follow the travel so far."""
         frames = block.frames
         if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
             raise InputError(

@@ -486,7 +486,8 @@ __kernel void onset_scan(
                 if (ready)
                     for (int i = 0; i < PIXELS; ++i) {
                         const int begin = times[p + i], frame = begin < 1 ? 1 : begin;
-                        const int done = (begin >= 0) & (now - begin < NEEDED) & (end - begin >= NEEDED), known = done & (begin > 0);
+                        const int done = (begin >= 0) & (now - begin < NEEDED) & (end - begin >= NEEDED);
+                        const int known = done & (begin > 0);
                         const float2 found = answer(&around, i, travel[frame - 1], travel[room + frame], levels[p + i],
                                                     levels[stride + p + i], noise, dark_tolerance,
                                                     light_tolerance);
