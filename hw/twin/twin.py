@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.hw.twin.camera import FRAME_RATE, Camera, frame_dtype
-from mirrorskin.hw.twin.objects import make_object
-from mirrorskin.hw.twin.optics import uniform_response
-from mirrorskin.hw.twin.surface import Object, zenith_azimuth
+from mirrorskin.hw.twin.objects.shapes import make_object
+from mirrorskin.hw.twin.optics.ideal import uniform_response
+from mirrorskin.hw.twin.objects.surface import Object, zenith_azimuth
 from mirrorskin.io import check_stroke
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Motion, Truth, pixel_axes
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin import Coin
-from mirrorskin.hw.twin.surface import zenith_azimuth
+from mirrorskin.hw.twin.objects.surface import zenith_azimuth
 
 PIXEL = 0.04
 SHAPE = (660, 660)

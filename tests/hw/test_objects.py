@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mirrorskin.hw.twin import Coin, Cone, HeightMap, Object, Plane, Sphere, make_object
-from mirrorskin.hw.twin.optics import uniform_response
-from mirrorskin.hw.twin.surface import zenith_azimuth
+from mirrorskin.hw.twin.optics.ideal import uniform_response
+from mirrorskin.hw.twin.objects.surface import zenith_azimuth
 
 PIXEL = 0.05
 SHAPES = [(211, 230), (64, 64), (1, 1)]

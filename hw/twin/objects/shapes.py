@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from mirrorskin.hw.twin.coin import Coin
-from mirrorskin.hw.twin.heightmap import DEFAULT_SCALE, HEIGHT_MAP_SUFFIXES, load_height_map
+from mirrorskin.hw.twin.objects.coin import Coin
+from mirrorskin.hw.twin.objects.heightmap import DEFAULT_SCALE, HEIGHT_MAP_SUFFIXES, load_height_map
 from mirrorskin.io.types import Floats, InputError
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.twin.surface import Object
+    from mirrorskin.hw.twin.objects.surface import Object
 
 OBJECT_NAMES = ("sphere", "coin", "plane", "cone")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from mirrorskin.hw.twin.surface import difference_slope
+from mirrorskin.hw.twin.objects.surface import difference_slope
 
 if TYPE_CHECKING:
     from mirrorskin.io.types import Floats

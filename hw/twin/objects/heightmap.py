@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.surface import difference_slope
+from mirrorskin.hw.twin.objects.surface import difference_slope
 from mirrorskin.io.types import Floats, InputError
 
 HEIGHT_MAP_SUFFIXES = (".npy", ".png", ".tif", ".tiff")

@@ -1,0 +1,1 @@
+"""What the camera sees in the mirror: the lit wall."""
