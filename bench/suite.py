@@ -11,10 +11,12 @@ from mirrorskin.bench.live import run_live
 from mirrorskin.bench.onset import OnsetCase, run_onset
 from mirrorskin.bench.results import Case
 from mirrorskin.bench.stacks import StackName
+from mirrorskin.bench.twin import run_twin
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 
 _HD, _MEMORY, _LIVE = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640)
+_RENDERED = (128, 480, 640)
 _QUICK = (12, 48, 64)
 _ROUNDS = 15
 
@@ -54,7 +56,9 @@ _PUSHED = {
     "live-random": _pushed("live-random", "random"),
 }
 
-NAMES = (*(case.name for case in _ONSET), *_PUSHED)
+_TWIN = "twin"
+
+NAMES = (*(case.name for case in _ONSET), *_PUSHED, _TWIN)
 
 
 def run_suite(
@@ -98,6 +102,8 @@ def _run(name: str, device: Device, quick: bool) -> Case:
         return replace(case, shape=_QUICK) if quick else case
 
     rounds = 1 if quick else _ROUNDS
+    if name == _TWIN:
+        return run_twin(_QUICK if quick else _RENDERED, device, rounds)
     if name in _PUSHED:
         return run_live({row: sized(case) for row, case in _PUSHED[name].items()}, device, rounds)
     return run_onset(sized(next(case for case in _ONSET if case.name == name)), device, rounds)

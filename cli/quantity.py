@@ -27,6 +27,7 @@ class _Kind(NamedTuple):
 _LENGTH = _Kind("millimeter", "meter", "a length", "0.1mm")
 _ANGLE = _Kind("radian", "radian", "an angle", "2.5deg")
 _MEMORY = _Kind("byte", "bit", "an amount of memory", "512MB")
+_TIME = _Kind("second", "second", "a time", "10ms")
 
 
 def length(text: str, option: str = "") -> float:
@@ -64,6 +65,27 @@ def lengths(text: str, option: str = "") -> tuple[float, float]:
     if len(values) > 2:
         raise _error(text, option, "one or two lengths are needed", "0.03mm,0.04mm")
     return values[0], values[-1]
+
+
+def vector(text: str, count: int, option: str = "") -> tuple[float, ...]:
+    """Read so many lengths, as in ``0mm,0mm,40mm``, in millimetres; see ``length``."""
+    values = tuple(length(part, option) for part in text.split(","))
+    if len(values) != count:
+        raise _error(text, option, f"{count} lengths are needed", ",".join(["0mm"] * (count - 1) + ["1mm"]))
+    return values
+
+
+def compliance(text: str, option: str = "") -> float:
+    """Read by how much a newton moves something, as in ``0.01mm/N``, in mm/N; see ``length``."""
+    distance, slash, newton = text.strip().rpartition("/")
+    if not slash or newton.strip() != "N":
+        raise _error(text, option, "a length for each newton is needed", "0.01mm/N")
+    return length(distance, option)
+
+
+def duration(text: str, option: str = "") -> float:
+    """Read a time, as in ``10ms``, in seconds; see ``length``."""
+    return _read(text, option, _TIME)
 
 
 def angle(text: str, option: str = "") -> float:

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mirrorskin.cli import options
-
-
-class SimulatedMotion(StrEnum):
-    """The movements that the twin can make."""
-
-    vertical = "vertical"
+from mirrorskin.cli.movements import DEFAULTS
 
 
 class FrameType(StrEnum):
@@ -25,52 +20,184 @@ class FrameType(StrEnum):
     float32 = "float32"
 
 
+class ContactName(StrEnum):
+    """How the sheet lies on the object."""
+
+    conform = "conform"
+    elastic = "elastic"
+
+
+class OpticsName(StrEnum):
+    """How the light of a slope is found."""
+
+    ideal = "ideal"
+    cylinder = "cylinder"
+
+
+class ReferenceName(StrEnum):
+    """Where the references come from."""
+
+    ball = "ball"
+    exact = "exact"
+
+
+def _of(motion: options.MotionName, name: str, metavar: str, text: str) -> Any:
+    """Make an option that only one motion, or all but the vertical one, have."""
+    return typer.Option(metavar=metavar, help=text, show_default=DEFAULTS[motion][name])
+
+
+_VERTICAL, _AXIAL = options.MotionName.vertical, options.MotionName.axial
+_HORIZONTAL, _TWIST = options.MotionName.horizontal, options.MotionName.twist
+
+
 def command(
-    motion: Annotated[SimulatedMotion, typer.Argument(help="How the body moves.")],
+    motion: Annotated[options.MotionName, typer.Argument(help="How the body moves.")],
     output: options.NewRecording,
     thing: Annotated[
         str,
-        typer.Option("--object", metavar="NAME", help="sphere, coin, plane, cone, or a height map's file."),
+        typer.Option(
+            "--object",
+            metavar="NAME",
+            help="sphere, cone, cylinder, plane, step, texture, coin, or a file:"
+            " heights in NPY, PNG or TIFF, or a mesh in STL, PLY or OBJ.",
+        ),
     ] = "sphere",
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "480x480",
     pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.025mm",
-    frames: Annotated[int, typer.Option(min=1, max=10**7, help="Frames to take.")] = 30,
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, max=10**7, help="Frames to take.", show_default="30; of a rotation one turn"),
+    ] = None,
     travel_step: Annotated[
-        str, typer.Option(metavar="LENGTH", help="Travel from frame to frame; below zero it is lifted.")
-    ] = "0.1mm",
-    travel_start: Annotated[str, typer.Option(metavar="LENGTH", help="Travel of the first frame.")] = "0.1mm",
+        str | None,
+        _of(_VERTICAL, "travel-step", "LENGTH", "Vertical: from frame to frame; below zero it is lifted."),
+    ] = None,
+    travel_start: Annotated[
+        str | None, _of(_VERTICAL, "travel-start", "LENGTH", "Vertical: travel of the first frame.")
+    ] = None,
     release: Annotated[
-        bool, typer.Option("--release", help="Then lift it by the same steps: frames - 1 more.")
+        bool, typer.Option("--release", help="Vertical: then lift it by the same steps, frames - 1 more.")
     ] = False,
+    compliance: Annotated[
+        str | None,
+        _of(_VERTICAL, "compliance", "LENGTH/N", "Vertical, elastic: how far the stage gives way."),
+    ] = None,
+    press: Annotated[
+        str | None, _of(_AXIAL, "press", "LENGTH", "All but vertical: how far the body is lowered.")
+    ] = None,
+    tilt: Annotated[str | None, _of(_AXIAL, "tilt", "ANGLE", "Axial: half-angle of the precession.")] = None,
+    phase_step: Annotated[
+        str | None, _of(_AXIAL, "phase-step", "ANGLE", "Axial: from frame to frame.")
+    ] = None,
+    pivot: Annotated[
+        str | None, _of(_AXIAL, "pivot", "X,Y,Z", "Axial: what it turns about, from the sheet's centre.")
+    ] = None,
+    displacement_step: Annotated[
+        str | None, _of(_HORIZONTAL, "displacement-step", "X,Y", "Horizontal: from frame to frame.")
+    ] = None,
+    twist_step: Annotated[
+        str | None, _of(_TWIST, "twist-step", "ANGLE", "Twist: from frame to frame.")
+    ] = None,
+    contact: Annotated[
+        ContactName, typer.Option(help="The sheet takes the object's shape (eq. 1), or resists.")
+    ] = ContactName.conform,
+    optics: Annotated[
+        OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")
+    ] = OpticsName.ideal,
+    pattern: Annotated[
+        str, typer.Option(metavar="NAME", help="Of the wall: uniform, linear in the zenith, or a picture.")
+    ] = "uniform",
+    air_gap: Annotated[str, typer.Option(metavar="LENGTH", help="Between body and wall.")] = "0mm",
+    asymmetry: Annotated[float, typer.Option(help="Of the lamps, as a share of their light.")] = 0.0,
+    scatter: Annotated[str, typer.Option(metavar="ANGLE", help="Of the sheet's flakes.")] = "3deg",
+    friction: Annotated[float, typer.Option(help="Coefficient, between sheet and object.")] = 0.8,
+    camera_distance: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
+    ] = None,
+    point_spread: Annotated[float, typer.Option(metavar="PIXELS", help="Of the lens, one sigma.")] = 0.0,
     dtype: Annotated[FrameType, typer.Option(help="Type of a sample.")] = FrameType.uint8,
-    noise: Annotated[float, typer.Option(metavar="COUNTS", help="Standard deviation of a sample.")] = 1.5,
+    bits: Annotated[
+        int | None, typer.Option(help="Of a uint16 sample: 10, 12 or 16.", show_default="12")
+    ] = None,
+    noise: Annotated[float, typer.Option(metavar="COUNTS", help="Read noise, one sigma.")] = 1.5,
+    electrons: Annotated[
+        float | None, typer.Option(metavar="N", help="In one count, for shot noise; without it none.")
+    ] = None,
+    gain_deviation: Annotated[float, typer.Option(help="Of the pixels' gains, one sigma.")] = 0.0,
+    offset_deviation: Annotated[
+        float, typer.Option(metavar="COUNTS", help="Of the pixels' offsets, one sigma.")
+    ] = 0.0,
+    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    exposure: Annotated[
+        str, typer.Option(metavar="TIME", help="In which the body moves on steadily; 0: it stands still.")
+    ] = "0s",
+    references: Annotated[
+        ReferenceName, typer.Option(help="Dark and bright: taken with a ball, as in a lab, or exact.")
+    ] = ReferenceName.ball,
     seed: Annotated[int, typer.Option(help="The same seed, the same recording.")] = 0,
     compression: options.Compression = options.CompressionName.raw,
+    device: options.Device = None,
 ) -> None:
     """Record what the twin sees, with the truth."""
     import numpy as np
 
     from mirrorskin import hw, io
+    from mirrorskin.cli.movements import make_movement
     from mirrorskin.cli.progress import progress
-    from mirrorskin.cli.quantity import frame_size, length, lengths
+    from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths
+    from mirrorskin.hw.twin import Body, Camera
 
-    io.check_output(output, keep=Path(thing))
-    steps = io.Steps(length(travel_step, "--travel-step"), length(travel_start, "--travel-start"))
-    down = steps.positions(frames)
-    travel = np.concatenate([down, down[-2::-1]]) if release else down
+    for file in (thing, pattern):
+        io.check_output(output, keep=Path(file))
+    words = {
+        "travel-step": travel_step,
+        "travel-start": travel_start,
+        "compliance": compliance,
+        "press": press,
+        "tilt": tilt,
+        "phase-step": phase_step,
+        "pivot": pivot,
+        "displacement-step": displacement_step,
+        "twist-step": twist_step,
+    }
     columns, rows = frame_size(size, "--size")
     twin = hw.Twin(
         object=thing,
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
-        travel=travel,
-        dtype=dtype.value,
-        noise=noise,
-        seed=seed,
+        movement=make_movement(motion, frames, release, words),
+        contact=contact.value,
+        optics=optics.value,
+        pattern=pattern,
+        body=Body(
+            air_gap=length(air_gap, "--air-gap"),
+            asymmetry=asymmetry,
+            scatter=angle(scatter, "--scatter"),
+            friction=friction,
+        ),
+        camera=Camera(
+            np.dtype(dtype.value),
+            bits=bits,
+            noise=noise,
+            electrons=float("inf") if electrons is None else electrons,
+            gain_deviation=gain_deviation,
+            offset_deviation=offset_deviation,
+            frame_rate=frame_rate,
+            exposure=duration(exposure, "--exposure"),
+            point_spread=point_spread,
+            distance=float("inf")
+            if camera_distance is None
+            else length(camera_distance, "--camera-distance"),
+            seed=seed,
+        ),
+        references=references.value,
+        device=device,
     )
+    count = twin.shape[0]
     with (
         io.Recorder(twin, output, compression.value, truth=twin.truth) as recorder,
-        progress("simulating", len(travel)) as show,
+        progress("simulating", count) as show,
     ):
         recorder.drain(show)
-    typer.echo(f"{output}: {len(travel)} frames of {columns} x {rows}: {twin.header.title}")
+    typer.echo(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}")

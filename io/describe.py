@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.layout import MARK
+from mirrorskin.io.layout import MARK, TRUTH_UNITS
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.result import open_result
@@ -56,12 +56,20 @@ def _recording(recording: Recording) -> dict[str, str]:
         facts["pixel size"] = f"{x:g} x {y:g} mm, field {x * columns:g} x {y * rows:g} mm"
     facts |= _range("travel", recording.travel, "mm")
     facts |= _range("phase", None if recording.phase is None else np.degrees(recording.phase), "deg")
+    facts |= _range("twist", None if recording.twist is None else np.degrees(recording.twist), "deg")
+    if recording.displacement is not None:
+        along_x, along_y = recording.displacement.T
+        facts |= _range("displacement x", along_x, "mm") | _range("displacement y", along_y, "mm")
+    if header.press is not None:
+        facts["press"] = f"{header.press:g} mm"
     if header.tilt is not None:
         facts["tilt"] = f"{np.degrees(header.tilt):g} deg"
     for name in ("dark", "bright"):
         reference = getattr(header, name)
         facts[f"{name} reference"] = "none" if reference is None else _median(reference)
-    facts["truth"] = "none" if recording.truth is None else "height, zenith, azimuth, contact"
+    truth = recording.truth
+    known = [] if truth is None else [name for name in TRUTH_UNITS if getattr(truth, name) is not None]
+    facts["truth"] = ", ".join(known) or "none"
     return facts
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import cast
 
 import numpy as np
@@ -16,7 +15,15 @@ MARK = "mirrorskin_recording"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
 # The maps of a simulation's truth, and their units.
-TRUTH_UNITS = {"height": "mm", "zenith": "rad", "azimuth": "rad", "contact": None}
+TRUTH_UNITS = {"height": "mm", "zenith": "rad", "azimuth": "rad", "contact": None, "slip": None}
+# What is known of each frame: where that is written, and in what unit.
+SERIES = {
+    "time": (f"{DETECTOR}/frame_time", "s"),
+    "travel": (f"{STAGE}/travel", "mm"),
+    "phase": (f"{STAGE}/phase", "rad"),
+    "displacement": (f"{STAGE}/displacement", "mm"),
+    "twist": (f"{STAGE}/twist", "rad"),
+}
 
 
 class Layout:
@@ -63,38 +70,50 @@ class Layout:
 
     def time(self) -> Floats | None:
         """Read the seconds of each frame, if they are known."""
-        return self._read(f"{DETECTOR}/frame_time", (self._count,), unit="s")
+        return self._series("time", (self._count,))
 
     def travel(self, given: Floats | None) -> Floats:
         """Read the travel of each frame of a vertical motion, mm, if it is not given; check it."""
-        name = f"{STAGE}/travel"
-        values = self._positions(given, name, "mm", "give --travel-step")
-        return check_stroke(values, self._count, f"{self._file.path}: {name}")
+        values = self._positions(given, "travel", "give --travel-step")
+        return check_stroke(values, self._count, f"{self._file.path}: {SERIES['travel'][0]}")
 
     def phase(self, given: Floats | None) -> Floats:
         """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""
-        name = f"{STAGE}/phase"
-        values = self._positions(given, name, "rad", "give --phase-step")
-        return check_phase(values, self._count, f"{self._file.path}: {name}")
+        values = self._positions(given, "phase", "give --phase-step")
+        return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}")
+
+    def displacement(self) -> Floats | None:
+        """Read where the body was along x and y in each frame of a horizontal motion, mm, if it is known."""
+        return self._series("displacement", (self._count, 2))
+
+    def twist(self) -> Floats | None:
+        """Read how far the body was turned in each frame of a twist, radians, if it is known."""
+        return self._series("twist", (self._count,))
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
-        found = {field.name: self._find(f"{TRUTH}/{field.name}") for field in fields(Truth)}
-        missing = [name for name, node in found.items() if node is None]
-        if len(missing) == len(found):
+        found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_UNITS}
+        present = {name: node for name, node in found.items() if node is not None}
+        if not present:
             return None
+        missing = [name for name in found if name not in present and name != "slip"]
         if missing:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
         maps = {
-            name: self._file.read(node, self._frame, unit=TRUTH_UNITS[name]) for name, node in found.items()
+            name: self._file.read(node, self._frame, unit=TRUTH_UNITS[name]) for name, node in present.items()
         }
-        contact = maps.pop("contact").astype(np.uint8)
-        return Truth(**{name: values.astype(np.float32) for name, values in maps.items()}, contact=contact)
+        height, zenith, azimuth = (maps[name].astype(np.float32) for name in ("height", "zenith", "azimuth"))
+        slip = maps["slip"].astype(np.uint8) if "slip" in maps else None
+        return Truth(height, zenith, azimuth, maps["contact"].astype(np.uint8), slip)
 
-    def _positions(self, given: Floats | None, name: str, unit: str, remedy: str) -> Floats:
+    def _series(self, name: str, shape: Shape, remedy: str = "") -> Floats | None:
+        where, unit = SERIES[name]
+        return self._read(where, shape, unit=unit, remedy=remedy)
+
+    def _positions(self, given: Floats | None, name: str, remedy: str) -> Floats:
         if given is not None:
             return given
-        values = self._read(name, (self._count,), unit=unit, remedy=remedy)
+        values = self._series(name, (self._count,), remedy)
         if values is None:
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
         return values

@@ -15,21 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
-from mirrorskin.io.layout import DETECTOR, MARK, STACK, STAGE, TRUTH, TRUTH_UNITS
+from mirrorskin.io.layout import MARK, SERIES, STACK, TRUTH, TRUTH_UNITS
 from mirrorskin.io.plain import legible
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
 
-# What a block says of each of its frames: where that is written, and in what unit.
-_SERIES = {
-    "time": (f"{DETECTOR}/frame_time", "s"),
-    "travel": (f"{STAGE}/travel", "mm"),
-    "phase": (f"{STAGE}/phase", "rad"),
-}
 # What the frames are plotted along, if it is known; else along the time.
-_AXES: dict[Motion, str] = {"vertical": "travel", "axial": "phase"}
+_AXES: dict[Motion, str] = {"vertical": "travel", "axial": "phase", "twist": "twist"}
 
 _BLOCK = 16_000_000  # bytes of frames that are drained at a time
 
@@ -106,10 +100,11 @@ class Recorder:
             self._count = part.stop
             self._check_count(self._count <= self.shape[0])
             self._frames[part] = block.frames
-            for name in _SERIES:
+            for name in SERIES:
                 values = getattr(block, name)
                 if values is not None:
-                    self._series.setdefault(name, np.full(self.shape[0], np.nan))[part] = values
+                    room = np.full((self.shape[0], *values.shape[1:]), np.nan)
+                    self._series.setdefault(name, room)[part] = values
             self._new.check()
         return block
 
@@ -131,7 +126,7 @@ class Recorder:
         if kind is None:
             self._check_count(self._count == self.shape[0])
             for name, values in self._series.items():
-                _put(self._new.root, *_SERIES[name], values)
+                _put(self._new.root, *SERIES[name], values)
             _make_plot(self._new.root, self._axis())
 
     def _check_count(self, fits: bool) -> None:
@@ -188,7 +183,7 @@ def _make_plot(file: h5py.File, axis: str | None) -> None:
     data = _group(file["entry"], "data", "NXdata", signal="frames")
     data["frames"] = h5py.SoftLink(STACK)
     if axis is not None:
-        target = _SERIES[axis][0]
+        target = SERIES[axis][0]
         name = target.rsplit("/", 1)[-1]
         data.attrs["axes"] = [name, ".", "."]
         data[name] = h5py.SoftLink(target)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,8 +44,10 @@ class Recording(Closing):
         Name of the stack in the file.
     name, header, shape, dtype, motion, rewindable
         As for every ``Source``.
-    time, travel, phase : ndarray, (T,), float64, or None
+    time, travel, phase, twist : ndarray, (T,), float64, or None
         Seconds, millimetres and radians.
+    displacement : ndarray, (T, 2), float64, or None
+        Millimetres.
     truth : Truth or None
         What a simulation knew.
     storage : str
@@ -58,9 +61,7 @@ class Recording(Closing):
         file: Hdf5File,
         stack: h5py.Dataset,
         header: Header,
-        time: Floats | None,
-        travel: Floats | None,
-        phase: Floats | None,
+        positions: Mapping[str, Floats | None],
         truth: Truth | None,
     ) -> None:
         self.path = file.path
@@ -70,7 +71,8 @@ class Recording(Closing):
         self.motion = header.motion
         self.shape = cast(tuple[int, int, int], tuple(map(int, stack.shape)))
         self.dtype: np.dtype[Any] = stack.dtype.newbyteorder("=")
-        self.time, self.travel, self.phase = time, travel, phase
+        self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
+        self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.truth = truth
         self.storage = describe_storage(stack)
         self._file = file
@@ -99,9 +101,19 @@ class Recording(Closing):
         with plainly(f"{self.path}: frames {start} to {stop - 1} of {self.dataset} cannot be read"):
             self._stack.read_direct(frames, np.s_[start:stop])
         self._next = stop
-        part = slice(start, stop)
-        time, travel, phase = (None if v is None else v[part] for v in (self.time, self.travel, self.phase))
-        return Block(frames, start, time=time, travel=travel, phase=phase)
+
+        def here(values: Floats | None) -> Floats | None:
+            return None if values is None else values[start:stop]
+
+        return Block(
+            frames,
+            start,
+            time=here(self.time),
+            travel=here(self.travel),
+            phase=here(self.phase),
+            displacement=here(self.displacement),
+            twist=here(self.twist),
+        )
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -164,16 +176,14 @@ def open_recording(
         layout = Layout(file, ours, stack.shape)
         header = layout.header(motion, tilt, pixel_size)
         count = stack.shape[0]
-        vertical, axial = header.motion == "vertical", header.motion == "axial"
-        recording = Recording(
-            file,
-            stack,
-            header,
-            time=layout.time(),
-            travel=layout.travel(_along(travel, count)) if vertical else None,
-            phase=layout.phase(_along(phase, count)) if axial else None,
-            truth=layout.truth(),
-        )
+        positions = {
+            "time": layout.time(),
+            "travel": layout.travel(_along(travel, count)) if header.motion == "vertical" else None,
+            "phase": layout.phase(_along(phase, count)) if header.motion == "axial" else None,
+            "displacement": layout.displacement() if header.motion == "horizontal" else None,
+            "twist": layout.twist() if header.motion == "twist" else None,
+        }
+        recording = Recording(file, stack, header, positions, layout.truth())
         opening.pop_all()  # from here on the recording closes its file
     return recording
 

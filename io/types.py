@@ -40,6 +40,10 @@ class Block:
         Millimetres that the body has been lowered (vertical motion).
     phase : ndarray, (n,), float64, or None
         Radians, counter-clockwise, of the precession (axial motion).
+    displacement : ndarray, (n, 2), float64, or None
+        Millimetres that the body has been moved along x and y (horizontal motion).
+    twist : ndarray, (n,), float64, or None
+        Radians that the body has been turned about its axis, counter-clockwise (twist).
     origin : (int, int)
         Row and column of the first pixel in the full picture.
     dropped : int
@@ -51,6 +55,8 @@ class Block:
     time: Floats | None = None
     travel: Floats | None = None
     phase: Floats | None = None
+    displacement: Floats | None = None
+    twist: Floats | None = None
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
 
@@ -73,7 +79,7 @@ class Header:
     tilt : float or None
         Half-angle of the precession, radians.
     pivot : (float, float, float) or None
-        Point that the body turns about, mm, in the rest-sheet frame.
+        Point that the body turns about, mm, from the rest sheet's centre, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
     """
@@ -151,7 +157,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a simulation knows of its object, in the mean pose.
+    """What a simulation knows of its object, in the mean pose: pressed, upright, neither moved nor twisted.
 
     Attributes
     ----------
@@ -160,13 +166,16 @@ class Truth:
     zenith, azimuth : ndarray, (H, W), float32
         Radians, of the surface normal.
     contact : ndarray, (H, W), uint8
-        1 where sheet and object touch at some time of the movement.
+        1 where sheet and object touch: of a vertical motion at some time, of the others in every frame.
+    slip : ndarray, (H, W), uint8, or None
+        1 where the sheet slips on the object at some time; None where no friction was worked out.
     """
 
     height: NDArray[np.float32]
     zenith: NDArray[np.float32]
     azimuth: NDArray[np.float32]
     contact: NDArray[np.uint8]
+    slip: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
-"""Figures for people: heights as a map, and cut across against the truth."""
+"""Figures for people: heights as a whole, and cut across against the truth."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,33 +11,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
-_MISSING = "0.88"
+_MISSING = "lightsteelblue"
+_MESH = 120  # samples of a surface along its longer side
 
 
-def height_figure(result: Result, truth: Truth, title: str, path: Path) -> None:
-    """Draw a height map, and a cut across its middle against the truth, into a PNG.
+def height_figure(
+    results: Mapping[str, Result], truth: Truth, title: str, path: Path, *, surface: bool = False
+) -> None:
+    """Draw heights, and cuts across the middle against the truth, into a PNG.
 
     Parameters
     ----------
-    result : Result
-        With ``height``, ``x`` and ``y``.
+    results : mapping
+        Names and results with ``height``, ``x`` and ``y``. The first is drawn as a whole, all are cut.
     truth : Truth
         Of the same size.
     title : str
     path : Path
         PNG to write.
+    surface : bool
+        Draw a surface in space, as Fig. 5 (a) of the paper, instead of height by brightness, as its Fig. 6.
 
     Raises
     ------
     InputError
-        Matplotlib is not installed, the result has no heights or axes, or the file cannot be written.
+        Matplotlib is not installed, a result has no heights or axes, or the file cannot be written.
     """
-    figure = _draw(result, truth)
+    figure = _draw(results, truth, surface)
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
     try:
         figure.savefig(path, dpi=110)
@@ -44,7 +52,22 @@ def height_figure(result: Result, truth: Truth, title: str, path: Path) -> None:
         raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def _draw(result: Result, truth: Truth) -> Figure:
+def _draw(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
+    for result in results.values():
+        _check(result, truth)
+    first = next(iter(results.values()))
+    height, x, y = _heights(first)
+    figure = _new_figure()
+    grid = figure.add_gridspec(1, 2, width_ratios=[1, 1.35])
+    if surface:
+        _draw_surface(figure.add_subplot(grid[0], projection="3d"), height, x, y)
+    else:
+        _draw_map(figure.add_subplot(grid[0]), height, x, y)
+    _draw_cuts(figure.add_subplot(grid[1]), {name: _heights(r)[0] for name, r in results.items()}, truth, x)
+    return figure
+
+
+def _check(result: Result, truth: Truth) -> None:
     height, x, y = result.height, result.x, result.y
     if height is None or x is None or y is None or min(height.shape) < 2:
         raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")
@@ -52,11 +75,13 @@ def _draw(result: Result, truth: Truth) -> Figure:
         raise InputError(
             f"the result is {height.shape} pixels, the truth {truth.height.shape}: not of one stack"
         )
-    figure = _new_figure()
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.35])
-    _draw_map(left, height, x, y)
-    _draw_cut(right, height, truth.height, x)
-    return figure
+
+
+def _heights(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
+    assert result.height is not None
+    assert result.x is not None
+    assert result.y is not None
+    return result.height, result.x, result.y
 
 
 def check_drawing() -> None:
@@ -72,31 +97,43 @@ def _new_figure() -> Figure:
     return Figure(figsize=(11, 4.6), layout="constrained")
 
 
-def _draw_map(
-    axes: Axes, height: NDArray[np.float32], x: NDArray[np.float64], y: NDArray[np.float64]
-) -> None:
+def _draw_map(axes: Axes, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
     half = (abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2)
     extent = (x[0] - half[0], x[-1] + half[0], y[-1] - half[1], y[0] + half[1])
     axes.set_facecolor(_MISSING)
-    heights = height[np.isfinite(height)]
-    # A few pixels at the edge of visibility must not take the colours from all others.
-    lowest, highest = np.percentile(heights, [0.2, 99.8]) if heights.size else (None, None)
+    lowest, highest = _span(height)
     picture = axes.imshow(
-        height, extent=extent, cmap="viridis", interpolation="nearest", vmin=lowest, vmax=highest
+        height, extent=extent, cmap="gray", interpolation="nearest", vmin=lowest, vmax=highest
     )
     axes.figure.colorbar(picture, ax=axes, label="height (mm)", shrink=0.85)
-    axes.axhline(0, color="white", lw=0.8, ls=":")
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="height; grey: no answer")
+    axes.axhline(0, color="tab:red", lw=0.8, ls=":")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="height by brightness; blue: no answer")
 
 
-def _draw_cut(
-    axes: Axes, height: NDArray[np.float32], truth: NDArray[np.float32], x: NDArray[np.float64]
-) -> None:
-    row = len(height) // 2
-    axes.plot(x, truth[row], color="0.55", lw=2.5, label="truth")
-    axes.plot(x, height[row], ".", color="tab:red", ms=3, label="reconstructed")
-    lowest = np.nanmin(height[row], initial=0.0)
-    axes.set(xlabel="x (mm)", ylabel="height (mm)", title="cut along the dotted line")
+def _draw_surface(axes: Axes3D, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
+    step = max(1, max(height.shape) // _MESH)
+    lowest, highest = _span(height)
+    shown = np.where((height >= lowest) & (height <= highest), height, np.nan)[::step, ::step]
+    across, up = np.meshgrid(x[::step], y[::step])
+    axes.plot_surface(across, up, shown, cmap="viridis", rstride=1, cstride=1, linewidth=0, antialiased=True)
+    axes.set_box_aspect((np.ptp(x), np.ptp(y), 0.45 * np.ptp(x)))
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="reconstructed (mm); holes: no answer")
+
+
+def _span(height: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the lowest and highest height but for a few pixels at the edge of visibility."""
+    heights = height[np.isfinite(height)]
+    lowest, highest = np.percentile(heights, [0.2, 99.8]) if heights.size else (-1.0, 0.0)
+    return float(lowest), float(highest)
+
+
+def _draw_cuts(axes: Axes, heights: Mapping[str, NDArray[np.float32]], truth: Truth, x: Floats) -> None:
+    row = len(truth.height) // 2
+    axes.plot(x, truth.height[row], color="0.6", lw=3, label="truth")
+    for number, (name, height) in enumerate(heights.items()):
+        axes.plot(x, height[row], ".", ms=max(2, 5 - number), label=name)
+    lowest = min(_span(height)[0] for height in heights.values())
+    axes.set(xlabel="x (mm)", ylabel="height (mm)", title="cut across the middle")
     axes.set_ylim(1.35 * lowest - 0.02, -0.12 * lowest + 0.02)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower center", ncols=2)
+    axes.legend(loc="lower center", ncols=2, markerscale=2)

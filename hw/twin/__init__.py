@@ -1,22 +1,56 @@
-"""The digital twin of the sensor: object, sheet, light and camera, as a source of frames."""
+"""The digital twin of the sensor: object, body, sheet, light and camera, as a source of frames."""
 
-from mirrorskin.hw.twin.camera import FRAME_RATE
-from mirrorskin.hw.twin.objects.coin import Coin
-from mirrorskin.hw.twin.objects.heightmap import HeightMap, load_height_map
-from mirrorskin.hw.twin.objects.shapes import OBJECT_NAMES, Cone, Plane, Sphere, make_object
-from mirrorskin.hw.twin.objects.surface import Object
-from mirrorskin.hw.twin.twin import Twin
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.hw.twin.camera import Camera
+from mirrorskin.hw.twin.live import Live
+from mirrorskin.hw.twin.movement import Axial, Horizontal, Movement, Twist, Vertical
+from mirrorskin.hw.twin.objects import (
+    OBJECT_NAMES,
+    Coin,
+    Cone,
+    Cylinder,
+    HeightMap,
+    Object,
+    Plane,
+    Sphere,
+    Step,
+    Texture,
+    check_fits,
+    load_height_map,
+    load_mesh,
+    make_object,
+)
+from mirrorskin.hw.twin.optics import design_range, visible_zenith
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.twin import ContactName, OpticsName, Twin
 
 __all__ = [
-    "FRAME_RATE",
     "OBJECT_NAMES",
+    "Axial",
+    "Body",
+    "Camera",
     "Coin",
     "Cone",
+    "ContactName",
+    "Cylinder",
     "HeightMap",
+    "Horizontal",
+    "Live",
+    "Movement",
     "Object",
+    "OpticsName",
     "Plane",
+    "Sheet",
     "Sphere",
+    "Step",
+    "Texture",
     "Twin",
+    "Twist",
+    "Vertical",
+    "check_fits",
+    "design_range",
     "load_height_map",
+    "load_mesh",
     "make_object",
+    "visible_zenith",
 ]

@@ -1,79 +1,201 @@
-"""The twin's camera: levels, noise and quantisation."""
+"""The twin's camera: each pixel's levels, noise and quantisation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.io.types import FRAME_DTYPES, InputError
+from mirrorskin.kernels.device import Device, open_device
 
-FRAME_RATE = 30.0
-
-_LEVELS = {"uint8": (16.0, 224.0), "uint16": (256.0, 3584.0), "float32": (16.0, 224.0)}
+_UINT8: np.dtype[Any] = np.dtype(np.uint8)
+_DARK, _BRIGHT = 16.0, 224.0  # counts of 8 bits
+_BITS = {"uint8": (8,), "uint16": (12, 10, 16), "float32": ()}  # the usual one first
+_C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
+_LEAST_GAIN = 0.05  # of the nominal one; a pixel that sees nothing would be a defect, not a deviation
+_NOISE_MAX = 2.0**16
+_ELECTRONS_MIN = 1e-3
+_WORD = 2**64
+_MAPS = 0x6D617073  # sets the stream of the pixels' deviations apart from others of the same seed
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera with additive Gaussian noise that depends on nothing but the seed and the frame's number.
+    """What a camera makes of light; its noise depends on the seed, the frame's number and the pixel alone.
 
     Attributes
     ----------
     dtype : dtype
         Of a sample: uint8, uint16 or float32.
     noise : float
-        Standard deviation in raw counts.
+        Standard deviation of the read noise, raw counts.
     seed : int
-        Not negative.
+        From 0 to 2^64 - 1.
+    bits : int
+        Of a sample: 8 for uint8; 12 unless given, 10 or 16 for uint16. None for float32, which is neither
+        rounded nor clipped.
+    electrons : float
+        Electrons of one count of light, 0.001 or more: a signal of S counts has shot noise of the variance
+        S / electrons. Infinite for none.
+    gain_deviation : float
+        Standard deviation of the pixels' gains, as a share; below 1. Gains below 0.05 are made 0.05.
+    offset_deviation : float
+        Standard deviation of the pixels' counts without light.
+    frame_rate : float
+        Frames in a second.
+    exposure : float
+        Seconds during which a frame gathers light, at most a frame's; 0: the body stands still meanwhile.
+    point_spread : float
+        Standard deviation of a point's Gaussian image, pixels.
+    distance : float
+        Millimetres of the pinhole above the sheet's rest plane; infinite for a telecentric lens.
 
     Raises
     ------
     InputError
-        The noise is negative or not finite, or the seed is negative.
+        A value cannot be.
     """
 
-    dtype: np.dtype[Any]
+    dtype: np.dtype[Any] = _UINT8
     noise: float = 1.5
     seed: int = 0
+    _: KW_ONLY
+    bits: int | None = None
+    electrons: float = math.inf
+    gain_deviation: float = 0.0
+    offset_deviation: float = 0.0
+    frame_rate: float = 30.0
+    exposure: float = 0.0
+    point_spread: float = 0.0
+    distance: float = math.inf
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.noise) and self.noise >= 0):
-            raise InputError(
-                f"noise {self.noise} cannot be: give its standard deviation in counts, 0 or more"
-            )
-        if self.seed < 0:
-            raise InputError(f"seed {self.seed} cannot be: give a whole number, 0 or more")
+        kind = frame_dtype(self.dtype)
+        choices = _BITS[kind.name]
+        bits = choices[0] if self.bits is None and choices else self.bits
+        if bits is not None and bits not in choices:
+            remedy = f"take {', '.join(map(str, sorted(choices)))}" if choices else "leave them out"
+            raise InputError(f"frames of {kind.name} cannot have {bits} bits: {remedy}")
+        object.__setattr__(self, "dtype", kind)
+        object.__setattr__(self, "bits", bits)
+        _check(self)
 
     @property
     def dark(self) -> float:
-        """Counts without light."""
-        return _LEVELS[self.dtype.name][0]
+        """Nominal counts without light."""
+        return _DARK * self._scale
 
     @property
     def bright(self) -> float:
-        """Counts in full light."""
-        return _LEVELS[self.dtype.name][1]
+        """Nominal counts in full light."""
+        return _BRIGHT * self._scale
 
-    def expose(self, counts: NDArray[np.float32], frame: int, out: NDArray[Any]) -> None:
-        """Write one frame: counts with noise; integer types are rounded and clipped to their range.
+    @property
+    def top(self) -> float:
+        """The largest count; infinite for float32."""
+        return math.inf if self.bits is None else 2.0**self.bits - 1
+
+    @property
+    def _scale(self) -> float:
+        return 1.0 if self.bits is None else 2.0 ** (self.bits - 8)
+
+
+class Sensor:
+    """The pixels of a camera, on a device: they turn light into counts.
+
+    A pixel's counts are ``offset + (full - offset) light`` and noise; integers are rounded, half to even, and
+    clipped to the camera's bits.
+
+    Parameters
+    ----------
+    camera : Camera
+    shape : (int, int)
+        Rows and columns.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Attributes
+    ----------
+    camera : Camera
+    dtype : dtype
+        Of a sample.
+    device : Device
+    offset, full : ndarray, (H, W), float32
+        Each pixel's exact counts without light and in full light, read-only.
+
+    Raises
+    ------
+    mirrorskin.kernels.errors.DeviceError
+        There is no device, or it has no room for a frame.
+    """
+
+    def __init__(self, camera: Camera, shape: tuple[int, int], device: str | Device | None = None) -> None:
+        self.camera, self.dtype = camera, camera.dtype
+        self.device = open_device(device)
+        self.offset, span = _levels(camera, shape)
+        self.full = self.offset + span
+        self.offset.flags.writeable = self.full.flags.writeable = False
+        self._shape, self._pixels = shape, shape[0] * shape[1]
+        self._quarter = -(-self._pixels // 4)  # the generator makes four numbers at a time
+        room = (4 * self._quarter,)
+        self._light = self.device.array("light", room, np.float32)
+        self._offset = self.device.array("offset", room, np.float32)
+        self._span = self.device.array("span", room, np.float32)
+        self._counts = self.device.array("counts", room, self.dtype)
+        for array, values in ((self._offset, self.offset), (self._span, span)):
+            array.host[: self._pixels] = values.ravel()
+            array.upload()
+        self._counts.upload()
+
+    def expose(self, light: NDArray[np.float32], frame: int, out: NDArray[Any]) -> None:
+        """Write one frame.
 
         Parameters
         ----------
-        counts : ndarray, (H, W), float32
-            What a noise-free camera would see.
+        light : ndarray, (H, W), float32
+            From 0 to 1, the mean over the exposure.
         frame : int
-            Its number in the stack; with the seed it decides the noise.
+            Its number, which decides the noise: a whole number of 64 bits. Negative ones can stand for frames
+            outside the stack.
         out : ndarray, (H, W), the camera's dtype
             Where to write.
         """
-        if self.noise > 0:
-            generator = np.random.default_rng((self.seed, frame))
-            counts = counts + self.noise * generator.standard_normal(counts.shape, dtype=np.float32)
-        if self.dtype.kind == "u":
-            counts = np.clip(np.rint(counts), 0, np.iinfo(self.dtype).max)
-        out[...] = counts
+        self._light.claim()
+        self._light.host[: self._pixels].reshape(self._shape)[...] = self._spread(light)
+        self._light.upload()
+        self._launch(frame)
+        out[...] = self._counts.download()[: self._pixels].reshape(self._shape)
+
+    def _spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Blur light by the lens; beyond the picture's edge it goes on as it ends."""
+        if self.camera.point_spread == 0:
+            return light
+        import cv2
+
+        sigma = self.camera.point_spread
+        edge = cv2.BORDER_REPLICATE
+        return np.asarray(
+            cv2.GaussianBlur(light, (0, 0), sigmaX=sigma, sigmaY=sigma, borderType=edge), light.dtype
+        )
+
+    def _launch(self, frame: int) -> None:
+        camera, quarter = self.camera, self._quarter
+        expose = self.device.kernel(
+            "exposure",
+            "expose",
+            FRAME=_C_TYPES[self.dtype.name],
+            WHOLE=int(camera.bits is not None),
+            SHOT=int(math.isfinite(camera.electrons)),
+        )
+        maps = self._light, self._offset, self._span
+        keys = np.int32(quarter), np.uint64(int(frame) % _WORD), np.uint64(camera.seed)
+        amounts = np.float32(camera.noise), np.float32(1 / camera.electrons), np.float32(camera.top)
+        moved = self._pixels * (len(maps) * 4 + self.dtype.itemsize)
+        expose(-(-quarter // self.device.shape.tile), *maps, *keys, *amounts, self._counts, moved=moved)
 
 
 def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:
@@ -85,3 +207,32 @@ def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     if kind not in FRAME_DTYPES:
         raise InputError(f"frames cannot be {dtype}: take {', '.join(known.name for known in FRAME_DTYPES)}")
     return kind
+
+
+def _levels(camera: Camera, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Draw each pixel's counts without light, and how many more it has in full light."""
+    generator = np.random.default_rng((camera.seed, _MAPS))
+    gain = 1 + camera.gain_deviation * generator.standard_normal(shape)
+    offset = camera.dark + camera.offset_deviation * generator.standard_normal(shape)
+    span = (camera.bright - camera.dark) * np.maximum(gain, _LEAST_GAIN)
+    return offset.astype(np.float32), span.astype(np.float32)
+
+
+def _check(camera: Camera) -> None:
+    period = 1 / camera.frame_rate if camera.frame_rate > 0 else 0.0
+    whole = isinstance(camera.seed, int | np.integer)
+    rules = {
+        "noise": (0 <= camera.noise <= _NOISE_MAX, "its standard deviation in counts, 0 to 65536"),
+        "seed": (whole and 0 <= camera.seed < _WORD, "a whole number, 0 or more, of 64 bits"),
+        "electrons": (camera.electrons >= _ELECTRONS_MIN, "those of a count of light, 0.001 or more"),
+        "gain_deviation": (0 <= camera.gain_deviation < 1, "a share of the gain, 0 or more and less than 1"),
+        "offset_deviation": (0 <= camera.offset_deviation <= _NOISE_MAX, "counts, 0 to 65536"),
+        "frame_rate": (0 < camera.frame_rate < math.inf, "frames in a second, more than 0"),
+        "exposure": (0 <= camera.exposure <= period, f"seconds, 0 to a frame's {period:.6g}"),
+        "point_spread": (0 <= camera.point_spread < math.inf, "pixels, 0 or more"),
+        "distance": (camera.distance > 0, "millimetres above the sheet, more than 0"),
+    }
+    for name, (holds, remedy) in rules.items():
+        if not holds:
+            value = getattr(camera, name)
+            raise InputError(f"{name.replace('_', ' ')} {value} of the camera cannot be: give {remedy}")

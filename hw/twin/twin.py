@@ -1,30 +1,44 @@
-"""The twin as a source of frames: press the sheet on an object and watch."""
+"""The twin as a source of frames: move the body on an object and watch."""
 
 from __future__ import annotations
 
+import functools
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.camera import FRAME_RATE, Camera, frame_dtype
-from mirrorskin.hw.twin.objects.shapes import make_object
-from mirrorskin.hw.twin.optics.ideal import uniform_response
-from mirrorskin.hw.twin.objects.surface import Object, zenith_azimuth
-from mirrorskin.io import check_stroke
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Motion, Truth, pixel_axes
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.hw.twin.camera import Camera, Sensor
+from mirrorskin.hw.twin.contact import Conform, Elastic, Friction
+from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
+from mirrorskin.hw.twin.objects import Object, check_fits, make_object, zenith_azimuth
+from mirrorskin.hw.twin.optics import Ideal, Linear, Wall, make_pattern
+from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, take_references
+from mirrorskin.hw.twin.scene import Film, Press
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io.types import Block, Closing, Header, InputError, Truth
+from mirrorskin.kernels.device import Device, open_device
+
+ContactName = Literal["conform", "elastic"]
+CONTACTS: tuple[ContactName, ...] = get_args(ContactName)
+OpticsName = Literal["ideal", "cylinder"]
+OPTICS: tuple[OpticsName, ...] = get_args(OpticsName)
 
 _PIXELS_MAX = 200_000_000
+_MEMORY = 512_000_000  # bytes of light that a movement may keep
+_REACH_POSES = 16  # that tell how far an object reaches
+_ALL = 1e3  # travel that reaches all of any object, mm
 
 
 class Twin(Closing):
-    """The sensor, simulated in vertical motion: a `mirrorskin.io.Source` that knows the truth.
+    """The sensor, simulated: a `mirrorskin.io.Source` that knows the truth.
 
-    The sheet conforms to the object (eq. 1 of the paper): a pixel is in contact in frame k when
-    ``travel[k] >= -height``, on its way down as on its way up. There it takes the object's slope and shows
-    ``dark + (bright - dark) g(zenith)``, with g from `uniform_response`; elsewhere it is flat and dark.
-    The camera adds noise and quantises.
+    In each frame the body is somewhere, the sheet lies on the object (contact), the camera sees the lit wall
+    in the sheet (optics), and turns that light into counts (camera).
 
     Parameters
     ----------
@@ -34,31 +48,37 @@ class Twin(Closing):
         Rows and columns of a frame.
     pixel_size : float or (float, float)
         Millimetres at the sheet along x and y.
-    travel : array_like, (T,)
-        Millimetres that the body has been lowered in each frame: of a press, of a release, or of one after
-        the other.
-    dtype : dtype_like
-        uint8 (levels 16 to 224), uint16 (256 to 3584) or float32 (16 to 224).
-    noise : float
-        Standard deviation in raw counts.
-    seed : int
-        The same seed gives the same frames, however they are read.
+    movement : Movement
+        `Vertical`, `Axial`, `Horizontal` or `Twist`.
+    contact : {"conform", "elastic"}
+        Whether the sheet takes the object's shape, as in eq. 1 of the paper, or is the surface of an elastic
+        body.
+    optics : {"ideal", "cylinder"}
+        Whether brightness goes by the zenith alone, or is traced to the real wall.
+    pattern : str or Path
+        Of the wall: "uniform", "linear" in the zenith, or a picture, unrolled.
+    body : Body
+    camera : Camera
+    references : {"exact", "ball"}
+        Where the header's dark and bright come from: the camera's exact levels, or frames as a lab takes
+        them; see `take_references`.
+    device : str or Device, optional
+        What renders; see `mirrorskin.kernels.device.open_device`.
 
     Attributes
     ----------
-    header : Header
-        Its ``dark`` and ``bright`` are the camera's exact levels, free of noise.
-    truth : Truth
-        The object as it is; ``azimuth`` is NaN where the surface is level, ``contact`` is that at the
-        greatest travel.
+    name, motion, shape, dtype, rewindable
+        As for every source.
+    movement : Movement
+    travel : ndarray, (T,), float64, or None
+        Millimetres, of a vertical movement.
 
     Raises
     ------
     InputError
-        A value cannot be, the object is unknown or its file unusable.
+        A value cannot be, the object is unknown or too large, or its file unusable.
     """
 
-    motion: Motion = "vertical"
     rewindable = True
 
     def __init__(
@@ -67,46 +87,97 @@ class Twin(Closing):
         object: Object | str | Path,  # noqa: A002 - the word users know it by
         shape: tuple[int, int],
         pixel_size: float | tuple[float, float],
-        travel: ArrayLike,
-        dtype: DTypeLike = np.uint8,
-        noise: float = 1.5,
-        seed: int = 0,
+        movement: Movement,
+        contact: ContactName = "conform",
+        optics: OpticsName = "ideal",
+        pattern: str | Path = "uniform",
+        body: Body | None = None,
+        camera: Camera | None = None,
+        references: ReferenceName = "exact",
+        device: str | Device | None = None,
     ) -> None:
         field = _check_shape(shape)
         pixel = _check_pixel_size(pixel_size)
-        self.travel = check_stroke(travel, np.size(travel), "travel")
-        if len(self.travel) == 0:
-            raise InputError("travel is empty: give the position of at least one frame, in mm")
-        self._camera = Camera(frame_dtype(dtype), noise, seed)
-        thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
+        _check_choice(contact, CONTACTS, "contact")
+        _check_choice(optics, OPTICS, "optics")
+        _check_choice(references, REFERENCES, "references")
+        self.movement = movement
+        self.motion = movement.motion
+        self.travel = movement.positions if isinstance(movement, Vertical) else None
+        self._body = body or Body()
+        self._camera = camera or Camera()
+        self._references: ReferenceName = references
+        self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
+        check_fits(self._thing, self._body.radius)
+        self._check_movement(contact)
 
-        x, y = np.meshgrid(*pixel_axes(field, pixel))
-        height = thing.height(x, y)
-        zenith, azimuth = zenith_azimuth(*thing.slope(x, y))
-        self._reached_at = -height  # NaN where there is no object, which no travel reaches
-        self._light = self._counts(zenith)
+        opened = open_device(device)
+        self._view = View(field, pixel, self._body, self._camera.distance)
+        self._pattern = make_pattern(pattern, self._body)
+        self._optics: Ideal | Wall = (
+            Ideal(self._body, self._pattern)
+            if optics == "ideal"
+            else Wall(self._body, self._pattern, self._view, opened)
+        )
+        self._contact = self._make_contact(contact)
+        self._scene = self._make_scene()
+        self._sensor = Sensor(self._camera, field, opened)
         self._next = 0
 
-        self.name = f"twin: {thing.name}"
-        self.shape = (len(self.travel), *field)
+        self.name = f"twin: {self._thing.name}"
+        self.shape = (len(movement.positions), *field)
         self.dtype = self._camera.dtype
-        self.header = Header(
-            motion=self.motion,
-            title=f"Digital twin, {thing.name}, vertical motion",
-            pixel_size=pixel,
-            dark=np.full(field, self._camera.dark, np.float32),
-            bright=np.full(field, self._camera.bright, np.float32),
+
+    @functools.cached_property
+    def header(self) -> Header:
+        """What holds for all frames; the references are taken when it is asked for."""
+        dark, bright = take_references(self._references, self._optics, self._sensor, self._view, self._body)
+        header = replace(
+            self.movement.header(),
+            title=f"Digital twin, {self._thing.name}, {self.motion} motion",
+            pixel_size=self._view.pixel_size,
+            dark=dark,
+            bright=bright,
         )
-        self.truth = Truth(
+        pattern = self._pattern
+        if not isinstance(pattern, Linear):
+            return header
+        low, span = self._camera.dark, self._camera.bright - self._camera.dark
+        gain, offset = np.asarray(span * pattern.gain), np.asarray(low + span * pattern.offset)
+        return replace(header, zenith_gain=gain, zenith_offset=offset)
+
+    @functools.cached_property
+    def truth(self) -> Truth:
+        """The object as it is under the upright body; worked out when it is asked for.
+
+        ``azimuth`` is NaN where the surface is level. ``contact`` is that at the greatest travel of a
+        vertical movement, and what lasts through all frames of another. ``slip`` is known of horizontal
+        movements and twists in elastic contact.
+        """
+        x, y = self._view.x, self._view.y
+        height = self._thing.height(x, y)
+        zenith, azimuth = zenith_azimuth(*self._thing.slope(x, y))
+        return Truth(
             height=height.astype(np.float32),
             zenith=zenith.astype(np.float32),
             azimuth=azimuth.astype(np.float32),
-            contact=(self.travel.max() >= self._reached_at).astype(np.uint8),
+            contact=self._touched().astype(np.uint8),
+            slip=self._slipped(),
         )
+
+    def sheet(self, frame: int) -> Sheet:
+        """Return how the sheet lies at the middle of a frame's exposure, worked out anew."""
+        place = self.movement.reduced(self.movement.path[frame])
+        return self._lie_once(self.movement.pose(place))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
+        self._scene.restart()
         self._next = 0
+
+    def skip(self, count: int) -> None:
+        """Pass over so many of the next frames, which are not rendered."""
+        self._next = min(self._next + count, self.shape[0])
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Render the next frames.
@@ -119,7 +190,7 @@ class Twin(Closing):
         Returns
         -------
         Block or None
-            The frames with their time (30 a second) and travel; None after the last.
+            The frames with their time and the body's positions; None after the last.
 
         Raises
         ------
@@ -138,16 +209,79 @@ class Twin(Closing):
         if len(frames) == 0:
             return None
         for k, frame in enumerate(frames, start=first):
-            touches = self.travel[k] >= self._reached_at
-            counts = np.where(touches, self._light, np.float32(self._camera.dark))
-            self._camera.expose(counts, k, frame)
+            self._sensor.expose(self._scene.light(k), k, frame)
         self._next = first + len(frames)
-        time = np.arange(first, self._next) / FRAME_RATE
-        return Block(frames, index=first, time=time, travel=self.travel[first : self._next])
+        time = np.arange(first, self._next) / self._camera.frame_rate
+        return self.movement.mark(Block(frames, index=first, time=time))
 
-    def _counts(self, zenith: Floats) -> NDArray[np.float32]:
-        share = np.nan_to_num(uniform_response(zenith))
-        return (self._camera.dark + (self._camera.bright - self._camera.dark) * share).astype(np.float32)
+    def _check_movement(self, contact: ContactName) -> None:
+        deepest = self.movement.deepest
+        if deepest >= self._body.height:
+            raise InputError(
+                f"travel of {deepest:g} mm is deeper than the sensor's body, {self._body.height:g} mm:"
+                " press less"
+            )
+        if self._compliance > 0 and contact == "conform":
+            raise InputError(
+                "compliance needs contact 'elastic': a sheet that only conforms presses with no force"
+            )
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames a second."""
+        return self._camera.frame_rate
+
+    @property
+    def _compliance(self) -> float:
+        return self.movement.compliance if isinstance(self.movement, Vertical) else 0.0
+
+    def _make_contact(self, name: ContactName) -> Conform | Elastic:
+        if name == "conform":
+            return Conform(self._thing, self._view, self._body.radius)
+        movement = self.movement
+        some = np.linspace(0, len(movement.path) - 1, _REACH_POSES).round().astype(np.intp)
+        poses = [movement.pose(place) for place in movement.path[np.unique(some)]]
+        deepest = pose_at_press(movement.deepest)
+        return Elastic(self._thing, [deepest, *poses], self._view, self._body, self._compliance)
+
+    def _make_scene(self) -> Film | Press:
+        share = self._camera.exposure * self._camera.frame_rate
+        contact, optics, view = self._contact, self._optics, self._view
+        if (
+            isinstance(self.movement, Vertical)
+            and isinstance(contact, Conform)
+            and isinstance(optics, Ideal)
+            and view.orthographic
+        ):
+            touched, untouched = (contact.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
+            height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
+            return Press(
+                height, optics.light(touched), optics.light(untouched), self.movement.positions, share
+            )
+        return Film(contact, optics, self.movement, share, view.shape, _MEMORY)
+
+    def _lie_once(self, pose: Pose) -> Sheet:
+        """Lay the sheet on the object without a thought for the pose before or after."""
+        if isinstance(self._contact, Elastic):
+            return self._contact.sheet(self._contact.solve(pose).pressure)
+        return self._contact.lie(pose)
+
+    def _touched(self) -> NDArray[np.bool_]:
+        if isinstance(self._scene, Film) and not isinstance(self.movement, Vertical):
+            return self._scene.touched_throughout()
+        return self._lie_once(pose_at_press(self.movement.deepest)).contact
+
+    def _slipped(self) -> NDArray[np.uint8] | None:
+        """Tell where the sheet slips at some time, by the pressure of the press before the movement."""
+        movement, contact = self.movement, self._contact
+        if not (isinstance(movement, Horizontal | Twist) and isinstance(contact, Elastic)):
+            return None
+        pressure = contact.solve(pose_at_press(movement.deepest)).pressure
+        friction = Friction(contact.space, pressure, self._body.friction)
+        slipped = np.zeros(pressure.shape, bool)
+        for place in movement.path:
+            slipped |= friction.move(contact.shift(movement.pose(place)))
+        return contact.crop(slipped).astype(np.uint8)
 
 
 def _check_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -164,3 +298,8 @@ def _check_pixel_size(pixel_size: float | tuple[float, float]) -> tuple[float, f
         raise InputError(f"pixel size {pixel_size} cannot be: give one positive number of mm, or x and y")
     along_x, along_y = np.broadcast_to(sizes, 2)
     return float(along_x), float(along_y)
+
+
+def _check_choice(value: str, known: tuple[str, ...], name: str) -> None:
+    if value not in known:
+        raise InputError(f"{name} {value!r} is unknown: take {', '.join(known)}")

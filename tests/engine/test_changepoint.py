@@ -7,9 +7,9 @@ import pytest
 from changes import assert_near, numpy_change, numpy_split
 from presses import SPEC, assert_equal, random_press
 from ramps import NOISES, WIDTHS, compare, errors, ramps, rms
-from stacks import MadeUp
+from stacks import MadeUp, ball
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine import ChangePointSearch, find_change_point, find_onset
 from mirrorskin.io import Block, InputError
 
@@ -430,7 +430,7 @@ TRAVEL = 0.1 * np.arange(1, 31)
 
 
 def twin(**changes):
-    source = hw.Twin(object="sphere", shape=(120, 120), pixel_size=0.1, travel=TRAVEL, noise=6.0, seed=7)
+    source = ball((120, 120), 0.1, TRAVEL, noise=6.0, seed=7)
     source.header = dataclasses.replace(source.header, **changes)
     return source
 

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from stacks import ball
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 
 TRAVEL = 0.1 * np.arange(1, 21)
 
 
 def twin(**options):
-    return hw.Twin(object="sphere", shape=(40, 50), pixel_size=0.2, travel=TRAVEL, **options)
+    return ball((40, 50), 0.2, TRAVEL, **options)
 
 
 def test_the_recordings_own_references_are_used():

@@ -4,16 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from stacks import MadeUp, record
+from stacks import MadeUp, ball, record
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 
 DOWN = 0.1 * np.arange(1, 31)
 STROKE = np.concatenate([DOWN, DOWN[::-1]])  # rests for two frames at its greatest travel
 
 
 def twin(travel=STROKE, **options):
-    return hw.Twin(object="sphere", shape=(160, 160), pixel_size=0.08, travel=travel, **options)
+    return ball((160, 160), 0.08, travel, **options)
 
 
 def frames_of(source):

@@ -3,8 +3,9 @@
 import geometry
 import numpy as np
 import pytest
+from stacks import ball
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 
 SHAPE, PIXEL, NOISE = (480, 480), 0.025, 1.5
 DARK, BRIGHT = geometry.LEVELS["uint8"]
@@ -29,7 +30,7 @@ class Spiked:
 def press(step, count, spikes=0.0):
     """Press the twin on the sphere; return the result and the height error, (H, W), mm."""
     travel = step * np.arange(1, count + 1)
-    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, travel=travel, noise=NOISE, seed=7)
+    twin = ball(SHAPE, PIXEL, travel, noise=NOISE, seed=7)
     result = engine.reconstruct(Spiked(twin, spikes) if spikes else twin)
     return result, result.height - geometry.sphere(SHAPE, PIXEL).height
 
@@ -73,7 +74,7 @@ def test_spikes_harm_few_pixels():
 
 def test_a_rendered_recording_gives_what_the_twin_gives(tmp_path):
     travel = 0.1 * np.arange(1, 31)
-    twin = hw.Twin(object="sphere", shape=(60, 70), pixel_size=0.15, travel=travel)
+    twin = ball((60, 70), 0.15, travel)
     direct = engine.reconstruct(twin)
     twin.rewind()
     with io.Recorder(twin, tmp_path / "sphere.h5", "bitshuffle", truth=twin.truth) as recorder:

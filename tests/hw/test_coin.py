@@ -6,8 +6,7 @@ import geometry
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin import Coin
-from mirrorskin.hw.twin.objects.surface import zenith_azimuth
+from mirrorskin.hw.twin.objects import Coin, zenith_azimuth
 
 PIXEL = 0.04
 SHAPE = (660, 660)
@@ -76,6 +75,14 @@ def test_relief_is_two_to_three_tenths_of_a_millimetre() -> None:
     lines = [on_circle(6.9, 130, 195).max(), along(0, -4.3, 0, -9.2).max(), along(-5.4, -3.5, -5.4, -7).max()]
     assert all(0.2 <= line - FIELD <= 0.3 for line in lines)
     assert height.min() == TABLE
+
+
+def test_no_wall_is_upright() -> None:
+    x, y = (places + 0.0037 for places in geometry.pixel_centres((1340, 1340), 0.02))
+    height = Coin().height(x, y)
+    steepest = np.tan(np.radians(40)) * 0.02 + 1e-12
+    for axis in (0, 1):
+        assert np.abs(np.diff(height, axis=axis)).max() <= steepest
 
 
 def test_every_ramp_is_in_the_visible_window_and_all_else_is_level() -> None:

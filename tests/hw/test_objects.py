@@ -6,9 +6,20 @@ import geometry
 import numpy as np
 import pytest
 
-from mirrorskin.hw.twin import Coin, Cone, HeightMap, Object, Plane, Sphere, make_object
+from mirrorskin.hw.twin.objects import (
+    Coin,
+    Cone,
+    Cylinder,
+    HeightMap,
+    Object,
+    Plane,
+    Sphere,
+    Step,
+    Texture,
+    make_object,
+    zenith_azimuth,
+)
 from mirrorskin.hw.twin.optics.ideal import uniform_response
-from mirrorskin.hw.twin.objects.surface import zenith_azimuth
 
 PIXEL = 0.05
 SHAPES = [(211, 230), (64, 64), (1, 1)]
@@ -28,7 +39,18 @@ def test_surface_is_the_geometry(name: str, shape: tuple[int, int]) -> None:
     np.testing.assert_allclose(np.remainder(turn + 1, 2 * np.pi), 1, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("thing", [Sphere(), Cone(), Plane(), Coin()], ids=lambda thing: thing.name)
+THINGS: list[Object] = [
+    Sphere(),
+    Cone(),
+    Plane(),
+    Coin(),
+    Cylinder(azimuth=0.3),
+    Step(azimuth=0.3),
+    Texture(azimuth=0.3),
+]
+
+
+@pytest.mark.parametrize("thing", THINGS, ids=lambda thing: thing.name)
 def test_slope_is_the_height_differentiated(thing: Object) -> None:
     places = np.random.default_rng(0).uniform(-4, 4, (2, 4000))
     x, y = places[:, np.hypot(*places) < 4.5]
@@ -113,3 +135,34 @@ def test_height_map_slopes_are_one_sided_at_its_edges() -> None:
     dz_dx, dz_dy = HeightMap(heights, (0.5, 0.25)).slope(x, y)
     np.testing.assert_allclose(dz_dx, [[-2.0, -4.0, -6.0], [-2.0, -2.0, np.nan]])
     np.testing.assert_allclose(dz_dy, [[8.0, 8.0, np.nan], [8.0, 8.0, np.nan]])
+
+
+def test_the_radius_of_a_height_map_leaves_out_the_table() -> None:
+    heights = np.full((41, 61), -2.0)
+    heights[20, 30:46] = -1.0
+    assert HeightMap(heights, (0.5, 0.25)).radius == pytest.approx(7.5)
+    heights[heights == -2] = np.nan  # no table: one level is the object
+    assert HeightMap(heights, (0.5, 0.25)).radius == pytest.approx(7.5)
+
+
+def test_a_height_map_against_one_place_at_a_time() -> None:
+    rng = np.random.default_rng(7)
+    heights = -rng.uniform(0, 3, (9, 12))
+    heights[rng.uniform(size=heights.shape) < 0.1] = np.nan
+    thing = HeightMap(heights, (0.5, 0.25))
+    places = rng.uniform(-3.5, 3.5, (500, 2))
+    places[:100] = np.round(places[:100] * 4) / 4  # on samples and halfway between them
+    for x, y in places:
+        column, row = x / 0.5 + 5.5, 4 - y / 0.25
+        weights = np.outer(
+            np.maximum(1 - np.abs(np.arange(9) - row), 0), np.maximum(1 - np.abs(np.arange(12) - column), 0)
+        )
+        used = weights > 0
+        expected = np.sum(weights[used] * heights[used]) if np.isclose(weights.sum(), 1) else np.nan
+        np.testing.assert_allclose(thing.height(np.array([x]), np.array([y])), [expected], atol=1e-12)
+
+
+def test_a_height_map_of_one_row() -> None:
+    thing = HeightMap(np.array([[0.0, -1.0]]), (0.5, 0.5))
+    found = thing.height(np.array([-0.25, 0.0, 0.25, 0.0]), np.array([0.0, 0.0, 0.0, 0.1]))
+    np.testing.assert_allclose(found, [0.0, -0.5, -1.0, np.nan])

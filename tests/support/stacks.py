@@ -22,9 +22,20 @@ def random_stack(dtype="uint8", shape=SHAPE, seed=0):
     return generator.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
 
 
+def ball(shape, pixel_size, travel, **camera):
+    """The twin, pressed on a ball of 10 mm: what its camera makes of the paper's own idealisation."""
+    return hw.Twin(
+        object="sphere",
+        shape=shape,
+        pixel_size=pixel_size,
+        movement=hw.twin.Vertical(travel),
+        camera=hw.twin.Camera(**camera),
+    )
+
+
 def sphere(dtype="uint8"):
     """The twin, pressed on a ball: 8 frames of 7 x 5."""
-    return hw.Twin(object="sphere", shape=SHAPE[1:], pixel_size=(0.5, 0.6), travel=TRAVEL, dtype=dtype)
+    return ball(SHAPE[1:], (0.5, 0.6), TRAVEL, dtype=dtype)
 
 
 class MadeUp:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -22,10 +23,13 @@ FLANK_ZENITH = math.radians(40.0)
 
 _RIM_FOOT = 9.6
 _LINE = 0.3  # half-width of a line at its foot
+_RAMP = RELIEF / math.tan(RELIEF_ZENITH)
 _GEAR_TEETH, _GEAR_RING, _GEAR_TIP, _TOOTH = 16, 3.3, 4.2, 0.36
+_GEAR_REACH = math.hypot(_GEAR_TIP, _TOOTH)
 _EAR_RADIUS, _STEM_START, _EAR_START = 6.9, math.radians(-110.0), math.radians(-35.0)
 _GRAIN_PITCH, _GRAIN_PAIRS, _GRAIN_TILT = math.radians(11.0), 9, math.radians(28.0)
 _GRAIN_LENGTH, _GRAIN_WIDTH, _GRAIN_OFFSET = 0.95, 0.45, 0.75  # halves of length and width
+_EAR_REACH, _EAR_BOTTOM = 1.35, -2.5  # no grain is further from the stem, no part lower
 _WATER_PITCH, _WATER_LINES, _WATER_TOP = 0.95, 7, -2.9
 _WATER_INNER, _WATER_OUTER = 4.4, 9.0
 _KANJI_HALF = 1.9
@@ -54,36 +58,61 @@ class Coin:
 
     It is drawn for this sensor: no wall is upright. The relief (0.25 mm; rim and broad motifs up to z = 0,
     lines to -0.04 mm) rises from the field in ramps of 35 degrees; the two flanks, outside 22 mm and inside
-    5 mm, fall to the table in ramps of 40 degrees, as a sheet would drape over them. Ramps are at least
-    0.12 mm wide, but where one ends in a corner.
+    5 mm, fall to the table in ramps of 40 degrees, as a sheet would drape over them: a ramp steeper than 45
+    degrees would stay dark. Ramps are at least 0.12 mm wide, but where one ends in a corner.
     """
 
     name: ClassVar[str] = "coin"
 
+    @property
+    def radius(self) -> float:
+        """Radius of the outer flank's foot on the table, mm."""
+        return RADIUS + THICKNESS / math.tan(FLANK_ZENITH)
+
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return z in mm of coin and table; finite everywhere."""
         r = np.hypot(x, y)
-        inset = np.max([r - _RIM_FOOT, _gear(x, y), _ear(x, y), _water(x, y), _writing(x, y)], axis=0)
-        face = np.clip(math.tan(RELIEF_ZENITH) * inset, 0.0, RELIEF) - RELIEF
+        face = np.clip(math.tan(RELIEF_ZENITH) * _inset(x, y, r), 0.0, RELIEF) - RELIEF
         flank = math.tan(FLANK_ZENITH) * np.minimum(RADIUS - r, r - HOLE_RADIUS)
         coin: Floats = np.minimum(face, flank)
         return np.maximum(coin, -THICKNESS)
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return dz/dx and dz/dy by central differences of the height over 0.2 um."""
-        return difference_slope(self.height, x, y, (1e-4, 1e-4))
+        """Return dz/dx and dz/dy: 0 where level, else by central differences of the height over 0.2 um."""
+        x, y = np.broadcast_arrays(x, y)
+        z = self.height(x, y)
+        ramp = (z != 0) & (z != -RELIEF) & (z != -THICKNESS)
+        slope = np.zeros((2, *x.shape))
+        slope[:, ramp] = difference_slope(self.height, x[ramp], y[ramp], (1e-4, 1e-4))
+        return slope[0], slope[1]
 
 
 # Each motif is its *inset*: the distance in mm from its outline, positive inside. Unions are maxima,
 # intersections minima, and the slope of an inset is 1, so that every ramp made of it has one steepness.
 
 
-def _gear(x: Floats, y: Floats) -> Floats:
+def _inset(x: Floats, y: Floats, r: Floats) -> Floats:
+    x, y, r = np.broadcast_arrays(x, y, r)
+    inset = np.asarray(np.maximum(r - _RIM_FOOT, _GEAR_RING - r))
+    # A motif is drawn only where it can rise above the field; within the ring the teeth are at its top.
+    motifs = [
+        (_teeth, (r > _GEAR_RING - _RAMP) & (r < _GEAR_REACH)),
+        (_ear, (np.abs(r - _EAR_RADIUS) < _EAR_REACH) & (y > _EAR_BOTTOM)),
+        (_water, (y < _WATER_TOP + _LINE) & (r > _WATER_INNER) & (r < _WATER_OUTER)),
+    ]
+    for strokes, centre_x, centre_y in _WRITING:
+        square = (np.abs(x - centre_x) < _KANJI_HALF) & (np.abs(y - centre_y) < _KANJI_HALF)
+        motifs.append((partial(_character, strokes, centre_x, centre_y), square))
+    for motif, near in motifs:
+        inset[near] = np.maximum(inset[near], motif(x[near], y[near]))
+    return inset
+
+
+def _teeth(x: Floats, y: Floats) -> Floats:
     r, angle = np.hypot(x, y), np.arctan2(y, x)
     pitch = 2 * math.pi / _GEAR_TEETH
     from_tooth = angle - pitch * np.round(angle / pitch)
-    tooth = np.minimum(_TOOTH - r * np.abs(np.sin(from_tooth)), _GEAR_TIP - r * np.cos(from_tooth))
-    return np.maximum(_GEAR_RING - r, tooth)
+    return np.minimum(_TOOTH - r * np.abs(np.sin(from_tooth)), _GEAR_TIP - r * np.cos(from_tooth))
 
 
 def _ear(x: Floats, y: Floats) -> Floats:
@@ -121,12 +150,10 @@ def _water(x: Floats, y: Floats) -> Floats:
     return inset
 
 
-def _writing(x: Floats, y: Floats) -> Floats:
-    insets = [
-        _LINE - _distance_to_segment(x - centre_x, y - centre_y, stroke)
-        for glyph, centre_x, centre_y in _WRITING
-        for stroke in glyph
-    ]
+def _character(
+    strokes: tuple[_Stroke, ...], centre_x: float, centre_y: float, x: Floats, y: Floats
+) -> Floats:
+    insets = [_LINE - _distance_to_segment(x - centre_x, y - centre_y, stroke) for stroke in strokes]
     inset: Floats = np.max(insets, axis=0)
     return inset
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.objects.surface import difference_slope
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.types import Floats, InputError, pixel_axes
 
 HEIGHT_MAP_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 DEFAULT_SCALE = 0.001
@@ -34,30 +34,40 @@ class HeightMap:
     pixel_size: tuple[float, float]
     name: str = "height map"
 
+    @property
+    def radius(self) -> float:
+        """Distance of the furthest sample above the lowest level, which is the table, mm."""
+        raised = self.heights > np.nanmin(self.heights)
+        rows, columns = np.nonzero(raised if raised.any() else np.isfinite(self.heights))
+        x, y = pixel_axes(self.heights.shape, self.pixel_size)
+        return float(np.hypot(x[columns], y[rows]).max())
+
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return z in mm, bilinear between the samples; NaN outside the map and next to its NaN samples."""
         rows, columns = self.heights.shape
         # Rounded, so that a sample's own place gives that sample and none of a neighbour that may be NaN.
-        column = np.round(x / self.pixel_size[0] + (columns - 1) / 2, 9)
-        row = np.round((rows - 1) / 2 - y / self.pixel_size[1], 9)
-        row, column = np.broadcast_arrays(row, column)
-        left, top = np.floor(column), np.floor(row)
-        total = np.zeros(row.shape)
-        for i, weight_i in ((top, 1 - (row - top)), (top + 1, row - top)):
-            for j, weight_j in ((left, 1 - (column - left)), (left + 1, column - left)):
-                weight = weight_i * weight_j
-                total += np.where(weight == 0, 0.0, weight * self._sample(i, j))
-        return total
+        left, share_x = _cell(np.round(x / self.pixel_size[0] + (columns - 1) / 2, 9), columns)
+        top, share_y = _cell(np.round((rows - 1) / 2 - y / self.pixel_size[1], 9), rows)
+        # One index into all samples is quicker than two. A neighbour without a share may be NaN: not met.
+        samples, corner = self.heights.ravel(), top * columns + left
+        to_right, down = (share_x > 0).astype(np.intp), columns * (share_y > 0)
+        upper, lower = (
+            (1 - share_x) * samples[start] + share_x * samples[start + to_right]
+            for start in (corner, corner + down)
+        )
+        height: Floats = (1 - share_y) * upper + share_y * lower
+        return height
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
         """Return dz/dx and dz/dy by differences to the next samples, one-sided at the object's edge."""
         return difference_slope(self.height, x, y, self.pixel_size)
 
-    def _sample(self, row: Floats, column: Floats) -> Floats:
-        rows, columns = self.heights.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-        return np.where(inside, self.heights[at], np.nan)
+
+def _cell(place: Floats, samples: int) -> tuple[NDArray[np.intp], Floats]:
+    """Return the sample before a place on the grid, and how far on the place is; NaN off the grid."""
+    inside = (place >= 0) & (place <= samples - 1)
+    before = np.where(inside, place, 0).astype(np.intp)
+    return before, np.where(inside, place - before, np.nan)
 
 
 def load_height_map(

@@ -1,22 +1,15 @@
-"""The objects that the twin knows by name, and those of simple shape."""
+"""Bodies of simple shape that stand alone under the sheet: ball, cone and rod."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from mirrorskin.hw.twin.objects.coin import Coin
-from mirrorskin.hw.twin.objects.heightmap import DEFAULT_SCALE, HEIGHT_MAP_SUFFIXES, load_height_map
-from mirrorskin.io.types import Floats, InputError
-
 if TYPE_CHECKING:
-    from mirrorskin.hw.twin.objects.surface import Object
-
-OBJECT_NAMES = ("sphere", "coin", "plane", "cone")
+    from mirrorskin.io.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,18 +25,19 @@ class Sphere:
     diameter: float = 10.0
     name: ClassVar[str] = "sphere"
 
+    @property
+    def radius(self) -> float:
+        """Half the diameter, mm."""
+        return self.diameter / 2
+
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return z = sqrt(r^2 - x^2 - y^2) - r, mm; NaN from the equator outwards."""
-        return self._rise(x, y) - self.diameter / 2
+        return _rise(self.radius, x**2 + y**2) - self.radius
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
         """Return (-x, -y) / sqrt(r^2 - x^2 - y^2); NaN from the equator outwards."""
-        rise = self._rise(x, y)
+        rise = _rise(self.radius, x**2 + y**2)
         return -x / rise, -y / rise
-
-    def _rise(self, x: Floats, y: Floats) -> Floats:
-        square = (self.diameter / 2) ** 2 - x**2 - y**2
-        return np.sqrt(np.where(square > 0, square, np.nan))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,83 +72,45 @@ class Cone:
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
-    """A tilted plate that ends where it would pass above the sheet's rest plane.
+class Cylinder:
+    """A rod lying on its side, its middle under the centre of the sheet; its ends are cut off upright.
 
     Attributes
     ----------
-    zenith, azimuth : float
-        Radians, of its normal.
-    reach : float
-        Millimetres from the picture's centre to the upper edge, against the azimuth; the edge is at z = 0.
+    diameter, length : float
+        Millimetres.
+    azimuth : float
+        Radians, of its axis.
     """
 
-    zenith: float = math.radians(20.0)
-    azimuth: float = math.radians(30.0)
-    reach: float = 5.0
-    name: ClassVar[str] = "plane"
+    diameter: float = 10.0
+    length: float = 20.0
+    azimuth: float = 0.0
+    name: ClassVar[str] = "cylinder"
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the rectangle that it covers, mm."""
+        return math.hypot(self.diameter, self.length) / 2
 
     def height(self, x: Floats, y: Floats, /) -> Floats:
-        """Return -tan(zenith) (reach + x cos(azimuth) + y sin(azimuth)), mm; NaN beyond the upper edge."""
-        return -math.tan(self.zenith) * self._below_edge(x, y)
+        """Return z = sqrt(r^2 - v^2) - r with v the distance from the axis, mm; NaN beyond sides and ends."""
+        return self._rise_and_across(x, y)[0] - self.diameter / 2
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return -tan(zenith) (cos(azimuth), sin(azimuth)); NaN beyond the upper edge."""
-        steepness = np.where(np.isnan(self._below_edge(x, y)), np.nan, -math.tan(self.zenith))
-        return steepness * math.cos(self.azimuth), steepness * math.sin(self.azimuth)
+        """Return -v / sqrt(r^2 - v^2) across the axis and 0 along it; NaN beyond sides and ends."""
+        rise, across = self._rise_and_across(x, y)
+        steepness = -across / rise
+        return -steepness * math.sin(self.azimuth), steepness * math.cos(self.azimuth)
 
-    def _below_edge(self, x: Floats, y: Floats) -> Floats:
-        distance = self.reach + x * math.cos(self.azimuth) + y * math.sin(self.azimuth)
-        return np.where(distance >= 0, distance, np.nan)
-
-
-_CENTRED: dict[str, Object] = {"sphere": Sphere(), "coin": Coin(), "cone": Cone()}
-
-
-def make_object(
-    name: str | Path,
-    shape: tuple[int, int],
-    pixel_size: tuple[float, float],
-    *,
-    scale: float = DEFAULT_SCALE,
-) -> Object:
-    """Make the object that a user asked for, as it lies in a given field of view.
-
-    Parameters
-    ----------
-    name : str or Path
-        "sphere" (10 mm), "coin" (5 yen), "plane" (20 degrees steep, its upper edge through the field's
-        highest corner), "cone" (30 degrees steep), or the path of a height map: .npy, .png, .tif or .tiff.
-    shape : (int, int)
-        Rows and columns of the field.
-    pixel_size : (float, float)
-        Millimetres along x and y; those of a height map too.
-    scale : float
-        Millimetres a count of a 16-bit height map.
-
-    Returns
-    -------
-    Object
-        Its highest point touches the sheet at travel 0.
-
-    Raises
-    ------
-    InputError
-        The name is none of these, or the file cannot be used.
-    """
-    if str(name) == "plane":
-        return _plane_in_field(shape, pixel_size)
-    if str(name) in _CENTRED:
-        return _CENTRED[str(name)]
-    if Path(name).suffix.lower() in HEIGHT_MAP_SUFFIXES:
-        return load_height_map(name, pixel_size, scale=scale)
-    raise InputError(
-        f"object {str(name)!r} is unknown: take {', '.join(OBJECT_NAMES)}"
-        f" or the path of a height map ({', '.join(HEIGHT_MAP_SUFFIXES)})"
-    )
+    def _rise_and_across(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        along = x * math.cos(self.azimuth) + y * math.sin(self.azimuth)
+        across = y * math.cos(self.azimuth) - x * math.sin(self.azimuth)
+        rise = _rise(self.diameter / 2, across**2)
+        return np.where(np.abs(along) <= self.length / 2, rise, np.nan), across
 
 
-def _plane_in_field(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Plane:
-    half_width, half_height = shape[1] * pixel_size[0] / 2, shape[0] * pixel_size[1] / 2
-    azimuth = Plane().azimuth
-    return Plane(reach=half_width * abs(math.cos(azimuth)) + half_height * abs(math.sin(azimuth)))
+def _rise(radius: float, square_distance: Floats) -> Floats:
+    """Return the height of a circle above its centre; NaN where it has none."""
+    square = radius**2 - square_distance
+    return np.sqrt(np.where(square > 0, square, np.nan))

@@ -22,6 +22,10 @@ class Object(Protocol):
     def name(self) -> str:
         """What to call it in a recording's title."""
 
+    @property
+    def radius(self) -> float:
+        """Radius of the circle about the origin that holds the object, not a table that it lies on; mm."""
+
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return the surface's z, mm, float64, shaped as x and y broadcast; NaN where there is no object."""
 

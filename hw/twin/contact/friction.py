@@ -1,0 +1,170 @@
+"""Where the sheet sticks to the object and where it slips, while the body moves along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.twin.contact.halfspace import HalfSpace, rectangle
+from mirrorskin.io.types import Floats
+
+TOLERANCE = 1e-3
+"""Largest error of the surface's shift in a step, as a share of how far the object moves in it."""
+
+ITERATIONS = 1000
+"""After this many a step has failed; most take 5 to 40."""
+
+# Of the way so far; a step that is no more than this is none.
+_NO_STEP = 1e-9
+
+# Tractions so close to the limit are at it.
+_AT_LIMIT = 1 - 1e-9
+
+
+class Friction:
+    """Coulomb friction between the body and an object that moves along it, pressed as before.
+
+    Traction does not raise the surface of an incompressible body, nor does pressure shift it: the contact and
+    its pressure p stay what they are (Johnson, Contact Mechanics, 1985, section 7.2). In a step the object
+    goes on by dU and the surface by du = C dq, C being Cerruti's response to the traction q. Where |q| < mu p
+    it sticks, du = dU; where |q| = mu p it may slip, and then q points along the slip dU - du. Among all
+    |q| <= mu p this q is the one of least dq C dq / 2 - dq dU (Kalker's principle for one step). It is found
+    by conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure.
+
+    Parameters
+    ----------
+    space : HalfSpace
+    pressure : ndarray, (H, W), float64
+        N/mm^2; they touch where it is above 0.
+    coefficient : float
+        Coulomb's mu.
+
+    Attributes
+    ----------
+    traction : ndarray, (2, H, W), float64
+        Of the object on the body, N/mm^2, along x (to the right) and along y (up the picture).
+    """
+
+    def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
+        self.traction = np.zeros((2, *space.shape))
+        self._contact = pressure > 0
+        if self._contact.any():
+            self._window = rectangle(self._contact)
+            self._touches = self._contact[self._window]
+            self._limit = np.where(self._touches, coefficient * pressure[self._window], 0.0)
+            self._space = space.window(*self._touches.shape)
+            self._before = self._shift = np.zeros((2, *self._touches.shape))
+            # How far a pixel shifts itself.
+            self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
+
+    def move(self, displacement: Floats) -> NDArray[np.bool_]:
+        """Move the object to another place; on the way it goes straight there.
+
+        Parameters
+        ----------
+        displacement : ndarray, (2, H, W), float64
+            Of the object against the body since the press, mm along x and y: the same everywhere if it is
+            pushed, a rotation if it is twisted.
+
+        Returns
+        -------
+        ndarray, (H, W), bool
+            Where it slips over the sheet in this step, by more than the tolerance; False outside the contact.
+
+        Raises
+        ------
+        RuntimeError
+            The step does not converge in `ITERATIONS`.
+        """
+        slips = np.zeros_like(self._contact)
+        if not self._contact.any():
+            return slips
+        here = np.where(self._touches, displacement[:, *self._window], 0.0)
+        step = here - self._before
+        far = float(_length(step).max())
+        # Steps of rounding are put together until they are worth a step.
+        if far > _NO_STEP * max(float(_length(place).max()) for place in (here, self._shift)):
+            tolerance = TOLERANCE * far
+            traction = self.traction[:, *self._window]
+            traction, self._shift, limited = self._follow(traction, self._shift + step, tolerance)
+            self.traction[:, *self._window] = traction
+            self._before = here
+            slips[self._window] = limited.where & (limited.slip > tolerance)
+        return slips
+
+    def _follow(self, traction: Floats, target: Floats, tolerance: float) -> tuple[Floats, Floats, _Limited]:
+        """Return the traction that shifts the surface to the target where the limit allows, and its shift."""
+        direction = last = np.zeros_like(traction)
+        last_gain = np.inf
+        for _ in range(ITERATIONS):
+            shift = self._space.tangential(traction)
+            lag = np.where(self._touches, target - shift, 0.0)
+            limited = _limited(traction, lag, self._limit)
+            residual = limited.turn(lag)
+            if float(_length(residual).max()) <= tolerance:
+                return traction, shift, limited
+            # Jacobi's preconditioner: where it slips far, only tiny turns of the traction are called for.
+            steepest = residual / (self._own + limited.curvature)
+            gain = float(np.vdot(residual, steepest))
+            memory = max(0.0, (gain - float(np.vdot(last, steepest))) / last_gain)
+            direction = steepest + memory * limited.turn(direction)
+            last, last_gain = residual, gain
+            resistance = self._space.tangential(direction) + limited.curvature * direction
+            traction = traction + np.vdot(residual, direction) / np.vdot(direction, resistance) * direction
+            traction *= _shrink(traction, self._limit)
+        raise RuntimeError(
+            f"stick and slip did not settle in {ITERATIONS} iterations: the shift is wrong by"
+            f" {float(_length(residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Limited:
+    """The pixels whose traction is at its limit and pushed beyond it: it can only turn.
+
+    Attributes
+    ----------
+    where : ndarray, (h, w), bool
+    along : ndarray, (2, h, w), float64
+        The traction's direction there, 0 elsewhere.
+    slip : ndarray, (h, w), float64
+        By how much the surface lags behind in that direction, mm.
+    curvature : ndarray, (h, w), float64
+        Of the energy where the limit's circle bends away from a straight turn: slip / limit, mm^3/N.
+    """
+
+    where: NDArray[np.bool_]
+    along: Floats
+    slip: Floats
+    curvature: Floats
+
+    def turn(self, vectors: Floats) -> Floats:
+        """Return vectors without their part along the traction where that cannot grow."""
+        turned: Floats = vectors - np.sum(vectors * self.along, axis=0) * self.along
+        return turned
+
+
+def _limited(traction: Floats, lag: Floats, limit: Floats) -> _Limited:
+    size = _length(traction)
+    # Without friction there is no traction, and slip goes where the object goes.
+    along = np.where(limit > 0, traction, lag)
+    along = along / np.maximum(_length(along), np.finfo(float).tiny)
+    slip = np.sum(lag * along, axis=0)
+    where = (size >= _AT_LIMIT * limit) & (slip > 0)
+    slip = np.where(where, slip, 0.0)
+    curvature = np.divide(slip, limit, out=np.zeros_like(slip), where=limit > 0)
+    return _Limited(where, np.where(where, along, 0.0), slip, curvature)
+
+
+def _shrink(traction: Floats, limit: Floats) -> Floats:
+    """Return the factors that bring tractions back to their limit, 1 for those within."""
+    size = _length(traction)
+    factors: Floats = np.divide(limit, size, out=np.ones_like(size), where=size > limit)
+    return factors
+
+
+def _length(vectors: Floats) -> Floats:
+    length: Floats = np.hypot(vectors[0], vectors[1])
+    return length

@@ -1,0 +1,177 @@
+"""How the silicone gives way: an incompressible elastic half-space under a grid of tractions."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from mirrorskin.io.types import Floats
+
+_WORKERS = 2
+
+
+class HalfSpace:
+    """An incompressible half-space whose surface is loaded evenly within each pixel of a grid.
+
+    Displacements are sums of those of single loaded pixels, which Love (1929) gave in closed form, from
+    Boussinesq's and Cerruti's solutions for a point (Johnson, Contact Mechanics, 1985, sections 3.2, 3.3 and
+    3.6). At Poisson ratio 0.5 pressure moves the surface along its normal only, traction along the surface
+    only. The sums are convolutions, done by FFT on a grid padded with zeros, so nothing outside the grid
+    presses and nothing comes round from the other side.
+
+    Displacements of an elastic body are told as seen from far inside it, where nothing moves.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the grid.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+    modulus : float
+        Young's modulus E, N/mm^2.
+    depth : float
+        Of the mirror below the surface, mm.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], pixel_size: tuple[float, float], modulus: float, depth: float = 0.0
+    ) -> None:
+        self.shape = shape
+        self.pixel_size = pixel_size
+        self.modulus = modulus
+        self.depth = depth
+        rows, columns = shape
+        self._padded = (fft.next_fast_len(2 * rows - 1), fft.next_fast_len(2 * columns - 1, real=True))
+
+    @property
+    def pixel_area(self) -> float:
+        """Of one pixel, mm^2."""
+        return self.pixel_size[0] * self.pixel_size[1]
+
+    @property
+    def softness(self) -> float:
+        """Displacement times distance of a point force, mm^2/N: 1 / (4 pi G) = 3 / (4 pi E)."""
+        return 3 / (4 * math.pi * self.modulus)
+
+    def window(self, rows: int, columns: int) -> HalfSpace:
+        """Return the same half-space below a grid of other size, for pressures that lie in a part of this."""
+        return HalfSpace((rows, columns), self.pixel_size, self.modulus, self.depth)
+
+    def surface(self, pressure: Floats) -> Floats:
+        """Return how deep pressure pushes the surface in.
+
+        Parameters
+        ----------
+        pressure : ndarray, (H, W), float64
+            N/mm^2, towards the inside of the body.
+
+        Returns
+        -------
+        ndarray, (H, W), float64
+            Millimetres at the pixels' centres, in the direction of the pressure.
+        """
+        return self._normal(pressure, 0.0)
+
+    def mirror(self, pressure: Floats) -> Floats:
+        """Return how deep pressure pushes in the layer that lies `depth` below the surface.
+
+        Below a point force P the displacement is P / (4 pi G) (1 / s + z^2 / s^3), s the distance and z the
+        depth (Johnson 1985, eq. 3.19); integrated over a pixel it is Love's formula for the surface with z in
+        its distances. The spectrum of this is the surface's times (1 + q z) exp(-q z), q the wavenumber.
+
+        Parameters and result are those of `surface`.
+        """
+        return self._normal(pressure, self.depth)
+
+    def tangential(self, traction: Floats) -> Floats:
+        """Return how traction shifts the surface along itself.
+
+        A point force Q along x shifts by Q / (4 pi G) times 1 / r + x^2 / r^3 along x and x y / r^3 along y
+        (Cerruti; Johnson 1985, eq. 3.75 at Poisson ratio 0.5).
+
+        Parameters
+        ----------
+        traction : ndarray, (2, H, W), float64
+            N/mm^2, along x (to the right) and along y (up the picture).
+
+        Returns
+        -------
+        ndarray, (2, H, W), float64
+            Millimetres along x and y at the pixels' centres.
+        """
+        xx, xy, yy = _tangential_spectra(self._padded, self.pixel_size)
+        along_x, along_y = self._spectrum(traction[0]), self._spectrum(traction[1])
+        shift = np.empty(traction.shape)
+        shift[0] = self._field(xx * along_x + xy * along_y)
+        shift[1] = self._field(xy * along_x + yy * along_y)
+        return shift
+
+    def _normal(self, pressure: Floats, depth: float) -> Floats:
+        spectrum = self._spectrum(pressure)
+        spectrum *= _normal_spectrum(self._padded, self.pixel_size, depth)
+        return self._field(spectrum)
+
+    def _spectrum(self, values: Floats) -> NDArray[np.complex128]:
+        # The axes one by one: rows of zeros need no transform.
+        rows, columns = self._padded
+        half = fft.rfft(values, columns, axis=1, workers=_WORKERS)
+        spectrum: NDArray[np.complex128] = fft.fft(half, rows, axis=0, workers=_WORKERS, overwrite_x=True)
+        return spectrum
+
+    def _field(self, spectrum: NDArray[np.complex128]) -> Floats:
+        rows, columns = self.shape
+        half = fft.ifft(spectrum, axis=0, workers=_WORKERS, overwrite_x=True)[:rows]
+        field: Floats = fft.irfft(half, self._padded[1], axis=1, workers=_WORKERS)[:, :columns]
+        field *= self.softness
+        return field
+
+
+def rectangle(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest rectangle round what is True; something must be."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+# Surface, mirror and the rectangle in contact, which grows; a spectrum is as large as two maps.
+@lru_cache(maxsize=4)
+def _normal_spectrum(padded: tuple[int, int], pixel_size: tuple[float, float], depth: float) -> Floats:
+    """Return the transform of the integral of 1 / s + z^2 / s^3 over a pixel; it is even, hence real."""
+    x, y = _corners(padded, pixel_size)
+    return _transform(_x_log(x, y, depth) + _x_log(y, x, depth))
+
+
+@lru_cache(maxsize=2)
+def _tangential_spectra(
+    padded: tuple[int, int], pixel_size: tuple[float, float]
+) -> tuple[Floats, Floats, Floats]:
+    """Return the transforms of the integrals of 1 / r + x^2 / r^3, x y / r^3 and 1 / r + y^2 / r^3."""
+    x, y = _corners(padded, pixel_size)
+    x_log, y_log = _x_log(x, y, 0.0), _x_log(y, x, 0.0)
+    return _transform(x_log + 2 * y_log), _transform(-np.hypot(x, y)), _transform(2 * x_log + y_log)
+
+
+def _corners(padded: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Return x (1, columns + 1) and y (rows + 1, 1) of the corners of pixels, as seen from pixel 0, mm.
+
+    Pixel k of n lies k to the right and below, or n - k to the left and above, whichever is nearer.
+    """
+    y, x = (np.arange(n + 1, dtype=np.float64) - 0.5 - n // 2 for n in padded)
+    return x[np.newaxis, :] * pixel_size[0], -y[:, np.newaxis] * pixel_size[1]
+
+
+def _x_log(x: Floats, y: Floats, z: float) -> Floats:
+    """Return x ln(y + s), s the distance of (x, y, z); its derivative by x and y is (y^2 + z^2) / s^3.
+
+    Of the logarithm only the part that depends on y is kept: the rest goes in the second difference.
+    """
+    return x * np.arcsinh(y / np.sqrt(x**2 + z**2))
+
+
+def _transform(corners: Floats) -> Floats:
+    """Return the real transform of what a pixel gets from an integral's value at its four corners."""
+    pixels = -np.diff(np.diff(corners, axis=0), axis=1)
+    return np.ascontiguousarray(fft.rfft2(fft.ifftshift(pixels), workers=_WORKERS).real)

@@ -1,0 +1,144 @@
+"""The sheet of a real sensor: the surface of an elastic body, which resists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.hw.twin.contact.elastic import Contact, press
+from mirrorskin.hw.twin.contact.halfspace import HalfSpace
+from mirrorskin.hw.twin.contact.obstacle import meet
+from mirrorskin.hw.twin.movement import Pose
+from mirrorskin.hw.twin.objects import Object
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io.types import Floats, InputError
+
+_POINTS_MAX = 4_000_000
+_COARSE = 97  # places across the body at which it is looked whether the object stands above the rest plane
+_VIEW_ROUNDS = 6  # fixed-point steps along an oblique ray; each gains a factor of slope times lean
+
+
+class Elastic:
+    """Frictionless contact of the rigid object with the body, taken for an incompressible half-space.
+
+    The pressure is worked out on the pixel grid, grown to all that the object can reach. The mirror lies a
+    sheet's thickness below the surface. Each pose starts from the solution of the one before.
+
+    Parameters
+    ----------
+    thing : Object
+    poses : iterable of Pose
+        Some that show how far the object reaches.
+    view : View
+        Of the camera.
+    body : Body
+    compliance : float
+        Of the stage, mm/N.
+
+    Raises
+    ------
+    InputError
+        The object reaches over too many pixels.
+    """
+
+    def __init__(
+        self, thing: Object, poses: Iterable[Pose], view: View, body: Body, compliance: float = 0.0
+    ) -> None:
+        self._thing = thing
+        self._view = view
+        self._compliance = compliance
+        rows, columns = view.shape
+        grow_y, grow_x = _margin(thing, poses, view, body)
+        shape = rows + 2 * grow_y, columns + 2 * grow_x
+        if shape[0] * shape[1] > _POINTS_MAX:
+            raise InputError(
+                f"elastic contact of the {thing.name} needs {shape[0]} x {shape[1]} points, and"
+                f" {_POINTS_MAX} are the most: take larger pixels or contact 'conform'"
+            )
+        self._grid = View(shape, view.pixel_size, body)
+        self._outside = np.hypot(self._grid.x, self._grid.y) > body.radius
+        self._field = np.s_[grow_y : grow_y + rows, grow_x : grow_x + columns]
+        self.space = HalfSpace(shape, view.pixel_size, body.modulus, body.sheet)
+        self._pressure: Floats | None = None
+
+    def restart(self) -> None:
+        """Forget the solution of the pose before."""
+        self._pressure = None
+
+    def solve(self, pose: Pose, start: Floats | None = None) -> Contact:
+        """Return pressure and force in a pose, on the grown grid."""
+        height = meet(self._thing, pose, self._grid).height
+        obstacle = np.where(self._outside, np.nan, height)
+        return press(self.space, obstacle, start=start, compliance=self._compliance)
+
+    def lie(self, pose: Pose) -> Sheet:
+        """Press the sheet on the object in a pose."""
+        contact = self.solve(pose, self._pressure)
+        self._pressure = contact.pressure
+        return self.sheet(contact.pressure)
+
+    def sheet(self, pressure: Floats) -> Sheet:
+        """Return the mirror under a pressure, as the camera's pixels see it."""
+        height = self.space.mirror(pressure)
+        along_x, along_y = self._view.pixel_size
+        dz_dx = _slope(height, 1) / along_x
+        dz_dy = -_slope(height, 0) / along_y
+        touches = pressure > 0
+        if self._view.orthographic:
+            here = self._field
+            return Sheet(height[here], dz_dx[here], dz_dy[here], touches[here])
+        at = self._seen(height)
+
+        def seen(values: NDArray[Any], order: int = 1) -> NDArray[Any]:
+            return np.asarray(ndimage.map_coordinates(values, at, order=order, mode="nearest"))
+
+        return Sheet(seen(height), seen(dz_dx), seen(dz_dy), seen(touches, order=0))
+
+    def shift(self, pose: Pose) -> Floats:
+        """Return how far an upright pose moves the object along x and y, (2, H, W), mm, on the grown grid."""
+        at = np.stack([self._grid.x, self._grid.y])
+        return np.tensordot(pose.rotation[:2, :2], at, 1) + pose.shift[:2, np.newaxis, np.newaxis] - at
+
+    def crop(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Cut the field of view out of a map on the grown grid, (..., H, W)."""
+        return values[(..., *self._field)]
+
+    def _seen(self, height: Floats) -> Floats:
+        """Return the rows and columns of the points that oblique rays meet, (2, H, W)."""
+        view, (along_x, along_y) = self._view, self._view.pixel_size
+        row, column = np.indices(view.shape, dtype=np.float64)
+        row, column = row + self._field[0].start, column + self._field[1].start
+        at = np.stack([row, column])
+        for _ in range(_VIEW_ROUNDS):
+            z = ndimage.map_coordinates(height, at, order=1, mode="nearest")
+            at = np.stack([row - z * view.slope_y / along_y, column + z * view.slope_x / along_x])
+        return at
+
+
+def _slope(height: Floats, axis: int) -> Floats:
+    """Differentiate along an axis, a pixel at a time; flat where there is but one."""
+    return np.gradient(height, axis=axis) if height.shape[axis] > 1 else np.zeros_like(height)
+
+
+def _margin(thing: Object, poses: Iterable[Pose], view: View, body: Body) -> tuple[int, int]:
+    """Return the rows and columns by which the field must grow to hold all that the object can touch."""
+    cell = 2 * body.radius / _COARSE
+    coarse = View((_COARSE, _COARSE), (cell, cell), body)
+    inside = np.hypot(coarse.x, coarse.y) <= body.radius
+    reached = np.zeros(coarse.shape, bool)
+    for pose in poses:
+        reached |= inside & np.isfinite(meet(thing, pose, coarse).height)
+    if not reached.any():
+        return 0, 0
+    grow = []
+    for places, size, pixel in zip((coarse.y, coarse.x), view.shape, view.pixel_size[::-1], strict=True):
+        half = min(float(np.abs(places[reached]).max()) + cell, body.radius)
+        grow.append(max(0, math.ceil(half / pixel - size / 2)))
+    return grow[0], grow[1]

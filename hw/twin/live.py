@@ -1,0 +1,97 @@
+"""The twin as a camera that does not wait: frames come when they are due."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.twin.twin import Twin
+from mirrorskin.io.types import Block, Closing, InputError
+
+_QUEUE = 8  # frames that wait for a late reader, as in a camera's driver
+
+
+class Live(Closing):
+    """A source that gives the twin's frames at a set rate, from the first read on.
+
+    A read waits for the next frame, and takes those with it that have come since the read before. A reader
+    that is late by more than 8 frames loses the oldest of them, and is told how many.
+
+    Parameters
+    ----------
+    twin : Twin
+        Read from where it is.
+    rate : float, optional
+        Frames a second; the twin's camera's own otherwise.
+    clock, sleep : callable
+        Tell the seconds, and let some pass.
+
+    Attributes
+    ----------
+    name, header, shape, dtype, motion, rewindable
+        As for every source; what was seen cannot be seen again.
+
+    Raises
+    ------
+    InputError
+        The rate is not above zero.
+    """
+
+    rewindable = False
+
+    def __init__(
+        self,
+        twin: Twin,
+        rate: float | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        rate = twin.frame_rate if rate is None else rate
+        if not (math.isfinite(rate) and rate > 0):
+            raise InputError(f"{twin.name}: {rate} frames a second cannot be: give more than 0")
+        self.name, self.header, self.motion = twin.name, twin.header, twin.motion
+        self.shape, self.dtype = twin.shape, twin.dtype
+        self._twin = twin
+        self._rate = rate
+        self._clock = clock
+        self._sleep = sleep
+        self._start: float | None = None
+        self._given = 0
+
+    def rewind(self) -> None:
+        """Refuse: time does not run back."""
+        raise RuntimeError("a live source cannot be rewound")
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Wait for the next frame; see ``Source.read``."""
+        if out is None:
+            out = np.empty((1, *self.shape[1:]), self.dtype)
+        if self._given == self.shape[0]:
+            return None
+        due = self._wait()
+        dropped = max(0, due - self._given - _QUEUE)
+        self._twin.skip(dropped)
+        self._given += dropped
+        block = self._twin.read(out[: max(1, due - self._given)])
+        if block is None:
+            return None
+        self._given += len(block.frames)
+        frame = np.arange(block.index, block.index + len(block.frames))
+        return replace(block, dropped=dropped, time=frame / self._rate)
+
+    def _wait(self) -> int:
+        """Wait until the next frame is due, and return how many are by then."""
+        if self._start is None:
+            self._start = self._clock()
+        early = self._start + self._given / self._rate - self._clock()
+        if early > 0:
+            self._sleep(early)
+        passed = self._clock() - self._start
+        return min(self.shape[0], max(self._given + 1, math.floor(passed * self._rate) + 1))

@@ -1,0 +1,171 @@
+"""What is printed on the patterned sheet round the body: how much light it lets through, and where."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
+from mirrorskin.io.types import Floats, InputError
+
+PATTERN_NAMES = ("uniform", "linear")
+
+_ROWS = 256  # a straight line between two of them misses the linear pattern by less than 1e-5
+
+
+class Pattern(Protocol):
+    """A patterned sheet, as it stands round the body."""
+
+    def table(self, body: Body, /) -> NDArray[np.float32]:
+        """Return what it lets through, (rows + 2, columns + 2), as `mirrorskin.kernels.wall` reads it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """A clear sheet: it lets all light through."""
+
+    def table(self, body: Body, /) -> NDArray[np.float32]:
+        """Return ones, (3, 3)."""
+        return np.ones((3, 3), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """A sheet whose transmittance is linear in zenith, as the paper's Figure 9 has it.
+
+    A mirror at the centre of the sheet at rest shows a camera that looks straight down the height z of the
+    wall when its zenith is half of what the wall's point lies off the axis. There the sheet lets through ::
+
+        T = (zenith - lower) / (upper - lower), from 0 to 1,     zenith = atan2(radius, z) / 2
+
+    Attributes
+    ----------
+    lower, upper : float
+        Zenith at which it lets nothing through, and all, radians.
+
+    Raises
+    ------
+    InputError
+        They are not in order between 0 and 90 degrees.
+    """
+
+    lower: float
+    upper: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lower < self.upper <= math.pi / 2:
+            raise InputError(
+                f"a pattern linear from a zenith of {self.lower} to {self.upper} rad cannot be:"
+                " give the lower one first, both from 0 to pi/2"
+            )
+
+    @property
+    def gain(self) -> float:
+        """Share of the full light for each radian of zenith."""
+        return 1 / (self.upper - self.lower)
+
+    @property
+    def offset(self) -> float:
+        """Share of the full light at zenith 0 if the line went on so far."""
+        return -self.lower * self.gain
+
+    def table(self, body: Body, /) -> NDArray[np.float32]:
+        """Return the transmittance from the wall's rim down to the rest plane, (258, 3)."""
+        height = body.height * (1 - (np.arange(_ROWS) + 0.5) / _ROWS)
+        ends = 2 * self._transmittance(np.array([body.height, 0.0]), body.radius)
+        inside = self._transmittance(height, body.radius)
+        # Beyond an edge lies what makes the line to the row before it meet the edge in its very value.
+        column = np.concatenate([ends[:1] - inside[:1], inside, ends[1:] - inside[-1:]])
+        return np.repeat(column.astype(np.float32)[:, np.newaxis], 3, axis=1)
+
+    def _transmittance(self, height: Floats, radius: float) -> Floats:
+        return np.clip(self.offset + self.gain * np.arctan2(radius, height) / 2, 0, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A sheet with any picture on it, unrolled as one sees it turning on the body's axis.
+
+    Attributes
+    ----------
+    values : ndarray, (rows, columns), float64
+        Transmittance, 0 to 1, at the middle of equal pieces of the wall, linear between them. Rows go down
+        from the wall's rim; columns go counter-clockwise, from azimuth -pi to pi. Given as uint8 or uint16,
+        it is divided by the type's greatest value.
+
+    Raises
+    ------
+    InputError
+        It is not two-dimensional, empty, of another type, or has values outside 0 to 1.
+    """
+
+    values: Floats
+
+    def __init__(self, values: ArrayLike) -> None:
+        object.__setattr__(self, "values", _transmittances(np.asarray(values)))
+
+    def table(self, body: Body, /) -> NDArray[np.float32]:
+        """Return the picture with top and bottom repeated and its sides joined, (rows + 2, columns + 2)."""
+        taller = np.pad(self.values, ((1, 1), (0, 0)), "edge")
+        return np.pad(taller, ((0, 0), (1, 1)), "wrap").astype(np.float32)
+
+
+def make_pattern(name: str | Path, body: Body) -> Pattern:
+    """Make a pattern that a user named.
+
+    Parameters
+    ----------
+    name : str or Path
+        "uniform"; "linear", from dark at the zenith that shows the wall's rim to clear at the one that
+        shows the horizon; or the path of a picture, PNG or TIFF, grey or made so.
+    body : Body
+        What it stands round.
+
+    Returns
+    -------
+    Pattern
+
+    Raises
+    ------
+    InputError
+        It is unknown, or its file cannot be used.
+    """
+    if name == "uniform":
+        return Uniform()
+    if name == "linear":
+        return linear_pattern(body)
+    path = Path(name)
+    if path.suffix.lower() not in PICTURE_SUFFIXES:
+        known, kinds = ", ".join(PATTERN_NAMES), ", ".join(PICTURE_SUFFIXES)
+        raise InputError(f"pattern {str(name)!r} is unknown: take {known} or the path of a picture ({kinds})")
+    try:
+        return Picture(read_picture(path))
+    except InputError as error:
+        raise InputError(f"pattern {error}") from None
+
+
+def linear_pattern(body: Body) -> Linear:
+    """Return the linear pattern that spans a wall: dark at its rim, clear at the rest plane."""
+    return Linear(math.atan2(body.radius, body.height) / 2, math.pi / 4)
+
+
+def _transmittances(values: NDArray[Any]) -> Floats:
+    if values.ndim != 2 or values.size == 0:
+        raise InputError(
+            f"a pattern has rows and columns only, this has shape {values.shape}: give one picture"
+        )
+    if values.dtype in (np.uint8, np.uint16):
+        return values / float(np.iinfo(values.dtype).max)
+    if values.dtype.kind != "f":
+        raise InputError(
+            f"a pattern cannot be {values.dtype}: give 8- or 16-bit counts, or floats from 0 to 1"
+        )
+    if not ((values >= 0) & (values <= 1)).all():
+        raise InputError("a pattern lets through from 0 to 1 of the light: scale its values to that")
+    return values.astype(np.float64)

@@ -1,0 +1,92 @@
+"""Which way the camera looks inside the body, at each pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.io.types import Floats, InputError, pixel_axes
+
+_ROUNDS = 100
+
+
+class View:
+    """The camera's lines of sight inside the body.
+
+    The pixel grid lies on the sheet's rest plane: pixel (x, y) sees all points ``(x + z slope_x, y + z
+    slope_y, z)``. An orthographic camera looks straight down everywhere. A pinhole on the body's axis looks
+    through the body's flat top, where each line is refracted: with the pinhole h above the top, the line
+    that meets the rest plane at distance r from the axis has tan(air) = w and tan(inside) = v where ::
+
+        h w + height v = r,     sin(air) = index sin(inside)
+
+    and its slope is v towards the axis.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    pixel_size : (float, float)
+        Millimetres at the rest plane along x and y.
+    body : Body
+    distance : float
+        Of the pinhole above the rest plane, mm; infinite for an orthographic camera.
+
+    Attributes
+    ----------
+    shape, pixel_size
+        As given.
+    x, y : ndarray, (H, W), float64
+        Where a pixel meets the rest plane, mm.
+    slope_x, slope_y : ndarray, (H, W), float64
+        By how much its line of sight moves along x and y for each millimetre of z.
+    orthographic : bool
+        Whether all slopes are zero.
+
+    Raises
+    ------
+    InputError
+        The pinhole is not above the body.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        pixel_size: tuple[float, float],
+        body: Body,
+        distance: float = math.inf,
+    ) -> None:
+        if not distance > body.height:
+            raise InputError(
+                f"a camera {distance} mm above the sheet is not above the body:"
+                f" put it more than {body.height} mm above, or at infinity"
+            )
+        self.shape, self.pixel_size = shape, pixel_size
+        self.x, self.y = np.meshgrid(*pixel_axes(shape, pixel_size))
+        self.orthographic = math.isinf(distance)
+        self.slope_x, self.slope_y = np.zeros((2, *shape))
+        if not self.orthographic:
+            away = np.sqrt(self.x**2 + self.y**2)
+            towards = -_tangent_inside(away, body, distance - body.height)
+            per_length = towards / np.where(away > 0, away, 1)
+            self.slope_x, self.slope_y = self.x * per_length, self.y * per_length
+
+
+def _tangent_inside(away: Floats, body: Body, above: float) -> Floats:
+    """Return the tangents of the lines inside the body, by how far from the axis they meet the rest plane.
+
+    Newton's iteration for the tangent w in air. The distance is a concave function of it, so the iteration
+    climbs to the answer from 0 without ever passing it.
+    """
+    index = body.index
+    tangent = np.zeros_like(away)
+    for _ in range(_ROUNDS):
+        under = 1 / np.sqrt(index**2 + (index**2 - 1) * tangent**2)
+        missing = away - above * tangent - body.height * tangent * under
+        step = missing / (above + body.height * index**2 * under**3)
+        tangent += step
+        if (np.abs(step) <= 1e-15 * (1 + tangent)).all():
+            break
+    return np.asarray(tangent / np.sqrt(index**2 + (index**2 - 1) * tangent**2))

@@ -1,0 +1,234 @@
+"""Stick and slip against the closed forms for balls and discs, and against the law of friction itself."""
+
+from __future__ import annotations
+
+import contact_theory
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw.twin.contact import friction
+from mirrorskin.hw.twin.contact.friction import Friction
+from mirrorskin.hw.twin.contact.halfspace import HalfSpace
+
+Map = NDArray[np.float64]
+
+MODULUS, MU = 0.7, 0.6
+SIDE, PIXEL, RADIUS = 125, 0.03, 1.8
+HERTZ = contact_theory.paraboloid(4.0, RADIUS, MODULUS)
+
+row, column = np.indices((SIDE, SIDE), dtype=float)
+X, Y = (column - (SIDE - 1) / 2) * PIXEL, ((SIDE - 1) / 2 - row) * PIXEL
+R = np.hypot(X, Y)
+SPACE = HalfSpace((SIDE, SIDE), (PIXEL, PIXEL), MODULUS)
+BALL = HERTZ.pressure(np.minimum(R, RADIUS))
+FAR = contact_theory.sliding_distance(HERTZ, MU, MODULUS)
+
+
+def push(x: float, y: float = 0.0, shape: tuple[int, int] = (SIDE, SIDE)) -> Map:
+    return np.stack([np.full(shape, x), np.full(shape, y)])
+
+
+def twist(angle: float) -> Map:
+    return angle * np.stack([-Y, X])
+
+
+def force(contact: Friction) -> Map:
+    total: Map = contact.traction.sum(axis=(1, 2)) * PIXEL**2
+    return total
+
+
+def torque(contact: Friction) -> float:
+    return float(np.sum(X * contact.traction[1] - Y * contact.traction[0])) * PIXEL**2
+
+
+def stick_radius(slips: NDArray[np.bool_], pressure: Map) -> float:
+    return float(np.sqrt(np.sum((pressure > 0) & ~slips) / np.pi)) * PIXEL
+
+
+@pytest.mark.parametrize("pixel_size", [(0.1, 0.1), (0.05, 0.2)])
+def test_tractions_shift_the_surface_as_cerruti_says(pixel_size: tuple[float, float]) -> None:
+    rows, columns = 4, 5
+    half_space = HalfSpace((rows, columns), pixel_size, MODULUS)
+    for loaded in [(0, 0), (2, 3)]:
+        for axis in (0, 1):
+            traction = np.zeros((2, rows, columns))
+            traction[(axis, *loaded)] = 1.0
+            shift = half_space.tangential(traction)
+            for there in np.ndindex(rows, columns):
+                x, y = (there[1] - loaded[1]) * pixel_size[0], (loaded[0] - there[0]) * pixel_size[1]
+                expected = contact_theory.traction_response(x, y, pixel_size, MODULUS)[:, axis]
+                np.testing.assert_allclose(shift[:, *there], expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_pushed_ball_sticks_in_the_disc_of_cattaneo_and_mindlin(share: float) -> None:
+    theory = contact_theory.pushed(HERTZ, MU, MODULUS, share * FAR)
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(share * FAR / 2))
+    slips = contact.move(push(share * FAR))
+    assert force(contact)[0] == pytest.approx(theory.force, rel=0.01)
+    assert force(contact)[1] == pytest.approx(0, abs=1e-3 * theory.force)
+    assert stick_radius(slips, BALL) == pytest.approx(theory.stick_radius, rel=0.01)
+    # One disc with some pixels off on its edge: the inside sticks, the outside slips.
+    assert not slips[0.97 * theory.stick_radius > R].any()
+    assert slips[(1.03 * theory.stick_radius < R) & (R < RADIUS)].all()
+
+
+def test_a_ball_pushed_far_enough_slides() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    slips = contact.move(push(0.0, -1.2 * FAR))
+    np.testing.assert_array_equal(slips, BALL > 0)
+    assert force(contact)[1] == pytest.approx(-MU * HERTZ.force, rel=0.005)
+    slips = contact.move(push(50.0, -1.2 * FAR))
+    np.testing.assert_array_equal(slips, BALL > 0)
+    np.testing.assert_allclose(contact.traction[0], MU * BALL, rtol=0, atol=1e-3 * MU * BALL.max())
+
+
+def test_a_ball_pushed_back_goes_through_mindlins_loop() -> None:
+    # By Masing's rule the way back is the way there, doubled: Johnson (1985), section 7.4.
+    there = 0.6 * FAR
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(there))
+    most = contact_theory.pushed(HERTZ, MU, MODULUS, there).force
+    for back in (0.2, 0.6, 1.0):
+        slips = contact.move(push(there - back * FAR))
+        half = contact_theory.pushed(HERTZ, MU, MODULUS, back * FAR / 2)
+        assert force(contact)[0] == pytest.approx(most - 2 * half.force, abs=0.01 * most)
+        assert stick_radius(slips, BALL) == pytest.approx(half.stick_radius, rel=0.01)
+
+
+def test_what_slipped_sticks_when_the_body_turns_back() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    onwards = contact.move(push(0.502 * FAR))
+    back = contact.move(push(0.5 * FAR))
+    assert onwards.sum() > 0.4 * (BALL > 0).sum()
+    assert back.sum() < 0.02 * (BALL > 0).sum()
+
+
+@pytest.mark.parametrize("share", [0.9, 0.6, 0.3])
+def test_a_twisted_ball_sticks_in_the_disc_of_lubkin(share: float) -> None:
+    theory = contact_theory.twisted(HERTZ, MU, MODULUS, share * RADIUS)
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(twist(theory.angle / 2))
+    slips = contact.move(twist(theory.angle))
+    assert torque(contact) == pytest.approx(theory.torque, rel=0.005)
+    assert stick_radius(slips, BALL) == pytest.approx(share * RADIUS, abs=0.01 * RADIUS)
+    np.testing.assert_allclose(force(contact), 0, atol=1e-4 * HERTZ.force)
+
+
+def test_a_ball_twisted_on_and_on_comes_to_the_torque_of_sliding() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    stuck = [stick_radius(contact.move(twist(angle)), BALL) for angle in (0.1, 0.3, 0.9, 2.0)]
+    assert stuck == sorted(stuck, reverse=True)
+    assert torque(contact) == pytest.approx(3 * np.pi / 16 * MU * HERTZ.force * RADIUS, rel=0.005)
+
+
+@pytest.fixture
+def glued() -> tuple[Friction, float]:
+    disc = np.where(R < RADIUS, 1.0, 0.0)
+    return Friction(SPACE, disc, 1e6), float(np.sqrt(disc.sum() / np.pi)) * PIXEL
+
+
+def test_a_glued_disc_is_as_stiff_as_the_books_say(glued: tuple[Friction, float]) -> None:
+    contact, radius = glued
+    slips = contact.move(push(0.3, 0.4))
+    assert not slips.any()
+    expected = contact_theory.disc_push(radius, MODULUS, 0.5)
+    np.testing.assert_allclose(force(contact), [0.6 * expected, 0.8 * expected], rtol=0.01)
+
+
+def test_a_glued_disc_resists_twist_as_reissner_and_sagoci_say(glued: tuple[Friction, float]) -> None:
+    contact, radius = glued
+    slips = contact.move(twist(-0.1))
+    assert not slips.any()
+    assert torque(contact) == pytest.approx(contact_theory.disc_torque(radius, MODULUS, -0.1), rel=0.01)
+
+
+def test_each_pixel_obeys_coulomb() -> None:
+    shape = (40, 53)
+    half_space = HalfSpace(shape, (0.05, 0.08), MODULUS)
+    pressure = np.maximum(np.random.default_rng(1).normal(0.1, 0.2, shape), 0.0)
+    contact = Friction(half_space, pressure, MU)
+    y, x = np.indices(shape, dtype=float)
+    here = np.zeros((2, *shape))
+    shares = []
+    for there in (push(0.02, shape=shape), push(0.05, 0.03, shape=shape), 0.002 * np.stack([y - 20, x - 9])):
+        before = contact.traction.copy()
+        slips = contact.move(there)
+        step = there - here
+        slip = step - half_space.tangential(contact.traction - before)
+        close = 2 * friction.TOLERANCE * float(np.hypot(*step)[pressure > 0].max())
+        size = np.hypot(*contact.traction)
+        assert (size <= MU * pressure * (1 + 1e-12)).all()
+        assert not slips[pressure == 0].any()
+        assert np.hypot(*slip)[(pressure > 0) & ~slips].max() <= close
+        np.testing.assert_allclose(size[slips], MU * pressure[slips], rtol=1e-6)
+        along = np.sum(slip * contact.traction, axis=0) / np.where(size > 0, size, 1.0)
+        assert (along[slips] > 0).all()
+        assert np.abs(np.hypot(*slip) - along)[slips].max() <= close
+        shares.append(slips.sum() / (pressure > 0).sum())
+        here = there
+    assert all(0.02 < share < 0.98 for share in shares)
+
+
+def test_a_turned_contact_slips_as_before() -> None:
+    pressure = np.random.default_rng(2).exponential(1.0, (31, 31))
+    half_space = HalfSpace((31, 31), (0.1, 0.1), MODULUS)
+    moves = [(0.3, 0.1), (0.2, 0.4)]
+    first, turned = Friction(half_space, pressure, MU), Friction(half_space, np.rot90(pressure), MU)
+    for x, y in moves:
+        slips = first.move(push(x, y, (31, 31)))
+        again = turned.move(push(-y, x, (31, 31)))
+        assert 0 < slips.sum() < slips.size
+        assert np.mean(np.rot90(slips) != again) < 0.01
+        quarter = np.rot90(np.stack([-first.traction[1], first.traction[0]]), axes=(1, 2))
+        np.testing.assert_allclose(turned.traction, quarter, rtol=0, atol=0.01 * MU * pressure.max())
+
+
+def test_without_friction_all_slips_and_nothing_pulls() -> None:
+    contact = Friction(SPACE, BALL, 0.0)
+    np.testing.assert_array_equal(contact.move(push(0.1)), BALL > 0)
+    assert not contact.traction.any()
+
+
+def test_a_body_that_stands_still_does_not_slip() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    assert not contact.move(push(0.0)).any()
+    contact.move(push(0.1))
+    held = contact.traction.copy()
+    assert not contact.move(push(0.1)).any()
+    np.testing.assert_array_equal(contact.traction, held)
+
+
+def test_rounding_is_no_movement() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.1))
+    assert not contact.move(push(0.1 * (1 + 1e-14))).any()
+    contact.move(push(0.0))
+    assert not contact.move(push(1e-17)).any()
+
+
+def test_without_contact_nothing_slips() -> None:
+    contact = Friction(SPACE, np.zeros((SIDE, SIDE)), MU)
+    assert not contact.move(push(1.0)).any()
+    assert not contact.traction.any()
+
+
+def test_a_single_pixel_sticks_and_then_slips() -> None:
+    pressure = np.zeros((5, 6))
+    pressure[2, 4] = 1.0
+    contact = Friction(HalfSpace((5, 6), (0.1, 0.1), MODULUS), pressure, MU)
+    # Its centre shifts by 3 / (4 pi E) of 1 / r + x^2 / r^3 integrated over it, 6 l ln(1 + sqrt 2).
+    most = MU * 6 * 0.1 * np.log(1 + np.sqrt(2)) * 3 / (4 * np.pi * MODULUS)
+    assert not contact.move(push(0.9 * most, shape=(5, 6))).any()
+    assert contact.traction[0, 2, 4] == pytest.approx(0.9 * MU, rel=0.01)
+    assert np.argwhere(contact.move(push(1.5 * most, shape=(5, 6)))).tolist() == [[2, 4]]
+    assert contact.traction[0, 2, 4] == pytest.approx(MU)
+
+
+def test_a_step_that_does_not_settle_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(friction, "ITERATIONS", 2)
+    with pytest.raises(RuntimeError, match="did not settle in 2 iterations"):
+        Friction(SPACE, BALL, MU).move(push(0.5 * FAR))

@@ -1,0 +1,118 @@
+"""Frames that come when they are due, on a clock that the tests wind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw import Live, Twin
+from mirrorskin.hw.twin import Vertical
+from mirrorskin.io import InputError
+
+COUNT, RATE = 40, 20.0
+TRAVEL = 0.05 * np.arange(COUNT)
+
+
+class Clock:
+    """Time that passes only when someone sleeps or works."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.slept: list[float] = []
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def make_live(rate: float | None = RATE) -> tuple[Live, Clock]:
+    twin = Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=Vertical(TRAVEL))
+    clock = Clock()
+    return Live(twin, rate, clock=clock, sleep=clock.sleep), clock
+
+
+def all_frames() -> np.ndarray:
+    twin = Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=Vertical(TRAVEL))
+    block = twin.read(np.empty(twin.shape, twin.dtype))
+    assert block is not None
+    return block.frames
+
+
+def test_frames_come_at_the_set_rate_and_are_the_twins() -> None:
+    live, clock = make_live()
+    frames, times = [], []
+    with live:
+        while (block := live.read()) is not None:
+            assert (block.dropped, len(block.frames)) == (0, 1)
+            frames.append(block.frames[0].copy())
+            times.append(clock.now)
+    np.testing.assert_allclose(np.diff(times), 1 / RATE)
+    np.testing.assert_array_equal(frames, all_frames())
+
+
+def test_blocks_tell_time_and_travel() -> None:
+    live, clock = make_live()
+    live.read()
+    clock.now += 4.5 / RATE
+    block = live.read(np.empty((10, *live.shape[1:]), live.dtype))
+    assert block is not None
+    assert (block.index, len(block.frames), block.dropped) == (1, 4, 0)
+    assert block.time is not None
+    assert block.travel is not None
+    np.testing.assert_allclose(block.time, np.arange(1, 5) / RATE)
+    np.testing.assert_array_equal(block.travel, TRAVEL[1:5])
+
+
+def test_a_small_buffer_leaves_the_rest_for_the_next_read() -> None:
+    live, clock = make_live()
+    live.read()
+    clock.now += 5 / RATE
+    out = np.empty((3, *live.shape[1:]), live.dtype)
+    first, second = live.read(out), live.read(out)
+    assert first is not None
+    assert second is not None
+    assert (first.index, len(first.frames), second.index, len(second.frames)) == (1, 3, 4, 2)
+    assert clock.slept == [] or max(clock.slept) <= 1 / RATE
+
+
+def test_a_late_reader_loses_the_oldest_frames_and_is_told() -> None:
+    live, clock = make_live()
+    live.read()
+    clock.now += 20 / RATE
+    block = live.read(np.empty((20, *live.shape[1:]), live.dtype))
+    assert block is not None
+    assert (block.dropped, block.index, len(block.frames)) == (12, 13, 8)
+    np.testing.assert_array_equal(block.frames, all_frames()[13:21])
+
+
+def test_after_the_last_frame_there_is_none_however_late_it_is() -> None:
+    live, clock = make_live()
+    live.read()
+    clock.now += 1000.0
+    block = live.read(np.empty((COUNT, *live.shape[1:]), live.dtype))
+    assert block is not None
+    assert (block.index, len(block.frames)) == (COUNT - 8, 8)
+    assert live.read() is None
+
+
+def test_without_a_rate_the_cameras_own_is_taken() -> None:
+    live, clock = make_live(None)
+    live.read()
+    live.read()
+    assert clock.slept == pytest.approx([1 / 30])
+
+
+def test_time_does_not_run_back() -> None:
+    live, _ = make_live()
+    assert not live.rewindable
+    with pytest.raises(RuntimeError, match="live"):
+        live.rewind()
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_that_cannot_be_is_refused(rate: float) -> None:
+    with pytest.raises(InputError, match="frames a second"):
+        make_live(rate)

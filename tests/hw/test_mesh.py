@@ -1,0 +1,228 @@
+"""Meshes against closed forms and against brute force."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from pathlib import Path
+
+import geometry
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from mirrorskin.hw.twin.objects import Object, check_fits, make_object
+from mirrorskin.hw.twin.objects.raster import top_surface
+from mirrorskin.io import InputError
+
+SHAPE = (120, 160)
+PIXEL = 0.05
+
+Map = NDArray[np.float64]
+
+
+def save(path: Path, mesh: trimesh.Trimesh | trimesh.Scene, file_type: str | None = None) -> Path:
+    mesh.export(path, file_type=file_type)
+    return path
+
+
+def load(path: Path, shape: tuple[int, int] = SHAPE, pixel: float = PIXEL) -> tuple[Object, Map]:
+    thing = make_object(path, shape, (pixel, pixel))
+    return thing, thing.height(*geometry.pixel_centres(shape, pixel))
+
+
+def box(size: tuple[float, float, float], middle: tuple[float, float, float]) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(size)
+    mesh.apply_translation(middle)
+    return mesh
+
+
+@pytest.mark.parametrize(
+    ("name", "file_type"),
+    [("b.stl", "stl"), ("b.STL", "stl"), ("b.stl", "stl_ascii"), ("b.ply", "ply"), ("b.Obj", "obj")],
+)
+@pytest.mark.parametrize("shape", [(120, 160), (121, 160), (121, 161)])
+def test_a_box_is_level_within_its_sides(
+    tmp_path: Path, name: str, file_type: str, shape: tuple[int, int]
+) -> None:
+    path = save(tmp_path / name, box((4.02, 3.02, 2.0), (70.0, -30.0, 8.0)), file_type)
+    thing, height = load(path, shape)
+    x, y = geometry.pixel_centres(shape, PIXEL)
+    covered = (np.abs(x) < 2.01) & (np.abs(y) < 1.51)
+    assert covered.sum() > 4000
+    np.testing.assert_array_equal(height, np.where(covered, 0.0, np.nan))
+    assert thing.name == path.name
+    assert thing.radius == pytest.approx(np.hypot(2.01, 1.51), abs=1.5 * PIXEL)
+
+
+@pytest.mark.parametrize("shape", [(240, 240), (241, 239)])
+def test_a_ball_of_triangles_lies_between_its_inner_and_outer_sphere(
+    tmp_path: Path, shape: tuple[int, int]
+) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
+    thing, height = load(save(tmp_path / "ball.ply", ball), shape)
+    outer = 5.0
+    inner = np.abs(np.einsum("ij,ij->i", ball.face_normals, ball.triangles[:, 0])).min()
+    assert inner > 4.99
+    z = height + ball.vertices[:, 2].max()
+    r = np.hypot(*geometry.pixel_centres(shape, PIXEL))
+    inside = r < inner
+    assert np.isfinite(z[inside]).all()
+    assert np.isnan(z[r > outer]).all()
+    assert (z[inside] >= np.sqrt(inner**2 - r[inside] ** 2) - 1e-6).all()  # PLY holds floats
+    assert (z[inside] <= np.sqrt(outer**2 - r[inside] ** 2) + 1e-6).all()
+    assert thing.radius == pytest.approx(5.0, abs=1.5 * PIXEL)
+
+
+def test_slopes_of_a_ball_off_the_grid(tmp_path: Path) -> None:
+    thing, _ = load(save(tmp_path / "ball.ply", trimesh.creation.icosphere(subdivisions=6, radius=5.0)))
+    places = np.random.default_rng(2).uniform(-4, 4, (2, 4000))
+    x, y = places[:, np.hypot(*places) < 3.5]
+    rise = np.sqrt(25 - x**2 - y**2)
+    np.testing.assert_allclose(thing.height(x, y), rise - 5, rtol=0, atol=2e-3)
+    errors = np.array(thing.slope(x, y)) - [-x / rise, -y / rise]
+    assert np.sqrt(np.mean(errors**2)) < 5e-3
+    assert np.abs(errors).max() < 0.03
+
+
+def test_the_corners_of_a_relief_on_the_pixels_are_its_heights(tmp_path: Path) -> None:
+    """Each pixel centre is a corner of six triangles: a gap or a neighbour's slope would show."""
+    x, y = geometry.pixel_centres((30, 40), 0.25)
+    z = np.round(-np.random.default_rng(3).integers(1, 1000, x.shape) / 512, 9)  # exact in the file
+    z[7, 9] = 0.0
+    corner = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (
+        part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:])
+    )
+    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
+    relief = trimesh.Trimesh(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), faces, process=False)
+    _, height = load(save(tmp_path / "relief.stl", relief), (30, 40), 0.25)
+    np.testing.assert_allclose(height, z, rtol=0, atol=1e-7)
+
+
+def test_a_heap_of_triangles_against_brute_force() -> None:
+    rng = np.random.default_rng(4)
+    triangles = rng.uniform(-3, 3, (60, 1, 3)) + rng.uniform(-1.5, 1.5, (60, 3, 3))
+    triangles[5, 1] = triangles[5, 0]  # a line
+    triangles[6] = triangles[6, 0]  # a point
+    triangles[7, :, 1] = 0.1  # upright, along a row
+    shape, pixel = (71, 84), (0.06, 0.05)
+    found = top_surface(triangles, shape, pixel)
+    x, y = np.meshgrid((np.arange(84) - 41.5) * 0.06, (35 - np.arange(71)) * 0.05)
+    expected = np.full(shape, np.nan)
+    for p, q, r in triangles:
+        turn = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        if turn == 0:
+            continue
+        share_q = ((x - p[0]) * (r[1] - p[1]) - (y - p[1]) * (r[0] - p[0])) / turn
+        share_r = ((q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])) / turn
+        z = p[2] + share_q * (q[2] - p[2]) + share_r * (r[2] - p[2])
+        inside = (share_q >= 0) & (share_r >= 0) & (share_q + share_r <= 1)
+        expected = np.fmax(expected, np.where(inside, z, np.nan))
+    assert 0.2 < np.isnan(expected).mean() < 0.8
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_only_what_is_seen_from_above_counts(tmp_path: Path) -> None:
+    mushroom = trimesh.Scene([box((1.01, 1.01, 5), (0, 0, 0)), box((3.01, 3.01, 1), (0, 0, 3))])
+    _, height = load(save(tmp_path / "mushroom.stl", mushroom))
+    x, y = geometry.pixel_centres(SHAPE, PIXEL)
+    covered = np.maximum(np.abs(x), np.abs(y)) < 1.505
+    np.testing.assert_array_equal(height, np.where(covered, 0.0, np.nan))
+
+
+def test_several_bodies_make_one_object(tmp_path: Path) -> None:
+    pair = trimesh.Scene([box((1, 1, 2), (-2, 0, 0)), box((1, 1, 3), (2, 0, 0))])
+    thing, _ = load(save(tmp_path / "pair.obj", pair))
+    height = thing.height(np.array([-2.0, 0.0, 2.0]), np.zeros(3))
+    np.testing.assert_allclose(height, [-0.5, np.nan, 0.0], atol=1e-6)
+
+
+def test_inside_out_is_no_matter(tmp_path: Path) -> None:
+    cone = trimesh.creation.cone(radius=2.0, height=1.0, sections=12)
+    _, height = load(save(tmp_path / "right.stl", cone))
+    cone.invert()
+    _, inverted = load(save(tmp_path / "wrong.stl", cone))
+    assert np.isfinite(height).sum() > 4000
+    np.testing.assert_allclose(inverted, height, rtol=0, atol=1e-12)
+
+
+def test_a_mesh_larger_than_the_sensor_is_refused(tmp_path: Path) -> None:
+    thing, _ = load(save(tmp_path / "slab.stl", box((36.0, 5.0, 1.0), (0, 0, 0))))
+    with pytest.raises(InputError, match=r"slab\.stl is larger than the sensor"):
+        check_fits(thing, 17.5)
+
+
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        make_object(path, SHAPE, (PIXEL, PIXEL))
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [((0.004, 0.006, 0.002), "no pixel meets it.*millimetres"), ((4e3, 6e3, 2e3), "too large.*millimetres")],
+)
+def test_metres_and_micrometres_are_refused(
+    tmp_path: Path, size: tuple[float, float, float], words: str
+) -> None:
+    refused(save(tmp_path / "box.stl", box(size, (0, 0, 0))), words)
+
+
+def test_a_cloud_of_points_is_no_surface(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    trimesh.PointCloud(np.random.default_rng(5).uniform(size=(20, 3))).export(path)
+    refused(path, "no surface")
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+@pytest.mark.parametrize("content", [b"", b"not a mesh", np.random.default_rng(6).bytes(3000)])
+def test_files_that_are_no_meshes(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"text{suffix}"
+    path.write_bytes(content)
+    refused(path, "no surface|can be read")
+
+
+@pytest.mark.parametrize(("name", "kept"), [("box.stl", 300), ("box.ply", -20)])
+def test_half_a_file(tmp_path: Path, name: str, kept: int) -> None:
+    path = save(tmp_path / name, box((1, 1, 1), (0, 0, 0)))
+    path.write_bytes(path.read_bytes()[:kept])
+    refused(path, "can be read")
+
+
+def one_triangle(path: Path, corners: list[list[float]]) -> Path:
+    path.write_bytes(
+        bytes(80) + struct.pack("<I", 1) + struct.pack("<12fH", 0, 0, 1, *np.ravel(corners).tolist(), 0)
+    )
+    return path
+
+
+def test_a_wall_has_no_upper_side(tmp_path: Path) -> None:
+    refused(one_triangle(tmp_path / "wall.stl", [[0, 0, 0], [3, 1, 0], [3, 1, 2]]), "from above")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_corners_must_be_finite(tmp_path: Path, bad: float) -> None:
+    refused(one_triangle(tmp_path / "bad.stl", [[0, 0, 0], [3, 1, 0], [0, 2, bad]]), "finite")
+
+
+def test_triangles_must_have_their_corners(tmp_path: Path) -> None:
+    path = tmp_path / "torn.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(header + faces + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n")
+    refused(path, "corners|can be read")
+
+
+def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+    refused(tmp_path / "missing.stl", "No such file")
+    (tmp_path / "folder.ply").mkdir()
+    refused(tmp_path / "folder.ply", "directory")
+
+
+def test_without_trimesh_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save(tmp_path / "box.stl", box((1, 1, 1), (0, 0, 0)))
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    refused(path, r"pip install 'mirrorskin\[mesh\]'")

@@ -1,0 +1,75 @@
+"""The camera's lines of sight inside the body, against Snell, Fermat and straight lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw.twin.body import Body
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io.types import InputError
+
+SHAPE, PIXEL = (13, 17), (2.0, 2.4)
+
+
+def at_top(view: View, body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Where the lines of sight cross the body's top."""
+    return view.x + body.height * view.slope_x, view.y + body.height * view.slope_y
+
+
+def test_an_orthographic_camera_looks_straight_down() -> None:
+    view = View(SHAPE, PIXEL, Body(), np.inf)
+    assert view.orthographic
+    assert not view.slope_x.any()
+    assert not view.slope_y.any()
+    assert view.x[0, -1] == pytest.approx(16.0)
+    assert view.y[0, 0] == pytest.approx(14.4)
+
+
+@pytest.mark.parametrize("distance", [40.001, 60.0, 200.0, 5000.0])
+@pytest.mark.parametrize("index", [1.0, 1.41, 2.0])
+def test_lines_are_refracted_at_the_top_towards_the_pinhole(distance: float, index: float) -> None:
+    body = Body(index=index)
+    view = View(SHAPE, PIXEL, body, distance)
+    assert not view.orthographic
+    x, y = at_top(view, body)
+    in_air = np.hypot(x, y) / np.hypot(np.hypot(x, y), distance - body.height)
+    slope = np.hypot(view.slope_x, view.slope_y)
+    inside = slope / np.sqrt(1 + slope**2)
+    np.testing.assert_allclose(in_air, index * inside, rtol=0, atol=1e-9)
+    # In one plane with the axis, towards which they lean.
+    np.testing.assert_allclose(view.slope_x * view.y, view.slope_y * view.x, atol=1e-12)
+    assert (view.slope_x * view.x + view.slope_y * view.y <= 0).all()
+
+
+def test_light_takes_the_shortest_time() -> None:
+    body, distance = Body(), 90.0
+    view = View(SHAPE, PIXEL, body, distance)
+
+    def time(move_x: float, move_y: float) -> np.ndarray:
+        x, y = at_top(view, body)
+        x, y = x + move_x, y + move_y
+        in_air = np.sqrt(x**2 + y**2 + (distance - body.height) ** 2)
+        return in_air + body.index * np.sqrt((x - view.x) ** 2 + (y - view.y) ** 2 + body.height**2)
+
+    for way in ((1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)):
+        later = time(*way) - time(0.0, 0.0)
+        assert (later > 0).all()
+        assert later.max() < 1e-7
+
+
+def test_without_refraction_lines_are_straight() -> None:
+    view = View(SHAPE, PIXEL, Body(index=1.0), 70.0)
+    np.testing.assert_allclose(view.slope_x, -view.x / 70, atol=1e-14)
+    np.testing.assert_allclose(view.slope_y, -view.y / 70, atol=1e-14)
+
+
+def test_on_the_axis_the_line_is_the_axis() -> None:
+    view = View((1, 1), PIXEL, Body(), 70.0)
+    assert view.slope_x[0, 0] == view.slope_y[0, 0] == 0
+
+
+@pytest.mark.parametrize("distance", [40.0, 39.0, 0.0, -50.0, -np.inf, np.nan])
+def test_a_camera_must_be_above_the_body(distance: float) -> None:
+    with pytest.raises(InputError, match=r"put it more than 40\.0 mm above"):
+        View(SHAPE, PIXEL, Body(), distance)
