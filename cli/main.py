@@ -9,6 +9,8 @@ import logging
 import signal
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Annotated
 
@@ -17,6 +19,7 @@ import typer
 from mirrorskin.cli import bench, demo, devices, import_, info, reconstruct, score, simulate
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
+_SOON = 0.001  # seconds
 
 app = typer.Typer(
     name="mirrorskin",
@@ -65,13 +68,38 @@ class _OneLine:
         sys.exit(code)
 
 
-def main() -> None:
-    """Run the command line."""
-    for name in ("SIGTERM", "SIGHUP"):  # as an exception, so that nothing half-written stays behind
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let signals end the program by an exception, so that nothing half-written stays behind."""
+    for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), lambda number, frame: sys.exit(128 + number))
+    told = sys.unraisablehook
+
+    def insist(lost: sys.UnraisableHookArgs) -> None:
+        """Raise it once more if it was lost, as exceptions are in destructors and callbacks."""
+        if not isinstance(lost.exc_value, KeyboardInterrupt | SystemExit) or not hasattr(signal, "setitimer"):
+            told(lost)
+            return
+        kind, given = type(lost.exc_value), lost.exc_value.args
+
+        def again(number: int, frame: object) -> None:
+            raise kind(*given)
+
+        signal.signal(signal.SIGALRM, again)
+        signal.setitimer(signal.ITIMER_REAL, _SOON)
+
+    sys.unraisablehook = insist
+    try:
+        yield
+    finally:
+        sys.unraisablehook = told
+
+
+def main() -> None:
+    """Run the command line."""
     words = sys.argv[1:] or ["--help"]
-    with _OneLine():
+    with _ended_by_signals(), _OneLine():
         sys.exit(app(words, standalone_mode=False) or 0)
 
 

@@ -18,6 +18,7 @@ DEFAULTS: dict[MotionName, dict[str, str]] = {
     MotionName.horizontal: {"press": "1mm", "displacement-step": "0.01mm,0mm"},
     MotionName.twist: {"press": "1mm", "twist-step": "0.2deg"},
 }
+FRAMES_MAX = 10**7
 _FRAMES = 30
 
 
@@ -39,7 +40,7 @@ def make_movement(
     Raises
     ------
     InputError
-        An option belongs to another motion, or cannot be read.
+        An option belongs to another motion, or cannot be read, or a turn has too many frames.
     """
     import numpy as np
 
@@ -56,23 +57,29 @@ def make_movement(
             f"{foreign[0]} says nothing of a motion that is {motion.value}: leave it out, or choose another"
         )
     words = own | {name: value for name, value in given.items() if value is not None}
-
-    def steps(count: int, step: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        return step * np.arange(count, dtype=np.float64)
-
+    count = frames or _FRAMES
     if motion == MotionName.vertical:
-        step = length(words["travel-step"], "--travel-step")
-        down = length(words["travel-start"], "--travel-start") + steps(frames or _FRAMES, step)
+        step, start = (length(words[name], f"--{name}") for name in ("travel-step", "travel-start"))
+        down = io.Steps(step, start).positions(count)
         travel = np.concatenate([down, down[-2::-1]]) if release else down
         return twin.Vertical(travel, compliance=compliance(words["compliance"], "--compliance"))
     press = length(words["press"], "--press")
     if motion == MotionName.axial:
         step = angle(words["phase-step"], "--phase-step")
-        turn = max(1, round(math.tau / abs(step))) if step else _FRAMES
         x, y, z = vector(words["pivot"], 3, "--pivot")
         tilt = angle(words["tilt"], "--tilt")
-        return twin.Axial(steps(frames or turn, step), tilt, press, (x, y, z))
+        return twin.Axial(io.Steps(step).positions(frames or _frames_of_a_turn(step)), tilt, press, (x, y, z))
     if motion == MotionName.horizontal:
         along = vector(words["displacement-step"], 2, "--displacement-step")
-        return twin.Horizontal(steps(frames or _FRAMES, 1.0)[:, np.newaxis] * np.array(along), press)
-    return twin.Twist(steps(frames or _FRAMES, angle(words["twist-step"], "--twist-step")), press)
+        return twin.Horizontal(np.stack([io.Steps(one).positions(count) for one in along], axis=1), press)
+    step = angle(words["twist-step"], "--twist-step")
+    return twin.Twist(io.Steps(step).positions(count), press)
+
+
+def _frames_of_a_turn(step: float) -> int:
+    from mirrorskin import io
+
+    # Steps so small that the division overflows are too many as well.
+    if 0 < abs(step) < math.tau / FRAMES_MAX:
+        raise io.InputError(f"a turn by this --phase-step is more than {FRAMES_MAX} frames: give --frames")
+    return max(1, round(math.tau / abs(step))) if step else _FRAMES

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.movements import DEFAULTS
+from mirrorskin.cli.movements import DEFAULTS, FRAMES_MAX
 
 
 class FrameType(StrEnum):
@@ -66,7 +66,9 @@ def command(
     pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.025mm",
     frames: Annotated[
         int | None,
-        typer.Option(min=1, max=10**7, help="Frames to take.", show_default="30; of a rotation one turn"),
+        typer.Option(
+            min=1, max=FRAMES_MAX, help="Frames to take.", show_default="30; of a rotation one turn"
+        ),
     ] = None,
     travel_step: Annotated[
         str | None,
@@ -80,7 +82,12 @@ def command(
     ] = False,
     compliance: Annotated[
         str | None,
-        _of(_VERTICAL, "compliance", "LENGTH/N", "Vertical, elastic: how far the stage gives way."),
+        _of(
+            _VERTICAL,
+            "compliance",
+            "LENGTH/N",
+            "Vertical, elastic: how far the stage gives way (the body has 1 N/mm^2).",
+        ),
     ] = None,
     press: Annotated[
         str | None, _of(_AXIAL, "press", "LENGTH", "All but vertical: how far the body is lowered.")
@@ -122,7 +129,7 @@ def command(
     ] = None,
     noise: Annotated[float, typer.Option(metavar="COUNTS", help="Read noise, one sigma.")] = 1.5,
     electrons: Annotated[
-        float | None, typer.Option(metavar="N", help="In one count, for shot noise; without it none.")
+        float | None, typer.Option(metavar="N", help="In one count of these bits, for shot noise.")
     ] = None,
     gain_deviation: Annotated[float, typer.Option(help="Of the pixels' gains, one sigma.")] = 0.0,
     offset_deviation: Annotated[
@@ -148,8 +155,8 @@ def command(
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths
     from mirrorskin.hw.twin import Body, Camera
 
-    for file in (thing, pattern):
-        io.check_output(output, keep=Path(file))
+    for given in map(Path, (thing, pattern)):
+        io.check_output(output, keep=given if given.suffix else None)  # a name is no file to keep
     words = {
         "travel-step": travel_step,
         "travel-start": travel_start,
@@ -196,7 +203,7 @@ def command(
     )
     count = twin.shape[0]
     with (
-        io.Recorder(twin, output, compression.value, truth=twin.truth) as recorder,
+        io.Recorder(twin, output, compression.value, truth=lambda: twin.truth) as recorder,
         progress("simulating", count) as show,
     ):
         recorder.drain(show)

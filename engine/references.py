@@ -41,7 +41,7 @@ def reference_maps(
     ------
     InputError
         A shape that does not fit, float frames without references, or a bright that is not above dark
-        at half of the pixels or more.
+        at half or more of the pixels where both are known, or none known at all.
     """
     if dtype.kind == "f" and (dark is None or bright is None):
         raise InputError("float frames have no natural range: give dark and bright, as counts or as maps")
@@ -49,8 +49,11 @@ def reference_maps(
     low = _as_map("dark", 0 if dark is None else dark, shape)
     high = _as_map("bright", top if bright is None else bright, shape)
     usable = _usable(low, high)
-    if 2 * np.count_nonzero(usable) <= usable.size:
-        share = 100 * (1 - np.count_nonzero(usable) / usable.size)
+    known = np.count_nonzero(np.isfinite(low) & np.isfinite(high))
+    if known == 0:
+        raise InputError("no pixel has a dark and a bright that are numbers: take the references again")
+    if 2 * np.count_nonzero(usable) <= known:
+        share = 100 * (1 - np.count_nonzero(usable) / known)
         raise InputError(f"bright is not above dark at {share:.3g} % of the pixels: are they swapped?")
     return low, high
 

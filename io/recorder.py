@@ -39,8 +39,8 @@ class Recorder:
     path : str or Path
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
         Raw frames are stored in one piece, which is the fastest to read; the others in one chunk a frame.
-    truth : Truth, optional
-        What a simulation knows.
+    truth : Truth or callable, optional
+        What a simulation knows; a callable is asked for it after the last frame.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Recorder:
         source: Source,
         path: str | Path,
         compression: Compression = "raw",
-        truth: Truth | None = None,
+        truth: Truth | Callable[[], Truth] | None = None,
     ) -> None:
         if compression not in COMPRESSIONS:
             raise InputError(f"unknown compression {compression!r}; known are {', '.join(COMPRESSIONS)}")
@@ -76,8 +76,6 @@ class Recorder:
             opening.enter_context(self.source)
             _write_header(self._new.root, self.header)
             self._frames = _make_stack(self._new.root, self.shape, self.dtype, self._compression)
-            if self._truth is not None:
-                _write_truth(self._new.root, self._truth)
             self._exit = opening.pop_all()
         return self
 
@@ -127,6 +125,9 @@ class Recorder:
             self._check_count(self._count == self.shape[0])
             for name, values in self._series.items():
                 _put(self._new.root, *SERIES[name], values)
+            if self._truth is not None:
+                truth = self._truth() if callable(self._truth) else self._truth
+                _write_truth(self._new.root, truth)
             _make_plot(self._new.root, self._axis())
 
     def _check_count(self, fits: bool) -> None:

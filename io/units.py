@@ -34,7 +34,11 @@ def factor(given: str, wanted: str, where: str) -> float:
     try:
         if not _NAMES.fullmatch(given):
             raise ValueError(given)
-        return float(_registry()(given).to(wanted).magnitude)
+        one = _registry()(given)
+        # A pixel of a style sheet, px, is a length, but nobody here means that one.
+        if "css_pixel" in str(one.units):
+            raise ValueError(given)
+        return float(one.to(wanted).magnitude)
     except (pint.PintError, AttributeError, ValueError, TypeError) as error:
         raise InputError(
             f"{where} is in {given!r}, which cannot be turned into {wanted}: correct its attribute units"

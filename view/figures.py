@@ -30,7 +30,8 @@ def height_figure(
     Parameters
     ----------
     results : mapping
-        Names and results with ``height``, ``x`` and ``y``. The first is drawn as a whole, all are cut.
+        Names and results with ``height``, ``x`` and ``y``. The first and the last are drawn as a whole, all
+        are cut.
     truth : Truth
         Of the same size.
     title : str
@@ -55,15 +56,17 @@ def height_figure(
 def _draw(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
     for result in results.values():
         _check(result, truth)
-    first = next(iter(results.values()))
-    height, x, y = _heights(first)
+    names = list(results)
+    whole = dict.fromkeys([names[0], names[-1]])
     figure = _new_figure()
-    grid = figure.add_gridspec(1, 2, width_ratios=[1, 1.35])
-    if surface:
-        _draw_surface(figure.add_subplot(grid[0], projection="3d"), height, x, y)
-    else:
-        _draw_map(figure.add_subplot(grid[0]), height, x, y)
-    _draw_cuts(figure.add_subplot(grid[1]), {name: _heights(r)[0] for name, r in results.items()}, truth, x)
+    grid = figure.add_gridspec(1, len(whole) + 1, width_ratios=[1] * len(whole) + [1.2])
+    for place, name in enumerate(whole):
+        if surface:
+            _draw_surface(figure.add_subplot(grid[place], projection="3d"), name, *_heights(results[name]))
+        else:
+            _draw_map(figure.add_subplot(grid[place]), name, *_heights(results[name]))
+    heights = {name: _heights(result)[0] for name, result in results.items()}
+    _draw_cuts(figure.add_subplot(grid[-1]), heights, truth, _heights(results[names[0]])[1])
     return figure
 
 
@@ -94,10 +97,10 @@ def _new_figure() -> Figure:
     check_drawing()
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(11, 4.6), layout="constrained")
+    return Figure(figsize=(14, 4.6), layout="constrained")
 
 
-def _draw_map(axes: Axes, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
+def _draw_map(axes: Axes, name: str, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
     half = (abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2)
     extent = (x[0] - half[0], x[-1] + half[0], y[-1] - half[1], y[0] + half[1])
     axes.set_facecolor(_MISSING)
@@ -107,17 +110,17 @@ def _draw_map(axes: Axes, height: NDArray[np.float32], x: Floats, y: Floats) -> 
     )
     axes.figure.colorbar(picture, ax=axes, label="height (mm)", shrink=0.85)
     axes.axhline(0, color="tab:red", lw=0.8, ls=":")
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="height by brightness; blue: no answer")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}; blue: no answer")
 
 
-def _draw_surface(axes: Axes3D, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
+def _draw_surface(axes: Axes3D, name: str, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
     step = max(1, max(height.shape) // _MESH)
     lowest, highest = _span(height)
     shown = np.where((height >= lowest) & (height <= highest), height, np.nan)[::step, ::step]
     across, up = np.meshgrid(x[::step], y[::step])
     axes.plot_surface(across, up, shown, cmap="viridis", rstride=1, cstride=1, linewidth=0, antialiased=True)
     axes.set_box_aspect((np.ptp(x), np.ptp(y), 0.45 * np.ptp(x)))
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="reconstructed (mm); holes: no answer")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name} (mm); holes: no answer")
 
 
 def _span(height: NDArray[np.float32]) -> tuple[float, float]:
@@ -131,7 +134,8 @@ def _draw_cuts(axes: Axes, heights: Mapping[str, NDArray[np.float32]], truth: Tr
     row = len(truth.height) // 2
     axes.plot(x, truth.height[row], color="0.6", lw=3, label="truth")
     for number, (name, height) in enumerate(heights.items()):
-        axes.plot(x, height[row], ".", ms=max(2, 5 - number), label=name)
+        # The first lies on top, small enough to show the others round it.
+        axes.plot(x, height[row], ".", ms=3 + number, zorder=9 - number, label=name)
     lowest = min(_span(height)[0] for height in heights.values())
     axes.set(xlabel="x (mm)", ylabel="height (mm)", title="cut across the middle")
     axes.set_ylim(1.35 * lowest - 0.02, -0.12 * lowest + 0.02)

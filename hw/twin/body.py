@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from mirrorskin.io.types import InputError
 
+_SCATTER_MAX = math.radians(20.0)
+
 
 @dataclass(frozen=True, slots=True)
 class Body:
@@ -53,21 +55,23 @@ class Body:
 
     def __post_init__(self) -> None:
         rules = {
-            "diameter": self.diameter > 0,
-            "height": self.height > 0,
-            "index": self.index >= 1,
-            "sheet": self.sheet >= 0,
-            "modulus": self.modulus > 0,
-            "friction": self.friction >= 0,
-            "scatter": 0 <= self.scatter <= math.radians(20),
-            "air_gap": self.air_gap >= 0,
-            "asymmetry": 0 <= self.asymmetry <= 1,
-            "asymmetry_azimuth": True,
+            "diameter": (self.diameter > 0, "mm, more than 0"),
+            "height": (self.height > 0, "mm, more than 0"),
+            "index": (self.index >= 1, "a refractive index, 1 or more"),
+            "sheet": (self.sheet >= 0, "mm, 0 or more"),
+            "modulus": (self.modulus > 0, "N/mm^2, more than 0"),
+            "friction": (self.friction >= 0, "a coefficient, 0 or more"),
+            "scatter": (0 <= self.scatter <= _SCATTER_MAX, "radians, 0 to those of 20 degrees"),
+            "air_gap": (self.air_gap >= 0, "mm, 0 or more"),
+            "asymmetry": (0 <= self.asymmetry <= 1, "a share, 0 to 1"),
+            "asymmetry_azimuth": (True, "radians"),
         }
-        for name, holds in rules.items():
+        for name, (holds, range_) in rules.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and holds):
-                raise InputError(f"{name.replace('_', ' ')} {value} of the sensor's body cannot be")
+                raise InputError(
+                    f"{name.replace('_', ' ')} {value} of the sensor's body cannot be: give {range_}"
+                )
 
     @property
     def radius(self) -> float:

@@ -39,8 +39,8 @@ class Camera:
         Of a sample: 8 for uint8; 12 unless given, 10 or 16 for uint16. None for float32, which is neither
         rounded nor clipped.
     electrons : float
-        Electrons of one count of light, 0.001 or more: a signal of S counts has shot noise of the variance
-        S / electrons. Infinite for none.
+        Electrons of one count of light, of this camera's own bits, 0.001 or more: a signal of S counts has
+        shot noise of the variance S / electrons. Infinite for none.
     gain_deviation : float
         Standard deviation of the pixels' gains, as a share; below 1. Gains below 0.05 are made 0.05.
     offset_deviation : float
@@ -49,6 +49,8 @@ class Camera:
         Frames in a second.
     exposure : float
         Seconds during which a frame gathers light, at most a frame's; 0: the body stands still meanwhile.
+        The mean of 5 poses stands for the light of a body that moves; of a vertical press in `conform` and
+        `ideal` it is exact.
     point_spread : float
         Standard deviation of a point's Gaussian image, pixels.
     distance : float

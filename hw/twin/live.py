@@ -18,7 +18,7 @@ _QUEUE = 8  # frames that wait for a late reader, as in a camera's driver
 
 
 class Live(Closing):
-    """A source that gives the twin's frames at a set rate, from the first read on.
+    """A source that gives the twin's frames, from the first of them on, at a set rate from the first read on.
 
     A read waits for the next frame, and takes those with it that have come since the read before. A reader
     that is late by more than 8 frames loses the oldest of them, and is told how many.
@@ -26,7 +26,7 @@ class Live(Closing):
     Parameters
     ----------
     twin : Twin
-        Read from where it is.
+        It is rewound.
     rate : float, optional
         Frames a second; the twin's camera's own otherwise.
     clock, sleep : callable
@@ -59,6 +59,7 @@ class Live(Closing):
         self.name, self.header, self.motion = twin.name, twin.header, twin.motion
         self.shape, self.dtype = twin.shape, twin.dtype
         self._twin = twin
+        twin.rewind()
         self._rate = rate
         self._clock = clock
         self._sleep = sleep

@@ -57,6 +57,9 @@ class Movement(Protocol):
     def deepest(self) -> float:
         """Greatest travel, mm."""
 
+    def rise(self, radius: float, /) -> float:
+        """Bound how far an object of a radius about the origin can rise above the rest plane, mm."""
+
     def reduced(self, path: Floats, /) -> Floats:
         """Make places on the path equal where they are the same."""
 
@@ -105,6 +108,10 @@ class Vertical:
     def deepest(self) -> float:
         """Greatest travel, mm."""
         return float(self.positions.max())
+
+    def rise(self, radius: float, /) -> float:
+        """Return how far the body is lowered: nothing tilts."""
+        return self.deepest
 
     def reduced(self, path: Floats, /) -> Floats:
         """Return the travel as it is."""
@@ -172,9 +179,15 @@ class Axial:
         self.tilt = tilt
         self.pivot = pivot
 
+    def rise(self, radius: float, /) -> float:
+        """Add to the press what tilting about the pivot and the object's own width can raise."""
+        x, y, z = self.pivot
+        outwards = radius + math.hypot(x, y)
+        return z + (self.deepest - z) * math.cos(self.tilt) + outwards * math.sin(self.tilt)
+
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns, and what of the phase rounding may differ by."""
-        return np.asarray(2 * np.pi * (np.round(path / (2 * np.pi), 12) % 1))
+        return np.asarray(2 * np.pi * (np.round(path / (2 * np.pi) % 1, 12) % 1))
 
     def pose(self, place: Floats, /) -> Pose:
         """Tilt the body about its pivot at a phase, radians."""
@@ -220,6 +233,10 @@ class Horizontal:
         self.path = self.positions
         self.deepest = _check_press(press)
 
+    def rise(self, radius: float, /) -> float:
+        """Return how far the body is lowered: nothing tilts."""
+        return self.deepest
+
     def reduced(self, path: Floats, /) -> Floats:
         """Return the displacement as it is."""
         return path
@@ -262,6 +279,10 @@ class Twist:
         _check_frames(self.positions, "twist")
         self.path = self.positions
         self.deepest = _check_press(press)
+
+    def rise(self, radius: float, /) -> float:
+        """Return how far the body is lowered: nothing tilts."""
+        return self.deepest
 
     def reduced(self, path: Floats, /) -> Floats:
         """Return the angle as it is."""

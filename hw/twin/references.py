@@ -37,15 +37,17 @@ def take_references(
     no full light either. For the bright reference a lab rolls a ball over the field, here one twice as wide
     as the field, pressed until it stands at 46 degrees at the rim of its contact: every pixel meets every
     slope, and its third-brightest sample is the reference. That is some tenths of the noise above the mean of
-    its bright samples, and includes what the pixel's own gain and place and the lamps do. Pixels that never
-    get a tenth of the light of the others, as those beyond the body, have no references.
+    its bright samples, and includes what the pixel's own gain and place and the lamps do; of uneven lamps it
+    tells only roughly, as it stops at slopes some 15 degrees apart. Pixels that never get a tenth of the
+    light of the others, as those beyond the body, have no references.
 
     Parameters
     ----------
     name : {"exact", "ball"}
         "exact" tells what no lab knows: the camera's own levels, with each pixel's deviation and without
-        noise.
+        noise, within what a sample can hold.
     optics : Ideal or Wall
+        Of the clear wall: a lab takes the printed sheet out.
     sensor : Sensor
     view : View
     body : Body
@@ -56,7 +58,8 @@ def take_references(
         NaN where a pixel has none.
     """
     if name == "exact":
-        return sensor.offset, sensor.full
+        low = -np.inf if sensor.camera.bits is None else 0.0
+        return np.clip(sensor.offset, low, sensor.camera.top), np.clip(sensor.full, low, sensor.camera.top)
     reach = max(size * pixel for size, pixel in zip(view.shape, view.pixel_size[::-1], strict=True))
     ball = Conform(Sphere(2 * reach), view, body.radius)
     depth = reach * (1 - math.cos(_STEEPEST))
@@ -77,7 +80,8 @@ def take_references(
         for kept in brightest:
             left, kept[...] = np.minimum(kept, left), np.maximum(kept, left)
     bright = brightest[-1]
-    seen = bright - dark >= _LEAST * np.median(bright - dark)
+    span, inside = bright - dark, np.hypot(view.x, view.y) <= body.radius
+    seen = span >= _LEAST * np.median(span[inside])
     return np.where(seen, dark, np.nan).astype(np.float32), np.where(seen, bright, np.float32(np.nan))
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +14,13 @@ from mirrorskin.io.types import Floats
 Light = NDArray[np.float32]
 
 _BLUR_POSES = 5  # poses that stand for the exposure of a moving body
-_BYTES_KEPT = 5  # of each pixel at each place
 
 
-class Contact(Protocol):
+class Skin(Protocol):
     """How the sheet lies in a pose."""
 
     def lie(self, pose: Pose, /) -> Sheet:
-        """Lay the sheet on the object; poses are asked for in their order."""
-
-    def restart(self) -> None:
-        """Begin anew, so that the same poses give the same sheets again."""
+        """Lay the sheet on the object."""
 
 
 class Optics(Protocol):
@@ -36,25 +31,20 @@ class Optics(Protocol):
 
 
 class Scene(Protocol):
-    """The light of each frame, asked for in order."""
+    """What is seen in each frame."""
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure, (H, W), float32; not to be written to."""
-
-    def restart(self) -> None:
-        """Begin again at the first frame."""
 
 
 class Film:
     """Any movement: sheet and optics are worked out for each place where the body is.
 
-    Places that come back, as those of a rotation do, are worked out once if the light of all fits in memory;
-    else each is worked out when it comes. Which of the two does not depend on how frames are read, and
-    neither does the light.
+    Places that come back, as those of a rotation do, are kept as long as there is memory for their light.
 
     Parameters
     ----------
-    contact : Contact
+    skin : Skin
     optics : Optics
     movement : Movement
     share : float
@@ -62,60 +52,51 @@ class Film:
     shape : (int, int)
         Rows and columns of a frame.
     memory_limit : int
-        Bytes that what is kept may take.
+        Bytes that kept light may take.
     """
 
     def __init__(
         self,
-        contact: Contact,
+        skin: Skin,
         optics: Optics,
         movement: Movement,
         share: float,
         shape: tuple[int, int],
         memory_limit: int,
     ) -> None:
-        self._contact = contact
+        self._skin = skin
         self._optics = optics
         self._movement = movement
-        self._shape = shape
-        self._places, self._number = _places(movement, share)
-        self._keeps = _BYTES_KEPT * shape[0] * shape[1] * len(self._places) <= memory_limit
-        self._seen: dict[int, _Seen] = {}
+        self._places, self._number = _distinct_places(movement, share)
+        self._room = memory_limit // (np.dtype(np.float32).itemsize * shape[0] * shape[1])
+        self._kept: dict[int, Light] = {}
+        self._visited = np.zeros(len(self._places), bool)
+        self._touched = np.ones(shape, bool)
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure."""
-        lights = [self._at(place).light for place in self._number[frame]]
+        lights = [self._at(place) for place in self._number[frame]]
         return lights[0] if len(lights) == 1 else np.mean(lights, axis=0, dtype=np.float32)
 
     def touched_throughout(self) -> NDArray[np.bool_]:
-        """Go through the whole movement, and return where sheet and object touch all the time, (H, W)."""
-        self.restart()
-        touched = np.ones(self._shape, bool)
-        for place in range(len(self._places)):
-            touched &= self._at(place).contact
-        self.restart()
-        return touched
+        """Return where sheet and object touch in all frames, (H, W); goes to the places not yet seen."""
+        for place in np.flatnonzero(~self._visited):
+            self._lie(int(place))
+        return self._touched
 
-    def restart(self) -> None:
-        """Begin again at the first frame."""
-        if not self._keeps:
-            self._contact.restart()
-            self._seen.clear()
+    def _at(self, place: int) -> Light:
+        if place not in self._kept:
+            light = self._optics.light(self._lie(place))
+            if len(self._kept) >= max(1, self._room):
+                self._kept.pop(next(iter(self._kept)))  # the one that was worked out first
+            self._kept[place] = light
+        return self._kept[place]
 
-    def _at(self, place: int) -> _Seen:
-        if place not in self._seen:
-            if not self._keeps:
-                self._seen.clear()
-            sheet = self._contact.lie(self._movement.pose(self._places[place]))
-            self._seen[place] = _Seen(self._optics.light(sheet), sheet.contact)
-        return self._seen[place]
-
-
-class _Seen(NamedTuple):
-    """What is kept of a place."""
-
-    light: Light
-    contact: NDArray[np.bool_]
+    def _lie(self, place: int) -> Sheet:
+        sheet = self._skin.lie(self._movement.pose(self._places[place]))
+        self._visited[place] = True
+        self._touched &= sheet.contact
+        return sheet
 
 
 class Press:
@@ -138,49 +119,34 @@ class Press:
     def __init__(
         self, height: Floats, touched: Light, untouched: Light, travel: Floats, share: float
     ) -> None:
-        self._reached_at = -height
+        self._reached_at = np.where(np.isnan(height), np.inf, -height)
         self._untouched = untouched
         self._gained = touched - untouched
         self._travel = travel
         self._share = share
+        # Begin, middle and end of each exposure, with constant velocity in between.
+        self._passed = _passed(travel, np.array([-share / 2, 0.0, share / 2]))
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure."""
-        time: NDArray[Any] = self._travel[frame] >= self._reached_at
         if self._share > 0:
-            time = _contact_time(_path(self._travel, frame, self._share), self._reached_at)
-        light: Light = self._untouched + time * self._gained
-        return light
+            begin, middle, end = map(float, self._passed[frame])
+            time = (self._time(begin, middle) + self._time(middle, end)) / np.float32(2)
+        else:
+            time = self._time(self._travel[frame], self._travel[frame])
+        return self._untouched + time * self._gained
 
-    def restart(self) -> None:
-        """Begin again: nothing is kept."""
-
-
-def _contact_time(path: Sequence[tuple[float, float, float]], reached_at: Floats) -> Light:
-    """Return the share of an exposure in which the travel is at least so much.
-
-    ``path`` has the exposure's pieces of constant velocity: their shares of the time, and the travel at
-    either end.
-    """
-    time = np.zeros(reached_at.shape, np.float32)
-    for share, begin, end in path:
+    def _time(self, begin: float, end: float) -> Light:
+        """Return the share of the time in which a steady travel is at least that of the touch, float32."""
         low, high = min(begin, end), max(begin, end)
         if high == low:
-            time += np.where(low >= reached_at, share, 0.0).astype(np.float32)
-        else:
-            passed = np.clip((high - reached_at) / (high - low), 0.0, 1.0)
-            time += (share * np.nan_to_num(passed)).astype(np.float32)
-    return time
+            return (low >= self._reached_at).astype(np.float32)
+        ahead = (high - self._reached_at).astype(np.float32)
+        return np.clip(ahead / np.float32(high - low), 0, 1, out=ahead)
 
 
-def _path(travel: Floats, frame: int, share: float) -> list[tuple[float, float, float]]:
-    """Cut a frame's exposure into the time before its middle and after it, each of constant velocity."""
-    begin, middle, end = _between(travel, frame, np.array([-share / 2, 0.0, share / 2]))
-    return [(0.5, float(begin), float(middle)), (0.5, float(middle), float(end))]
-
-
-def _places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the places where the body is in some exposure, each once and in the order of their first time.
+def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the places where the body is in some exposure, each once.
 
     Returns
     -------
@@ -188,34 +154,22 @@ def _places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]
     number : ndarray, (T, m), intp
         Of each frame's m places.
     """
-    positions = movement.path
+    offsets = np.zeros(1)
     if share > 0:
         offsets = share * ((np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5)
-        passed = np.stack([_between(positions, frame, offsets) for frame in range(len(positions))])
-    else:
-        passed = positions[:, np.newaxis]
-    reduced = movement.reduced(passed)
-    flat = reduced.reshape(passed.shape[0] * passed.shape[1], -1)
-    _, first, number = np.unique(flat, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    places = reduced.reshape(-1, *positions.shape[1:])[first[order]]
-    return places, rank[number.reshape(-1)].reshape(len(positions), -1)
+    passed = movement.reduced(_passed(movement.path, offsets))
+    count, each, *place = passed.shape
+    distinct, number = np.unique(passed.reshape(count * each, -1), axis=0, return_inverse=True)
+    return distinct.reshape(-1, *place), number.reshape(count, each)
 
 
-def _between(positions: Floats, frame: int, offsets: Floats) -> Floats:
-    """Return where the body is so many frames before or after a frame, at constant velocity in between.
+def _passed(path: Floats, offsets: Floats) -> Floats:
+    """Return where the body is so many frames before or after each frame, (T, offsets, ...).
 
-    Before the first frame and after the last it goes on as it went next to them.
+    Its velocity is constant between two frames; before the first and after the last it goes on as it went.
     """
-    if len(positions) == 1:
-        return np.repeat(positions, len(offsets), axis=0)
-    before = min(max(frame - 1, 0), len(positions) - 2)
-    after = min(frame, len(positions) - 2)
-    steps = np.where(
-        (offsets < 0).reshape(-1, *([1] * (positions.ndim - 1))),
-        positions[before + 1] - positions[before],
-        positions[after + 1] - positions[after],
-    )
-    return np.asarray(positions[frame] + steps * offsets.reshape(-1, *([1] * (positions.ndim - 1))))
+    steps = np.diff(path, axis=0) if len(path) > 1 else np.zeros_like(path)
+    before, after = np.concatenate([steps[:1], steps]), np.concatenate([steps, steps[-1:]])
+    late = offsets.reshape(-1, *([1] * (path.ndim - 1)))
+    step = np.where(late < 0, before[: len(path), np.newaxis], after[: len(path), np.newaxis])
+    return np.asarray(path[:, np.newaxis] + late * step)

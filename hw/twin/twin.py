@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
-from mirrorskin.hw.twin.contact import Conform, Elastic, Friction
-from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
-from mirrorskin.hw.twin.objects import Object, check_fits, make_object, zenith_azimuth
-from mirrorskin.hw.twin.optics import Ideal, Linear, Wall, make_pattern
+from mirrorskin.hw.twin.contact import Conform, Elastic
+from mirrorskin.hw.twin.movement import Movement, Vertical, pose_at_press
+from mirrorskin.hw.twin.objects import Object, check_fits, make_object
+from mirrorskin.hw.twin.optics import Ideal, Linear, Pattern, Uniform, Wall, make_pattern
 from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, take_references
 from mirrorskin.hw.twin.scene import Film, Press
 from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.truth import tell_truth
 from mirrorskin.hw.twin.view import View
-from mirrorskin.io.types import Block, Closing, Header, InputError, Truth
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
 from mirrorskin.kernels.device import Device, open_device
 
 ContactName = Literal["conform", "elastic"]
@@ -72,6 +73,8 @@ class Twin(Closing):
     movement : Movement
     travel : ndarray, (T,), float64, or None
         Millimetres, of a vertical movement.
+    frame_rate : float
+        Frames in a second.
 
     Raises
     ------
@@ -101,78 +104,62 @@ class Twin(Closing):
         _check_choice(contact, CONTACTS, "contact")
         _check_choice(optics, OPTICS, "optics")
         _check_choice(references, REFERENCES, "references")
+        self._body = body or Body()
+        self._camera = camera or Camera()
+        self._names, self._references = (contact, optics), references
+        self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
+
+        self.name = f"twin: {self._thing.name}"
         self.movement = movement
         self.motion = movement.motion
         self.travel = movement.positions if isinstance(movement, Vertical) else None
-        self._body = body or Body()
-        self._camera = camera or Camera()
-        self._references: ReferenceName = references
-        self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
-        check_fits(self._thing, self._body.radius)
-        self._check_movement(contact)
-
-        opened = open_device(device)
-        self._view = View(field, pixel, self._body, self._camera.distance)
-        self._pattern = make_pattern(pattern, self._body)
-        self._optics: Ideal | Wall = (
-            Ideal(self._body, self._pattern)
-            if optics == "ideal"
-            else Wall(self._body, self._pattern, self._view, opened)
-        )
-        self._contact = self._make_contact(contact)
-        self._scene = self._make_scene()
-        self._sensor = Sensor(self._camera, field, opened)
-        self._next = 0
-
-        self.name = f"twin: {self._thing.name}"
         self.shape = (len(movement.positions), *field)
         self.dtype = self._camera.dtype
+        self.frame_rate = self._camera.frame_rate
+
+        check_fits(self._thing, self._body.radius)
+        self._check_movement()
+        self._view = View(field, pixel, self._body, self._camera.distance)
+        self._pattern = make_pattern(pattern, self._body)
+        self._sensor = Sensor(self._camera, field, open_device(device))
+        self._skin = self._make_skin()
+        self._scene = self._make_scene()
+        self._next = 0
 
     @functools.cached_property
     def header(self) -> Header:
         """What holds for all frames; the references are taken when it is asked for."""
-        dark, bright = take_references(self._references, self._optics, self._sensor, self._view, self._body)
-        header = replace(
+        clear = self._make_optics(Uniform())
+        dark, bright = take_references(self._references, clear, self._sensor, self._view, self._body)
+        gain, offset = self._zenith_scale() or (None, None)
+        contact, optics = self._names
+        return replace(
             self.movement.header(),
-            title=f"Digital twin, {self._thing.name}, {self.motion} motion",
+            title=f"Digital twin, {self._thing.name}, {self.motion} motion, {contact}, {optics}",
             pixel_size=self._view.pixel_size,
             dark=dark,
             bright=bright,
+            zenith_gain=gain,
+            zenith_offset=offset,
         )
-        pattern = self._pattern
-        if not isinstance(pattern, Linear):
-            return header
-        low, span = self._camera.dark, self._camera.bright - self._camera.dark
-        gain, offset = np.asarray(span * pattern.gain), np.asarray(low + span * pattern.offset)
-        return replace(header, zenith_gain=gain, zenith_offset=offset)
 
     @functools.cached_property
     def truth(self) -> Truth:
-        """The object as it is under the upright body; worked out when it is asked for.
+        """The object as it is under the upright body, and what the movement does to the sheet.
 
-        ``azimuth`` is NaN where the surface is level. ``contact`` is that at the greatest travel of a
-        vertical movement, and what lasts through all frames of another. ``slip`` is known of horizontal
-        movements and twists in elastic contact.
+        Worked out when it is asked for; after the last frame most of it is known.
         """
-        x, y = self._view.x, self._view.y
-        height = self._thing.height(x, y)
-        zenith, azimuth = zenith_azimuth(*self._thing.slope(x, y))
-        return Truth(
-            height=height.astype(np.float32),
-            zenith=zenith.astype(np.float32),
-            azimuth=azimuth.astype(np.float32),
-            contact=self._touched().astype(np.uint8),
-            slip=self._slipped(),
-        )
+        film = self._scene if self.motion != "vertical" and isinstance(self._scene, Film) else None
+        touched = None if film is None else film.touched_throughout()
+        return tell_truth(self._thing, self.movement, self._skin, self._view, self._body, touched)
 
     def sheet(self, frame: int) -> Sheet:
         """Return how the sheet lies at the middle of a frame's exposure, worked out anew."""
         place = self.movement.reduced(self.movement.path[frame])
-        return self._lie_once(self.movement.pose(place))
+        return self._skin.lie(self.movement.pose(place))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
-        self._scene.restart()
         self._next = 0
 
     def skip(self, count: int) -> None:
@@ -214,74 +201,69 @@ class Twin(Closing):
         time = np.arange(first, self._next) / self._camera.frame_rate
         return self.movement.mark(Block(frames, index=first, time=time))
 
-    def _check_movement(self, contact: ContactName) -> None:
-        deepest = self.movement.deepest
-        if deepest >= self._body.height:
+    def _check_movement(self) -> None:
+        rise = self.movement.rise(self._body.radius)
+        if rise >= self._body.height:
             raise InputError(
-                f"travel of {deepest:g} mm is deeper than the sensor's body, {self._body.height:g} mm:"
-                " press less"
+                f"the {self._thing.name} may rise {rise:g} mm into the sensor's body, which is"
+                f" {self._body.height:g} mm high: press less, or turn about a nearer pivot"
             )
-        if self._compliance > 0 and contact == "conform":
+        if self._compliance > 0 and self._names[0] == "conform":
             raise InputError(
                 "compliance needs contact 'elastic': a sheet that only conforms presses with no force"
             )
 
     @property
-    def frame_rate(self) -> float:
-        """Frames a second."""
-        return self._camera.frame_rate
-
-    @property
     def _compliance(self) -> float:
         return self.movement.compliance if isinstance(self.movement, Vertical) else 0.0
 
-    def _make_contact(self, name: ContactName) -> Conform | Elastic:
-        if name == "conform":
+    def _make_skin(self) -> Conform | Elastic:
+        if self._names[0] == "conform":
             return Conform(self._thing, self._view, self._body.radius)
         movement = self.movement
-        some = np.linspace(0, len(movement.path) - 1, _REACH_POSES).round().astype(np.intp)
-        poses = [movement.pose(place) for place in movement.path[np.unique(some)]]
-        deepest = pose_at_press(movement.deepest)
-        return Elastic(self._thing, [deepest, *poses], self._view, self._body, self._compliance)
+        poses = [movement.pose(place) for place in _spread(movement.reduced(movement.path))]
+        poses.append(pose_at_press(movement.deepest))
+        return Elastic(self._thing, poses, self._view, self._body, self._compliance)
+
+    def _make_optics(self, pattern: Pattern) -> Ideal | Wall:
+        if self._names[1] == "ideal":
+            return Ideal(self._body, pattern)
+        return Wall(self._body, pattern, self._view, self._sensor.device)
 
     def _make_scene(self) -> Film | Press:
         share = self._camera.exposure * self._camera.frame_rate
-        contact, optics, view = self._contact, self._optics, self._view
+        skin, optics, view = self._skin, self._make_optics(self._pattern), self._view
         if (
             isinstance(self.movement, Vertical)
-            and isinstance(contact, Conform)
+            and isinstance(skin, Conform)
             and isinstance(optics, Ideal)
             and view.orthographic
         ):
-            touched, untouched = (contact.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
+            touched, untouched = (skin.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
             height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
             return Press(
                 height, optics.light(touched), optics.light(untouched), self.movement.positions, share
             )
-        return Film(contact, optics, self.movement, share, view.shape, _MEMORY)
+        return Film(skin, optics, self.movement, share, view.shape, _MEMORY)
 
-    def _lie_once(self, pose: Pose) -> Sheet:
-        """Lay the sheet on the object without a thought for the pose before or after."""
-        if isinstance(self._contact, Elastic):
-            return self._contact.sheet(self._contact.solve(pose).pressure)
-        return self._contact.lie(pose)
-
-    def _touched(self) -> NDArray[np.bool_]:
-        if isinstance(self._scene, Film) and not isinstance(self.movement, Vertical):
-            return self._scene.touched_throughout()
-        return self._lie_once(pose_at_press(self.movement.deepest)).contact
-
-    def _slipped(self) -> NDArray[np.uint8] | None:
-        """Tell where the sheet slips at some time, by the pressure of the press before the movement."""
-        movement, contact = self.movement, self._contact
-        if not (isinstance(movement, Horizontal | Twist) and isinstance(contact, Elastic)):
+    def _zenith_scale(self) -> tuple[Floats, Floats] | None:
+        """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""
+        pattern = self._pattern
+        if self._names[1] != "ideal" or not isinstance(pattern, Linear):
             return None
-        pressure = contact.solve(pose_at_press(movement.deepest)).pressure
-        friction = Friction(contact.space, pressure, self._body.friction)
-        slipped = np.zeros(pressure.shape, bool)
-        for place in movement.path:
-            slipped |= friction.move(contact.shift(movement.pose(place)))
-        return contact.crop(slipped).astype(np.uint8)
+        dark, bright = np.asarray(self._camera.dark), np.asarray(self._camera.bright)
+        if self._references == "exact":
+            dark, bright = (levels.astype(np.float64) for levels in (self._sensor.offset, self._sensor.full))
+        return (bright - dark) * pattern.gain, dark + (bright - dark) * pattern.offset
+
+
+def _spread(places: Floats) -> Floats:
+    """Return some of the places: the outermost along each coordinate, and others between them."""
+    places = np.unique(places, axis=0)
+    flat = places.reshape(len(places), -1)
+    some = np.linspace(0, len(places) - 1, _REACH_POSES).round().astype(np.intp)
+    chosen: Floats = places[np.unique([*some, *flat.argmin(axis=0), *flat.argmax(axis=0)])]
+    return chosen
 
 
 def _check_shape(shape: tuple[int, int]) -> tuple[int, int]:

@@ -5,11 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from mirrorskin.bench import NAMES, as_data, as_markdown, as_rows, memory, onset, run_suite
+from mirrorskin.bench import NAMES, as_data, as_markdown, as_rows, memory, onset, run_suite, twin
 from mirrorskin.bench.peers import Peer, numpy_
 from mirrorskin.bench.same import DisagreementError
 from mirrorskin.io import InputError
+from mirrorskin.kernels.device import open_device
 from mirrorskin.kernels.errors import DeviceError
+
+TWIN = ["mirrorskin, vertical", "mirrorskin, rotation", "NumPy, vertical"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -19,16 +22,18 @@ def test_a_case_agrees_on_every_device(device, name):
     assert names[:3] == ["read limit", "copy limit", "triad limit"]
     assert case.name == name
     assert case.share(case.rows[0]) == case.kernel_share(case.rows[0]) == 1
-    if not name.startswith("live"):
+    if name == "twin":
+        assert names[3:] == [*TWIN, "mirrorskin, elastic 64 x 64"]
+    elif not name.startswith("live"):
         assert {"mirrorskin", "mirrorskin, push only", "NumPy", "OpenCV"} <= set(names)
     for row in case.rows:
-        limit = "limit" in row.name
+        limit, elastic = "limit" in row.name, "elastic" in row.name
         frame = 48 * 64 * {"uint16": 2, "float32": 4}.get(name.split("-")[-1], 1)
-        assert row.bytes == pytest.approx(
-            frame if limit and name.startswith("live") else 12 * frame, rel=0.02
-        )
-        assert row.frames == (0 if limit else 12)
-        assert ("kernel" in row.measured.device) == (limit or "mirrorskin" in row.name)
+        moved = frame if limit and name.startswith("live") else 12 * frame
+        assert row.bytes == pytest.approx(64 * 64 if elastic else moved, rel=0.02)
+        assert row.frames == (0 if limit else 1 if elastic else 12)
+        on_device = limit or ("mirrorskin" in row.name and not elastic)
+        assert ("kernel" in row.measured.device) == on_device
 
 
 @pytest.mark.parametrize(
@@ -59,6 +64,47 @@ def test_a_peer_that_differs_is_named_and_nothing_is_timed(device, monkeypatch, 
         DisagreementError, match=f"Odd one differs from mirrorskin in the {word} of 1 of 3072 pixels"
     ):
         run_suite(device, [name], quick=True)
+    assert not timed
+
+
+@pytest.mark.parametrize(
+    ("ours", "spoil", "said"),
+    [
+        (True, lambda frames, clean: frames + np.uint8(1), r"mean of 0\.\d+ "),
+        (
+            True,
+            lambda frames, clean: np.where(np.arange(12) == 7, frames.T - np.uint8(1), frames.T).T,
+            "frame 7 ",
+        ),
+        (True, lambda frames, clean: np.rint(clean).astype(np.uint8), r"spread of 0\.[0-3]"),
+        (
+            False,
+            lambda frames, clean: (clean + 1.2 * (frames - clean)).astype(np.uint8),
+            r"spread of 1\.[12]",
+        ),
+        (False, lambda frames, clean: np.rint(clean[::-1]).astype(np.uint8), "noise"),
+    ],
+    ids=["brighter", "one frame darker", "no noise", "more noise", "another press"],
+)
+def test_a_twin_whose_noise_is_not_the_camera_s_is_named_and_nothing_is_timed(monkeypatch, ours, spoil, said):
+    kept, timed = {}, []
+    clean, render = twin._clean, twin._render if ours else twin._render_numpy
+
+    def keep(*given):
+        kept["clean"] = clean(*given)
+        return kept["clean"]
+
+    def wrong(given, out):
+        out[...] = spoil(render(given, out), kept["clean"])
+        return out
+
+    monkeypatch.setattr(twin, "_clean", keep)
+    monkeypatch.setattr(twin, "_render" if ours else "_render_numpy", wrong)
+    monkeypatch.setattr("mirrorskin.bench.harness._measured", lambda *given: timed.append(given))
+    name = "mirrorskin, vertical" if ours else "NumPy, vertical"
+    with pytest.raises(DisagreementError, match=f"^{name}: .*{said}") as caught:
+        run_suite(open_device(), ["twin"], quick=True)
+    assert "\n" not in str(caught.value)
     assert not timed
 
 

@@ -8,10 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mirrorskin.cli.quantity import angle, frame_size, length, lengths, memory
+from mirrorskin.cli.quantity import angle, compliance, duration, frame_size, length, lengths, memory, vector
 from mirrorskin.io import InputError
 
-READERS = [angle, frame_size, length, lengths, memory]
+
+def two(text, option=""):
+    return vector(text, 2, option)
+
+
+def three(text, option=""):
+    return vector(text, 3, option)
+
+
+READERS = [angle, compliance, duration, frame_size, length, lengths, memory, two, three]
 
 
 @pytest.mark.parametrize(
@@ -78,6 +87,42 @@ def test_one_or_two_lengths(text, sizes):
     assert lengths(text) == pytest.approx(sizes, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("read", "text", "millimetres"),
+    [
+        (two, "0.01mm,-20um", (0.01, -0.02)),
+        (two, " 1 mm , 2 mm ", (1, 2)),
+        (three, "0mm,-1cm,0.04m", (0, -10, 40)),
+        (lambda text, option: vector(text, 1, option), "1in", (25.4,)),
+    ],
+)
+def test_vectors_have_as_many_lengths_as_are_needed(read, text, millimetres):
+    found = read(text, "--o")
+    assert isinstance(found, tuple)
+    assert found == pytest.approx(millimetres, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "millimetres_per_newton"),
+    [
+        ("0.01mm/N", 0.01),
+        ("10um/N", 0.01),
+        (" 0.01 mm / N ", 0.01),
+        ("0mm/N", 0.0),
+        ("-1e-5m/N", -0.01),
+    ],
+)
+def test_compliance_is_in_millimetres_a_newton(text, millimetres_per_newton):
+    assert compliance(text) == pytest.approx(millimetres_per_newton, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10ms", 0.01), ("0s", 0.0), ("250 us", 2.5e-4), ("1min", 60.0), ("-1s", -1.0)]
+)
+def test_durations_are_in_seconds(text, seconds):
+    assert duration(text) == pytest.approx(seconds, rel=1e-12)
+
+
 def test_frame_sizes_are_columns_and_rows():
     assert frame_size("640x480") == (640, 480)
 
@@ -115,6 +160,22 @@ def test_frame_sizes_that_are_none(text):
         (lengths, "0.03mm,2", "--o 2: a unit is needed; write e.g. 0.1mm"),
         (lengths, "1mm,2mm,3mm", "--o 1mm,2mm,3mm: one or two lengths are needed; write e.g. 0.03mm,0.04mm"),
         (lengths, "0.1mm,", "--o: a number and a unit are needed; write e.g. 0.1mm"),
+        (two, "1mm", "--o 1mm: 2 lengths are needed; write e.g. 0mm,1mm"),
+        (two, "1mm,2mm,3mm", "--o 1mm,2mm,3mm: 2 lengths are needed; write e.g. 0mm,1mm"),
+        (three, "1mm,2mm", "--o 1mm,2mm: 3 lengths are needed; write e.g. 0mm,0mm,1mm"),
+        (three, "1mm,2mm,3", "--o 3: a unit is needed; write e.g. 0.1mm"),
+        (three, "1mm,2mm,3deg", "--o 3deg: degrees are not a length; write e.g. 0.1mm"),
+        (three, "", "--o: a number and a unit are needed; write e.g. 0.1mm"),
+        (compliance, "0.01mm", "--o 0.01mm: a length for each newton is needed; write e.g. 0.01mm/N"),
+        (compliance, "0.01mm/kg", "--o 0.01mm/kg: a length for each newton is needed; write e.g. 0.01mm/N"),
+        (compliance, "0.01mm/n", "--o 0.01mm/n: a length for each newton is needed; write e.g. 0.01mm/N"),
+        (compliance, "", "--o: a length for each newton is needed; write e.g. 0.01mm/N"),
+        (compliance, "/N", "--o: a number and a unit are needed; write e.g. 0.1mm"),
+        (compliance, "1N/N", "--o 1N: newtons are not a length; write e.g. 0.1mm"),
+        (compliance, "1mm/N/N", "--o 1mm/N: a number and a unit are needed; write e.g. 0.1mm"),
+        (duration, "10", "--o 10: a unit is needed; write e.g. 10ms"),
+        (duration, "10mm", "--o 10mm: millimeters are not a time; write e.g. 10ms"),
+        (duration, "10Hz", "--o 10Hz: hertzs are not a time; write e.g. 10ms"),
     ],
 )
 def test_messages_name_the_option_the_value_and_an_example(read, text, message):
@@ -153,7 +214,7 @@ def test_messages_name_the_option_the_value_and_an_example(read, text, message):
         "1mm; import os",
     ],
 )
-@pytest.mark.parametrize("read", [length, angle, memory])
+@pytest.mark.parametrize("read", [length, angle, duration, memory])
 def test_what_is_not_one_number_and_one_unit_is_refused(read, text):
     with pytest.raises(InputError, match="a number and a unit are needed; write e"):
         read(text, "--travel-step")
@@ -167,10 +228,11 @@ def test_messages_are_one_line():
 
 NUMBERS = st.floats().map(repr) | st.integers().map(str)
 WORDS = st.text("abcdefghiklmnoprstuvxyzABCDEGKMNPRTW\u00b5\u03bc", max_size=5) | st.text(max_size=4)
+ONE = st.builds("{}{}".format, NUMBERS, WORDS | st.sampled_from(["mm", "deg", "s", "MB"]))
 
 
 @settings(deadline=None, max_examples=400)
-@given(st.text(max_size=12) | st.builds("{}{}".format, NUMBERS, WORDS))
+@given(st.text(max_size=12) | ONE | ONE.map("{}/N".format) | st.lists(ONE, max_size=4).map(",".join))
 def test_any_text_is_a_finite_number_or_an_input_error(text):
     for read in READERS:
         with contextlib.suppress(InputError):

@@ -1,28 +1,13 @@
 """Bad input gets one clear line, exit code 2, and nothing is written."""
 
-import io as text_io
-import sys
-
 import h5py
 import numpy as np
 import pytest
-
-from mirrorskin.cli import main as command_line
+from commands import run
 
 FRAMES = np.full((6, 5, 7), 20, np.uint8)
 FRAMES[3:] = 200
 TRAVEL = np.arange(6) * 0.1
-
-
-def run(monkeypatch, *words):
-    """Run the command line in this process; return its exit code and what it said on stderr."""
-    monkeypatch.setattr(sys, "argv", ["mirrorskin", *map(str, words)])
-    monkeypatch.setattr(sys, "stdout", text_io.StringIO())
-    said = text_io.StringIO()
-    monkeypatch.setattr(sys, "stderr", said)
-    with pytest.raises(SystemExit) as ended:
-        command_line.main()
-    return ended.value.code, said.getvalue()
 
 
 def ours(path, **changes):
@@ -158,7 +143,7 @@ def test_bad_input_is_refused_in_one_line(tmp_path, monkeypatch, case):
     make(path)
     before = {entry.name for entry in tmp_path.iterdir()}
     monkeypatch.chdir(tmp_path)
-    code, said = run(monkeypatch, "reconstruct", path, *options)
+    code, _, said = run("reconstruct", path, *options)
     assert code == 2, said
     assert words in said
     assert said.count("\n") == 1
@@ -167,29 +152,26 @@ def test_bad_input_is_refused_in_one_line(tmp_path, monkeypatch, case):
     assert {entry.name for entry in tmp_path.iterdir()} == before
 
 
-def test_the_made_up_recording_is_good_where_nothing_is_replaced(tmp_path, monkeypatch):
+def test_the_made_up_recording_is_good_where_nothing_is_replaced(tmp_path):
     ours(tmp_path / "good.h5")
-    monkeypatch.setattr(sys, "argv", ["mirrorskin", "reconstruct", str(tmp_path / "good.h5")])
-    with pytest.raises(SystemExit) as ended:
-        command_line.main()
-    assert not ended.value.code
+    assert run("reconstruct", tmp_path / "good.h5").code == 0
     assert (tmp_path / "good-result.h5").exists()
 
 
-def test_the_input_is_not_overwritten(tmp_path, monkeypatch):
+def test_the_input_is_not_overwritten(tmp_path):
     path = tmp_path / "good.h5"
     ours(path)
     kept = path.read_bytes()
-    code, said = run(monkeypatch, "reconstruct", path, "-o", path)
+    code, _, said = run("reconstruct", path, "-o", path)
     assert code == 2
     assert "is the input" in said
     assert path.read_bytes() == kept
 
 
-def test_an_output_below_a_file_is_refused(tmp_path, monkeypatch):
+def test_an_output_below_a_file_is_refused(tmp_path):
     path = tmp_path / "good.h5"
     ours(path)
-    code, said = run(monkeypatch, "reconstruct", path, "-o", path / "result.h5")
+    code, _, said = run("reconstruct", path, "-o", path / "result.h5")
     assert code == 2
     assert said.count("\n") == 1
 
@@ -198,7 +180,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
     claims_too_much(tmp_path / "bad.h5")
     taken = []
     monkeypatch.setattr(np, "empty", lambda *args, **kwargs: taken.append(args))
-    code, _ = run(monkeypatch, "reconstruct", tmp_path / "bad.h5", *GIVEN)
+    code, *_ = run("reconstruct", tmp_path / "bad.h5", *GIVEN)
     assert code == 2
     assert not taken
 
@@ -226,7 +208,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
 )
 def test_other_commands_refuse_too(tmp_path, monkeypatch, words, said_of):
     monkeypatch.chdir(tmp_path)
-    code, said = run(monkeypatch, *words)
+    code, _, said = run(*words)
     assert code == 2, said
     assert said_of in said
     assert said.count("\n") == 1

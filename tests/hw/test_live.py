@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.hw import Live, Twin
-from mirrorskin.hw.twin import Vertical
+from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io import InputError
 
 COUNT, RATE = 40, 20.0
@@ -116,3 +116,52 @@ def test_time_does_not_run_back() -> None:
 def test_a_rate_that_cannot_be_is_refused(rate: float) -> None:
     with pytest.raises(InputError, match="frames a second"):
         make_live(rate)
+
+
+def test_frames_of_other_movements_are_passed_over_too_and_told_apart() -> None:
+    def make() -> Twin:
+        movement = Axial(np.arange(COUNT) * 2 * np.pi / 10, 0.1, 1.0)
+        return Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=movement)
+
+    twin, clock = make(), Clock()
+    live = Live(twin, RATE, clock=clock, sleep=clock.sleep)
+    assert (live.name, live.motion, live.shape, live.dtype) == (twin.name, "axial", twin.shape, twin.dtype)
+    assert live.header is twin.header
+    whole = make().read(np.empty(twin.shape, twin.dtype))
+    assert whole is not None
+    indexes = []
+    for late in (0.0, 14.2, 0.1, 3.3, 500.0):
+        clock.now += late / RATE
+        block = live.read(np.empty((9, *live.shape[1:]), live.dtype))
+        assert block is not None
+        here = np.arange(block.index, block.index + len(block.frames))
+        np.testing.assert_array_equal(block.frames, whole.frames[here])
+        np.testing.assert_array_equal(block.phase, twin.movement.positions[here])
+        indexes.append((block.index, len(block.frames), block.dropped))
+    assert indexes == [(0, 1, 0), (7, 8, 6), (15, 1, 0), (16, 3, 0), (32, 8, 13)]
+    assert live.read() is None
+
+
+def test_a_twin_read_from_the_middle_begins_anew() -> None:
+    twin = Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=Vertical(TRAVEL))
+    twin.skip(COUNT - 2)
+    clock = Clock()
+    live = Live(twin, RATE, clock=clock, sleep=clock.sleep)
+    for number in range(3):
+        block = live.read()
+        assert block is not None
+        assert (block.index, len(block.frames), block.dropped) == (number, 1, 0)
+        np.testing.assert_array_equal(block.frames[0], all_frames()[number])
+
+
+def test_a_buffer_that_does_not_fit_is_refused() -> None:
+    live, _ = make_live()
+    with pytest.raises(InputError, match="buffer"):
+        live.read(np.empty((1, 2, 3), live.dtype))
+
+
+def test_closing_is_leaving() -> None:
+    live, _ = make_live()
+    with live as entered:
+        assert entered is live
+    live.close()

@@ -199,6 +199,30 @@ def one_triangle(path: Path, corners: list[list[float]]) -> Path:
     return path
 
 
+def joined(faces: list[list[int]]) -> trimesh.Trimesh:
+    """Make triangles of the middle of a sheet's edge, and places round it."""
+    corners = [
+        [0, -1, 0],
+        [0, 1, 0],
+        [2, 0, -0.5],
+        [-2, 0, -0.5],
+        [0.5, 0.0, 1],
+        [4, 1, -1],
+        [4, -1, -1],
+        [5, 0, 0],
+    ]
+    return trimesh.Trimesh(corners, faces, process=False)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+def test_triangles_that_are_no_surface(tmp_path: Path, suffix: str) -> None:
+    refused(save(tmp_path / f"apart{suffix}", joined([[0, 2, 1], [5, 6, 7]])), "is no surface.*do not join")
+    fin = joined([[0, 2, 1], [0, 1, 3], [0, 1, 4]])
+    refused(save(tmp_path / f"fin{suffix}", fin), "is no surface: at 1 of its edges three triangles")
+    _, height = load(save(tmp_path / f"roof{suffix}", joined([[0, 2, 1], [0, 1, 3]])))
+    assert np.isfinite(height).sum() > 1000
+
+
 def test_a_wall_has_no_upper_side(tmp_path: Path) -> None:
     refused(one_triangle(tmp_path / "wall.stl", [[0, 0, 0], [3, 1, 0], [3, 1, 2]]), "from above")
 

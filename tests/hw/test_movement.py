@@ -9,8 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.hw.twin import Axial, Horizontal, Twist, Vertical
+from mirrorskin.hw.twin import Axial, Body, Cylinder, Horizontal, Object, Plane, Sphere, Twist, Vertical
+from mirrorskin.hw.twin.contact.obstacle import meet
 from mirrorskin.hw.twin.movement import Movement
+from mirrorskin.hw.twin.view import View
 from mirrorskin.io import Block, InputError
 
 POINTS = np.random.default_rng(3).uniform(-8, 8, (50, 3))
@@ -49,6 +51,34 @@ def test_whole_turns_are_the_same_pose() -> None:
     for frame in range(8):
         np.testing.assert_array_equal(seen(movement, frame), seen(movement, frame + 8))
         np.testing.assert_array_equal(seen(movement, frame), seen(movement, frame + 16))
+
+
+@pytest.mark.parametrize("count", [3, 5, 7, 10, 12, 36, 100])
+def test_turns_by_parts_that_binary_numbers_only_come_close_to_are_the_same_poses(count: int) -> None:
+    phase = 0.3 + np.arange(4 * count) * 2 * np.pi / count
+    for turned in (phase, phase % (2 * np.pi), -phase):
+        movement = Axial(turned, 0.04, 1.0)
+        assert len(np.unique(movement.reduced(movement.path))) == count
+        for frame in range(count):
+            np.testing.assert_array_equal(seen(movement, frame), seen(movement, frame + 3 * count))
+
+
+def test_places_are_kept_to_rounding() -> None:
+    for movement in (
+        Axial(np.linspace(-20, 20, 77), 0.1, 1.0),
+        Horizontal(np.random.default_rng(1).normal(size=(9, 2)), 1.0),
+        Twist([0.0, 7.0, -9.0], 1.0),
+        Vertical([-0.1, 0.2]),
+    ):
+        reduced = movement.reduced(movement.path)
+        turns = (
+            (movement.path - reduced) / (2 * np.pi)
+            if isinstance(movement, Axial)
+            else reduced - movement.path
+        )
+        np.testing.assert_allclose(turns, np.rint(turns), atol=1e-11)
+        if isinstance(movement, Axial):
+            assert 0 <= reduced.min() < reduced.max() < 2 * np.pi
 
 
 def test_a_phase_that_jumps_back_goes_on_as_a_path() -> None:
@@ -109,3 +139,31 @@ def test_bad_input_is_refused_in_one_line(make: Any, words: str) -> None:
 
 def test_a_tilt_of_thirty_degrees_is_the_most() -> None:
     assert Axial([0.0], np.radians(30), 1.0).tilt == np.radians(30)
+
+
+@pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 40.0), (3.0, -2.0, -1.5), (-30.0, 10.0, 0.0)])
+def test_a_rotation_raises_the_rim_of_a_disc_as_far_as_it_says(pivot: tuple[float, float, float]) -> None:
+    angles = np.linspace(-np.pi, np.pi, 721)
+    movement = Axial(angles[:-1], 0.3, 1.2, pivot)
+    rim = 8.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+    highest = max(
+        float((rim @ pose.rotation.T + pose.shift)[:, 2].max()) for pose in map(movement.pose, movement.path)
+    )
+    assert highest <= movement.rise(8.0) + 1e-12
+    assert highest == pytest.approx(movement.rise(8.0), abs=1e-3)
+
+
+@pytest.mark.parametrize("thing", [Sphere(), Cylinder(), Plane()])
+def test_nothing_stands_higher_than_its_rise(thing: Object) -> None:
+    rng = np.random.default_rng(6)
+    view = View((60, 60), (0.6, 0.6), Body())
+    for _ in range(5):
+        x, y, z = rng.uniform(-6, 6, 3)
+        movement = Axial(rng.uniform(-3, 3, 1), rng.uniform(0.05, 0.5), rng.uniform(1, 4), (x, y, z))
+        highest = np.nanmax(meet(thing, movement.pose(movement.path[0]), view).height, initial=0.0)
+        assert 0 < highest <= movement.rise(thing.radius)
+
+
+def test_what_stays_upright_rises_as_far_as_the_body_is_lowered() -> None:
+    for movement in (Vertical([0.1, 1.5, 0.7]), Horizontal([[9.0, 0.0]], 1.5), Twist([2.0], 1.5)):
+        assert movement.rise(10.0) == 1.5

@@ -166,11 +166,11 @@ def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
         assert (recording.truth, recording.travel) == (None, None)
         for size in (1, 3, 8, 20):
             recording.rewind()
-            found, time, travel, phase = read_all(recording, size)
-            np.testing.assert_array_equal(found, frames)
-            np.testing.assert_array_equal(time, TRAVEL)
-            np.testing.assert_array_equal(phase, PHASE)
-            assert travel is None
+            found = read_all(recording, size)
+            np.testing.assert_array_equal(found.frames, frames)
+            np.testing.assert_array_equal(found.time, TRAVEL)
+            np.testing.assert_array_equal(found.phase, PHASE)
+            assert (found.travel, found.displacement, found.twist) == (None, None, None)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -189,9 +189,9 @@ def test_the_twin_s_recording_is_the_twin(tmp_path, dtype):
 def test_the_recorder_passes_on_what_it_writes(tmp_path):
     frames = random_stack()
     with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=TRAVEL), tmp_path / "a.h5") as recorder:
-        found, _, travel, _ = read_all(recorder, 3)
-    np.testing.assert_array_equal(found, frames)
-    np.testing.assert_array_equal(travel, TRAVEL)
+        found = read_all(recorder, 3)
+    np.testing.assert_array_equal(found.frames, frames)
+    np.testing.assert_array_equal(found.travel, TRAVEL)
 
 
 def test_drain_goes_block_by_block_and_tells_how_far_it_is(tmp_path, monkeypatch):

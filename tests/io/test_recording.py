@@ -227,6 +227,8 @@ BAD = [
     (f"{DETECTOR}/x_pixel_size", 0.0, None, "pixel size .* above zero"),
     (f"{DETECTOR}/y_pixel_size", np.nan, None, "y_pixel_size is nan, which is not finite: give --pixel"),
     (f"{DETECTOR}/y_pixel_size", 0.1, "pixel", "y_pixel_size is in 'pixel', which cannot be turned into mm"),
+    (f"{DETECTOR}/y_pixel_size", 0.1, "px", "y_pixel_size is in 'px', which cannot be turned into mm"),
+    (f"{DETECTOR}/y_pixel_size", 0.1, "1/px", "y_pixel_size is in '1/px', which cannot be turned into mm"),
     (f"{DETECTOR}/y_pixel_size", 0.1, "rad", "y_pixel_size is in 'rad', which cannot be turned into mm"),
     (
         f"{DETECTOR}/y_pixel_size",
@@ -323,7 +325,7 @@ def test_references_may_be_unknown_at_some_pixels(press):
 def test_a_recording_is_described(press):
     assert {name: text for name, text in io.describe(press).items() if name != "start"} == {
         "kind": "recording",
-        "title": "Digital twin, sphere, vertical motion",
+        "title": sphere().header.title,
         "motion": "vertical",
         "frames": "8 of 7 x 5, uint8",
         "storage": "in one piece",

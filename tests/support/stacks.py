@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import h5py
 import numpy as np
 
@@ -78,14 +80,25 @@ def record(source, path, compression="raw", block=1, truth=None):
     return path
 
 
+class Read(NamedTuple):
+    """All frames of a source, and what its blocks say beside them."""
+
+    frames: Any
+    time: Any
+    travel: Any
+    phase: Any
+    displacement: Any
+    twist: Any
+
+
 def read_all(source, block):
     """Read a source in blocks; return the frames, and the series of what the blocks say beside them."""
     out = np.empty((block, *source.shape[1:]), source.dtype)
     blocks = []
     while (got := source.read(out)) is not None:
         assert got.index == sum(len(frames) for frames, *_ in blocks)
-        blocks.append((got.frames.copy(), got.time, got.travel, got.phase))
-    return tuple(None if parts[0] is None else np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        blocks.append((got.frames.copy(), *(getattr(got, name) for name in Read._fields[1:])))
+    return Read(*(None if parts[0] is None else np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 def assert_same(found, expected):

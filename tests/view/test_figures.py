@@ -3,23 +3,61 @@
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from mpl_toolkits.mplot3d import Axes3D
 
 from mirrorskin import io, view
 
+KINDS = pytest.mark.parametrize("surface", [False, True], ids=["brightness", "surface"])
 
-def result_and_truth(height):
+
+def slope(shape=(20, 30)):
+    """Heights that differ at every pixel, and fall to the lower right."""
+    return np.fromfunction(lambda row, column: -0.01 * column - 0.0001 * row, shape).astype(np.float32)
+
+
+def result_of(height):
     x, y = io.pixel_axes(height.shape, (0.1, 0.2))
-    truth = io.Truth(height, *(np.zeros_like(height) for _ in range(2)), np.ones(height.shape, np.uint8))
-    return io.Result(height=height, x=x, y=y), truth
+    return io.Result(height=height, x=x, y=y)
 
 
-@pytest.mark.parametrize("kind", ["slope", "empty"])
-def test_a_height_map_becomes_a_picture(tmp_path, kind):
-    height = np.fromfunction(lambda row, column: -0.01 * column, (20, 30)).astype(np.float32)
-    if kind == "empty":
+def truth_of(height):
+    return io.Truth(height, *(np.zeros_like(height) for _ in range(2)), np.ones(height.shape, np.uint8))
+
+
+def draw(results, truth, surface=False):
+    """Draw a figure; return the axes of the whole, and those of the cuts."""
+    figure = view.figures._draw(results, truth, surface)
+    return figure.axes[0], next(axes for axes in figure.axes if "cut" in axes.get_title())
+
+
+@pytest.fixture
+def surfaces(monkeypatch):
+    """The x, y and z of all surfaces that are drawn."""
+    drawn = []
+    plot = Axes3D.plot_surface
+
+    def plot_surface(axes, *given, **style):
+        drawn.append(given)
+        return plot(axes, *given, **style)
+
+    monkeypatch.setattr(Axes3D, "plot_surface", plot_surface)
+    return drawn
+
+
+@pytest.mark.parametrize(
+    ("kind", "surface"),
+    [("slope", False), ("nothing", False), ("slope", True), ("nothing", True), ("pixel", True)],
+)
+def test_a_height_map_becomes_a_picture(tmp_path, kind, surface):
+    height = slope()
+    if kind == "nothing":
         height[:] = np.nan
-    view.height_figure(*result_and_truth(height), "a slope", tmp_path / "slope.png")
-    picture = cv2.imread(str(tmp_path / "slope.png"))
+    elif kind == "pixel":
+        height[np.arange(height.size).reshape(height.shape) != 44] = np.nan
+    path = tmp_path / "slope.png"
+    view.height_figure({"a slope": result_of(height)}, truth_of(slope()), "title", path, surface=surface)
+    picture = cv2.imread(str(path))
     assert picture.shape[0] > 300
     colours = len(np.unique(picture.reshape(-1, 3), axis=0))
     assert colours > 30
@@ -27,11 +65,14 @@ def test_a_height_map_becomes_a_picture(tmp_path, kind):
 
 def test_a_figure_needs_heights_and_a_place_to_go(tmp_path):
     height = np.zeros((4, 5), np.float32)
-    result, truth = result_and_truth(height)
-    with pytest.raises(io.InputError, match="heights and the pixel size"):
-        view.height_figure(io.Result(height=height), truth, "", tmp_path / "a.png")
+    result, truth = result_of(height), truth_of(height)
+    for lacking in (io.Result(height=height), io.Result(x=result.x, y=result.y)):
+        for results in ({"a": lacking}, {"a": result, "b": lacking}):
+            with pytest.raises(io.InputError, match="heights and the pixel size"):
+                view.height_figure(results, truth, "", tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())
     with pytest.raises(io.InputError, match="cannot be written"):
-        view.height_figure(result, truth, "", tmp_path / "missing" / "a.png")
+        view.height_figure({"a": result}, truth, "", tmp_path / "missing" / "a.png")
 
 
 def test_without_matplotlib_the_remedy_is_named(monkeypatch):
@@ -40,25 +81,127 @@ def test_without_matplotlib_the_remedy_is_named(monkeypatch):
         view.check_drawing()
 
 
-def test_the_map_lies_as_the_picture_does_and_the_cut_tells_truth_from_result():
-    height = np.fromfunction(lambda row, column: -0.01 * column - row, (20, 30)).astype(np.float32)
-    result, truth = result_and_truth(height)
-    left, right, *_ = view.figures._draw(
-        result, truth.__class__(height - 5, *(height,) * 2, truth.contact)
-    ).axes
+def test_what_cannot_be_drawn_is_refused():
+    one_row, larger = result_of(np.zeros((1, 5), np.float32)), result_of(np.zeros((4, 5), np.float32))
+    with pytest.raises(io.InputError, match="2 x 2 pixels"):
+        draw({"a": one_row}, truth_of(one_row.height))
+    with pytest.raises(io.InputError, match="not of one stack"):
+        draw({"a": larger}, truth_of(one_row.height))
+    with pytest.raises(io.InputError, match="not of one stack"):
+        draw({"a": larger, "b": result_of(slope())}, truth_of(larger.height))
+
+
+def test_the_first_map_lies_as_the_picture_does():
+    height = slope()
+    height[3, 4] = np.nan
+    left, _ = draw({"first": result_of(height), "second": result_of(2 * height)}, truth_of(height))
     picture = left.get_images()[0]
-    np.testing.assert_array_equal(picture.get_array(), height)
+    np.testing.assert_array_equal(np.ma.filled(picture.get_array(), np.nan), height)
     assert picture.origin == "upper"
     np.testing.assert_allclose(picture.get_extent(), (-1.5, 1.5, -2.0, 2.0))
+
+
+@KINDS
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_the_first_and_the_last_are_drawn_as_a_whole(surfaces, surface, count):
+    results = {f"sensor {k}": result_of(slope() - np.float32(0.1 * k)) for k in range(count)}
+    figure = view.figures._draw(results, truth_of(slope()), surface)
+    wholes = [axes for axes in figure.axes if axes.get_title().startswith("sensor")]
+    names = [axes.get_title().split(";")[0].removesuffix(" (mm)") for axes in wholes]
+    expected = ["sensor 0"] if count == 1 else ["sensor 0", f"sensor {count - 1}"]
+    assert names == expected
+    drawn = surfaces if surface else [axes.get_images()[0].get_array() for axes in wholes]
+    for name, shown in zip(expected, drawn, strict=True):
+        height = results[name].height
+        if surface:
+            assert np.nanmax(shown[2]) == pytest.approx(height.max(), abs=1e-3)
+        else:
+            np.testing.assert_array_equal(shown, height)
+
+
+def test_higher_is_brighter_and_what_is_not_known_is_no_grey():
+    height = slope()
+    left, _ = draw({"a": result_of(height)}, truth_of(height))
+    picture = left.get_images()[0]
+    colours = picture.cmap(picture.norm(height))
+    assert np.all(colours[..., 0] == colours[..., 1])
+    assert np.all(np.diff(colours[0, :, 0]) < 0)  # the slope falls to the right
+    unknown = to_rgb(left.get_facecolor())
+    assert len(set(unknown)) == 3
+    assert picture.cmap.get_bad()[3] == 0  # and shows through where there is no answer
+
+
+def test_a_few_wild_pixels_do_not_take_the_grey_of_the_others():
+    height = slope((100, 100))
+    height[0, 0] = -50
+    picture = draw({"a": result_of(height)}, truth_of(height))[0].get_images()[0]
+    assert picture.norm.vmin > -1.1
+
+
+def test_a_surface_stands_in_space_over_the_field(surfaces):
+    height = slope()
+    height[4:9, 10:15] = np.nan
+    axes, _ = draw({"a": result_of(height)}, truth_of(height), surface=True)
+    ((across, up, shown),) = surfaces
+    x, y = io.pixel_axes(height.shape, (0.1, 0.2))
+    np.testing.assert_array_equal(across, np.broadcast_to(x, height.shape))
+    np.testing.assert_array_equal(up, np.broadcast_to(y[:, np.newaxis], height.shape))
+    # All but the few at the ends of the span are as they are.
+    known = np.isfinite(shown)
+    np.testing.assert_array_equal(shown[known], height[known])
+    assert 0 < np.count_nonzero(np.isfinite(height) & ~known) < 10
+    assert not known[4:9, 10:15].any()
+    for (low, high), place in zip((axes.get_xlim(), axes.get_ylim()), (x, y), strict=True):
+        assert low <= place.min() < place.max() <= high
+    assert axes.get_zlim()[0] <= np.nanmin(shown)
+
+
+def test_a_millimetre_is_as_long_along_x_as_along_y(monkeypatch):
+    aspects = []
+    monkeypatch.setattr(Axes3D, "set_box_aspect", lambda axes, aspect: aspects.append(aspect))
+    draw({"a": result_of(slope())}, truth_of(slope()), surface=True)
+    across, up, _ = aspects[-1]
+    assert up / across == pytest.approx((19 * 0.2) / (29 * 0.1))
+
+
+def test_a_large_surface_is_drawn_of_some_samples(surfaces):
+    height = slope((700, 500))
+    draw({"a": result_of(height)}, truth_of(height), surface=True)
+    ((across, up, shown),) = surfaces
+    assert 5_000 < shown.size < 20_000
+    assert np.ptp(across) == pytest.approx(500 * 0.1, rel=0.02)
+    assert np.ptp(up) == pytest.approx(700 * 0.2, rel=0.02)
+
+
+@KINDS
+def test_all_results_are_cut_across_the_middle_against_the_truth(surface):
+    truth = slope()
+    results = {f"sensor {number}": result_of(truth - np.float32(0.1 * number)) for number in range(1, 5)}
+    _, right = draw(results, truth_of(truth), surface)
+    lines = {line.get_label(): line for line in right.get_lines()}
+    assert list(lines) == ["truth", *results]
+    x, _ = io.pixel_axes(truth.shape, (0.1, 0.2))
+    for name, line in lines.items():
+        np.testing.assert_array_equal(line.get_xdata(), x)
+        expected = truth if name == "truth" else results[name].height
+        np.testing.assert_array_equal(line.get_ydata(), expected[10])
+    assert len({to_rgb(line.get_color()) for line in lines.values()}) == len(lines)
+    assert [text.get_text() for text in right.get_legend().get_texts()] == list(lines)
+    lowest, highest = right.get_ylim()
+    assert lowest < min(result.height.min() for result in results.values())
+    assert highest > 0
+
+
+@pytest.mark.parametrize(
+    ("empty", "surface"), [("first", False), ("second", False), ("first", True), ("both", True)]
+)
+def test_a_result_without_any_answer_is_shown_as_such(empty, surface):
+    truth = slope()
+    nothing = np.full_like(truth, np.nan)
+    results = {name: result_of(nothing if empty in (name, "both") else truth) for name in ("first", "second")}
+    left, right = draw(results, truth_of(truth), surface)
     lines = {line.get_label(): line.get_ydata() for line in right.get_lines()}
-    np.testing.assert_array_equal(lines["reconstructed"], height[10])
-    np.testing.assert_array_equal(lines["truth"], height[10] - 5)
-
-
-def test_what_cannot_be_drawn_is_refused():
-    result, truth = result_and_truth(np.zeros((1, 5), np.float32))
-    with pytest.raises(io.InputError, match="2 x 2 pixels"):
-        view.figures._draw(result, truth)
-    result, _ = result_and_truth(np.zeros((4, 5), np.float32))
-    with pytest.raises(io.InputError, match="not of one stack"):
-        view.figures._draw(result, truth)
+    assert np.isnan(lines["first"]).all() == (empty != "second")
+    np.testing.assert_array_equal(lines["truth"], truth[10])
+    assert np.all(np.isfinite([*left.get_xlim(), *left.get_ylim(), *right.get_ylim()]))
+    assert right.get_ylim()[0] < truth[10].min()

@@ -28,9 +28,6 @@ class Conform:
         self._view = view
         self._outside = np.hypot(view.x, view.y) > radius
 
-    def restart(self) -> None:
-        """Begin anew: nothing is kept of a pose."""
-
     def lie(self, pose: Pose) -> Sheet:
         """Lay the sheet on the object in a pose."""
         obstacle = meet(self._thing, pose, self._view)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from mirrorskin.hw.twin.contact.halfspace import HalfSpace, rectangle
+from mirrorskin.hw.twin.contact.halfspace import HalfSpace, inner, rectangle
 from mirrorskin.io.types import Floats
 
 TOLERANCE = 1e-6
@@ -127,9 +127,9 @@ def _minimise(system: _System, pressure: Floats) -> tuple[Floats, int]:
         if float(np.abs(residual).max()) <= tolerance:
             return pressure, iteration
         steepest = np.where(free, system.precondition(residual), 0.0)
-        decline = float(np.vdot(residual, steepest))
+        decline = inner(residual, steepest)
         # Polak and Ribiere's rule, which forgets by itself when pixels come and go.
-        memory = max(0.0, (decline - float(np.vdot(last, steepest))) / last_decline)
+        memory = max(0.0, (decline - inner(last, steepest)) / last_decline)
         direction = steepest + memory * np.where(free, direction, 0.0)
         last, last_decline = residual, decline
         pressure, gap = _step(system, pressure, gap, residual, direction)
@@ -144,7 +144,7 @@ def _step(
 ) -> tuple[Floats, Floats]:
     """Go to the lowest energy along the direction, without pull; return pressure and gap."""
     response = system.response(direction)
-    length = float(np.vdot(residual, direction)) / float(np.vdot(direction, response))
+    length = inner(residual, direction) / inner(direction, response)
     moved = pressure - length * direction
     if moved.min() >= 0:
         return moved, gap - length * response

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.contact.halfspace import HalfSpace, rectangle
+from mirrorskin.hw.twin.contact.halfspace import HalfSpace, inner, rectangle
 from mirrorskin.io.types import Floats
 
 TOLERANCE = 1e-3
@@ -107,12 +107,12 @@ class Friction:
                 return traction, shift, limited
             # Jacobi's preconditioner: where it slips far, only tiny turns of the traction are called for.
             steepest = residual / (self._own + limited.curvature)
-            gain = float(np.vdot(residual, steepest))
-            memory = max(0.0, (gain - float(np.vdot(last, steepest))) / last_gain)
+            gain = inner(residual, steepest)
+            memory = max(0.0, (gain - inner(last, steepest)) / last_gain)
             direction = steepest + memory * limited.turn(direction)
             last, last_gain = residual, gain
             resistance = self._space.tangential(direction) + limited.curvature * direction
-            traction = traction + np.vdot(residual, direction) / np.vdot(direction, resistance) * direction
+            traction = traction + inner(residual, direction) / inner(direction, resistance) * direction
             traction *= _shrink(traction, self._limit)
         raise RuntimeError(
             f"stick and slip did not settle in {ITERATIONS} iterations: the shift is wrong by"

@@ -130,6 +130,11 @@ class HalfSpace:
         return field
 
 
+def inner(a: Floats, b: Floats) -> float:
+    """Return the sum of products; not by BLAS, whose threads take longer to meet than to add so few."""
+    return float(np.sum(a * b))
+
+
 def rectangle(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Return the rows and columns of the smallest rectangle round what is True; something must be."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))

@@ -45,11 +45,12 @@ def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float,
     Raises
     ------
     InputError
-        trimesh is not installed; the file is missing or unreadable, or holds no surface that can be seen from
-        above; or its size cannot be in millimetres.
+        trimesh is not installed; the file is missing or unreadable; its triangles are no surface, or none
+        that can be seen from above; or its size cannot be in millimetres.
     """
     path = Path(path)
     triangles = _read_triangles(path)
+    _check_surface(path, triangles)
     # Upright triangles have no area seen from above; their neighbours' edges are theirs.
     triangles = triangles[_areas_from_above(triangles) > 0]
     if len(triangles) == 0:
@@ -81,6 +82,24 @@ def _read_triangles(path: Path) -> Floats:
     if not np.isfinite(triangles).all():
         raise InputError(f"{path}: has corners that are not finite: repair the mesh")
     return triangles
+
+
+def _check_surface(path: Path, triangles: Floats) -> None:
+    """Refuse triangles that do not join, or of which three or another odd number meet at an edge.
+
+    Four meet where two bodies share an edge.
+    """
+    _, corner = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    ends = np.sort(corner.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    ends = ends[ends[:, 0] < ends[:, 1]]
+    _, uses = np.unique(ends[:, 0] * (corner.max() + 1) + ends[:, 1], return_counts=True)
+    torn = int(np.count_nonzero((uses > 2) & (uses % 2 == 1)))
+    if torn:
+        raise InputError(
+            f"{path}: is no surface: at {torn} of its edges three triangles meet; repair the mesh"
+        )
+    if len(triangles) > 1 and not (uses == 2).any():
+        raise InputError(f"{path}: is no surface: its triangles do not join; repair the mesh")
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh:

@@ -32,19 +32,15 @@ class Ideal:
 
         light(t) = (G(t + w) - G(t - w)) / 2w,     w = scatter / 2
 
-    Left out: how the window changes off the axis, how the sheet's height does, and what is dark or not
-    beyond the horizon with the linear pattern. `mirrorskin.hw.twin.optics.wall.Wall` traces all of it.
+    Left out: how the window changes off the axis, how the sheet's height and an oblique line of sight change
+    it, and what is dark or not beyond the horizon with the linear pattern. All of it is traced by
+    `mirrorskin.hw.twin.optics.wall.Wall`.
 
     Parameters
     ----------
     body : Body
     pattern : Pattern
         Uniform or Linear.
-
-    Attributes
-    ----------
-    gain, offset : float or None
-        Of the linear pattern: light = offset + gain zenith over its `design_range`; None for the uniform one.
 
     Raises
     ------
@@ -54,10 +50,6 @@ class Ideal:
     """
 
     def __init__(self, body: Body, pattern: Pattern) -> None:
-        self.gain: float | None = None
-        self.offset: float | None = None
-        if isinstance(pattern, Linear):
-            self.gain, self.offset = pattern.gain, pattern.offset
         _check(body, pattern)
         self._body, self._pattern = body, pattern
 

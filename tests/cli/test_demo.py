@@ -1,0 +1,160 @@
+"""The demo: the paper's experiments on each sensor, here with few pixels and frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from commands import run, small_experiments
+
+from mirrorskin import io, view
+from mirrorskin.cli import demo
+
+FULL = demo._EXPERIMENTS
+PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
+MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
+
+# The table's rows.
+EXPECTED = [
+    [name, sensor.replace("-", ", "), method]
+    for name, each in MADE.items()
+    for sensor in each
+    for method in (("eq. 4", "sub-frame") if sensor == PAPERS else ("sub-frame",))
+]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """What a small demo printed, the folder that it made, and what its figures were drawn of."""
+    folder = tmp_path_factory.mktemp("demo") / "made"
+    figures, draw = {}, view.height_figure
+
+    def watch(results, truth, title, path, *, surface):
+        figures[path.name] = (list(results), title, surface)
+        draw(results, truth, title, path, surface=surface)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "_EXPERIMENTS", small_experiments())
+        patch.setattr(view, "height_figure", watch)
+        ended = run("demo", "-o", folder)
+    assert (ended.code, ended.said) == (0, "")
+    return ended.out.splitlines(), folder, figures
+
+
+def test_the_small_demo_leaves_nothing_out():
+    for small, full in zip(small_experiments(), FULL, strict=True):
+        assert small.size * small.pixel_size == pytest.approx(full.size * full.pixel_size)
+        assert small.frames * small.step == pytest.approx(full.frames * full.step)
+        for name in ("name", "thing", "title", "sensors", "surface"):
+            assert getattr(small, name) == getattr(full, name)
+
+
+def test_the_presses_are_those_of_the_paper():
+    sphere, coin, soft = FULL
+    assert (sphere.thing, sphere.frames, sphere.step) == ("sphere", 30, 0.1)
+    assert (coin.thing, coin.frames, coin.step) == ("coin", 90, 0.02)
+    assert soft.thing == "coin"
+    for one, diameter in ((sphere, 10), (coin, 22), (soft, 22)):
+        assert diameter < one.size * one.pixel_size < 1.25 * diameter
+        assert f"{one.frames} x {one.step} mm" in one.title
+
+
+def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
+    _, folder, _ = shown
+    files = {f"{name}-{sensor}{end}" for name, each in MADE.items() for sensor in each for end in
+             (".h5", "-result.h5")}  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == files | {f"{name}.png" for name in MADE}
+    for name in MADE:
+        assert cv2.imread(str(folder / f"{name}.png")).shape[0] > 300
+
+
+def test_the_ball_is_drawn_in_space_and_the_coins_by_brightness_and_all_sensors_are_cut(shown):
+    names = {name: [sensor.replace("-", ", ") for sensor in each] for name, each in MADE.items()}
+    assert shown[2] == {
+        f"{full.name}.png": (names[full.name], full.title, full.thing == "sphere") for full in FULL
+    }
+
+
+def test_the_table_tells_of_each_sensor_and_what_it_costs(shown):
+    head, *rows = shown[0][: 1 + len(EXPECTED)]
+    names = ["answered", "untouched", "RMS", "mean", "99 %", "shared", "cost"]
+    assert cells(head) == ["experiment", "contact, optics", "method", *names]
+    assert [cells(row)[:3] for row in rows] == EXPECTED
+    found = {}
+    for row in rows:
+        name, sensor, method, *told = cells(row)
+        found[name, sensor, method] = dict(zip(names, (float(one.split()[0]) for one in told), strict=True))
+    for (name, sensor, method), told in found.items():
+        ideal = found[name, "conform, ideal", "sub-frame"]["shared"]
+        assert told["answered"] > 50
+        assert abs(told["mean"]) <= told["RMS"] < 2
+        assert told["99 %"] > 0
+        assert told["cost"] == pytest.approx(told["shared"] - ideal, abs=0.0011)
+        # A sheet that only takes the object's shape is light where it touches and nowhere else.
+        assert (told["untouched"] == 0) == (sensor == "conform, ideal"), (name, sensor, method)
+    assert max(map(len, rows)) <= 110
+    *legend, last = shown[0][1 + len(EXPECTED) :]
+    for word in names[:2] + names[5:]:
+        assert f"{word}: " in " ".join(legend)
+    assert last.endswith("fig5.png")
+
+
+def cells(row):
+    return [cell.strip() for cell in row.split("  ") if cell.strip()]
+
+
+def test_the_recordings_are_of_those_sensors_and_presses(shown):
+    _, folder, _ = shown
+    for small in small_experiments():
+        truths = {}
+        for sensor in MADE[small.name]:
+            with io.open_recording(folder / f"{small.name}-{sensor}.h5") as recording:
+                assert recording.shape == (small.frames, small.size, small.size)
+                assert recording.header.pixel_size == pytest.approx((small.pixel_size,) * 2)
+                np.testing.assert_allclose(
+                    recording.travel, small.step * np.arange(1, small.frames + 1), rtol=1e-12
+                )
+                truths[sensor] = recording.truth
+            result = io.open_result(folder / f"{small.name}-{sensor}-result.h5")
+            assert result.process["subframe"] is True
+            assert result.process["source"] == str(folder / f"{small.name}-{sensor}.h5")
+        for sensor, truth in truths.items():
+            np.testing.assert_array_equal(truth.height, truths[PAPERS].height)
+            # An elastic body touches less: it gives way all around.
+            same = np.array_equal(truth.contact, truths[PAPERS].contact)
+            assert same == sensor.startswith("conform")
+            assert truth.contact.sum() <= truths[PAPERS].contact.sum()
+
+
+def test_json_tells_the_scores(tmp_path, monkeypatch):
+    only = dataclasses.replace(small_experiments()[1], sensors=demo._SENSORS[:1])
+    monkeypatch.setattr(demo, "_EXPERIMENTS", (only,))
+    ended = run("demo", "-o", tmp_path, "--json")
+    told = json.loads(ended.out)
+    assert {name: list(scores) for name, scores in told["fig6"].items()} == {
+        "conform, ideal": ["eq. 4", "sub-frame"]
+    }
+    ours, papers = (told["fig6"]["conform, ideal"][method] for method in ("sub-frame", "eq. 4"))
+    assert ours["answered"] == papers["answered"] > 50
+    assert ours["rms"] < papers["rms"]
+    assert ours["shared_rms"] == pytest.approx(ours["rms"])  # one sensor shares all it answers
+    assert papers["mean"] < -0.3 * only.step
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    code, out, said = run("demo", "-o", tmp_path / "file" / "demo")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert "cannot be made" in said
+    assert "choose another folder with -o" in said
+
+
+def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr("mirrorskin.view.figures.find_spec", lambda name: None)
+    code, _, said = run("demo", "-o", tmp_path / "demo")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "pip install 'mirrorskin" in said
+    assert not (tmp_path / "demo").exists()

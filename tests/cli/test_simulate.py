@@ -1,0 +1,620 @@
+"""`mirrorskin simulate`: what is asked for is what the recording shows, and what cannot be is refused."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from pathlib import Path
+
+import cv2
+import geometry
+import numpy as np
+import pytest
+from commands import run
+from stacks import read_all
+
+from mirrorskin import hw, io
+from mirrorskin.hw.twin import OBJECT_NAMES, Body, Camera
+
+SMALL = ["--size", "24x18", "--pixel-size", "0.4mm"]
+SHAPE, PIXEL = (18, 24), 0.4
+EXACT = ["--references", "exact"]
+MOTIONS = io.MOTIONS
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+
+def simulate(motion, *words, size=SMALL):
+    """Simulate, and return the recording's frames and positions, and the recording, which is closed."""
+    path = f"{next(_NUMBER)}.h5"
+    code, out, said = run("simulate", motion, *size, *words, "-o", path)
+    assert (code, said) == (0, ""), said
+    with io.open_recording(path) as recording:
+        found = read_all(recording, 7)
+    columns, rows = recording.shape[:0:-1]
+    start = f"{path}: {recording.shape[0]} frames of {columns} x {rows}: Digital twin, "
+    assert out.startswith(start)
+    assert f", {motion} motion" in out
+    assert out.count("\n") == 1
+    return found, recording
+
+
+_NUMBER = itertools.count()
+
+
+def assert_refused(words, said_of):
+    """Run a call that is wrong; nothing may be written but one line."""
+    before = {path: path.read_bytes() for path in Path().iterdir()}
+    code, out, said = run("simulate", *words)
+    assert code == 2, said
+    assert out == ""
+    assert said_of in said
+    assert said.startswith("mirrorskin: ")
+    assert said.count("\n") == 1
+    assert {path: path.read_bytes() for path in Path().iterdir()} == before
+
+
+# What is given for each motion, and what then must be in the recording.
+GIVEN = {
+    "vertical": ["--travel-start", "0.5mm", "--travel-step", "200um"],
+    "axial": ["--press", "1.5mm", "--tilt", "4deg", "--phase-step=-20deg", "--pivot", "1mm,-2mm,0.03m"],
+    "horizontal": ["--press", "0.8mm", "--displacement-step=0.02mm,-0.05mm"],
+    "twist": ["--press", "0.8mm", "--twist-step=-0.5deg"],
+}
+STEPS = np.arange(5.0)
+RECORDED = {
+    "vertical": ("travel", 0.5 + 0.2 * STEPS),
+    "axial": ("phase", np.radians(-20) * STEPS),
+    "horizontal": ("displacement", np.stack([0.02 * STEPS, -0.05 * STEPS], axis=1)),
+    "twist": ("twist", np.radians(-0.5) * STEPS),
+}
+
+
+@pytest.mark.parametrize("contact", ["conform", "elastic"])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_each_motion_is_recorded_as_it_is_given(motion, contact):
+    words = [*GIVEN[motion], "--frames", "5", "--contact", contact, *EXACT]
+    found, recording = simulate(motion, *words)
+    assert found.frames.shape == (5, *SHAPE)
+    assert found.frames.dtype == np.uint8
+    name, positions = RECORDED[motion]
+    for series, values in dict.fromkeys(("travel", "phase", "displacement", "twist")).items():
+        expected = positions if series == name else values
+        if expected is None:
+            assert getattr(found, series) is None
+        else:
+            np.testing.assert_allclose(getattr(found, series), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.time, STEPS / 30)
+    header = recording.header
+    assert recording.motion == header.motion == motion
+    assert header.pixel_size == (PIXEL, PIXEL)
+    press = {"vertical": None, "axial": 1.5, "horizontal": 0.8, "twist": 0.8}[motion]
+    assert header.press == press
+    assert header.tilt == (pytest.approx(math.radians(4)) if motion == "axial" else None)
+    assert header.pivot == (pytest.approx((1, -2, 30)) if motion == "axial" else None)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_truth_is_the_object_under_the_upright_body(motion):
+    surface = geometry.sphere(SHAPE, PIXEL)
+    words = ["--press", "1.5mm"] if motion == "axial" else [*GIVEN[motion], "--frames", "3"]
+    found, recording = simulate(motion, *words, *EXACT)
+    truth = recording.truth
+    for name in ("height", "zenith", "azimuth"):
+        np.testing.assert_allclose(getattr(truth, name), getattr(surface, name), atol=1e-6)
+    assert truth.slip is None
+    press = recording.header.press
+    deepest = found.travel.max() if press is None else press
+    touched = -surface.height <= deepest
+    if motion == "vertical":
+        np.testing.assert_array_equal(truth.contact, touched)
+    else:  # small movements: what touches all the time is nearly what touches at rest
+        assert touched.sum() > 50
+        assert np.mean(truth.contact != touched) < 0.1
+
+
+@pytest.mark.parametrize("motion", ["horizontal", "twist"])
+def test_elastic_contact_knows_where_the_sheet_slips(motion):
+    words = [*GIVEN[motion], "--frames", "4", "--contact", "elastic", *EXACT]
+    slips = [simulate(motion, *words, "--friction", friction)[1].truth for friction in ("0", "0.05", "100")]
+    frictionless, some, rough = ((truth.slip, truth.contact) for truth in slips)
+    assert frictionless[0][frictionless[1] == 1].all()
+    # Even the roughest contact slips at its rim, where there is no pressure.
+    assert rough[0].sum() < some[0].sum() <= frictionless[0].sum()
+    assert some[0].sum() > 0
+
+
+def documented():
+    """Return the defaults that --help tells, by option."""
+    code, out, _ = run("simulate", "--help")
+    assert code == 0
+    entries = re.split(r"\n\s+(?=--|-o)", out)
+    found = {}
+    for entry in entries:
+        name = re.match(r"(--[a-z-]+)", entry)
+        default = re.search(r"\[default:\s+([^\]]*)\]", entry)
+        if name and default:
+            found[name[1]] = " ".join(default[1].strip("()").split())
+    return found
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the twin was asked for, call by call."""
+    calls = []
+    twin = hw.Twin
+
+    def spy(**given):
+        calls.append(given)
+        return twin(**given)
+
+    monkeypatch.setattr(hw, "Twin", spy)
+    return calls
+
+
+def test_help_tells_the_defaults_of_all_options_that_have_one():
+    defaults = documented()
+    assert set(defaults) >= {
+        "--travel-step",
+        "--press",
+        "--tilt",
+        "--pivot",
+        "--noise",
+        "--exposure",
+        "--bits",
+    }
+
+
+def test_without_options_a_press_is_the_documented_one():
+    told = documented()
+    found, _ = simulate("vertical", *EXACT)
+    assert len(found.travel) == 30
+    assert told["--frames"].startswith("30; of a rotation one turn")
+    assert told["--travel-start"] == told["--travel-step"] == "0.1mm"
+    np.testing.assert_allclose(found.travel, 0.1 * np.arange(1, 31))
+    assert told["--frame-rate"] == "30.0"
+    np.testing.assert_allclose(found.time, np.arange(30) / 30)
+
+
+def test_without_options_a_rotation_is_one_turn_of_the_documented_one():
+    told = documented()
+    found, recording = simulate("axial", *EXACT)
+    assert (told["--phase-step"], told["--tilt"], told["--press"]) == ("45deg", "2.5deg", "1mm")
+    np.testing.assert_allclose(found.phase, np.arange(8) * np.pi / 4)
+    assert recording.header.tilt == pytest.approx(math.radians(2.5))
+    assert recording.header.press == 1
+    assert told["--pivot"] == "0mm,0mm,0mm"
+    assert recording.header.pivot == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("step", "count"), [("45deg", 8), ("-90deg", 4), ("50deg", 7), ("0deg", 30)])
+def test_a_turn_has_as_many_frames_as_steps_fit_in_it(step, count):
+    assert len(simulate("axial", f"--phase-step={step}", *EXACT)[0].phase) == count
+
+
+def test_a_turn_of_countless_frames_is_refused():
+    assert_refused(["axial", *SMALL, "--phase-step", "1e-9deg", "-o", "a.h5"], "--frames")
+
+
+def test_without_options_the_other_motions_are_the_documented_ones():
+    told = documented()
+    found, recording = simulate("horizontal", *EXACT)
+    assert told["--displacement-step"] == "0.01mm,0mm"
+    np.testing.assert_allclose(found.displacement, np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1))
+    assert recording.header.press == 1
+    found, recording = simulate("twist", *EXACT)
+    assert told["--twist-step"] == "0.2deg"
+    np.testing.assert_allclose(found.twist, np.radians(0.2) * np.arange(30))
+    assert recording.header.press == 1
+
+
+def test_without_options_the_field_is_the_documented_one(asked, monkeypatch):
+    told = documented()
+
+    def refuse(**given):
+        asked.append(given)
+        raise io.InputError("enough is known")
+
+    monkeypatch.setattr(hw, "Twin", refuse)
+    assert_refused(["vertical", "-o", "a.h5"], "enough is known")
+    rows, columns = asked[0]["shape"]
+    assert f"{columns}x{rows}" == told["--size"] == "480x480"
+    assert asked[0]["pixel_size"] == (0.025, 0.025)
+    assert told["--pixel-size"] == "0.025mm"
+
+
+def test_without_options_body_and_camera_are_the_twin_s_own(asked):
+    told = documented()
+    simulate("vertical", "--frames", "2")
+    (given,) = asked
+    assert given["body"] == Body()
+    assert given["camera"] == Camera()
+    chosen = {name: given[name] for name in ("object", "contact", "optics", "pattern", "references")}
+    assert chosen == {name: told[f"--{name}"] for name in chosen}
+    assert chosen["references"] == "ball"
+    for option, value in (("--friction", Body().friction), ("--noise", Camera().noise)):
+        assert float(told[option]) == value
+    assert told["--scatter"] == f"{math.degrees(Body().scatter):g}deg"
+    assert told["--bits"] == str(Camera(np.dtype(np.uint16)).bits)
+    assert told["--dtype"] == Camera().dtype.name
+
+
+WALL = ["--optics", "cylinder"]
+
+
+@pytest.mark.parametrize(
+    ("words", "part", "expected"),
+    [
+        (["--object", "cone"], "object", "cone"),
+        (["--contact", "elastic"], "contact", "elastic"),
+        (WALL, "optics", "cylinder"),
+        (["--pattern", "linear"], "pattern", "linear"),
+        ([*WALL, "--air-gap", "0.5mm"], "body", Body(air_gap=0.5)),
+        ([*WALL, "--asymmetry", "0.2"], "body", Body(asymmetry=0.2)),
+        (["--scatter", "5deg"], "body", Body(scatter=math.radians(5))),
+        (["--friction", "0.3"], "body", Body(friction=0.3)),
+        (["--camera-distance", "20cm"], "camera", Camera(distance=200)),
+        (["--point-spread", "0.7"], "camera", Camera(point_spread=0.7)),
+        (["--dtype", "uint16"], "camera", Camera(np.dtype(np.uint16), bits=12)),
+        (["--dtype", "uint16", "--bits", "16"], "camera", Camera(np.dtype(np.uint16), bits=16)),
+        (["--noise", "3", "--seed", "7"], "camera", Camera(noise=3, seed=7)),
+        (["--electrons", "40"], "camera", Camera(electrons=40)),
+        (["--gain-deviation", "0.02"], "camera", Camera(gain_deviation=0.02)),
+        (["--offset-deviation", "0.5"], "camera", Camera(offset_deviation=0.5)),
+        (["--frame-rate", "120", "--exposure", "8ms"], "camera", Camera(frame_rate=120, exposure=0.008)),
+        (EXACT, "references", "exact"),
+        (["--pixel-size", "0.3mm,400um"], "pixel_size", pytest.approx((0.3, 0.4))),
+        (["--device", "0"], "device", "0"),
+    ],
+)
+def test_each_option_reaches_the_twin(asked, words, part, expected):
+    simulate("vertical", "--frames", "2", *words)
+    assert asked[0][part] == expected
+
+
+def test_compliance_reaches_the_movement(asked):
+    simulate("vertical", "--frames", "2", "--contact", "elastic", "--compliance", "20um/N")
+    assert asked[0]["movement"].compliance == pytest.approx(0.02)
+
+
+OWN = {
+    "travel-step": ("1mm", ["vertical"]),
+    "travel-start": ("1mm", ["vertical"]),
+    "compliance": ("0.1mm/N", ["vertical"]),
+    "press": ("1mm", ["axial", "horizontal", "twist"]),
+    "tilt": ("2deg", ["axial"]),
+    "phase-step": ("45deg", ["axial"]),
+    "pivot": ("0mm,0mm,1mm", ["axial"]),
+    "displacement-step": ("1um,1um", ["horizontal"]),
+    "twist-step": ("1deg", ["twist"]),
+}
+
+
+@pytest.mark.parametrize(
+    ("motion", "option"), [(m, o) for o, (_, own) in OWN.items() for m in MOTIONS if m not in own]
+)
+def test_an_option_of_another_motion_is_refused(motion, option):
+    words = [motion, *SMALL, f"--{option}", OWN[option][0], "-o", "a.h5"]
+    assert_refused(words, f"--{option} says nothing of a motion that is {motion}: leave it out")
+
+
+@pytest.mark.parametrize("motion", ["axial", "horizontal", "twist"])
+def test_only_a_press_is_released(motion):
+    assert_refused(
+        [motion, *SMALL, "--release", "-o", "a.h5"], f"--release says nothing of a motion that is {motion}"
+    )
+
+
+def points(path):
+    """Write an OBJ of points alone."""
+    Path(path).write_text("v 0 0 0\nv 1 0 0\nv 0 1 1\n", encoding="ascii")
+
+
+def wall(path):
+    """Write an OBJ of an upright triangle: from above there is nothing to see."""
+    Path(path).write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n", encoding="ascii")
+
+
+def wide(path):
+    """Write a height map of two rods too far apart for the sensor."""
+    heights = np.zeros((2, 200))
+    heights[:, [0, -1]] = 1
+    np.save(path, heights)
+
+
+def picture(path):
+    cv2.imwrite(path, np.full((4, 4), 99, np.uint8))
+
+
+NOT_A_SURFACE = "points alone are no surface: export it as a mesh"
+BAD = {
+    "no tilt": (["axial", "--tilt", "0deg"], "tilt 0 degrees cannot be: give more than 0 and at most 30"),
+    "much tilt": (["axial", "--tilt", "31deg"], "tilt 31 degrees cannot be"),
+    "tilt back": (["axial", "--tilt=-2deg"], "tilt -2 degrees cannot be"),
+    "tilt without a unit": (["axial", "--tilt", "2"], "--tilt 2: a unit is needed"),
+    "a deep press": (
+        ["twist", "--press", "40mm"],
+        "may rise 40 mm into the sensor's body, which is 40 mm high",
+    ),
+    "a deep travel": (["vertical", "--travel-step", "2mm"], "may rise 58.1 mm into the sensor's body"),
+    "compliance of nothing": (["vertical", "--compliance", "1um/N"], "compliance needs contact 'elastic'"),
+    "compliance below zero": (
+        ["vertical", "--contact", "elastic", "--compliance=-1um/N"],
+        "compliance -0.001 mm/N cannot be",
+    ),
+    "compliance without a force": (["vertical", "--compliance", "1um"], "write e.g. 0.01mm/N"),
+    "an unknown object": (["vertical", "--object", "teapot"], f"take {', '.join(OBJECT_NAMES)}, or the path"),
+    "a missing object": (["vertical", "--object", "no.stl"], "no.stl: cannot be read: No such file"),
+    "a large object": (["vertical", "--object", "wide.npy"], "is larger than the sensor: it needs a circle"),
+    "points": (["vertical", "--object", "points.obj"], NOT_A_SURFACE),
+    "a wall": (["vertical", "--object", "wall.obj"], "wall.obj: shows no area seen from above"),
+    "no mesh": (["vertical", "--object", "picture.ply"], "is no PLY mesh that can be read"),
+    "an unknown pattern": (
+        ["vertical", "--pattern", "dots"],
+        "pattern 'dots' is unknown: take uniform, linear",
+    ),
+    "a missing pattern": (["vertical", *WALL, "--pattern", "no.png"], "no.png"),
+    "a picture for ideal optics": (
+        ["vertical", "--pattern", "picture.png"],
+        "not of a picture as pattern: take the optics 'cylinder'",
+    ),
+    "a gap for ideal optics": (["vertical", "--air-gap", "1mm"], "not of an air gap: take the optics"),
+    "lamps for ideal optics": (["vertical", "--asymmetry", "0.1"], "not of lamps that light one side more"),
+    "a gap below zero": (["vertical", *WALL, "--air-gap=-1mm"], "air gap -1.0"),
+    "scatter below zero": (["vertical", "--scatter=-1deg"], "scatter"),
+    "friction below zero": (["twist", "--friction=-0.1"], "friction -0.1"),
+    "9 bits": (["vertical", "--bits", "9"], "frames of uint8 cannot have 9 bits: take 8"),
+    "9 bits of 16": (["vertical", "--dtype", "uint16", "--bits", "9"], "cannot have 9 bits: take 10, 12, 16"),
+    "bits of a float": (["vertical", "--dtype", "float32", "--bits", "12"], "leave them out"),
+    "a long exposure": (["vertical", "--exposure", "40ms"], "exposure 0.04 of the camera cannot be"),
+    "an exposure below zero": (["vertical", "--exposure=-1ms"], "exposure -0.001"),
+    "no frame rate": (["vertical", "--frame-rate", "0"], "frame rate 0.0"),
+    "half a pivot": (["axial", "--pivot", "1mm,2mm"], "--pivot 1mm,2mm: 3 lengths are needed"),
+    "half a displacement": (["horizontal", "--displacement-step", "1mm"], "2 lengths are needed"),
+    "noise below zero": (["vertical", "--noise=-1"], "noise -1.0 of the camera cannot be"),
+    "noise that is no number": (["vertical", "--noise", "nan"], "noise nan of the camera cannot be"),
+    "no electrons": (["vertical", "--electrons", "0"], "electrons 0.0 of the camera cannot be"),
+    "a gain of nothing": (["vertical", "--gain-deviation", "1"], "gain deviation 1.0"),
+    "offsets below zero": (["vertical", "--offset-deviation=-1"], "offset deviation -1.0"),
+    "a point spread below zero": (["vertical", "--point-spread=-1"], "point spread -1.0"),
+    "a seed below zero": (["vertical", "--seed=-1"], "seed -1"),
+    "a camera in the body": (
+        ["vertical", "--camera-distance", "40mm"],
+        "a camera 40.0 mm above the sheet is not",
+    ),
+    "a camera below": (["vertical", "--camera-distance=-1mm"], "distance -1.0 of the camera cannot be"),
+    "a travel beyond numbers": (["vertical", "--travel-step", "1e308mm"], "travel is inf at frame 2"),
+    "a displacement beyond numbers": (
+        ["horizontal", "--displacement-step", "1e308mm,0mm"],
+        "displacement is not finite at frame 2",
+    ),
+    "no frames": (["vertical", "--frames", "0"], "--frames"),
+    "a size of nothing": (["vertical", "--size", "0x9"], "--size 0x9"),
+    "an unknown contact": (["vertical", "--contact", "sticky"], "sticky"),
+    "an unknown motion": (["sideways"], "sideways"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_is_refused_in_one_line(case):
+    points("points.obj")
+    wall("wall.obj")
+    wide("wide.npy")
+    picture("picture.png")
+    Path("picture.png").with_suffix(".ply").write_bytes(Path("picture.png").read_bytes())
+    words, said_of = BAD[case]
+    size = [] if "--size" in words else SMALL
+    assert_refused([*words, *size, "-o", "a.h5"], said_of)
+
+
+def test_a_refusal_leaves_the_recording_that_was_there():
+    Path("a.h5").write_bytes(b"as it was")
+    assert_refused(["axial", *SMALL, "--tilt", "0deg", "-o", "a.h5"], "tilt")
+
+
+def test_an_input_is_not_overwritten_but_a_name_is_no_input():
+    picture("wall.png")
+    assert_refused(["vertical", *WALL, "--pattern", "wall.png", "-o", "wall.png"], "is the input")
+    Path("sphere").mkdir()
+    for _ in range(2):
+        code, _, said = run("simulate", "vertical", *SMALL, "--frames", "2", *EXACT, "-o", "sphere/a.h5")
+        assert (code, said) == (0, "")
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_same_seed_gives_the_same_frames(motion):
+    words = [*GIVEN[motion], "--frames", "3", *WALL, "--contact", "elastic", "--electrons", "40"]
+    deviations = ["--gain-deviation", "0.02", "--offset-deviation", "0.5"]
+    first, again, other = (simulate(motion, *words, *deviations, "--seed", seed) for seed in "778")
+    for found, expected in zip(again[0], first[0], strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for name in ("dark", "bright"):
+        reference = getattr(first[1].header, name)
+        np.testing.assert_array_equal(getattr(again[1].header, name), reference)
+        assert not np.array_equal(getattr(other[1].header, name), reference)
+    assert not np.array_equal(other[0].frames, first[0].frames)
+
+
+def test_exact_references_are_the_camera_s_levels():
+    _, recording = simulate("vertical", "--frames", "2", *EXACT)
+    np.testing.assert_array_equal(recording.header.dark, np.full(SHAPE, 16))
+    np.testing.assert_array_equal(recording.header.bright, np.full(SHAPE, 224))
+
+
+def test_references_by_the_ball_are_measured():
+    header = simulate("vertical", "--frames", "2", "--references", "ball", "--noise", "2")[1].header
+    # The mean of 16 frames of whole counts, and one count of one frame.
+    np.testing.assert_array_equal(16 * header.dark % 1, 0)
+    np.testing.assert_array_equal(header.bright % 1, 0)
+    assert header.dark.std() == pytest.approx(math.sqrt((2**2 + 1 / 12) / 16), rel=0.2)
+    assert header.dark.mean() == pytest.approx(16, abs=0.1)
+    assert 224 < header.bright.mean() < 224 + 3 * 2
+    assert header.bright.std() > 0.5
+    quiet = simulate("vertical", "--frames", "2", "--references", "ball", "--noise", "0")[1].header
+    np.testing.assert_array_equal(quiet.bright, np.full(SHAPE, 224))
+
+
+def test_a_release_goes_back_by_the_same_steps():
+    words = ["--frames", "5", "--travel-start", "0.5mm", "--travel-step", "0.5mm"]
+    found, recording = simulate("vertical", *words, "--release", "--noise", "0", *EXACT)
+    np.testing.assert_allclose(found.travel, [0.5, 1, 1.5, 2, 2.5, 2, 1.5, 1, 0.5])
+    np.testing.assert_array_equal(found.frames, found.frames[::-1])
+    assert recording.truth.contact.sum() == np.count_nonzero(geometry.sphere(SHAPE, PIXEL).height >= -2.5)
+
+
+def test_a_release_of_one_frame_is_that_frame():
+    found, _ = simulate("vertical", "--frames", "2", "--travel-step=-0.1mm", "--travel-start", "1mm", *EXACT)
+    np.testing.assert_allclose(found.travel, [1, 0.9])
+
+
+CLEAR = ["--noise", "0", *EXACT]
+
+
+def test_electrons_make_shot_noise_where_there_is_light():
+    words = ["--frames", "30", "--travel-start", "3mm", "--travel-step", "0mm", "--dtype", "float32", *CLEAR]
+    frames = simulate("vertical", *words, "--electrons", "20")[0].frames
+    clean = simulate("vertical", *words)[0].frames
+    dark, bright = clean[0] == 16, clean[0] == 224
+    assert dark.sum() > 50
+    assert bright.sum() > 50
+    np.testing.assert_array_equal(frames[:, dark], 16)
+    # 208 counts of light are 4160 electrons.
+    count = frames[:, bright].size
+    assert frames[:, bright].mean() == pytest.approx(224, abs=5 * math.sqrt(208 / 20 / count))
+    assert frames[:, bright].var() == pytest.approx(208 / 20, rel=5 * math.sqrt(2 / count))
+
+
+@pytest.mark.parametrize(("bits", "scale"), [("10", 4), ("12", 16), ("16", 256), (None, 16)])
+def test_bits_set_the_camera_s_levels(bits, scale):
+    words = ["--frames", "2", "--travel-start", "3mm", "--travel-step", "0mm", "--dtype", "uint16", *CLEAR]
+    found, recording = simulate("vertical", *words, *([] if bits is None else ["--bits", bits]))
+    assert found.frames.dtype == np.uint16
+    assert (found.frames.min(), found.frames.max()) == (16 * scale, 224 * scale)
+    assert recording.header.bright[0, 0] == 224 * scale
+
+
+def test_read_noise_stays_within_the_bits():
+    words = ["--frames", "2", "--dtype", "uint16", "--bits", "10", "--noise", "2000", *EXACT]
+    frames = simulate("vertical", *words)[0].frames
+    assert (frames.min(), frames.max()) == (0, 1023)
+
+
+def test_the_point_spread_blurs_each_frame():
+    words = ["--frames", "3", "--travel-start", "2mm", "--dtype", "float32", *CLEAR]
+    sharp = simulate("vertical", *words)[0].frames
+    blurred = simulate("vertical", *words, "--point-spread", "1.5")[0].frames
+    offsets = np.arange(-12, 13)
+    weights = np.exp(-(offsets**2) / (2 * 1.5**2))
+    weights /= weights.sum()
+    for before, after in zip(sharp, blurred, strict=True):
+        padded = np.pad(before.astype(float), 12, "edge")
+        rows = sum(w * padded[k : k + SHAPE[0]] for k, w in enumerate(weights))
+        expected = sum(w * rows[:, k : k + SHAPE[1]] for k, w in enumerate(weights))
+        np.testing.assert_allclose(after, expected, atol=0.5)
+    assert np.abs(sharp - blurred).max() > 30
+
+
+def test_a_body_that_moves_on_is_seen_for_part_of_the_exposure():
+    words = ["--frames", "6", "--travel-step", "0.4mm", "--travel-start", "0.3mm", "--dtype", "float32"]
+    frames = simulate("vertical", *words, *CLEAR, "--frame-rate", "20", "--exposure", "40ms")[0].frames
+    surface = geometry.sphere(SHAPE, PIXEL)
+    full = geometry.light_level(surface.zenith, 16, 224)
+    # The exposure takes 0.8 of the time between frames, and so 0.32 mm, half of it before its middle.
+    travel = 0.3 + 0.4 * np.arange(6)[:, None, None]
+    share = np.clip((travel + 0.16 + surface.height) / 0.32, 0, 1)
+    expected = np.where(np.isnan(share), 16, 16 + share * (full - 16))
+    np.testing.assert_allclose(frames, expected, rtol=1e-4)
+    assert np.count_nonzero((share > 0.1) & (share < 0.9) & (full > 20)) > 20
+
+
+def test_contact_and_optics_change_what_is_seen():
+    words = ["--travel-start", "2mm", "--frames", "2", *CLEAR]
+    frames = [
+        simulate("vertical", *words, "--contact", contact, "--optics", optics)[0].frames
+        for contact in ("conform", "elastic")
+        for optics in ("ideal", "cylinder")
+    ]
+    for one, other in itertools.combinations(frames, 2):
+        assert not np.array_equal(one, other)
+
+
+def test_a_picture_can_stand_round_the_body():
+    shown = np.zeros((2, 8), np.uint8)
+    shown[:, 4:] = 255
+    cv2.imwrite("half.png", shown)
+    words = ["--travel-start", "3mm", "--travel-step", "0mm", "--frames", "2", *WALL, *CLEAR]
+    clear = simulate("vertical", *words)[0].frames[0]
+    half = simulate("vertical", *words, "--pattern", "half.png")[0].frames[0]
+    # Half of the wall is dark, from azimuth -180 to 0 degrees: that is what the lower half of the ball shows,
+    # and the upper half shows the clear one.
+    upper, lower = np.s_[:8], np.s_[10:]
+    for part, light in ((upper, True), (lower, False)):
+        lit = clear[part] > 200
+        assert lit.sum() > 20
+        assert np.median(half[part][lit] > 120) == light
+
+
+def test_a_linear_pattern_tells_the_zenith_in_the_header():
+    found, recording = simulate("axial", "--pattern", "linear", "--frames", "2", "--dtype", "float32", *CLEAR)
+    header, truth = recording.header, recording.truth
+    # Between the zeniths that show the wall's rim and the horizon, counts go from dark to bright.
+    rim = math.atan2(17.5, 40) / 2
+    np.testing.assert_allclose(header.zenith_gain, 208 / (math.pi / 4 - rim))
+    np.testing.assert_allclose(header.zenith_offset + header.zenith_gain * rim, 16, rtol=1e-6)
+    zenith = (found.frames.mean(axis=0) - header.zenith_offset) / header.zenith_gain
+    inside = (truth.contact == 1) & (truth.zenith > math.radians(17)) & (truth.zenith < math.radians(40))
+    assert inside.sum() > 10
+    # Of a body that is tilted by 2.5 degrees.
+    assert np.abs(zenith - truth.zenith)[inside].max() < math.radians(2.6)
+
+
+def test_objects_come_from_files():
+    heights = np.zeros((9, 9))
+    heights[2:7, 3:6] = [[1, 2, 1]] * 5
+    np.save("ridge.npy", heights)
+    truth = simulate("vertical", "--object", "ridge.npy", "--frames", "2", *EXACT)[1].truth
+    # The map's samples lie between the picture's pixels: 9 of them, and 18 x 24 pixels.
+    np.testing.assert_allclose(truth.height[8, 9:14], [-2, -1.5, -0.5, -0.5, -1.5])
+    Path("roof.obj").write_text(
+        "v -2 -1 0\nv 2 -1 0\nv 2 1 0\nv -2 1 0\nv 0 0 1\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n",
+        encoding="ascii",
+    )
+    _, recording = simulate("vertical", "--object", "roof.obj", "--frames", "2", *EXACT)
+    x, y = geometry.pixel_centres(SHAPE, PIXEL)
+    roof = -np.maximum(np.abs(x) / 2, np.abs(y))
+    np.testing.assert_allclose(recording.truth.height, np.where(roof < -1, np.nan, roof), atol=1e-6)
+    assert recording.header.title.startswith("Digital twin, roof.obj, vertical motion")
+
+
+@pytest.mark.parametrize("packing", io.COMPRESSIONS)
+def test_frames_are_packed_as_asked(packing):
+    plain, _ = simulate("vertical", "--frames", "3", *EXACT)
+    found, recording = simulate("vertical", "--frames", "3", *EXACT, "--compression", packing)
+    np.testing.assert_array_equal(found.frames, plain.frames)
+    assert (recording.storage == "in one piece") == (packing == "raw")
+
+
+NO_METHOD = {"axial": "axial", "horizontal": "horizontal", "twist": "twist"}
+
+
+@pytest.mark.parametrize("motion", NO_METHOD)
+def test_what_has_no_method_yet_is_recorded_and_told(motion):
+    assert run("simulate", motion, *SMALL, "--frames", "3", *EXACT, "-o", "a.h5").code == 0
+    facts = run("info", "a.h5")
+    assert facts.code == 0
+    assert re.search(rf"motion +{motion}\n", facts.out)
+    assert re.search(r"press +1 mm\n", facts.out)
+    code, out, said = run("reconstruct", "a.h5")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert "a.h5" in said
+    assert motion in said
+    assert {path.name for path in Path().iterdir()} == {"a.h5"}
+    io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "r.h5")
+    code, out, said = run("score", "r.h5", "--truth", "a.h5")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert "not of one stack" in said

@@ -1,0 +1,199 @@
+"""The references as a lab takes them, against what no lab knows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from geometry import pixel_centres
+from numpy.typing import NDArray
+
+from mirrorskin.hw import Twin
+from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
+from mirrorskin.hw.twin.references import _places
+from mirrorskin.hw.twin.view import View
+
+Counts = NDArray[np.float32]
+
+SHAPE, PIXEL = (30, 36), 0.3
+NOISE = 1.5
+
+
+def make_twin(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL, **changes: Any) -> Twin:
+    given: dict[str, Any] = {"object": "sphere", "movement": Vertical([0.0, 1.0]), "references": "ball"}
+    given["camera"] = Camera(np.dtype(np.float32), NOISE)
+    return Twin(shape=shape, pixel_size=pixel, **(given | changes))
+
+
+def references(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL, **changes: Any) -> tuple[Counts, Counts]:
+    header = make_twin(shape, pixel, **changes).header
+    assert header.dark is not None
+    assert header.bright is not None
+    assert header.dark.dtype == header.bright.dtype == np.float32
+    assert header.dark.shape == header.bright.shape == shape
+    return header.dark, header.bright
+
+
+@pytest.mark.parametrize("optics", ["ideal", "cylinder"])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_a_ball_brings_dark_and_bright_of_each_pixel(dtype: str, optics: str) -> None:
+    scale = 16 if dtype == "uint16" else 1
+    camera = Camera(np.dtype(dtype), NOISE * scale, 3, gain_deviation=0.03, offset_deviation=4.0 * scale)
+    exact = references(camera=camera, optics=optics, references="exact")
+    taken = references(camera=camera, optics=optics)
+    dark, bright = (found - level for found, level in zip(taken, exact, strict=True))
+    # Dark is the mean of 16 samples, which may be rounded.
+    noise = scale * np.hypot(NOISE, (12**-0.5 / scale if dtype != "float32" else 0))
+    assert dark.std() == pytest.approx(noise / 4, rel=0.1)
+    assert abs(dark.mean()) < 5 * noise / 4 / np.sqrt(dark.size)
+    # Bright is the third of the brightest samples: some tenths of the noise above, never of one glint.
+    assert 0 < bright.mean() < 1.2 * noise
+    assert np.abs(bright).max() < 4 * noise
+    full = exact[1] - exact[0]
+    np.testing.assert_allclose(taken[1] - taken[0], full, rtol=0.04)
+    assert np.mean(np.abs((taken[1] - taken[0]) / full - 1)) < 0.01
+    assert np.corrcoef((taken[1] - taken[0]).ravel(), full.ravel())[0, 1] > 0.99
+    assert np.corrcoef(taken[0].ravel(), exact[0].ravel())[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("shape", "pixel"), [((40, 40), 0.8), ((40, 40), 1.2), ((30, 60), 1.5), ((60, 12), 1.0)]
+)
+def test_beyond_the_body_there_are_no_references(shape: tuple[int, int], pixel: float) -> None:
+    away = np.hypot(*pixel_centres(shape, pixel))
+    for optics in ("ideal", "cylinder"):
+        dark, bright = references(shape, pixel, optics=optics)
+        for reference in (dark, bright):
+            assert np.isnan(reference[away > 17.5]).all()
+            assert np.isfinite(reference[away < 17.2]).all()
+        assert (away > 17.5).sum() > 50
+        np.testing.assert_allclose(bright[away < 16], 224, atol=6)
+
+
+def test_a_small_field_needs_only_a_small_ball_and_has_references_all_over() -> None:
+    dark, bright = references((9, 11), 0.01, camera=Camera(np.dtype(np.float32), 0.0))
+    np.testing.assert_allclose(dark, 16, atol=1e-4)
+    np.testing.assert_allclose(bright, 224, atol=1e-4)
+
+
+def test_without_noise_the_ball_shows_the_exact_levels() -> None:
+    camera = Camera(np.dtype(np.float32), 0.0, gain_deviation=0.05, offset_deviation=2.0)
+    for found, exact in zip(
+        references(camera=camera), references(camera=camera, references="exact"), strict=True
+    ):
+        np.testing.assert_allclose(found, exact, atol=1e-3)
+
+
+def test_a_field_that_is_longer_than_wide_is_covered() -> None:
+    for shape in [(8, 70), (70, 8)]:
+        _, bright = references(shape, 0.2)
+        assert np.isfinite(bright).all()
+        assert bright.min() > 224 - 3 * NOISE
+
+
+@pytest.mark.parametrize("shape", [(8, 70), (70, 8), (30, 30)])
+def test_each_pixel_meets_slopes_towards_all_sides(shape: tuple[int, int]) -> None:
+    radius = 14.0
+    places = np.array(_places(View(shape, (0.2, 0.2), Body()), radius))
+    x, y = pixel_centres(shape, 0.2)
+    counts = []
+    for row in (0, shape[0] // 2, -1):
+        for column in (0, shape[1] // 2, -1):
+            away = np.array([x[row, column], y[row, column]]) - places
+            zenith = np.degrees(np.arcsin(np.minimum(np.hypot(*away.T) / radius, 1)))
+            lit = (zenith > 13) & (zenith < 43)
+            quarter = np.floor(np.degrees(np.arctan2(*away[lit].T)) / 90)
+            assert {*quarter} == {-2, -1, 0, 1}
+            counts.append(lit.sum())
+    assert min(counts) > 0.6 * max(counts)
+    assert min(counts) >= 6
+
+
+def test_references_are_taken_anew_with_each_seed_and_are_the_same_with_the_same() -> None:
+    first, again = references(), references()
+    other = references(camera=Camera(np.dtype(np.float32), NOISE, 1))
+    for one, two, third in zip(first, again, other, strict=True):
+        np.testing.assert_array_equal(one, two)
+        assert np.abs(np.corrcoef((one - one.mean()).ravel(), (third - third.mean()).ravel())[0, 1]) < 0.2
+
+
+def test_references_have_noise_of_their_own() -> None:
+    twin = make_twin(movement=Vertical(np.full(100, -1.0)))
+    dark, bright = twin.header.dark, twin.header.bright
+    assert dark is not None
+    assert bright is not None
+    block = twin.read(np.empty(twin.shape, np.float32))
+    assert block is not None
+    noise = (block.frames - 16).reshape(100, -1)
+    for frames in (noise[:1], noise[1:17], noise[:16], noise[16:32]):
+        assert abs(np.corrcoef(frames.mean(axis=0), dark.ravel())[0, 1]) < 0.15
+    # No frame has just the noise of the bright reference, but by chance.
+    nearest = np.abs(noise - (bright.ravel() - 224)).min(axis=0)
+    assert np.mean(nearest < 1e-3) < 0.2
+
+
+def test_taking_references_does_not_change_the_frames() -> None:
+    twin, untouched = make_twin(), make_twin(references="exact")
+    assert twin.header is twin.header  # taken once
+    for source in (twin, untouched):
+        source.rewind()
+    np.testing.assert_array_equal(twin.read().frames, untouched.read().frames)  # type: ignore[union-attr]
+    assert twin.header.dark is not None
+    np.testing.assert_array_equal(twin.read().frames, untouched.read().frames)  # type: ignore[union-attr]
+
+
+def test_bright_follows_the_lamps() -> None:
+    lamps = Body(asymmetry=0.4, asymmetry_azimuth=0.0)
+    camera = Camera(np.dtype(np.float32), 0.0)
+    shape, pixel = (36, 36), 0.9
+    x, y = pixel_centres(shape, pixel)
+    inside = np.hypot(x, y) < 15
+    _, even = references(shape, pixel, camera=camera, optics="cylinder")
+    _, uneven = references(shape, pixel, camera=camera, optics="cylinder", body=lamps)
+    share = ((uneven - 16) / (even - 16))[inside]
+    assert share.max() <= 1 + 1e-4
+    assert share.min() > 0.6 / 1.4  # of the darkest side
+    assert share[np.hypot(x, y)[inside] < 8].min() > 0.75  # what sees all sides has the brighter ones
+    assert share.std() > 0.005
+    # Mirrored lamps, mirrored references.
+    turned = Body(asymmetry=0.4, asymmetry_azimuth=np.pi)
+    _, mirrored = references(shape, pixel, camera=camera, optics="cylinder", body=turned)
+    np.testing.assert_allclose(mirrored[inside], uneven[:, ::-1][inside], atol=0.5)
+    assert np.abs(mirrored - uneven)[inside].max() > 1
+
+
+def test_any_movement_has_the_same_references() -> None:
+    taken, still = references(movement=Axial([0.0, 1.0], 0.1, 1.0)), references()
+    for one, other in zip(taken, still, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_exact_references_are_within_what_a_sample_holds() -> None:
+    camera = Camera(np.dtype(np.uint8), 0.0, gain_deviation=0.3, offset_deviation=20.0)
+    dark, bright = references(camera=camera, references="exact")
+    assert dark.min() == 0
+    assert bright.max() == 255
+    floats = Camera(np.dtype(np.float32), 0.0, gain_deviation=0.3, offset_deviation=20.0)
+    for clipped, levels in zip((dark, bright), references(camera=floats, references="exact"), strict=True):
+        np.testing.assert_array_equal(clipped, np.clip(levels, 0, 255))
+        assert (clipped != levels).sum() > 20
+
+
+def test_references_are_those_of_the_clear_wall(tmp_path: Path) -> None:
+    # No more than a third of the light comes through.
+    checks = np.kron(np.indices((4, 6)).sum(axis=0) % 2, np.ones((8, 8))) * 90
+    picture = tmp_path / "checks.png"
+    assert cv2.imwrite(str(picture), checks.astype(np.uint8))
+    camera = Camera(np.dtype(np.float32), 0.0, gain_deviation=0.05)
+    clear, exact = (
+        references(camera=camera, optics="cylinder", references=name) for name in ("ball", "exact")
+    )
+    for optics, pattern in (("ideal", "linear"), ("cylinder", "linear"), ("cylinder", picture)):
+        taken = references(camera=camera, optics=optics, pattern=pattern)
+        for found, level in zip(taken, exact, strict=True):
+            np.testing.assert_allclose(found, level, atol=0.02 * 208)
+        if optics == "cylinder":
+            np.testing.assert_array_equal(taken, clear)

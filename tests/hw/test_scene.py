@@ -1,0 +1,320 @@
+"""The light of each frame: what is worked out, when, and that it is the same however it is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
+from mirrorskin.hw.twin.contact import Conform
+from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
+from mirrorskin.hw.twin.optics import Ideal, Uniform
+from mirrorskin.hw.twin.scene import Film, Press
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.view import View
+
+Map = NDArray[np.float64]
+
+SHAPE, PIXEL = (41, 52), 0.2
+PLACE_BYTES = 4 * SHAPE[0] * SHAPE[1]  # float32 light
+PLENTY = 10**9
+VIEW = View(SHAPE, (PIXEL, PIXEL), Body())
+BALL = Sphere()
+
+TENTHS = 2 * np.pi * np.arange(30) / 10  # three turns by tenths, which binary numbers only come close to
+MOVEMENTS: dict[str, Movement] = {
+    "vertical": Vertical([0.1, 0.5, 1.1, 1.1, 0.6, 0.2]),
+    "axial": Axial(TENTHS, 0.1, 1.0, (0.0, 0.0, 4.0)),
+    "horizontal": Horizontal([[0.0, 0.0], [0.3, -0.2], [0.9, 0.1], [0.9, 0.1], [0.2, 1.0]], 1.0),
+    "twist": Twist([0.0, 0.1, 0.3, 0.1, -0.4], 1.0),
+}
+
+
+class Recall:
+    """A contact and optics of its own kind: light tells the pose."""
+
+    def __init__(self) -> None:
+        self.poses: list[Pose] = []
+        self.lit = 0
+
+    def lie(self, pose: Pose) -> Sheet:
+        self.poses.append(pose)
+        return Sheet(np.full(SHAPE, tell(pose)), np.zeros(SHAPE), np.zeros(SHAPE), np.ones(SHAPE, bool))
+
+    def light(self, sheet: Sheet) -> NDArray[np.float32]:
+        self.lit += 1
+        return sheet.height.astype(np.float32)
+
+
+def tell(pose: Pose) -> float:
+    """Make one number of a pose that no other has."""
+    weights = np.linspace(0.3, 1.1, 9).reshape(3, 3)
+    return float(np.sum(pose.rotation * weights) + pose.shift @ [0.7, 0.4, 0.9])
+
+
+def recalling(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> tuple[Film, Recall]:
+    contact = Recall()
+    return Film(contact, contact, movement, share, SHAPE, limit), contact
+
+
+def real(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> Film:
+    contact, optics = Conform(BALL, VIEW, 17.5), Ideal(Body(), Uniform())
+    return Film(contact, optics, movement, share, SHAPE, limit)
+
+
+def all_light(scene: Film | Press, movement: Movement) -> NDArray[np.float32]:
+    return np.array([scene.light(frame).copy() for frame in range(len(movement.path))])
+
+
+def turns(count: int, per_turn: int, start: float = 0.0) -> Axial:
+    return Axial(start + 2 * np.pi * np.arange(count * per_turn) / per_turn, 0.1, 1.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+@pytest.mark.parametrize("per_turn", [3, 7, 8, 10, 36])
+def test_places_of_a_rotation_are_worked_out_once_in_the_order_of_their_first_time(
+    per_turn: int, share: float
+) -> None:
+    movement = turns(3, per_turn, start=0.4)
+    film, contact = recalling(movement, share)
+    light = all_light(film, movement)
+    blur = 1 if share == 0 else 5
+    # The first frame's exposure begins before any place of the path.
+    offsets = 2 * np.pi / per_turn * share * (np.arange(blur) - (blur - 1) / 2) / blur
+    expected = [movement.pose(np.asarray(p + o)) for p in movement.path[:per_turn] for o in offsets]
+    assert len(contact.poses) == contact.lit == len(expected)
+    for found, pose in zip(contact.poses, expected, strict=True):
+        np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-11)
+    np.testing.assert_array_equal(light[:per_turn], light[per_turn : 2 * per_turn])
+    np.testing.assert_array_equal(light[:per_turn], light[2 * per_turn :])
+    assert len({float(frame[0, 0]) for frame in light}) == per_turn
+
+
+def test_places_gone_back_to_are_worked_out_once() -> None:
+    movement = Twist([0.0, 0.2, 0.1, 0.2, 0.0, 0.1], 1.0)
+    film, contact = recalling(movement)
+    all_light(film, movement)
+    assert [tell(pose) for pose in contact.poses] == [
+        tell(movement.pose(np.asarray(angle))) for angle in (0.0, 0.2, 0.1)
+    ]
+
+
+def test_nothing_is_worked_out_before_it_is_asked_for() -> None:
+    film, contact = recalling(MOVEMENTS["axial"])
+    assert not contact.poses
+    film.light(0)
+    film.light(0)
+    assert len(contact.poses) == contact.lit == 1
+
+
+@pytest.mark.parametrize(("limit", "count"), [(10 * PLACE_BYTES, 10), (10 * PLACE_BYTES - 1, 30)])
+def test_light_is_kept_as_long_as_there_is_room(limit: int, count: int) -> None:
+    film, contact = recalling(MOVEMENTS["axial"], limit=limit)
+    all_light(film, MOVEMENTS["axial"])
+    assert len(contact.poses) == count
+    all_light(film, MOVEMENTS["axial"])
+    assert len(contact.poses) == (count if count == 10 else 2 * count)
+
+
+@pytest.mark.parametrize(("room", "worked_out"), [(1, [0, 1, 2, 1, 0]), (2, [0, 1, 2, 0]), (3, [0, 1, 2])])
+def test_the_light_that_was_worked_out_first_makes_room(room: int, worked_out: list[int]) -> None:
+    angles = np.array([0.0, 0.1, 0.2])
+    movement = Twist(angles[[0, 1, 2, 1, 0]], 1.0)
+    film, contact = recalling(movement, limit=room * PLACE_BYTES)
+    all_light(film, movement)
+    assert [tell(pose) for pose in contact.poses] == [tell(movement.pose(angles[k])) for k in worked_out]
+
+
+def test_a_body_that_waits_is_worked_out_once_however_little_is_kept() -> None:
+    film, contact = recalling(MOVEMENTS["horizontal"], limit=0)
+    all_light(film, MOVEMENTS["horizontal"])
+    assert len(contact.poses) == 4
+
+
+@pytest.mark.parametrize("limit", [0, PLENTY])
+@pytest.mark.parametrize("share", [0.0, 0.7])
+@pytest.mark.parametrize("name", MOVEMENTS)
+def test_light_is_the_same_whatever_else_was_asked(name: str, share: float, limit: int) -> None:
+    movement = MOVEMENTS[name]
+    whole = all_light(recalling(movement, share, limit)[0], movement)
+    film, _ = recalling(movement, share, limit)
+    np.testing.assert_array_equal(all_light(film, movement), whole)
+    for frame in range(3):
+        film.light(frame)
+    np.testing.assert_array_equal(all_light(film, movement), whole)
+    film, _ = recalling(movement, share, limit)
+    for frame in reversed(range(len(whole))):
+        np.testing.assert_array_equal(film.light(frame), whole[frame])
+    film, _ = recalling(movement, share, limit)
+    for frame in range(len(whole)):  # contact is asked for when some frames have been seen
+        if frame == 2:
+            film.touched_throughout()
+        np.testing.assert_array_equal(film.light(frame), whole[frame])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+@pytest.mark.parametrize("name", ["horizontal", "twist"])
+def test_light_that_made_room_comes_back_the_same(name: str, share: float) -> None:
+    movement = MOVEMENTS[name]
+    whole = all_light(real(movement, share), movement)
+    assert whole.max() > 0.9
+    for limit in (0, 2 * PLACE_BYTES):
+        film = real(movement, share, limit)
+        for _ in range(2):
+            np.testing.assert_array_equal(all_light(film, movement), whole)
+
+
+@pytest.mark.parametrize("limit", [0, PLENTY])
+def test_contact_is_asked_of_the_places_not_yet_seen_and_without_light(limit: int) -> None:
+    movement = MOVEMENTS["axial"]
+    film, contact = recalling(movement, limit=limit)
+    for frame in (0, 3, 13):  # the third is the second, a turn later
+        film.light(frame)
+    lit = contact.lit
+    film.touched_throughout()
+    film.touched_throughout()
+    assert contact.lit == lit
+    assert len({tell(pose) for pose in contact.poses}) == 10
+    assert len(contact.poses) - lit == 8
+
+
+@pytest.mark.parametrize("limit", [0, PLENTY])
+@pytest.mark.parametrize("share", [0.0, 1.0])
+@pytest.mark.parametrize("name", ["axial", "horizontal"])
+def test_what_lasts_is_the_contact_in_every_pose(name: str, share: float, limit: int) -> None:
+    movement = MOVEMENTS[name]
+    if name == "axial":
+        movement = Axial([0.0, 0.7, 1.9], 0.2, 1.0, (0.0, 0.0, 4.0))
+    film = real(movement, share, limit)
+    contact = Conform(BALL, VIEW, 17.5)
+    expected = np.ones(SHAPE, bool)
+    for place in exposed(movement, share, 5) if share else movement.path:
+        expected &= contact.lie(movement.pose(place)).contact
+    np.testing.assert_array_equal(film.touched_throughout(), expected)
+    film.light(0)
+    np.testing.assert_array_equal(film.touched_throughout(), expected)
+    always = contact.lie(movement.pose(movement.path[0])).contact
+    assert 50 < expected.sum() < always.sum()
+
+
+def exposed(movement: Movement, share: float, count: int) -> Map:
+    """Return evenly spread places of all exposures, frame by frame: piece by piece at constant velocity."""
+    path = movement.path
+    number = np.arange(len(path), dtype=float)
+    moments = number[:, np.newaxis] + share * ((np.arange(count) + 0.5) / count - 0.5)
+    longer = np.concatenate([[2 * path[0] - path[1]], path, [2 * path[-1] - path[-2]]])
+    known = np.concatenate([[-1.0], number, [number[-1] + 1]])
+    columns = [np.interp(moments.ravel(), known, column) for column in longer.reshape(len(known), -1).T]
+    places: Map = np.stack(columns, axis=-1).reshape(-1, *path.shape[1:])
+    return places
+
+
+@pytest.mark.parametrize("name", ["axial", "horizontal", "twist"])
+def test_an_exposure_is_the_mean_over_the_poses_that_the_body_passes(name: str) -> None:
+    movement, share = MOVEMENTS[name], 0.8
+    if name == "axial":  # slow to work out
+        movement = Axial([0.0, 0.7, 1.9], 0.1, 1.0, (0.0, 0.0, 4.0))
+    contact, optics = Conform(BALL, VIEW, 17.5), Ideal(Body(), Uniform())
+
+    def mean(count: int) -> NDArray[np.float32]:
+        light = [optics.light(contact.lie(movement.pose(place))) for place in exposed(movement, share, count)]
+        return np.mean(np.reshape(light, (-1, count, *SHAPE)), axis=1, dtype=np.float64)
+
+    found = all_light(real(movement, share), movement)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, mean(5), atol=1e-6)
+    np.testing.assert_allclose(found.mean(axis=(1, 2)), mean(25).mean(axis=(1, 2)), rtol=0.01)
+    if name != "twist":  # a ball does not show that it is turned
+        still = all_light(real(movement), movement)
+        assert np.abs(found - still).max() > 0.1
+
+
+def test_one_frame_alone_is_exposed_where_the_body_stands() -> None:
+    movement = Horizontal([[0.4, 0.2]], 1.0)
+    np.testing.assert_allclose(real(movement, 0.9).light(0), real(movement).light(0), atol=1e-6)
+
+
+# A press, seen from straight above, is worked out at once.
+
+HEIGHT = np.random.default_rng(8).uniform(-2.2, 0.0, SHAPE)
+HEIGHT[:3] = np.nan
+BEFORE, AFTER = (
+    np.random.default_rng(seed).uniform(low, high, SHAPE).astype(np.float32)
+    for seed, low, high in ((1, 0, 0.3), (2, 0.5, 1.0))
+)
+STROKES: dict[str, list[float]] = {
+    "down": [0.1, 0.4, 0.5, 1.3, 2.0],
+    "down and up": [0.2, 0.9, 1.4, 2.0, 1.1, 0.3],
+    "down, hovering, up": [0.2, 1.4, 1.4, 1.4, 0.3],
+    "up": [2.0, 1.1, 0.3],
+    "two": [0.5, 1.5],
+    "still": [1.0, 1.0],
+    "one": [1.2],
+}
+
+
+def press(travel: list[float], share: float) -> Press:
+    return Press(HEIGHT, AFTER, BEFORE, np.asarray(travel, np.float64), share)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("stroke", STROKES)
+def test_a_press_is_exposed_as_a_fine_grid_of_times_says(stroke: str, share: float) -> None:
+    travel = STROKES[stroke]
+    moments = 4000
+    if len(travel) > 1:
+        passed = exposed(Vertical(travel), share, moments).reshape(len(travel), moments)
+    else:
+        passed = np.full((1, moments), travel[0])
+    scene = press(travel, share)
+    for frame, way in enumerate(passed):
+        # Of the sorted depths those from the height's on are in contact; none where there is no object.
+        missed = np.searchsorted(np.sort(way), -np.nan_to_num(HEIGHT, nan=-9.0))
+        contact = 1 - missed / moments
+        expected = BEFORE + contact * (AFTER - BEFORE)
+        np.testing.assert_allclose(scene.light(frame), expected, atol=2 / moments + 1e-6)
+        np.testing.assert_array_equal(scene.light(frame)[:3], BEFORE[:3])
+
+
+@pytest.mark.parametrize("stroke", STROKES)
+def test_a_press_without_exposure_is_in_contact_or_not(stroke: str) -> None:
+    scene = press(STROKES[stroke], 0.0)
+    for frame, depth in enumerate(STROKES[stroke]):
+        expected = np.where(-np.nan_to_num(HEIGHT, nan=-9.0) <= depth, AFTER, BEFORE)
+        np.testing.assert_allclose(scene.light(frame), expected, atol=1e-7)
+
+
+def test_a_press_can_be_asked_in_any_order() -> None:
+    scene, again = press(STROKES["down and up"], 0.5), press(STROKES["down and up"], 0.5)
+    whole = all_light(again, Vertical(STROKES["down and up"]))
+    for frame in (4, 0, 3, 3):
+        np.testing.assert_array_equal(scene.light(frame), whole[frame])
+
+
+@pytest.mark.parametrize("stroke", STROKES)
+def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
+    movement = Vertical(STROKES[stroke])
+    optics, contact = Ideal(Body(), Uniform()), Conform(BALL, VIEW, 17.5)
+    touched, untouched = (optics.light(contact.lie(pose_at_press(depth))) for depth in (10.0, -10.0))
+    height = BALL.height(VIEW.x, VIEW.y)
+
+    def make(share: float) -> Press:
+        return Press(height, touched, untouched, movement.positions, share)
+
+    film = all_light(real(movement), movement)
+    np.testing.assert_array_equal(film, all_light(make(0.0), movement))
+    assert film.max() > 0.9
+    for share in (0.4, 1.0):
+        blurred = all_light(real(movement, share), movement)
+        exact = all_light(make(share), movement)
+        # Five poses tell time to a tenth of an exposure's.
+        np.testing.assert_allclose(blurred, exact, atol=0.1 + 1e-6)
+        np.testing.assert_allclose(blurred.mean(axis=(1, 2)), exact.mean(axis=(1, 2)), atol=0.01)
+
+
+def test_the_way_up_looks_like_the_way_down() -> None:
+    movement = Vertical([0.0, 0.5, 1.0, 1.0, 0.5, 0.0])
+    for share in (0.0, 1.0):
+        light = all_light(real(movement, share), movement)
+        np.testing.assert_allclose(light, light[::-1], atol=1e-6)

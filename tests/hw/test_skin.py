@@ -1,0 +1,313 @@
+"""The elastic sheet in the sensor: how much of it is worked out, what pixels see of it, where it ends."""
+
+from __future__ import annotations
+
+import contact_theory
+import numpy as np
+import poses
+import pytest
+import rays
+from geometry import pixel_centres
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from mirrorskin.hw.twin import Axial, Body, Camera, Coin, Cylinder, Object, Plane, Sphere, Twin
+from mirrorskin.hw.twin.contact import Conform, Elastic
+from mirrorskin.hw.twin.movement import Pose, pose_at_press
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io import InputError
+
+Map = NDArray[np.float64]
+
+BODY = Body()
+RADIUS = 17.5
+
+
+def view(shape: tuple[int, int], pixel: float, distance: float = np.inf) -> View:
+    return View(shape, (pixel, pixel), BODY, distance)
+
+
+def elastic(
+    thing: Object, pose: Pose, shape: tuple[int, int], pixel: float, body: Body = BODY, **more: float
+) -> Elastic:
+    return Elastic(
+        thing, [pose], View(shape, (pixel, pixel), body, more.pop("distance", np.inf)), body, **more
+    )
+
+
+def lie(thing: Object, pose: Pose, shape: tuple[int, int], pixel: float, body: Body = BODY) -> Sheet:
+    return elastic(thing, pose, shape, pixel, body).lie(pose)
+
+
+def inner(values: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
+    """Cut the middle out of a map; what is left on opposite sides is alike."""
+    rows, columns = ((big - small) // 2 for big, small in zip(values.shape, shape, strict=True))
+    return values[rows : rows + shape[0], columns : columns + shape[1]]
+
+
+def parts(sheet: Sheet) -> tuple[Map, Map, Map]:
+    return sheet.height, sheet.dz_dx, sheet.dz_dy
+
+
+LEANING = Axial([2.0], 0.15, 0.8, (0.0, 0.0, 20.0))
+REACHES: dict[str, tuple[Object, Pose]] = {
+    "plane": (Plane(), pose_at_press(3.0)),
+    "the coin's table": (Coin(), pose_at_press(1.7)),
+    "a ball aside": (Sphere(8.0), Pose(np.eye(3), np.array([5.0, -3.0, 1.0]))),
+    "a leaning ball": (Sphere(), LEANING.pose(LEANING.path[0])),
+}
+
+
+@pytest.mark.parametrize("reach", REACHES)
+def test_a_small_field_shows_what_a_field_as_large_as_the_body_shows(reach: str) -> None:
+    # What touches beyond the field's edge pushes the sheet in within it, too.
+    thing, pose = REACHES[reach]
+    small, large, pixel = (10, 16), (90, 90), 0.4
+    found, expected = lie(thing, pose, small, pixel), lie(thing, pose, large, pixel)
+    assert expected.contact.sum() > inner(expected.contact, small).sum() + 10
+    assert found.height.max() > 0.05
+    np.testing.assert_array_equal(found.contact, inner(expected.contact, small))
+    for here, there in zip(parts(found), parts(expected), strict=True):
+        assert here.shape == small
+        np.testing.assert_allclose(here, inner(there, small), atol=2e-5)
+
+
+def test_only_as_much_is_worked_out_as_the_object_can_reach() -> None:
+    shape = (30, 40)
+    assert elastic(Sphere(), pose_at_press(0.5), shape, 0.3).space.shape == shape
+    assert elastic(Sphere(), pose_at_press(-0.5), shape, 0.3).space.shape == shape
+    rows, columns = elastic(Cylinder(), pose_at_press(0.3), (10, 11), 0.2).space.shape
+    # The rod, 20 mm long, reaches sqrt(5^2 - 4.7^2) mm to either side.
+    assert 101 <= columns <= 107
+    assert 2 * 1.7 / 0.2 <= rows <= 2 * 1.7 / 0.2 + 6
+    assert elastic(Coin(), pose_at_press(1.7), (10, 10), 0.5).space.shape == (70, 70)  # the body, no more
+
+
+def test_every_phase_counts_for_how_far_the_object_reaches() -> None:
+    # 15 turns and one frame: each eighth frame is at the same phase.
+    def reach(count: int) -> tuple[int, int]:
+        movement = Axial(np.arange(count) * np.pi / 4, 0.2, 1.0, (0.0, 0.0, 40.0))
+        twin = Twin(object="sphere", shape=(8, 8), pixel_size=0.2, movement=movement, contact="elastic")
+        assert isinstance(twin._skin, Elastic)
+        return twin._skin.space.shape
+
+    assert reach(121) == reach(8)
+    assert reach(8)[0] == reach(8)[1] > 60
+
+
+def test_an_object_that_needs_too_many_points_is_told_what_to_do() -> None:
+    with pytest.raises(
+        InputError, match=r"coin needs 17500 x 17500 points.*larger pixels or.*conform"
+    ) as caught:
+        elastic(Coin(), pose_at_press(1.7), (20, 20), 0.002)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_sheet_lies_on_the_object_in_contact_and_bulges_beside_it() -> None:
+    # A ball of 20 mm, and a sheet without thickness. Hertz: contact to sqrt(10 mm x 0.6 mm).
+    body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
+    thing = Sphere(20.0)
+    found = lie(thing, pose, shape, pixel, body)
+    soft = Conform(thing, view(shape, pixel), RADIUS).lie(pose)
+    x, y = pixel_centres(shape, pixel)
+    theory = contact_theory.sphere(10.0, 2.4164, 1.0)
+    assert theory.depth == pytest.approx(0.6, rel=0.01)
+    radius = np.sqrt(found.contact.sum() / np.pi) * pixel
+    assert radius == pytest.approx(2.4164 * np.sqrt(0.6 / theory.depth), rel=0.01)
+    np.testing.assert_allclose(found.height[found.contact], soft.height[found.contact], atol=1e-5)
+    assert (soft.contact | ~found.contact).all()
+    assert soft.contact.sum() > 1.5 * found.contact.sum()
+    assert (found.height >= soft.height - 1e-5).all()
+    assert (found.height[~found.contact] > soft.height[~found.contact]).all()
+    well_inside = np.hypot(x, y) < 0.9 * radius
+    np.testing.assert_allclose(found.dz_dx[well_inside], soft.dz_dx[well_inside], atol=1e-3)
+    np.testing.assert_allclose(found.dz_dy[well_inside], soft.dz_dy[well_inside], atol=1e-3)
+    assert soft.dz_dx[well_inside].min() < -0.15
+
+
+def test_slopes_are_those_of_the_height_along_x_and_y() -> None:
+    body = Body(sheet=0.0)
+    field = View((40, 30), (0.2, 0.1), body)
+    pose = Pose(np.eye(3), np.array([0.5, -0.4, 1.0]))
+    found = Elastic(Sphere(20.0), [pose], field, body).lie(pose)
+    by_row, by_column = np.gradient(found.height)
+    some = np.s_[1:-1, 1:-1]  # the grid goes on beyond the edge
+    np.testing.assert_allclose(found.dz_dx[some], by_column[some] / 0.2, atol=1e-12)
+    np.testing.assert_allclose(found.dz_dy[some], -by_row[some] / 0.1, atol=1e-12)
+    # In contact the sheet falls as the ball does, away from its apex.
+    x, y = field.x - 0.5, field.y + 0.4
+    down = np.sqrt(10.0**2 - x**2 - y**2)
+    inside = np.hypot(x, y) < 1.5
+    assert found.contact[inside].all()
+    np.testing.assert_allclose(found.dz_dx[inside], (-x / down)[inside], atol=1e-3)
+    np.testing.assert_allclose(found.dz_dy[inside], (-y / down)[inside], atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1)])
+def test_a_field_of_one_row_or_column_has_slopes(shape: tuple[int, int]) -> None:
+    sheet = lie(Sphere(2.0), pose_at_press(0.05), shape, 0.5)
+    assert all(part.shape == shape and np.isfinite(part).all() for part in parts(sheet))
+
+
+@pytest.mark.parametrize("thing", [Sphere(), Coin()])
+def test_a_symmetric_object_is_seen_symmetric(thing: Object) -> None:
+    if isinstance(thing, Coin):
+        sheet = lie(thing, pose_at_press(0.5), (110, 110), 0.25)
+        # Only the hole and the flanks are symmetric.
+        x, y = pixel_centres((110, 110), 0.25)
+        where = np.hypot(x, y) < 2.0
+    else:
+        sheet = lie(thing, pose_at_press(1.0), (60, 60), 0.1)
+        where = np.ones((60, 60), bool)
+    close = 1e-4 * float(sheet.height.max()) if where.all() else 0.05
+    np.testing.assert_allclose(sheet.height[where], sheet.height[::-1][where], atol=close)
+    np.testing.assert_allclose(sheet.height[where], sheet.height[:, ::-1][where], atol=close)
+    np.testing.assert_allclose(sheet.height[where], sheet.height.T[where], atol=close)
+    if where.all():
+        np.testing.assert_allclose(sheet.dz_dy, -sheet.dz_dx.T, atol=1e-3)
+        np.testing.assert_allclose(sheet.dz_dx, -sheet.dz_dx[:, ::-1], atol=1e-3)
+
+
+def test_a_thick_sheet_shows_softer_slopes() -> None:
+    slopes = [
+        float(np.abs(lie(Coin(), pose_at_press(0.4), (60, 60), 0.2, Body(sheet=depth)).dz_dx).max())
+        for depth in (0.0, 0.2)
+    ]
+    assert slopes[0] > 1.3 * slopes[1] > 0
+
+
+def test_the_modulus_changes_the_force_but_not_where_the_sheet_is() -> None:
+    pose, shape = pose_at_press(0.7), (50, 50)
+    soft, hard = (elastic(Sphere(), pose, shape, 0.1, Body(modulus=modulus)) for modulus in (0.2, 4.0))
+    assert hard.solve(pose).force == pytest.approx(20 * soft.solve(pose).force, rel=1e-4)
+    np.testing.assert_allclose(hard.lie(pose).height, soft.lie(pose).height, atol=1e-5)
+
+
+def test_there_is_no_sheet_beyond_the_body() -> None:
+    shape, pixel = (80, 84), 0.5
+    x, y = pixel_centres(shape, pixel)
+    outside = np.hypot(x, y) > RADIUS
+    for distance in (np.inf, 90.0):
+        # The plate is pressed up to the body's very rim.
+        contact = elastic(
+            Plane(radius=RADIUS, reach=10.0), pose_at_press(9.0), shape, pixel, distance=distance
+        )
+        sheet = contact.lie(pose_at_press(9.0))
+        assert sheet.height[~outside].max() > 2
+        assert sheet.contact[~outside & (np.hypot(x, y) > RADIUS - 1)].any()
+        assert not sheet.contact[outside].any()
+        for part in parts(sheet):
+            assert not part[outside].any()
+
+
+def test_nothing_presses_beyond_the_body() -> None:
+    shape, pixel, pose = (80, 84), 0.5, Pose(np.eye(3), np.array([15.0, 0.0, 2.0]))
+    contact = elastic(Sphere(20.0), pose, shape, pixel)
+    assert contact.space.shape == shape
+    pressed = contact.solve(pose).pressure > 0
+    away = np.hypot(*pixel_centres(shape, pixel))
+    assert pressed[away > RADIUS - 0.6].any()
+    assert not pressed[away > RADIUS].any()
+
+
+@pytest.mark.parametrize("distance", [50.0, 65.0])
+def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -> None:
+    shape, pixel, press = (60, 80), 0.4, 2.5
+    pose = Pose(np.eye(3), np.array([9.0, 4.0, press]))
+    oblique = elastic(Sphere(20.0), pose, shape, pixel, distance=distance)
+    upright = elastic(Sphere(20.0), pose, shape, pixel)
+    assert oblique.space.shape == upright.space.shape == shape
+    pressure = upright.solve(pose).pressure
+    seen, whole = oblique.sheet(pressure), upright.sheet(pressure)
+
+    x, y = pixel_centres(shape, pixel)
+    lean_x, lean_y = rays.sight_line(x, y, distance)
+    maps = [
+        RegularGridInterpolator((y[::-1, 0], x[0]), part[::-1], bounds_error=False, fill_value=0.0)
+        for part in parts(whole)
+    ]
+
+    def on_line(values: RegularGridInterpolator, z: Map) -> Map:
+        found: Map = values(np.stack([y + z * lean_y, x + z * lean_x], axis=-1))
+        return found
+
+    low, high = np.zeros(shape), np.full(shape, 4.0)
+    for _ in range(30):
+        middle = (low + high) / 2
+        above = middle > on_line(maps[0], middle)
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    # The grid's outermost row is where brute force knows no more.
+    clear = (np.hypot(x, y) < RADIUS) & np.pad(np.ones((56, 76), bool), 2)
+    np.testing.assert_allclose(seen.height[clear], low[clear], atol=5e-6)
+    for part, values in zip(parts(seen)[1:], maps[1:], strict=True):
+        np.testing.assert_allclose(part[clear], on_line(values, low)[clear], atol=1e-5)
+    assert np.abs(seen.height - whole.height)[clear].max() > 0.03  # it does matter
+    # Contact is that of the nearest point of the grid.
+    row, column = (29.5 - (y + low * lean_y) / pixel, 39.5 + (x + low * lean_x) / pixel)
+    sure = clear & (np.abs(row % 1 - 0.5) > 1e-3) & (np.abs(column % 1 - 0.5) > 1e-3)
+    nearest = whole.contact[np.rint(row).astype(int).clip(0, 59), np.rint(column).astype(int).clip(0, 79)]
+    np.testing.assert_array_equal(seen.contact[sure], nearest[sure])
+    assert (seen.contact != whole.contact).sum() > 10
+
+
+def test_a_pinhole_camera_sees_a_small_field_as_a_part_of_a_large_one() -> None:
+    small, large, pixel, pose = (20, 24), (90, 90), 0.4, pose_at_press(1.7)
+    found, expected = (
+        elastic(Coin(), pose, shape, pixel, distance=80.0).lie(pose) for shape in (small, large)
+    )
+    for here, there in zip(parts(found), parts(expected), strict=True):
+        np.testing.assert_allclose(here, inner(there, small), atol=2e-5)
+
+
+def test_a_pose_is_solved_for_itself() -> None:
+    stroke = [pose_at_press(depth) for depth in (0.3, 0.6, 0.9)]
+    contact = elastic(Coin(), stroke[-1], (50, 50), 0.2)
+    down = [contact.lie(pose) for pose in stroke]
+    up = [contact.lie(pose) for pose in reversed(stroke)][::-1]
+    alone = [elastic(Coin(), stroke[-1], (50, 50), 0.2).lie(pose) for pose in stroke]
+    for first, *others in zip(down, up, alone, strict=True):
+        assert first.height.max() > 0.1
+        for other in others:
+            np.testing.assert_array_equal(first.contact, other.contact)
+            for one, again in zip(parts(first), parts(other), strict=True):
+                np.testing.assert_array_equal(one, again)
+
+
+def test_the_object_shifts_on_the_grown_grid_as_its_points_do() -> None:
+    shape, pixel = (12, 20), 0.3
+    contact = elastic(Coin(), pose_at_press(1.7), shape, pixel)
+    x, y = pixel_centres(contact.space.shape, pixel)
+    assert contact.space.shape != shape
+    for pose in (poses.moved_aside((0.4, -0.1), 1.7), poses.twisted(0.3, 1.7)):
+        points = np.stack([x, y, np.full_like(x, -1.7)], axis=-1)
+        moved = pose.to_body(points) - points
+        shift = contact.shift(Pose(pose.turn, pose.shift))
+        np.testing.assert_allclose(shift, np.moveaxis(moved[..., :2], -1, 0), atol=1e-12)
+    here_x, here_y = contact.crop(np.stack([x, y]))
+    np.testing.assert_allclose(here_x, pixel_centres(shape, pixel)[0], atol=1e-12)
+    np.testing.assert_allclose(here_y, pixel_centres(shape, pixel)[1], atol=1e-12)
+
+
+def test_an_object_out_of_reach_leaves_the_sheet_flat() -> None:
+    contact = elastic(Sphere(), pose_at_press(-0.2), (12, 13), 0.3)
+    for pose in (pose_at_press(-0.2), Pose(np.eye(3), np.array([60.0, 0.0, 1.0]))):
+        sheet = contact.lie(pose)
+        assert not sheet.contact.any()
+        assert not any(part.any() for part in parts(sheet))
+
+
+def test_the_camera_decides_how_the_twin_sees_the_sheet() -> None:
+    movement = Axial([0.3], 0.05, 1.5)
+    sheets = [
+        Twin(
+            object="sphere",
+            shape=(30, 30),
+            pixel_size=0.3,
+            movement=movement,
+            contact="elastic",
+            camera=Camera(distance=distance),
+        ).sheet(0)
+        for distance in (70.0, np.inf)
+    ]
+    assert np.abs(sheets[0].height - sheets[1].height).max() > 0.01

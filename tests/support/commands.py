@@ -1,0 +1,54 @@
+"""The command line: run in this process, which is quick, and the paper's experiments at a size that is."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import sys
+from typing import NamedTuple
+from unittest import mock
+
+from mirrorskin.cli import demo
+from mirrorskin.cli.main import main
+
+
+class Ended(NamedTuple):
+    """How a command ended: its exit code, and what it wrote to standard output and standard error."""
+
+    code: int
+    out: str
+    said: str
+
+
+def run(*words: object) -> Ended:
+    """Run the command line with these words, in the working directory."""
+    out, said = io.StringIO(), io.StringIO()
+    given = mock.patch.object(sys, "argv", ["mirrorskin", *map(str, words)])
+    with given, contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code or 0
+    return Ended(code, out.getvalue(), said.getvalue())
+
+
+def small_experiments() -> tuple[demo._Experiment, ...]:
+    """Return the demo's own experiments over the same fields and travels, of few pixels and frames."""
+    size, frames = 24, 8
+    return tuple(
+        dataclasses.replace(
+            one,
+            size=size,
+            pixel_size=one.pixel_size * one.size / size,
+            frames=frames,
+            step=one.step * one.frames / frames,
+        )
+        for one in demo._EXPERIMENTS
+    )
+
+
+def main_with_a_small_demo() -> None:
+    """Run the command line of a process, with `mirrorskin demo` small."""
+    demo._EXPERIMENTS = small_experiments()
+    main()
