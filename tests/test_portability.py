@@ -131,6 +131,11 @@ def test_a_report_is_a_failure_even_where_all_tests_pass(monkeypatch, other):
     assert portability.examine(other) == Finding("1.0", "5 of 5 passed", "3", (REPORT * 3,))
 
 
+def asking(tests):
+    """A check that is given these of the tests in the project's top folder."""
+    return Check("other", "package", "no/such/file", tests=tests, folders=(".",))
+
+
 def write_test(folder, body):
     """Make a project of one test and return the environment to run it in."""
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n    device\n")
@@ -152,7 +157,7 @@ def write_test(folder, body):
 def test_what_pytest_says_is_shown_unless_all_pass(monkeypatch, tmp_path, body, shown, word):
     monkeypatch.setattr(portability, "ROOT", tmp_path)
     environment = write_test(tmp_path, body)
-    tests, details = portability.run_tests("", environment, tmp_path / "tests.xml")
+    tests, details = portability.run_tests(asking(""), environment, tmp_path / "tests.xml")
     assert tests == shown
     assert bool(details) == (shown != "1 of 1 passed")
     assert word in "".join(details)
@@ -160,7 +165,7 @@ def test_what_pytest_says_is_shown_unless_all_pass(monkeypatch, tmp_path, body, 
 
 def test_no_tests_at_all_is_a_failure(monkeypatch, tmp_path):
     monkeypatch.setattr(portability, "ROOT", tmp_path)
-    tests, details = portability.run_tests("", dict(os.environ), tmp_path / "tests.xml")
+    tests, details = portability.run_tests(asking(""), dict(os.environ), tmp_path / "tests.xml")
     assert (tests, bool(details)) == ("0 of 0 passed", True)
 
 
@@ -170,7 +175,7 @@ def test_only_the_tests_asked_for_are_run(monkeypatch, tmp_path):
     with (tmp_path / "test_it.py").open("a") as file:
         file.write("\ndef test_without_a_device(): assert False\n")
         file.write("\n@pytest.mark.device\ndef test_statistics(): assert False\n")
-    tests, details = portability.run_tests("not statistics", environment, tmp_path / "tests.xml")
+    tests, details = portability.run_tests(asking("not statistics"), environment, tmp_path / "tests.xml")
     assert (tests, details) == ("1 of 1 passed", ())
 
 

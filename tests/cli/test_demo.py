@@ -87,14 +87,15 @@ def test_the_table_tells_of_each_sensor_and_what_it_costs(shown):
     for row in rows:
         name, sensor, method, *told = cells(row)
         found[name, sensor, method] = dict(zip(names, (float(one.split()[0]) for one in told), strict=True))
-    for (name, sensor, method), told in found.items():
+    for (name, sensor, _), told in found.items():
         ideal = found[name, "conform, ideal", "sub-frame"]["shared"]
         assert told["answered"] > 50
         assert abs(told["mean"]) <= told["RMS"] < 2
         assert told["99 %"] > 0
         assert told["cost"] == pytest.approx(told["shared"] - ideal, abs=0.0011)
-        # A sheet that only takes the object's shape is light where it touches and nowhere else.
-        assert (told["untouched"] == 0) == (sensor == "conform, ideal"), (name, sensor, method)
+        # A sheet that only takes the object's shape is light where it touches; an elastic one before, too.
+        share = told["untouched"] / told["answered"]
+        assert share < 0.02 if sensor.startswith("conform") else share > 0.05
     assert max(map(len, rows)) <= 110
     *legend, last = shown[0][1 + len(EXPECTED) :]
     for word in names[:2] + names[5:]:

@@ -24,6 +24,8 @@ OCLGRIND = "usr/lib/oclgrind/liboclgrind-rt-icd.so"
 # It keeps records of all memory at each launch: with its usual 128 MB a launch takes a second.
 LITTLE_MEMORY = {"OCLGRIND_GLOBAL_MEM_SIZE": "8000000"}
 
+# Whole frames of the twin are hours in an interpreter as well.
+KERNELS = ("tests/engine", "tests/kernels")
 # Tests that need many pixels because they judge statistics: hours in an interpreter.
 STATISTICS = "honest or cost_little or longer_than or never_gets or hovers or noise_alone or as_good_as"
 # Tests on few pixels that still reach all kernels and types.
@@ -38,6 +40,7 @@ class Check:
     package: str
     library: str  # a pattern below /
     tests: str = ""  # of those marked "device", as pytest's -k has it
+    folders: tuple[str, ...] = ("tests",)
     faults: tuple[str, ...] = ()  # that it must report
     told: Mapping[str, str] = field(default_factory=dict)
 
@@ -52,6 +55,7 @@ CHECKS = (
         "oclgrind",
         OCLGRIND,
         tests=f"not ({STATISTICS})",
+        folders=KERNELS,
         faults=tuple(name for name in FAULTS if name != NEVER_SET),
         told={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
     ),
@@ -60,6 +64,7 @@ CHECKS = (
         "oclgrind",
         OCLGRIND,
         tests=SMALL,
+        folders=KERNELS,
         faults=(NEVER_SET,),
         # Of optimised kernels it does not know all instructions, and crashes on some.
         told={"OCLGRIND_UNINITIALIZED": "1", "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable", **LITTLE_MEMORY},
@@ -104,7 +109,7 @@ def examine(check: Check) -> Finding:
         missed = missed_faults(check.faults, environment, log)
         if missed:
             return Finding(child.stdout.strip(), "-", "-", (f"not reported: {', '.join(missed)}",))
-        tests, details = run_tests(check.tests, environment, Path(folder, "tests.xml"))
+        tests, details = run_tests(check, environment, Path(folder, "tests.xml"))
         reports = reports_in(log)
         if reports:
             details += (read(log),)
@@ -141,10 +146,10 @@ def run_kernel(environment: Mapping[str, str], *fault: str) -> subprocess.Comple
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
-def run_tests(which: str, environment: Mapping[str, str], record: Path) -> tuple[str, tuple[str, ...]]:
-    """Run some of the tests marked ``device``; return how many pass, and what pytest says if not all do."""
-    options = ["-m", "device", "-k", which, "-q", "-p", "no:cacheprovider", f"--junitxml={record}"]
-    command = [sys.executable, "-P", "-m", "pytest", *options]
+def run_tests(check: Check, environment: Mapping[str, str], record: Path) -> tuple[str, tuple[str, ...]]:
+    """Run a check's tests marked ``device``; return how many pass, and what pytest says if not all do."""
+    options = ["-m", "device", "-k", check.tests, "-q", "-p", "no:cacheprovider", f"--junitxml={record}"]
+    command = [sys.executable, "-P", "-m", "pytest", *options, *check.folders]
     child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if not record.exists():
         return f"ended with {child.returncode}", (child.stdout, child.stderr)
