@@ -19,6 +19,7 @@ _C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LEAST_GAIN = 0.05  # of the nominal one; a pixel that sees nothing would be a defect, not a deviation
 _NOISE_MAX = 2.0**16
 _ELECTRONS_MIN = 1e-3
+_SPREAD_MAX = 100.0
 _WORD = 2**64
 _MAPS = 0x6D617073  # sets the stream of the pixels' deviations apart from others of the same seed
 
@@ -231,7 +232,7 @@ def _check(camera: Camera) -> None:
         "offset_deviation": (0 <= camera.offset_deviation <= _NOISE_MAX, "counts, 0 to 65536"),
         "frame_rate": (0 < camera.frame_rate < math.inf, "frames in a second, more than 0"),
         "exposure": (0 <= camera.exposure <= period, f"seconds, 0 to a frame's {period:.6g}"),
-        "point_spread": (0 <= camera.point_spread < math.inf, "pixels, 0 or more"),
+        "point_spread": (0 <= camera.point_spread <= _SPREAD_MAX, "pixels, 0 to 100"),
         "distance": (camera.distance > 0, "millimetres above the sheet, more than 0"),
     }
     for name, (holds, remedy) in rules.items():

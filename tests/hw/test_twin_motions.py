@@ -590,6 +590,7 @@ def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, nam
             {"movement": Vertical([1.0, 40.0])},
             "sphere may rise 40 mm into the sensor's body, which is 40 mm high",
         ),
+        ({"pixel_size": 1e3}, "no pixel of 1000 x 1000 mm lies on the sensor.*smaller"),
         ({"movement": Axial([0.0], 0.1, 41.0)}, "rise 42.* mm into .*press less"),
         ({"movement": Twist([0.0], 3.0), "body": Body(height=3.0)}, "rise 3 mm into .* 3 mm high"),
         ({"movement": Axial([0.0], 0.1, 1.0, (1e3, 0.0, 0.0))}, "rise 10.* mm .*turn about a nearer pivot"),
