@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +122,7 @@ class Press:
         self._reached_at = np.where(np.isnan(height), np.inf, -height)
         self._untouched = untouched
         self._gained = touched - untouched
+        self._glows = bool(untouched.any())
         self._travel = travel
         self._share = share
         # Begin, middle and end of each exposure, with constant velocity in between.
@@ -129,12 +130,14 @@ class Press:
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure."""
+        time: NDArray[Any] = self._travel[frame] >= self._reached_at
         if self._share > 0:
             begin, middle, end = map(float, self._passed[frame])
             time = (self._time(begin, middle) + self._time(middle, end)) / np.float32(2)
-        else:
-            time = self._time(self._travel[frame], self._travel[frame])
-        return self._untouched + time * self._gained
+        light: Light = time * self._gained
+        if self._glows:
+            light += self._untouched
+        return light
 
     def _time(self, begin: float, end: float) -> Light:
         """Return the share of the time in which a steady travel is at least that of the touch, float32."""

@@ -121,7 +121,9 @@ class Twin(Closing):
         self._check_movement()
         self._view = View(field, pixel, self._body, self._camera.distance)
         if not (np.hypot(self._view.x, self._view.y) <= self._body.radius).any():
-            raise InputError(f"no pixel of {pixel[0]:g} x {pixel[1]:g} mm lies on the sensor: take smaller ones")
+            raise InputError(
+                f"no pixel of {pixel[0]:g} x {pixel[1]:g} mm lies on the sensor: take smaller ones"
+            )
         self._pattern = make_pattern(pattern, self._body)
         self._sensor = Sensor(self._camera, field, open_device(device))
         self._skin = self._make_skin()
