@@ -44,14 +44,14 @@ def run_twin(shape: tuple[int, int, int], device: Device, rounds: int) -> Case:
     travel = np.linspace(0.05, 3.0, shape[0])
     press = _make(shape, Vertical(travel), device)
     turn = _make(shape, Axial(np.arange(shape[0]) * 2 * np.pi / _PHASES, np.radians(2.5), 1.0), device)
-    frames = np.empty(shape, np.uint8)
+    frames, others, theirs = np.empty((3, *shape), np.uint8)
     clean = _clean(shape, travel, device)
     side = min(512, max(shape[1:]))
     limits = Limits(device, np.zeros(shape, np.uint8))
     ours: dict[str, Work] = {
-        _OURS: lambda: _render(press, frames).copy(),
-        "mirrorskin, rotation": lambda: _render(turn, frames),
-        _PEER: lambda: _render_numpy(clean, frames).copy(),
+        _OURS: lambda: _render(press, frames),
+        "mirrorskin, rotation": lambda: _render(turn, others),
+        _PEER: lambda: _render_numpy(clean, theirs),
         f"mirrorskin, elastic {side} x {side}": _elastic(side, device),
     }
 

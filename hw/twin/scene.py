@@ -123,21 +123,25 @@ class Press:
         self._untouched = untouched
         self._gained = touched - untouched
         self._glows = bool(untouched.any())
+        # Fresh arrays would cost more, by their page faults, than what is written to them.
+        self._touches, self._light = np.empty(height.shape, bool), np.empty_like(touched)
         self._travel = travel
         self._share = share
         # Begin, middle and end of each exposure, with constant velocity in between.
         self._passed = _passed(travel, np.array([-share / 2, 0.0, share / 2]))
 
     def light(self, frame: int, /) -> Light:
-        """Return the mean light over a frame's exposure."""
-        time: NDArray[Any] = self._travel[frame] >= self._reached_at
+        """Return the mean light over a frame's exposure; it holds until the next is asked for."""
+        time: NDArray[Any] = self._touches
         if self._share > 0:
             begin, middle, end = map(float, self._passed[frame])
             time = (self._time(begin, middle) + self._time(middle, end)) / np.float32(2)
-        light: Light = time * self._gained
+        else:
+            np.greater_equal(self._travel[frame], self._reached_at, out=self._touches)
+        np.multiply(time, self._gained, out=self._light)
         if self._glows:
-            light += self._untouched
-        return light
+            self._light += self._untouched
+        return self._light
 
     def _time(self, begin: float, end: float) -> Light:
         """Return the share of the time in which a steady travel is at least that of the touch, float32."""
