@@ -17,7 +17,7 @@ from mirrorskin.hw.twin.movement import Movement, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object, check_fits, make_object
 from mirrorskin.hw.twin.optics import Ideal, Linear, Pattern, Uniform, Wall, make_pattern
 from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, take_references
-from mirrorskin.hw.twin.scene import Film, Press
+from mirrorskin.hw.twin.scene import Film, Press, Scene
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.truth import tell_truth
 from mirrorskin.hw.twin.view import View
@@ -234,7 +234,7 @@ class Twin(Closing):
             return Ideal(self._body, pattern)
         return Wall(self._body, pattern, self._view, self._sensor.device)
 
-    def _make_scene(self) -> Film | Press:
+    def _make_scene(self) -> Scene:
         share = self._camera.exposure * self._camera.frame_rate
         skin, optics, view = self._skin, self._make_optics(self._pattern), self._view
         if (
