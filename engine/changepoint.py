@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.bands import Band
 from mirrorskin.engine.references import reference_pair
-from mirrorskin.engine.samples import C_TYPES, travel_pairs
+from mirrorskin.engine.samples import travel_pairs
 from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
-from mirrorskin.kernels.device import Array, Device, Kernel, open_device
+from mirrorskin.kernels.device import C_TYPES, Array, Device, Kernel, open_device
 
 _EVIDENCE = 12.0  # log of how much likelier the samples must be with a change than without
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
@@ -290,9 +290,8 @@ class ChangePointSearch(Search):
         return int(-(-band.pixels // self.device.shape.tile))
 
     def _kernel(self, name: str) -> Kernel:
-        kind, size = self._dtype.kind, self._dtype.itemsize
-        top = {} if kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}
-        return self.device.kernel("changepoint", name, FRAME=C_TYPES[f"{kind}{size}"], **top)
+        top = {} if self._dtype.kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}
+        return self.device.kernel("changepoint", name, FRAME=C_TYPES[self._dtype.name], **top)
 
 
 def _maps(dtype: np.dtype[Any], passes: int) -> dict[str, DTypeLike]:

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.bands import Band, Planes
 from mirrorskin.engine.fitting import fit
 from mirrorskin.engine.references import check_threshold, reference_maps
-from mirrorskin.engine.samples import C_TYPES
 from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
 from mirrorskin.io import Block, InputError
-from mirrorskin.kernels.device import Array, Device, open_device
+from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
 _PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
@@ -129,7 +128,7 @@ class OnsetSearch(Search):
         # The plateau that a run comes from: no reference tells how light a pixel was before its release.
         self._own_dark = self._release or dark is None
         self._macros: dict[str, str | int] = {
-            "FRAME": C_TYPES[f"{dtype.kind}{dtype.itemsize}"],
+            "FRAME": C_TYPES[dtype.name],
             "BITS": 8 * dtype.itemsize,
             "HOLD": min(hold, _LONGEST),
             "SAMPLES": int(subframe),

@@ -11,8 +11,6 @@ from mirrorskin.engine.noise import estimate_noise, thin_out
 from mirrorskin.io import FRAME_DTYPES, InputError
 from mirrorskin.kernels.device import Array, Device
 
-C_TYPES = {"u1": "uchar", "u2": "ushort", "f4": "float"}
-
 
 class Noise:
     """The standard deviation of a sample: given, or told from the first two frames that are seen.

@@ -26,6 +26,8 @@ from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.shape import BESIDE, CORE
 
 DeviceKind = Literal["gpu", "cpu", "other"]
+C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
+"""OpenCL's names of the types that a frame's sample can have."""
 
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()

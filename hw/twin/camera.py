@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.io.types import FRAME_DTYPES, InputError
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 _UINT8: np.dtype[Any] = np.dtype(np.uint8)
 _DARK, _BRIGHT = 16.0, 224.0  # counts of 8 bits
 _BITS = {"uint8": (8,), "uint16": (12, 10, 16), "float32": ()}  # the usual one first
-_C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LEAST_GAIN = 0.05  # of the nominal one; a pixel that sees nothing would be a defect, not a deviation
 _NOISE_MAX = 2.0**16
 _ELECTRONS_MIN = 1e-3
@@ -190,7 +189,7 @@ class Sensor:
         expose = self.device.kernel(
             "exposure",
             "expose",
-            FRAME=_C_TYPES[self.dtype.name],
+            FRAME=C_TYPES[self.dtype.name],
             WHOLE=int(camera.bits is not None),
             SHOT=int(math.isfinite(camera.electrons)),
         )

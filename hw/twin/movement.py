@@ -78,7 +78,27 @@ def pose_at_press(travel: float) -> Pose:
     return Pose(np.eye(3), np.array([0.0, 0.0, travel]))
 
 
-class Vertical:
+class _Upright:
+    """What all movements share that do not tilt the body."""
+
+    positions: Floats
+    deepest: float
+
+    @property
+    def path(self) -> Floats:
+        """The positions, which do not jump."""
+        return self.positions
+
+    def rise(self, radius: float, /) -> float:
+        """Return how far the body is lowered: nothing tilts."""
+        return self.deepest
+
+    def reduced(self, path: Floats, /) -> Floats:
+        """Return the places as they are."""
+        return path
+
+
+class Vertical(_Upright):
     """Press, release, or one after the other.
 
     Parameters
@@ -99,23 +119,10 @@ class Vertical:
     def __init__(self, travel: ArrayLike, *, compliance: float = 0.0) -> None:
         self.positions = check_stroke(travel, _count(travel), "travel")
         _check_frames(self.positions, "travel")
-        self.path = self.positions
         if not (math.isfinite(compliance) and compliance >= 0):
             raise InputError(f"compliance {compliance} mm/N cannot be: give 0 or more")
         self.compliance = compliance
-
-    @property
-    def deepest(self) -> float:
-        """Greatest travel, mm."""
-        return float(self.positions.max())
-
-    def rise(self, radius: float, /) -> float:
-        """Return how far the body is lowered: nothing tilts."""
-        return self.deepest
-
-    def reduced(self, path: Floats, /) -> Floats:
-        """Return the travel as it is."""
-        return path
+        self.deepest = float(self.positions.max())
 
     def pose(self, place: Floats, /) -> Pose:
         """Lower the body to a travel, mm."""
@@ -207,7 +214,7 @@ class Axial:
         return replace(block, phase=self.positions[_frames(block)])
 
 
-class Horizontal:
+class Horizontal(_Upright):
     """Move the pressed body sideways.
 
     Parameters
@@ -230,16 +237,7 @@ class Horizontal:
         if self.positions.ndim != 2 or self.positions.shape[1] != 2:
             raise InputError(f"displacement of shape {self.positions.shape} cannot be: give x and y a frame")
         _check_frames(self.positions, "displacement")
-        self.path = self.positions
         self.deepest = _check_press(press)
-
-    def rise(self, radius: float, /) -> float:
-        """Return how far the body is lowered: nothing tilts."""
-        return self.deepest
-
-    def reduced(self, path: Floats, /) -> Floats:
-        """Return the displacement as it is."""
-        return path
 
     def pose(self, place: Floats, /) -> Pose:
         """Move the body by x and y, mm: the object goes the other way in the picture."""
@@ -254,7 +252,7 @@ class Horizontal:
         return replace(block, displacement=self.positions[_frames(block)])
 
 
-class Twist:
+class Twist(_Upright):
     """Turn the pressed body about its axis.
 
     Parameters
@@ -277,16 +275,7 @@ class Twist:
         if self.positions.ndim != 1:
             raise InputError(f"twist of shape {self.positions.shape} cannot be: give one angle a frame")
         _check_frames(self.positions, "twist")
-        self.path = self.positions
         self.deepest = _check_press(press)
-
-    def rise(self, radius: float, /) -> float:
-        """Return how far the body is lowered: nothing tilts."""
-        return self.deepest
-
-    def reduced(self, path: Floats, /) -> Floats:
-        """Return the angle as it is."""
-        return path
 
     def pose(self, place: Floats, /) -> Pose:
         """Turn the body by an angle: the object goes the other way in the picture."""

@@ -8,10 +8,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Sensor
 from mirrorskin.hw.twin.contact import Conform
-from mirrorskin.hw.twin.movement import Pose
+from mirrorskin.hw.twin.movement import Pose, pose_at_press
 from mirrorskin.hw.twin.objects import Sphere
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.view import View
@@ -28,10 +27,17 @@ _STEP = 0.4  # from place to place of the ball, as a share of its radius
 _STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact: all that a wall can show
 
 
-def take_references(
-    name: ReferenceName, optics: Ideal | Wall, sensor: Sensor, view: View, body: Body
-) -> tuple[_Counts, _Counts]:
-    """Tell each pixel's counts without light and in full light.
+def exact_references(sensor: Sensor) -> tuple[_Counts, _Counts]:
+    """Tell what no lab knows: each pixel's own counts without light and in full light, (H, W), float32.
+
+    They are free of noise, and within what a sample can hold.
+    """
+    low = -np.inf if sensor.camera.bits is None else 0.0
+    return np.clip(sensor.offset, low, sensor.camera.top), np.clip(sensor.full, low, sensor.camera.top)
+
+
+def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_Counts, _Counts]:
+    """Take each pixel's counts without light and in full light, as a lab does.
 
     A sheet at rest shows no light, so the dark reference is the mean of 16 frames before the touch. It shows
     no full light either. For the bright reference a lab rolls a ball over the field, here one twice as wide
@@ -43,31 +49,23 @@ def take_references(
 
     Parameters
     ----------
-    name : {"exact", "ball"}
-        "exact" tells what no lab knows: the camera's own levels, with each pixel's deviation and without
-        noise, within what a sample can hold.
     optics : Ideal or Wall
         Of the clear wall: a lab takes the printed sheet out.
     sensor : Sensor
     view : View
-    body : Body
 
     Returns
     -------
     dark, bright : ndarray, (H, W), float32
         NaN where a pixel has none.
     """
-    if name == "exact":
-        low = -np.inf if sensor.camera.bits is None else 0.0
-        return np.clip(sensor.offset, low, sensor.camera.top), np.clip(sensor.full, low, sensor.camera.top)
     reach = max(size * pixel for size, pixel in zip(view.shape, view.pixel_size[::-1], strict=True))
-    ball = Conform(Sphere(2 * reach), view, body.radius)
+    ball = Conform(Sphere(2 * reach), view)
     depth = reach * (1 - math.cos(_STEEPEST))
-    away = Pose(np.eye(3), np.array([0.0, 0.0, -depth]))
 
     counts = np.empty(view.shape, sensor.dtype)
     dark = np.zeros(view.shape)
-    untouched = optics.light(ball.lie(away))
+    untouched = optics.light(ball.lie(pose_at_press(-depth)))
     for number in range(_DARK_FRAMES):
         sensor.expose(untouched, -1 - number, counts)  # a frame's number below 0 is one of no recording
         dark += counts / _DARK_FRAMES
@@ -80,8 +78,8 @@ def take_references(
         for kept in brightest:
             left, kept[...] = np.minimum(kept, left), np.maximum(kept, left)
     bright = brightest[-1]
-    span, inside = bright - dark, np.hypot(view.x, view.y) <= body.radius
-    seen = span >= _LEAST * np.median(span[inside])
+    span = bright - dark
+    seen = span >= _LEAST * np.median(span[view.on_body])
     return np.where(seen, dark, np.nan).astype(np.float32), np.where(seen, bright, np.float32(np.nan))
 
 

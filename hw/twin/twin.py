@@ -16,7 +16,7 @@ from mirrorskin.hw.twin.contact import Conform, Elastic
 from mirrorskin.hw.twin.movement import Movement, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object, check_fits, make_object
 from mirrorskin.hw.twin.optics import Ideal, Linear, Pattern, Uniform, Wall, make_pattern
-from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, take_references
+from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, ball_references, exact_references
 from mirrorskin.hw.twin.scene import Film, Press, Scene
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.truth import tell_truth
@@ -62,7 +62,7 @@ class Twin(Closing):
     camera : Camera
     references : {"exact", "ball"}
         Where the header's dark and bright come from: the camera's exact levels, or frames as a lab takes
-        them; see `take_references`.
+        them; see `ball_references`.
     device : str or Device, optional
         What renders; see `mirrorskin.kernels.device.open_device`.
 
@@ -120,7 +120,7 @@ class Twin(Closing):
         check_fits(self._thing, self._body.radius)
         self._check_movement()
         self._view = View(field, pixel, self._body, self._camera.distance)
-        if not (np.hypot(self._view.x, self._view.y) <= self._body.radius).any():
+        if not self._view.on_body.any():
             raise InputError(
                 f"no pixel of {pixel[0]:g} x {pixel[1]:g} mm lies on the sensor: take smaller ones"
             )
@@ -133,8 +133,10 @@ class Twin(Closing):
     @functools.cached_property
     def header(self) -> Header:
         """What holds for all frames; the references are taken when it is asked for."""
-        clear = self._make_optics(Uniform())
-        dark, bright = take_references(self._references, clear, self._sensor, self._view, self._body)
+        if self._references == "exact":
+            dark, bright = exact_references(self._sensor)
+        else:
+            dark, bright = ball_references(self._make_optics(Uniform()), self._sensor, self._view)
         gain, offset = self._zenith_scale() or (None, None)
         contact, optics = self._names
         return replace(
@@ -223,7 +225,7 @@ class Twin(Closing):
 
     def _make_skin(self) -> Conform | Elastic:
         if self._names[0] == "conform":
-            return Conform(self._thing, self._view, self._body.radius)
+            return Conform(self._thing, self._view)
         movement = self.movement
         poses = [movement.pose(place) for place in _spread(movement.reduced(movement.path))]
         poses.append(pose_at_press(movement.deepest))

@@ -40,6 +40,8 @@ class View:
         As given.
     x, y : ndarray, (H, W), float64
         Where a pixel meets the rest plane, mm.
+    on_body : ndarray, (H, W), bool
+        Whether that is on the body: there is no sheet beyond it.
     slope_x, slope_y : ndarray, (H, W), float64
         By how much its line of sight moves along x and y for each millimetre of z.
     orthographic : bool
@@ -65,6 +67,7 @@ class View:
             )
         self.shape, self.pixel_size = shape, pixel_size
         self.x, self.y = np.meshgrid(*pixel_axes(shape, pixel_size))
+        self.on_body = np.hypot(self.x, self.y) <= body.radius
         self.orthographic = math.isinf(distance)
         self.slope_x, self.slope_y = np.zeros((2, *shape))
         if not self.orthographic:

@@ -59,7 +59,7 @@ def recalling(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> tu
 
 
 def real(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> Film:
-    contact, optics = Conform(BALL, VIEW, 17.5), Ideal(Body(), Uniform())
+    contact, optics = Conform(BALL, VIEW), Ideal(Body(), Uniform())
     return Film(contact, optics, movement, share, SHAPE, limit)
 
 
@@ -187,7 +187,7 @@ def test_what_lasts_is_the_contact_in_every_pose(name: str, share: float, limit:
     if name == "axial":
         movement = Axial([0.0, 0.7, 1.9], 0.2, 1.0, (0.0, 0.0, 4.0))
     film = real(movement, share, limit)
-    contact = Conform(BALL, VIEW, 17.5)
+    contact = Conform(BALL, VIEW)
     expected = np.ones(SHAPE, bool)
     for place in exposed(movement, share, 5) if share else movement.path:
         expected &= contact.lie(movement.pose(place)).contact
@@ -215,7 +215,7 @@ def test_an_exposure_is_the_mean_over_the_poses_that_the_body_passes(name: str) 
     movement, share = MOVEMENTS[name], 0.8
     if name == "axial":  # slow to work out
         movement = Axial([0.0, 0.7, 1.9], 0.1, 1.0, (0.0, 0.0, 4.0))
-    contact, optics = Conform(BALL, VIEW, 17.5), Ideal(Body(), Uniform())
+    contact, optics = Conform(BALL, VIEW), Ideal(Body(), Uniform())
 
     def mean(count: int) -> NDArray[np.float32]:
         light = [optics.light(contact.lie(movement.pose(place))) for place in exposed(movement, share, count)]
@@ -295,7 +295,7 @@ def test_a_press_can_be_asked_in_any_order() -> None:
 @pytest.mark.parametrize("stroke", STROKES)
 def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
     movement = Vertical(STROKES[stroke])
-    optics, contact = Ideal(Body(), Uniform()), Conform(BALL, VIEW, 17.5)
+    optics, contact = Ideal(Body(), Uniform()), Conform(BALL, VIEW)
     touched, untouched = (optics.light(contact.lie(pose_at_press(depth))) for depth in (10.0, -10.0))
     height = BALL.height(VIEW.x, VIEW.y)
 

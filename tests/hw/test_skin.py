@@ -109,7 +109,7 @@ def test_the_sheet_lies_on_the_object_in_contact_and_bulges_beside_it() -> None:
     body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
     thing = Sphere(20.0)
     found = lie(thing, pose, shape, pixel, body)
-    soft = Conform(thing, view(shape, pixel), RADIUS).lie(pose)
+    soft = Conform(thing, view(shape, pixel)).lie(pose)
     x, y = pixel_centres(shape, pixel)
     theory = contact_theory.sphere(10.0, 2.4164, 1.0)
     assert theory.depth == pytest.approx(0.6, rel=0.01)

@@ -19,19 +19,15 @@ class Conform:
     thing : Object
     view : View
         Of the camera.
-    radius : float
-        Of the body, mm: there is no sheet beyond it.
     """
 
-    def __init__(self, thing: Object, view: View, radius: float) -> None:
+    def __init__(self, thing: Object, view: View) -> None:
         self._thing = thing
         self._view = view
-        self._outside = np.hypot(view.x, view.y) > radius
 
     def lie(self, pose: Pose) -> Sheet:
         """Lay the sheet on the object in a pose."""
         obstacle = meet(self._thing, pose, self._view)
-        contact = np.isfinite(obstacle.height) & ~self._outside
-
+        contact = np.isfinite(obstacle.height) & self._view.on_body
         height, dz_dx, dz_dy = (np.where(contact, values, 0.0) for values in obstacle)
         return Sheet(height, dz_dx, dz_dy, contact)

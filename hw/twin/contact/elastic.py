@@ -25,20 +25,26 @@ class Contact:
 
     Attributes
     ----------
+    space : HalfSpace
     pressure : ndarray, (H, W), float64
         N/mm^2, 0 or more; they touch where it is above 0.
-    displacement : ndarray, (H, W), float64
-        Of the surface, mm up from the body's rest plane.
-    force : float
-        Newtons: the pressure's sum over the area.
     iterations : int
         That it took.
     """
 
+    space: HalfSpace
     pressure: Floats
-    displacement: Floats
-    force: float
     iterations: int
+
+    @property
+    def force(self) -> float:
+        """Newtons: the pressure's sum over the area."""
+        return self.space.pixel_area * float(self.pressure.sum())
+
+    @property
+    def displacement(self) -> Floats:
+        """Of the surface, mm up from the body's rest plane, (H, W), float64; worked out at each call."""
+        return self.space.surface(self.pressure)
 
 
 def press(
@@ -88,8 +94,7 @@ def press(
         first = np.zeros(reach.shape) if start is None else np.maximum(start, 0.0)
         system = _System(space, obstacle[window], reach[window], compliance)
         pressure[window], iterations = _minimise(system, np.where(reach, first, 0.0)[window])
-    force = space.pixel_area * float(pressure.sum())
-    return Contact(pressure, space.surface(pressure), force, iterations)
+    return Contact(space, pressure, iterations)
 
 
 class _System:

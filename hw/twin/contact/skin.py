@@ -64,14 +64,13 @@ class Elastic:
                 f" {_POINTS_MAX} are the most: take larger pixels or contact 'conform'"
             )
         self._grid = View(shape, view.pixel_size, body)
-        self._outside = np.hypot(self._grid.x, self._grid.y) > body.radius
         self._field = np.s_[grow_y : grow_y + rows, grow_x : grow_x + columns]
         self.space = HalfSpace(shape, view.pixel_size, body.modulus, body.sheet)
 
     def solve(self, pose: Pose) -> Contact:
         """Return pressure and force in a pose, on the grown grid."""
         height = meet(self._thing, pose, self._grid).height
-        obstacle = np.where(self._outside, np.nan, height)
+        obstacle = np.where(self._grid.on_body, height, np.nan)
         return press(self.space, obstacle, compliance=self._compliance)
 
     def lie(self, pose: Pose) -> Sheet:
@@ -85,14 +84,13 @@ class Elastic:
         dz_dx = _slope(height, 1) / along_x
         dz_dy = -_slope(height, 0) / along_y
         at = None if self._view.orthographic else self._seen(height)
-        outside = self.crop(self._outside)
 
         def seen(values: NDArray[Any], order: int = 1) -> NDArray[Any]:
             if at is None:
                 here = self.crop(values)
             else:
                 here = ndimage.map_coordinates(values, at, order=order, mode="nearest")
-            return np.where(outside, np.zeros_like(here), here)
+            return np.where(self._view.on_body, here, np.zeros_like(here))
 
         return Sheet(seen(height), seen(dz_dx), seen(dz_dy), seen(pressure > 0, order=0))
 
@@ -126,10 +124,9 @@ def _margin(thing: Object, poses: Iterable[Pose], view: View, body: Body) -> tup
     """Return the rows and columns by which the field must grow to hold all that the object can touch."""
     cell = 2 * body.radius / _COARSE
     coarse = View((_COARSE, _COARSE), (cell, cell), body)
-    inside = np.hypot(coarse.x, coarse.y) <= body.radius
     reached = np.zeros(coarse.shape, bool)
     for pose in poses:
-        reached |= inside & np.isfinite(meet(thing, pose, coarse).height)
+        reached |= coarse.on_body & np.isfinite(meet(thing, pose, coarse).height)
     if not reached.any():
         return 0, 0
     grow = []

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.optics.pattern import Linear, Pattern, Uniform
+from mirrorskin.hw.twin.optics.pattern import Linear, Pattern, Uniform, zenith_window
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.io.types import Floats, InputError
 
@@ -109,11 +108,6 @@ def uniform_response(zenith: Floats, body: Body = _PAPER) -> Floats:
     if body.scatter == 0:
         return np.where(np.isnan(zenith), np.nan, (zenith >= first) & (zenith <= last))
     return _boxed(lambda at: np.clip(at, first, last), zenith, body.scatter / 2)
-
-
-def zenith_window(body: Body) -> tuple[float, float]:
-    """Return the zeniths at which a mirror at the centre shows the wall's rim and the horizon, radians."""
-    return math.atan2(body.radius, body.height) / 2, math.pi / 4
 
 
 def design_range(body: Body) -> tuple[float, float]:

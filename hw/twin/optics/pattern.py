@@ -150,9 +150,14 @@ def make_pattern(name: str | Path, body: Body) -> Pattern:
         raise InputError(f"pattern {error}") from None
 
 
+def zenith_window(body: Body) -> tuple[float, float]:
+    """Return the zeniths at which a mirror at the centre shows the wall's rim and the horizon, radians."""
+    return math.atan2(body.radius, body.height) / 2, math.pi / 4
+
+
 def linear_pattern(body: Body) -> Linear:
     """Return the linear pattern that spans a wall: dark at its rim, clear at the rest plane."""
-    return Linear(math.atan2(body.radius, body.height) / 2, math.pi / 4)
+    return Linear(*zenith_window(body))
 
 
 def _transmittances(values: NDArray[Any]) -> Floats:
