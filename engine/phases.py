@@ -1,0 +1,117 @@
+"""The phases of an axial rotation: whether they determine mean, cosine and sine, and how these follow."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io import InputError, check_phase
+
+Doubles = NDArray[np.float64]
+
+_WORST = 1e8  # condition of the Gram matrix up to which a fit is told
+_SAME = 1e-9  # radians within which two phases are one
+
+
+def basis(phase: ArrayLike) -> Doubles:
+    """Return the functions that are fitted, 1, cos alpha and sin alpha, as columns: (N, 3) float64."""
+    alpha = np.asarray(phase, np.float64)
+    return np.stack([np.ones_like(alpha), np.cos(alpha), np.sin(alpha)], axis=1)
+
+
+def check_weights(weights: ArrayLike | None, count: int) -> Doubles:
+    """Return the weights of some frames, (count,) float64, if they can be used; 1 each by default.
+
+    Parameters
+    ----------
+    weights : array_like, (count,), or None
+        How much a frame counts; 0 for a missing one.
+    count : int
+        Frames.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        They are of another length, or not all of them are finite and at least 0.
+    """
+    if weights is None:
+        return np.ones(count)
+    values = np.asarray(weights)
+    if values.dtype.kind not in "biuf" or values.shape != (count,):
+        told = f"weights of type {values.dtype} and shape {values.shape} for {count} frames"
+        raise InputError(f"{told}: one number a frame is needed")
+    wrong = ~(np.isfinite(values) & (values >= 0))
+    if np.any(wrong):
+        frame = int(np.argmax(wrong))
+        raise InputError(f"weight {values[frame]} at frame {frame}: a finite number from 0 on is needed")
+    return values.astype(np.float64)
+
+
+def check_phases(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
+    """Return phases as float64, (N,), if they determine mean, cosine and sine of what they sample.
+
+    Parameters
+    ----------
+    phase : array_like, (N,)
+        Radians.
+    weights : array_like, (N,), optional
+        How much each frame counts; one of weight 0 does not.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Phases or weights that are no finite numbers, weights below 0, fewer than three different phases, or
+        phases so close together that the condition of the Gram matrix exceeds 1e8.
+    """
+    alpha = check_phase(phase, int(np.size(phase)), "phase")
+    weight = check_weights(weights, len(alpha))
+    known = alpha[weight > 0]
+    if len(alpha) > 0 and len(known) == 0:
+        raise InputError(f"all {len(alpha)} frames have weight 0: nothing is left to be fitted")
+    different = _count_different(known)
+    if different < 3:
+        problem = f"{len(known)} frames at {different} different phases do not determine a fit"
+        raise InputError(f"{problem} of mean, cosine and sine: at least 3 are needed")
+    weighted = basis(known) * np.sqrt(weight[weight > 0] / weight.max())[:, np.newaxis]
+    condition = float(np.linalg.cond(weighted)) ** 2
+    if not condition <= _WORST:
+        limit = f"condition {condition:.0e}, at most {_WORST:.0e}"
+        problem = f"the phases are too close together to tell mean, cosine and sine apart ({limit})"
+        raise InputError(f"{problem}: spread them over more of the turn")
+    return alpha
+
+
+def fit_matrix(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
+    """Return the matrix that makes mean, cosine and sine of samples: the weighted pseudo-inverse.
+
+    It minimises sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With N evenly spaced phases and equal
+    weights, its rows are 1/N, (2/N) cos alpha and (2/N) sin alpha: the time average of the paper, and the
+    correlations of its equations 17 and 20, as sums over a whole turn.
+
+    Parameters
+    ----------
+    phase, weights
+        As for ``check_phases``.
+
+    Returns
+    -------
+    ndarray, (3, N), float64
+        Its product with the samples, (N,), is a, b and c.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        As ``check_phases``.
+    """
+    alpha = check_phases(phase, weights)
+    root = np.sqrt(check_weights(weights, len(alpha)))
+    return np.asarray(np.linalg.pinv(basis(alpha) * root[:, np.newaxis]) * root)
+
+
+def _count_different(phase: Doubles) -> int:
+    """Return how many different points of the circle phases are, but for rounding."""
+    if len(phase) == 0:
+        return 0
+    turn = np.sort(np.mod(phase, 2 * np.pi))
+    gaps = np.diff(turn, append=turn[0] + 2 * np.pi)
+    return max(1, int(np.count_nonzero(gaps > _SAME)))

@@ -1,0 +1,278 @@
+"""Least squares over the phases of a rotation: what ``correlation.cl`` computes, in plain NumPy.
+
+Samples E_k at the phases alpha_k are fitted by a + b cos alpha_k + c sin alpha_k, so that
+SS = sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2 is least. With X the matrix of rows
+(1, cos alpha, sin alpha) and W the weights, four sums over the samples tell all there is to know: Z'E, where
+Z is W X but for rounding, and E'W E.
+
+Whole counts of frames that all have weight 1 are summed as integers, with the cosines and sines of Z rounded
+to multiples of a unit, so that nothing is lost however long a stack is, nor where a frame leaves a sliding
+window again. The rounding of Z does no harm: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol,
+Econometrica 9, 1941), exact for samples that the model describes, and SS is E'W E - beta' X'W X beta then.
+Otherwise it differs from least squares by the noise times the rounding, less than a part in 100 000 of it.
+
+Any other samples are summed as pairs of floats, which are as good as float64, after the first one has been
+subtracted; Z is then rounded to float32.
+
+``fit`` says what follows from the sums s = Z'(E - r) of a pixel's samples less its reference r. With
+L'L = X'W X, L upper triangular ::
+
+    u = L (Z'X)^-1 s        (a - r, b, c) = L^-1 u        SS = sum_k w_k (E_k - r)^2 - u'u
+
+It is a table, (28,) float32: the matrix L (Z'X)^-1, row by row, as two floats each, all the high ones first;
+L^-1; and one over the degrees of freedom, N - 3, or NaN where there are none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Counts = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Answers = tuple[Floats, Floats, Floats, Floats]
+
+WINDOW = 64
+"""Frames that a sliding window can hold."""
+
+
+def correlation_slide(
+    frames: NDArray[Any],
+    first: int,
+    window: int,
+    basis: NDArray[np.int32],
+    ring: NDArray[Any],
+    total: Counts,
+    cosine: Counts,
+    sine: Counts,
+    square: Counts,
+) -> None:
+    """Move a sliding window on over some frames: add them, and take away those that they replace.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8 or uint16
+        Samples; the kernel is told ``n``, ``P`` and the pixels from plane to plane of the ring after it.
+    first : int
+        Number of the first of these frames since the window was empty.
+    window : int
+        Frames that it holds.
+    basis : ndarray, (n, 6), int32
+        Of each new frame its weight, 0 or 1, and the weight times cosine and sine, in units; and the same of
+        the frame that it replaces.
+    ring : ndarray, (window, P), as frames
+        The samples that are in the window, each frame at its number modulo ``window``.
+    total, cosine, sine, square : ndarray, (P,), int64
+        The sums: of the samples, of their products with cosine and sine, in units, and of their squares. The
+        kernel's are int32 for uint8.
+    """
+    for number, frame in enumerate(frames, start=first):
+        row = basis[number - first].astype(np.int64)
+        now, gone = frame.astype(np.int64), ring[number % window].astype(np.int64)
+        total += row[0] * now - row[3] * gone
+        cosine += row[1] * now - row[4] * gone
+        sine += row[2] * now - row[5] * gone
+        square += row[0] * now**2 - row[3] * gone**2
+        ring[number % window] = frame
+
+
+def correlation_add(
+    frames: NDArray[Any],
+    place: NDArray[np.int32],
+    basis: NDArray[np.int32],
+    total: Counts,
+    cosine: Counts,
+    sine: Counts,
+    square: Counts,
+) -> None:
+    """Add some frames, of weight 1 each, to the sums so far.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8 or uint16
+        Samples; the kernel is told the number of places and ``P`` after it.
+    place : ndarray, (m,), int32
+        Which of the frames are to be added.
+    basis : ndarray, (m, 3), int32
+        Of each of them 1, and cosine and sine of its phase in units.
+    total, cosine, sine, square
+        The sums, as for ``correlation_slide``, but of any number of frames.
+    """
+    for number, (_, along, across) in zip(place, basis.astype(np.int64), strict=True):
+        sample = frames[number].astype(np.int64)
+        total += sample
+        cosine += along * sample
+        sine += across * sample
+        square += sample**2
+
+
+def correlation_solve_counts(
+    frames: int,
+    cosines: int,
+    sines: int,
+    total: Counts,
+    cosine: Counts,
+    sine: Counts,
+    square: Counts,
+    fit: NDArray[np.float32],
+) -> Answers:
+    """Return mean, cosine, sine and residual that integer sums tell.
+
+    Parameters
+    ----------
+    frames : int
+        Frames in the sums; the kernel is told ``P`` before it.
+    cosines, sines : int
+        Sums of their cosines and sines, units.
+    total, cosine, sine, square : ndarray, (P,), int64
+        As for ``correlation_slide`` or ``correlation_add``.
+    fit : ndarray, (28,), float32
+        See the module.
+
+    Returns
+    -------
+    mean, cosine, sine, residual : ndarray, (P,), float64
+        Counts.
+    """
+    return _solve(_centre(frames, cosines, sines, total, cosine, sine, square), fit)
+
+
+def correlation_convert(
+    frames: int,
+    cosines: int,
+    sines: int,
+    unit: float,
+    total: Counts,
+    cosine: Counts,
+    sine: Counts,
+    square: Counts,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Turn integer sums into those that ``correlation_sum`` goes on with; the kernel does so in place.
+
+    Parameters
+    ----------
+    frames, cosines, sines, total, cosine, sine, square
+        As for ``correlation_solve_counts``; the kernel is told ``P`` before them.
+    unit : float
+        What cosines and sines were rounded to multiples of.
+
+    Returns
+    -------
+    reference, total, cosine, sine, square : ndarray, (P,), float64
+    """
+    reference, *sums = _centre(frames, cosines, sines, total, cosine, sine, square)
+    return reference, sums[0], unit * sums[1], unit * sums[2], sums[3]
+
+
+def correlation_sum(
+    frames: NDArray[Any],
+    fresh: bool,
+    place: NDArray[np.int32],
+    basis: NDArray[np.float32],
+    reference: NDArray[np.floating],
+    total: Floats,
+    cosine: Floats,
+    sine: Floats,
+    square: Floats,
+) -> None:
+    """Add some frames of any weights to the sums so far.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, P), uint8, uint16 or float32
+        Samples; the kernel is told the number of places and ``P`` after it.
+    fresh : bool
+        Whether there are no sums so far.
+    place : ndarray, (m,), int32
+        Which of the frames are to be added.
+    basis : ndarray, (m, 3), float32
+        Of each of them its weight, and the weight times cosine and sine of its phase.
+    reference : ndarray, (P,), float32
+        The very first sample, which is subtracted from all.
+    total, cosine, sine, square : ndarray, (P,), float64
+        Weighted sums of the samples, of their products with cosine and sine, and of their squares; the kernel
+        holds each as the sum of two floats.
+    """
+    if fresh:
+        reference[:] = frames[place[0]]
+        for array in (total, cosine, sine, square):
+            array[:] = 0
+    for number, (weight, along, across) in zip(place, basis.astype(np.float64), strict=True):
+        sample = (frames[number].astype(np.float32) - reference.astype(np.float32)).astype(np.float64)
+        total += weight * sample
+        cosine += along * sample
+        sine += across * sample
+        square += weight * sample**2
+
+
+def correlation_solve_pairs(
+    reference: NDArray[np.floating],
+    total: Floats,
+    cosine: Floats,
+    sine: Floats,
+    square: Floats,
+    fit: NDArray[np.float32],
+) -> Answers:
+    """Return mean, cosine, sine and residual that the sums of ``correlation_sum`` tell.
+
+    The kernel is told ``P`` before all.
+    """
+    return _solve(np.stack([reference.astype(np.float64), total, cosine, sine, square]), fit)
+
+
+def correlation_keep(frames: NDArray[Any], first: int, window: int, ring: NDArray[Any]) -> None:
+    """Put frames into the ring of a sliding window whose samples are summed anew each time.
+
+    Parameters
+    ----------
+    frames, first, window, ring
+        As for ``correlation_slide``, but float32.
+    """
+    for number, frame in enumerate(frames, start=first):
+        ring[number % window] = frame
+
+
+def correlation_window(
+    ring: NDArray[Any], place: NDArray[np.int32], basis: NDArray[np.float32], fit: NDArray[np.float32]
+) -> Answers:
+    """Return mean, cosine, sine and residual of the frames in a ring, summed anew.
+
+    Parameters
+    ----------
+    ring : ndarray, (window, P), uint8, uint16 or float32
+        Samples; the kernel is told the number of places, ``P`` and the pixels from plane to plane after it.
+    place, basis
+        As for ``correlation_sum``.
+    fit : ndarray, (28,), float32
+        See the module.
+
+    Returns
+    -------
+    mean, cosine, sine, residual : ndarray, (P,), float64
+        Counts.
+    """
+    reference, total, cosine, sine, square = sums = np.zeros((5, ring.shape[1]))
+    correlation_sum(ring, True, place, basis, *sums)
+    return correlation_solve_pairs(reference, total, cosine, sine, square, fit)
+
+
+def _centre(
+    frames: int, cosines: int, sines: int, total: Counts, cosine: Counts, sine: Counts, square: Counts
+) -> Floats:
+    """Take a whole number near the mean from all samples: return it and the sums, while exact, (5, P)."""
+    reference = np.floor(total / frames + 0.5).astype(np.int64)
+    rest = total - reference * frames
+    spread = square - reference * (total + rest)
+    parts = reference, rest, cosine - reference * cosines, sine - reference * sines, spread
+    return np.stack(parts).astype(np.float64)
+
+
+def _solve(sums: Floats, fit: NDArray[np.float32]) -> Answers:
+    """Return mean, cosine, sine and residual; the sums are (5, P), the reference first."""
+    table = fit.astype(np.float64)
+    parts = (table[:9] + table[9:18]).reshape(3, 3) @ sums[1:4]
+    mean, cosine, sine = table[18:27].reshape(3, 3) @ parts
+    left = sums[4] - np.sum(parts**2, axis=0)
+    return sums[0] + mean, cosine, sine, np.sqrt(np.where(left < 0, 0, left) * table[27])

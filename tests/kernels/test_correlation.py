@@ -1,0 +1,226 @@
+"""Correlation: the reference against exact numbers, and the kernels against the reference."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.kernels import correlation
+from mirrorskin.kernels.device import C_TYPES, Array, Device
+
+PIXELS = [1, 1300]
+PHASES = np.array([0.1, 1.0, 1.7, 2.9, 3.3, 4.4, 5.2, 6.1, 7.0, 8.8, 9.1])
+STEPS = {"uint8": 2**17, "uint16": 2**23}
+SUMS = ("total", "cosine", "sine", "square")
+
+
+def samples(dtype: str, pixels: int, seed: int = 0) -> NDArray[Any]:
+    """Frames of a full swing, with the extreme counts among them."""
+    rng = np.random.default_rng(seed)
+    shape = len(PHASES), pixels
+    if dtype == "float32":
+        return rng.normal(1000, 3, shape).astype(dtype)
+    frames = rng.integers(0, np.iinfo(dtype).max, shape, endpoint=True).astype(dtype)
+    frames[:, 0] = np.iinfo(dtype).max
+    return frames
+
+
+def steps(dtype: str) -> NDArray[np.int32]:
+    """Rows of 1, cosine and sine in whole steps."""
+    rows = np.stack([np.ones_like(PHASES), *(STEPS[dtype] * f(PHASES) for f in (np.cos, np.sin))], axis=1)
+    return np.rint(rows).astype(np.int32)
+
+
+def fit_of(rows: NDArray[Any]) -> NDArray[np.float32]:
+    """The table of the least-squares fit for sums that were made with these rows."""
+    exact = np.stack([np.ones_like(PHASES), np.cos(PHASES), np.sin(PHASES)], axis=1)
+    upper = np.linalg.cholesky(exact.T @ (rows[:, :1] * exact)).T
+    project = (upper @ np.linalg.inv(rows.T.astype(np.float64) @ exact)).ravel()
+    high = project.astype(np.float32)
+    table = [high, project - high, np.linalg.inv(upper).ravel(), [1 / (len(PHASES) - 3)]]
+    return np.concatenate(table).astype(np.float32)
+
+
+def launch(device: Device, name: str, pixels: int, arguments: list[Any], wide: int, dtype: str) -> list[Any]:
+    """Run a kernel; return its arrays as it leaves them."""
+    arrays: list[Array] = []
+    values: list[Array | np.generic] = []
+    for argument in arguments:
+        if isinstance(argument, np.ndarray):
+            arrays.append(device.array("a", argument.shape, argument.dtype))
+            arrays[-1].host[...] = argument
+            arrays[-1].upload()
+            values.append(arrays[-1])
+        else:
+            values.append(np.int32(argument) if isinstance(argument, int) else argument)
+    bits = 8 * np.dtype(dtype).itemsize
+    kernel = device.kernel("correlation", name, FRAME=C_TYPES[dtype], BITS=bits, WIDE=wide)
+    kernel(-(-pixels // device.shape.tile), *values, moved=1)
+    return [array.download().copy() for array in arrays]
+
+
+def pairs(sums: NDArray[Any]) -> NDArray[np.float64]:
+    """What pairs of floats hold, as the kernels leave them."""
+    return np.asarray(sums).view(np.float32).reshape(*sums.shape[:1], 2).astype(np.float64).sum(axis=1)
+
+
+def close(found: list[Any], expected: Any, dtype: str) -> None:
+    """Compare mean, cosine, sine and residual."""
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=3e-7, atol=1e-7 * np.abs(expected[3]).max())
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_a_window_moves_on(device: Device, dtype: str, pixels: int) -> None:
+    frames, rows, window, stride = samples(dtype, pixels), steps(dtype), 4, pixels + 3
+    width = np.int32 if dtype == "uint8" else np.int64
+    basis = np.hstack([rows, np.vstack([np.zeros((window, 3), np.int32), rows[:-window]])])
+    ring, sums = np.zeros((window, stride), dtype), np.zeros((4, pixels), np.int64)
+    shape = len(frames), pixels, stride, 1, window
+    arrays = [ring, *sums.astype(width)]
+    found = launch(device, "correlation_slide", pixels, [frames, *shape, basis, *arrays], 0, dtype)[2:]
+    correlation.correlation_slide(frames, 1, window, basis, ring[:, :pixels], *sums)
+    np.testing.assert_array_equal(found[0], ring)
+    np.testing.assert_array_equal(found[1:], sums)
+    last = frames[-window:].astype(object)
+    np.testing.assert_array_equal(sums[3], (last**2).sum(axis=0).astype(np.int64))
+    np.testing.assert_array_equal(
+        sums[1], (rows[-window:, 1:2].astype(object) * last).sum(axis=0).astype(int)
+    )
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("pixels", PIXELS)
+@pytest.mark.parametrize("count", [1, 8, 11, 150])
+def test_frames_are_added(device: Device, dtype: str, pixels: int, count: int) -> None:
+    frames, rows = samples(dtype, pixels), steps(dtype)
+    place = np.arange(count, dtype=np.int32) * 5 % len(frames)
+    sums = np.random.default_rng(1).integers(-(10**6), 10**6, (4, pixels))
+    given = [frames, count, pixels, place, rows[place], *sums.copy()]
+    found = launch(device, "correlation_add", pixels, given, 1, dtype)[3:]
+    correlation.correlation_add(frames, place, rows[place], *sums)
+    np.testing.assert_array_equal(found, sums)
+
+
+@pytest.mark.parametrize(("dtype", "wide"), [("uint8", 0), ("uint8", 1), ("uint16", 0), ("uint16", 1)])
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_counts_tell_the_fit(device: Device, dtype: str, wide: int, pixels: int) -> None:
+    frames, rows = samples(dtype, pixels), steps(dtype)
+    sums = np.zeros((4, pixels), np.int64)
+    correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, *sums)
+    narrow = sums if wide or dtype == "uint16" else sums.astype(np.int32)
+    known = len(rows), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
+    fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
+    given = [pixels, *known, *narrow, fit, *answers]
+    found = launch(device, "correlation_solve_counts", pixels, given, wide, dtype)[5:]
+    close(found, correlation.correlation_solve_counts(*known, *sums, fit), dtype)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_counts_become_pairs(device: Device, dtype: str, pixels: int) -> None:
+    frames, rows = samples(dtype, pixels), steps(dtype)
+    sums = np.zeros((4, pixels), np.int64)
+    correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, *sums)
+    known = len(rows), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
+    unit = np.float32(1 / STEPS[dtype])
+    given = [pixels, *known, unit, np.zeros(pixels, np.float32), *sums]
+    reference, *found = launch(device, "correlation_convert", pixels, given, 1, dtype)
+    expected = correlation.correlation_convert(*known, unit, *sums)
+    # A mean next to a half may be rounded either way: the sums of the samples themselves are the same.
+    np.testing.assert_allclose(reference, expected[0], atol=1)
+    same = reference == expected[0]
+    assert same.mean() > 0.9
+    for one, other in zip(found, expected[1:], strict=True):
+        np.testing.assert_allclose(pairs(one)[same], other[same], rtol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_samples_are_summed_as_in_float64(device: Device, dtype: str, pixels: int) -> None:
+    frames = samples(dtype, pixels)
+    basis = np.random.default_rng(2).normal(1, 3, (len(PHASES), 3)).astype(np.float32)
+    kept, state = [np.zeros(pixels, np.float32), *np.zeros((4, pixels, 2), np.float32)], np.zeros((5, pixels))
+    for fresh, place in ((1, [3, 1, 4]), (0, [0, 9])):
+        which = np.array(place, np.int32)
+        given = [frames, len(place), pixels, fresh, which, basis[place], *kept]
+        kept = launch(device, "correlation_sum", pixels, given, int(dtype != "float32"), dtype)[3:]
+        correlation.correlation_sum(frames, bool(fresh), which, basis[place], *state)
+    np.testing.assert_array_equal(kept[0], frames[3])
+    for one, other in zip(kept[1:], state[1:], strict=True):
+        np.testing.assert_allclose(pairs(one), other, rtol=1e-13, atol=1e-13 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("pixels", PIXELS)
+def test_a_ring_is_summed_anew(device: Device, dtype: str, pixels: int) -> None:
+    frames, stride = samples(dtype, pixels), pixels + 5
+    rows = np.stack([np.ones_like(PHASES), np.cos(PHASES), np.sin(PHASES)], axis=1).astype(np.float32)
+    order = (np.arange(len(frames), dtype=np.int32) + 3) % len(frames)
+    ring = np.zeros((len(frames), stride), dtype)
+    ring[order, :pixels] = frames
+    if dtype == "float32":
+        given = [frames, len(frames), pixels, stride, 3, len(frames), np.zeros_like(ring)]
+        kept = launch(device, "correlation_keep", pixels, given, 0, dtype)[1]
+        np.testing.assert_array_equal(kept, ring)
+
+    fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
+    given = [ring, len(frames), pixels, stride, order, rows, fit, *answers]
+    found = launch(device, "correlation_window", pixels, given, 0, dtype)[4:]
+    expected = correlation.correlation_window(ring[:, :pixels], order, rows, fit)
+    close(found, expected, dtype)
+
+    state = np.zeros((5, pixels))
+    correlation.correlation_sum(ring[:, :pixels], True, order, rows, *state)
+    high = state.astype(np.float32)
+    held = [
+        np.stack([part, whole - part], axis=1).astype(np.float32)
+        for part, whole in zip(high, state, strict=True)
+    ][1:]
+    given = [pixels, high[0], *held, fit, *answers]
+    again = launch(device, "correlation_solve_pairs", pixels, given, int(dtype != "float32"), dtype)[6:]
+    close(again, expected, dtype)
+
+
+def test_rounded_instruments_are_exact_for_samples_of_the_model() -> None:
+    made = np.array([[100, 7, -4], [30, 0, 12]])
+    phases = np.pi / 2 * np.array([0, 1, 2, 3, 1])
+    frames = np.stack(
+        [made[:, 0] + c * made[:, 1] + s * made[:, 2] for c, s in [(1, 0), (0, 1), (-1, 0), (0, -1), (0, 1)]]
+    )
+    coarse = np.array([[1, 3, 1], [1, -1, 2], [1, -3, 1], [1, 1, -3], [1, 0, 4]], np.int32)
+    exact = np.stack([np.ones(5), np.cos(phases), np.sin(phases)], axis=1)
+    upper = np.linalg.cholesky(exact.T @ exact).T
+    project = (upper @ np.linalg.inv(coarse.T @ exact)).ravel()
+    high = project.astype(np.float32)
+    fit = np.concatenate([high, project - high, np.linalg.inv(upper).ravel(), [0.5]]).astype(np.float32)
+    sums = np.zeros((4, 2), np.int64)
+    correlation.correlation_add(frames.astype(np.uint8), np.arange(5, dtype=np.int32), coarse, *sums)
+    answers = correlation.correlation_solve_counts(5, *coarse.sum(axis=0)[1:].tolist(), *sums, fit)
+    np.testing.assert_allclose(np.stack(answers[:3], axis=1), made, atol=1e-5)
+    np.testing.assert_allclose(answers[3], 0, atol=1e-4)
+
+
+def test_the_reference_is_least_squares_in_fractions() -> None:
+    phases = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    counts = [[10, 200], [17, 3], [12, 250], [200, 0]]
+    rows = np.array([[1, c, s] for c, s in phases], np.int32)
+    sums = np.zeros((4, 2), np.int64)
+    correlation.correlation_add(np.array(counts, np.uint8), np.arange(4, dtype=np.int32), rows, *sums)
+    upper = np.diag([2, np.sqrt(2), np.sqrt(2)])
+    project = np.linalg.inv(upper).ravel()
+    high = project.astype(np.float32)
+    fit = np.concatenate([high, project - high, np.linalg.inv(upper).ravel(), [1]]).astype(np.float32)
+    answers = correlation.correlation_solve_counts(4, 0, 0, *sums, fit)
+    for pixel in range(2):
+        column = [Fraction(row[pixel]) for row in counts]
+        mean = sum(column) / 4
+        cosine, sine = (column[0] - column[2]) / 2, (column[1] - column[3]) / 2
+        left = sum((e - mean - c * cosine - s * sine) ** 2 for e, (c, s) in zip(column, phases, strict=True))
+        expected = [float(mean), float(cosine), float(sine), float(left) ** 0.5]
+        np.testing.assert_allclose([answer[pixel] for answer in answers], expected, rtol=1e-6)
