@@ -1,0 +1,305 @@
+"""Axial frames resampled along with the object, which the body's tilting moves through the picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.samples import check_dtype
+from mirrorskin.io import Block, Header, InputError, Motion, Source, check_phase, pixel_axes
+from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
+from mirrorskin.kernels.registration import BORDER
+
+_BLOCK = 16_000_000  # bytes of the source's frames that are read at a time
+_FRAME: np.dtype[Any] = np.dtype(np.float32)
+
+
+class Registered:
+    """A source's frames, resampled so that each pixel keeps seeing one point of the object.
+
+    That point is the one that the pixel sees in the mean pose, pressed and upright: p = (x, y, height +
+    press) in the body's frame, of which z = 0 is the sheet's rest plane. The body turns about the pivot q; at
+    the phase alpha it sees the point at ::
+
+        p' = q + Rz(alpha) Ry(tilt) Rz(-alpha) (p - q)
+
+    and a camera that looks straight down, at the pixel of p'.x and p'.y. So the point moves along the
+    direction of alpha alone ::
+
+        (p'.x, p'.y) = (x, y) + (sin(tilt) (p.z - q.z) - (1 - cos(tilt)) u) (cos(alpha), sin(alpha))
+
+    with u = (x - q.x) cos(alpha) + (y - q.y) sin(alpha). There, eq. 10 of the paper holds for the normal of
+    the mean pose.
+
+    A sample between the pixels is made of the 16 round it; see `mirrorskin.kernels.registration`. It is NaN
+    where any of them is outside the picture, clipped (at either end of an integer type) or not a finite
+    number, and where the height is unknown. Where each pixel has its own ``zenith_gain`` and
+    ``zenith_offset``, counts are brought to the scale of the pixel that they come to.
+
+    Whether the sheet touches a point in every pose is not asked: frames show what is seen there. Nor is it
+    whether a point is hidden by others: a mirror skin takes the object's shape, and a camera that looks along
+    the body's axis sees all of it that does not overhang.
+
+    Parameters
+    ----------
+    source : Source
+        Of axial motion, with pixel size, tilt, press and pivot in its header. Open it, or enter this, which
+        enters it.
+    heights : array_like, (H, W)
+        Millimetres of the object's surface; z = 0 is the sheet's rest plane at travel 0. NaN where unknown.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``. It holds five maps and a frame.
+
+    Attributes
+    ----------
+    name, header, motion, shape, rewindable
+        Those of the source.
+    dtype : dtype
+        float32.
+    phase : ndarray, (T,), float64, or None
+        That of the source, if it knows its phases beforehand.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The motion is not axial, the header says too little, or the heights do not fit.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one without room for the maps.
+    """
+
+    dtype = _FRAME
+
+    def __init__(self, source: Source, heights: ArrayLike, device: str | Device | None = None) -> None:
+        check_dtype(source.dtype)
+        self._geometry = _Geometry.of(source)
+        heights = _check_heights(heights, source.shape[1:])
+        self.name, self.header, self.shape = source.name, source.header, source.shape
+        self.motion: Motion = source.motion
+        self.rewindable = source.rewindable
+        self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
+        self.device = open_device(device)
+        self._source = source
+        self._maps = _Maps(self.device, heights, *_levels(self.header, source.shape[1:]), source.dtype)
+        length = _BLOCK // (math.prod(self.shape[1:]) * source.dtype.itemsize)
+        self._room = np.empty((min(max(1, length), self.shape[0]), *self.shape[1:]), source.dtype)
+
+    @property
+    def noise_gain(self) -> NDArray[np.float32]:
+        """By what the noise of a sample is scaled, (H, W), RMS over the frames read since the first.
+
+        NaN where there was no sample. It is that of noise which is independent from pixel to pixel, and equal
+        on their shared scale; that of registered neighbours is not independent.
+        """
+        return self._maps.noise_gain()
+
+    def rewind(self) -> None:
+        """Go back to the first frame, and forget the noise."""
+        self._source.rewind()
+        self._maps.forget()
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames and resample them; see ``Source.read``.
+
+        Raises
+        ------
+        ValueError
+            ``out`` does not fit the frames.
+        InputError
+            The phase of a frame is missing, or the source cannot be read.
+        """
+        if out is None:
+            out = np.empty((1, *self.shape[1:]), self.dtype)
+        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
+            raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{self.shape[1:]}) {self.dtype}")
+        block = self._source.read(self._room[: len(out)])
+        if block is None:
+            return None
+        count = len(block.frames)
+        phases = check_phase(block.phase, count, f"{self.name}: the phase of frames from {block.index} on")
+        for frame, phase, registered in zip(block.frames, phases, out, strict=False):
+            self._maps.resample(frame, self._geometry.shift(float(phase)), registered)
+        return replace(block, frames=out[:count])
+
+    def __enter__(self) -> Self:
+        self._source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self._source.__exit__(kind, error, trace)
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """How the object's points move when the body tilts.
+
+    Attributes
+    ----------
+    corner : (float, float)
+        x and y of the first pixel, mm.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+    tilt : float
+        Radians.
+    press : float
+        Millimetres.
+    pivot : (float, float, float)
+        Millimetres.
+    """
+
+    corner: tuple[float, float]
+    pixel_size: tuple[float, float]
+    tilt: float
+    press: float
+    pivot: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, source: Source) -> Self:
+        """Take what a source's header says, or raise InputError."""
+        if source.motion != "axial":
+            raise InputError(f"{source.name} is of {source.motion} motion: only axial ones can be registered")
+        pixel_size, tilt, press, pivot = (
+            _known(source, name) for name in ("pixel_size", "tilt", "press", "pivot")
+        )
+        x, y = pixel_axes(source.shape[1:], pixel_size)
+        return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot)
+
+    def shift(self, phase: float) -> NDArray[np.float32]:
+        """Return where the points are found at a phase, (2, 4), as ``registration_resample`` takes it."""
+        cosine, sine = math.cos(phase), math.sin(phase)
+        along_x, along_y = self.pixel_size
+        rise, drop = math.sin(self.tilt), 2 * math.sin(self.tilt / 2) ** 2
+        outwards = (self.corner[0] - self.pivot[0]) * cosine + (self.corner[1] - self.pivot[1]) * sine
+        # Millimetres along the phase's direction: a number, and what each column, row and mm of height adds.
+        moved = [
+            rise * (self.press - self.pivot[2]) - drop * outwards,
+            -drop * along_x * cosine,
+            drop * along_y * sine,
+            rise,
+        ]
+        return np.outer([cosine / along_x, -sine / along_y], moved).astype(np.float32)
+
+
+class _Maps:
+    """What the device holds: the maps that do not change, and room for one frame on its way.
+
+    Parameters
+    ----------
+    device : Device
+    height : ndarray, (H, W), float32
+        Millimetres.
+    offset, gain : ndarray, (H, W) or (1, 1), float32
+        See ``registration_admit``.
+    dtype : dtype
+        Of a sample of the source.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        height: NDArray[np.float32],
+        offset: NDArray[np.float32],
+        gain: NDArray[np.float32],
+        dtype: np.dtype[Any],
+    ) -> None:
+        rows, columns = height.shape
+        self._device, self._macros = device, _macros(dtype, levels=offset.size > 1)
+        self._sizes = np.int32(rows), np.int32(columns)
+        self._items = rows * -(-columns // device.shape.tile)
+        padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
+        self._padded = self._put("padded", padding)
+        self._height, self._offset = self._put("height", height), self._put("offset", offset)
+        self._gain = self._put("gain", gain)
+        self._noise = self._put("noise", np.zeros((2, rows, columns), np.float32))
+        self._shift = device.array("shift", (2, 4), np.float32)
+        self._frame = device.array("frame", (rows, columns), dtype)
+        self._registered = device.array("registered", (rows, columns), np.float32)
+
+    def resample(self, frame: NDArray[Any], shift: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+        """Write a frame, (H, W), as it looks from the mean pose."""
+        self._fill(self._frame, frame)
+        self._fill(self._shift, shift)
+        levels = self._offset, self._gain
+        counts, samples = self._frame.host.nbytes, self._registered.host.nbytes
+        self._run("registration_admit", self._frame, *levels, self._padded, moved=counts + samples)
+        self._run(
+            "registration_resample",
+            *(self._padded, self._height, self._shift, *levels, self._registered, self._noise),
+            moved=7 * samples,
+        )
+        out[:] = self._registered.download()
+
+    def noise_gain(self) -> NDArray[np.float32]:
+        """Return the RMS over the frames so far of what scales the noise, (H, W)."""
+        squares, count = self._noise.download()
+        gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
+        return gain
+
+    def forget(self) -> None:
+        """Begin the noise anew."""
+        self._fill(self._noise, np.zeros_like(self._noise.host))
+
+    def _put(self, name: str, values: NDArray[np.float32]) -> Array:
+        array = self._device.array(name, values.shape, np.float32)
+        self._fill(array, values)
+        return array
+
+    def _fill(self, array: Array, values: NDArray[Any]) -> None:
+        array.claim()
+        array.host[:] = values
+        array.upload()
+
+    def _run(self, name: str, *arrays: Array, moved: int) -> None:
+        kernel = self._device.kernel("registration", name, **self._macros)
+        kernel(self._items, *self._sizes, *arrays, moved=moved)
+
+
+def _macros(dtype: np.dtype[Any], levels: bool) -> dict[str, str | int]:
+    top = {"TOP": int(np.iinfo(dtype).max)} if dtype.kind == "u" else {}
+    return {"FRAME": C_TYPES[dtype.name], "LEVELS": int(levels), **top}
+
+
+def _known(source: Source, name: str) -> Any:
+    """Return what a header says, or raise InputError where it says nothing, or no number."""
+    value = getattr(source.header, name)
+    words = name.replace("_", " ")
+    if value is None:
+        raise InputError(
+            f"{source.name} does not say its {words}: record it with pixel size, tilt, press and pivot, which"
+            " registration needs"
+        )
+    if not np.isfinite(value).all():
+        raise InputError(f"{source.name}: {words} is {value}: registration needs finite numbers")
+    return value
+
+
+def _check_heights(heights: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return a map of the frames' size, float32, or raise InputError."""
+    values = np.asarray(heights)
+    if values.dtype.kind not in "iuf":
+        raise InputError(f"heights are of type {values.dtype}: give millimetres")
+    if values.shape != shape:
+        raise InputError(
+            f"heights have shape {values.shape}, the frames are {shape[0]} x {shape[1]}:"
+            " give a map of the frames' size"
+        )
+    if not np.isfinite(values).any():
+        raise InputError("no height is a number: give a map of the object's surface in mm")
+    return values.astype(np.float32)
+
+
+def _levels(header: Header, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return each pixel's counts at zenith 0 and for a unit of it; 0 and 1, (1, 1), where all are alike."""
+    offset = np.asarray(0.0 if header.zenith_offset is None else header.zenith_offset)
+    gain = np.asarray(1.0 if header.zenith_gain is None else header.zenith_gain)
+    if (offset == offset.flat[0]).all() and (gain == gain.flat[0]).all():
+        return np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32)
+    gain = np.where(np.isfinite(gain) & (gain != 0), gain, np.nan)
+    offset, gain = np.broadcast_to(offset, shape), np.broadcast_to(gain, shape)
+    return offset.astype(np.float32), gain.astype(np.float32)

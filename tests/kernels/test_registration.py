@@ -1,0 +1,183 @@
+"""Resampling along with the object: the reference against closed forms, and the kernel against it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.kernels import registration
+from mirrorskin.kernels.device import C_TYPES, Device
+from mirrorskin.kernels.registration import BORDER, registration_admit, registration_resample, weights
+
+DTYPES = ["uint8", "uint16", "float32"]
+ALIKE = np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32)
+# Pixels to the right and down: a number, and what a column, a row and a millimetre of height add.
+SHIFT = np.array([[1.3, 0.011, -0.017, 2.1], [-0.6, -0.021, 0.013, -1.4]], np.float32)
+
+
+class Answer(NamedTuple):
+    padded: NDArray[np.float32]
+    registered: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+
+def make_room(shape: tuple[int, int]) -> Answer:
+    rows, columns = shape
+    padded = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
+    return Answer(padded, np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32))
+
+
+def numpy_frame(frame, height, shift, offset, gain) -> Answer:
+    room = make_room(frame.shape)
+    registration_admit(frame, offset, gain, room.padded)
+    registration_resample(room.padded, height, shift, offset, gain, room.registered, room.noise)
+    return room
+
+
+def device_frame(device: Device, frame, height, shift, offset, gain) -> Answer:
+    given = {"frame": frame, "height": height, "shift": shift, "offset": offset, "gain": gain}
+    arrays = {}
+    for name, values in (given | make_room(frame.shape)._asdict()).items():
+        arrays[name] = device.array(name, values.shape, values.dtype)
+        arrays[name].host[:] = values
+        arrays[name].upload()
+    rows, columns = frame.shape
+    top = {"TOP": int(np.iinfo(frame.dtype).max)} if frame.dtype.kind == "u" else {}
+    macros = {"FRAME": C_TYPES[frame.dtype.name], "LEVELS": int(offset is not ALIKE[0]), **top}
+    items, sizes = rows * -(-columns // device.shape.tile), (np.int32(rows), np.int32(columns))
+    for name, wanted in (
+        ("registration_admit", "frame offset gain padded"),
+        ("registration_resample", "padded height shift offset gain registered noise"),
+    ):
+        kernel = device.kernel("registration", name, **macros)
+        kernel(items, *sizes, *(arrays[argument] for argument in wanted.split()), moved=frame.nbytes)
+    return Answer(*(arrays[name].download().copy() for name in Answer._fields))
+
+
+def random_case(dtype: str, shape: tuple[int, int], each: bool = False) -> dict[str, Any]:
+    """Frames with clipped and missing samples, heights with gaps, and shifts that leave the picture."""
+    generator = np.random.default_rng(shape[1])
+    kind = np.dtype(dtype)
+    frame = generator.normal(100, 30, shape).astype(kind)
+    some = generator.random(shape)
+    frame[some < 0.01] = np.inf if kind.kind == "f" else np.iinfo(kind).max
+    frame[some > 0.99] = np.nan if kind.kind == "f" else 0
+    height = generator.uniform(-1, 0, shape).astype(np.float32)
+    height[generator.random(shape) < 0.05] = np.nan
+    offset, gain = ALIKE
+    if each:
+        offset, gain = (generator.uniform(*ends, shape).astype(np.float32) for ends in ((5, 20), (200, 260)))
+    return {"frame": frame, "height": height, "shift": SHIFT, "offset": offset, "gain": gain}
+
+
+def polynomial(x, y):
+    """A surface that is cubic along rows, along columns, and in their products."""
+    return (2 + x - 0.3 * x**2 + 0.05 * x**3) * (1 - 0.4 * y + 0.2 * y**2 - 0.03 * y**3)
+
+
+def moved(shift, height):
+    """Where each pixel's point is, in columns and rows."""
+    row, column = np.indices(height.shape)
+    ways = np.stack([np.ones_like(height), column, row, height])
+    return column + np.tensordot(shift[0], ways, 1), row + np.tensordot(shift[1], ways, 1)
+
+
+def test_weights_take_a_cubic_through_four_samples() -> None:
+    part = np.linspace(0, 1, 11)
+    for power in range(4):
+        samples = np.array([-1.0, 0, 1, 2]) ** power
+        np.testing.assert_allclose(samples @ weights(part), part**power, atol=1e-14)
+    np.testing.assert_array_equal(weights(np.array(0.0)), [0, 1, 0, 0])
+
+
+def test_the_reference_finds_a_cubic_surface_where_it_has_moved_to() -> None:
+    shape = 12, 14
+    row, column = np.indices(shape)
+    height = np.random.default_rng(0).uniform(-1, 0, shape).astype(np.float32)
+    found = numpy_frame(polynomial(column, row).astype(np.float32), height, SHIFT, *ALIKE).registered
+    x, y = moved(SHIFT.astype(float), height.astype(float))
+    inside = (x >= 1) & (x < 12) & (y >= 1) & (y < 10)
+    assert inside.sum() > 60
+    np.testing.assert_allclose(found[inside], polynomial(x, y)[inside], rtol=1e-5, atol=1e-3)
+    assert np.isnan(found[~inside]).all()
+
+
+def test_a_shift_of_whole_pixels_moves_samples_and_noise_as_they_are() -> None:
+    frame = np.random.default_rng(1).normal(100, 30, (8, 9)).astype(np.float32)
+    shift = np.array([[2, 0, 0, 0], [-1, 0, 0, 0]], np.float32)
+    found = numpy_frame(frame, np.zeros((8, 9), np.float32), shift, *ALIKE)
+    expected = np.full((8, 9), np.nan, np.float32)
+    expected[2:7, :5] = frame[1:6, 2:7]
+    # Of what is found elsewhere, one of the 16 samples is beyond the edge.
+    np.testing.assert_array_equal(found.registered[2:7, :5], expected[2:7, :5])
+    np.testing.assert_array_equal(found.noise, np.broadcast_to(np.isfinite(found.registered), (2, 8, 9)))
+    assert np.isfinite(found.registered).sum() == 5 * 5
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.5), (0.25, 0.0), (0.1, 0.8)])
+def test_noise_is_scaled_by_what_single_samples_come_to(place: tuple[float, float]) -> None:
+    shift = np.array([[place[0], 0, 0, 0], [place[1], 0, 0, 0]], np.float32)
+    height = np.zeros((7, 7), np.float32)
+    parts = []
+    for single in np.eye(49, dtype=np.float32).reshape(49, 7, 7):
+        found = numpy_frame(single, height, shift, *ALIKE)
+        parts.append(found.registered[3, 3])
+    assert np.count_nonzero(parts) in (4, 16)
+    assert found.noise[0, 3, 3] == pytest.approx(np.sum(np.square(parts)), rel=1e-6)
+    assert 0.64**2 - 1e-6 <= found.noise[0, 3, 3] < 1
+    assert sum(parts) == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_clipped_and_missing_counts_are_not_admitted(dtype: str) -> None:
+    kind = np.dtype(dtype)
+    fine = [1, 2, 254]
+    bad = [np.nan, np.inf, -np.inf] if kind.kind == "f" else [0, np.iinfo(kind).max]
+    frame = np.array([fine + bad]).astype(kind)
+    room = make_room(frame.shape)
+    registration_admit(frame, *ALIKE, room.padded)
+    np.testing.assert_array_equal(room.padded[2, 2:-2], fine + [np.nan] * len(bad))
+    assert np.isnan(room.padded[[0, 1, 3, 4]]).all()
+    assert np.isnan(room.padded[:, [0, 1, -2, -1]]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 6), (33, 1100)])
+@pytest.mark.parametrize(("dtype", "each"), [("uint8", False), ("uint16", True), ("float32", False)])
+def test_a_device_agrees_with_the_reference(
+    device: Device, dtype: str, shape: tuple[int, int], each: bool
+) -> None:
+    case = random_case(dtype, shape, each)
+    found, expected = device_frame(device, **case), numpy_frame(**case)
+    assert np.isfinite(expected.registered).any() == (min(shape) > 4)
+    for name in Answer._fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=2e-5, atol=2e-4)
+
+
+@pytest.mark.parametrize("far", [1e4, -1e4, 3e9, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_is_far_outside_the_picture_is_missing(device: Device, far: float, axis: int) -> None:
+    shift = np.zeros((2, 4), np.float32)
+    shift[axis, 0] = far
+    frame, height = np.full((6, 8), 7, np.uint8), np.zeros((6, 8), np.float32)
+    with np.errstate(invalid="ignore"):
+        answers = [
+            numpy_frame(frame, height, shift, *ALIKE),
+            device_frame(device, frame, height, shift, *ALIKE),
+        ]
+    for found in answers:
+        assert np.isnan(found.registered).all()
+        assert not found.noise.any()
+
+
+def test_noise_is_summed_over_frames(device: Device) -> None:
+    case = random_case("uint8", (9, 20))
+    room = make_room((9, 20))
+    for _ in range(3):
+        registration.registration_admit(case["frame"], *ALIKE, room.padded)
+        registration_resample(room.padded, case["height"], SHIFT, *ALIKE, room.registered, room.noise)
+    once = device_frame(device, **case)
+    np.testing.assert_allclose(room.noise, 3 * once.noise, rtol=1e-5)
+    assert once.noise[1].sum() > 20
