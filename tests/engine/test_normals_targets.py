@@ -1,0 +1,202 @@
+"""Normals from axial rotations, against the statistical limit (tests/support/rotations.py)."""
+
+import itertools
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import rotations
+from rotations import BINS, SETUPS, TILT, UNEVEN, Setup
+
+from mirrorskin import engine
+
+DRAWS = 10_000
+# So little noise that an estimate's own curvature, of second order in it, is no bias that one could see.
+CALM = Setup(gain=60.0, noise=3.0, offset=150.0, dtype="uint16")
+FLOATS = replace(CALM, dtype="float32")
+
+
+@cache
+def drawn(name):
+    return rotations.draw(SETUPS[name], DRAWS, seed=1)
+
+
+def estimate(frames, setup, device, **given):
+    """Estimate with what a lab knows: phases, tilt, gain, offset, and the noise of a sample."""
+    known = {"noise": setup.spread, "device": device, **given}
+    return engine.estimate_normals(frames, setup.phase, setup.tilt, setup.slope, setup.offset, **known)
+
+
+@pytest.fixture(scope="module", params=SETUPS)
+def answered(request, device):
+    """What the exact method makes of thousands of draws a bin, and the score of it."""
+    stack = drawn(request.param)
+    normals = estimate(stack.frames, stack.setup, device)
+    return normals, rotations.scores(normals.vectors, normals.sigma, stack), stack
+
+
+def test_the_exact_method_reaches_the_bound_in_every_bin(answered):
+    _, told, _ = answered
+    assert np.all(told.ratio <= 1.05), np.round(told.ratio, 3)
+    assert np.all(told.ratio >= 0.95), "better than can be: the scorer is wrong"
+
+
+def test_sigma_is_honest_in_every_bin(answered):
+    _, told, _ = answered
+    np.testing.assert_allclose(told.chi_square, 1, rtol=0, atol=0.05)
+
+
+def test_all_that_is_in_contact_is_told_so(answered):
+    normals, _, stack = answered
+    assert normals.contact.shape == stack.bound.shape
+    assert np.all(np.mean(normals.contact == 0, axis=1) <= 0.01)
+
+
+def test_the_noise_is_told_from_the_residuals(device):
+    stack = drawn("uint8")
+    normals = estimate(stack.frames, stack.setup, device, noise=None)
+    assert normals.noise == pytest.approx(stack.setup.spread, rel=0.02)
+    told = rotations.scores(normals.vectors, normals.sigma, stack)
+    np.testing.assert_allclose(told.chi_square, 1, rtol=0, atol=0.07)
+
+
+@pytest.mark.parametrize("noise", [None, 1.0])
+def test_frames_without_noise_are_answered_exactly(device, noise):
+    setup = replace(SETUPS["float32"], noise=0.0, offset=10.0)
+    normals = rotations.random_normals(300, seed=2)
+    normals[0, :8] = rotations.axes(setup.phase, TILT)  # a sample's own axis, where its angle has no slope
+    normals[0, 8:16] = rotations.direction(2 * TILT, setup.phase)
+    found = estimate(rotations.expose(normals, setup, seed=2), setup, device, noise=noise)
+    assert np.degrees(rotations.between(found.vectors.astype(float), normals)).max() <= 0.01
+    np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=-1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("phase", [rotations.EIGHTHS, UNEVEN], ids=["even", "uneven"])
+@pytest.mark.parametrize("name", ["uint8", "uint16", "float32"])
+def test_the_paper_method_is_equations_16_to_22(device, name, phase):
+    setup = replace(SETUPS[name], phase=phase)
+    stack = rotations.draw(setup, 500, seed=3)
+    expected = rotations.paper(stack.frames, setup)
+    found = estimate(stack.frames, setup, device, method="paper")
+    swings = expected.modulation > 1e-5  # without a swing there is no direction to tell
+    assert np.mean(swings) > 0.99
+    np.testing.assert_allclose(found.zenith[swings], expected.zenith[swings], rtol=0, atol=1e-5)
+    turned = found.azimuth.astype(float) - expected.azimuth
+    turned = np.abs(np.arctan2(np.sin(turned), np.cos(turned)))
+    assert np.all(turned[swings] <= 1e-5 * TILT / expected.modulation[swings])
+
+
+def test_the_paper_method_is_where_the_errata_say_it_fails(device):
+    stack = drawn("float32")
+    told = rotations.scores(estimate(stack.frames, stack.setup, device, method="paper").vectors, None, stack)
+    assert np.all(told.ratio[1:6] > 3)  # at and below the tilt
+    assert np.all(told.ratio[-6:] < 1.05)  # far above
+
+
+UNUSUAL = {
+    "uneven phases": (replace(CALM, phase=UNEVEN), None),
+    "uneven phases, one frame missing": (replace(CALM, phase=UNEVEN), "weight"),
+    "one frame missing": (CALM, "weight"),
+    "one frame left out": (CALM, "left out"),
+    "one sample missing, any": (FLOATS, "nan"),
+}
+
+
+@cache
+def unusual(case):
+    return rotations.draw(UNUSUAL[case][0], 2500, seed=4)
+
+
+def without_one(stack, how, device):
+    """Estimate without one frame, or one sample of each pixel; return the bound of what is left, too."""
+    frames, setup, given = stack.frames.copy(), stack.setup, {}
+    left = np.ones(frames.shape)
+    if how == "weight":
+        frames[3], left[3] = 0, 0
+        given = {"weights": left[:, 0, 0]}
+    elif how == "nan":
+        lost = np.random.default_rng(0).integers(0, 8, (1, *stack.bound.shape))
+        np.put_along_axis(frames, lost, np.nan, axis=0)
+        np.put_along_axis(left, lost, 0, axis=0)
+    elif how == "left out":
+        frames, left = np.delete(frames, 3, axis=0), np.delete(left, 3, axis=0)
+        setup = replace(setup, phase=tuple(np.delete(setup.phase, 3)))
+    return estimate(frames, setup, device, **given), rotations.bound(stack.normals, setup, left)
+
+
+@pytest.mark.parametrize("case", UNUSUAL)
+def test_uneven_phases_and_missing_frames_cost_what_they_must_and_no_bias(device, case):
+    stack = unusual(case)
+    normals, best = without_one(stack, UNUSUAL[case][1], device)
+    assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)) < 4)
+    told = rotations.scores(normals.vectors, normals.sigma, stack._replace(bound=best))
+    np.testing.assert_allclose(told.ratio, 1, atol=0.06)
+    np.testing.assert_allclose(told.chi_square, 1, atol=0.12)
+
+
+@cache
+def clipped(side):
+    """Draw normals of which about one sample of eight is beyond what is linear."""
+    setup = replace(CALM, noise=1.5)
+    normals = rotations.random_normals(2500, seed=5, bins=BINS[2:])  # upright, all samples are alike
+    each = np.sort(rotations.levels(normals, setup), axis=0)
+    ends = {"low": np.ceil(each[:2].mean(axis=0)), "high": np.floor(each[-2:].mean(axis=0))}
+    setup = replace(setup, **{side: ends[side]})
+    best = rotations.bound(normals, setup, rotations.clipped_share(normals, setup))
+    return rotations.Stack(rotations.expose(normals, setup, seed=5), normals, setup, best)
+
+
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_a_clipped_frame_is_no_bias(device, side):
+    stack = clipped(side)
+    lost = np.mean(stack.frames == getattr(stack.setup, side), axis=(0, 2)) * 8
+    assert np.all((lost > 0.9) & (lost < 1.6)), lost
+    normals = estimate(stack.frames, stack.setup, device, **{side: getattr(stack.setup, side)})
+    assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)) < 4)
+    told = rotations.scores(normals.vectors, normals.sigma, stack)
+    np.testing.assert_allclose(told.ratio, 1, atol=0.08)
+    np.testing.assert_allclose(told.chi_square, 1, atol=0.2)
+
+
+def test_what_the_camera_itself_clips_is_no_bias(device):
+    setup = Setup(gain=4.1, noise=1.0, offset=6.0)
+    stack = rotations.draw(setup, 2500, seed=6, bins=[(56, 57), (58, 59), (59, 60), (60, 61)])
+    assert np.all(np.mean(stack.frames == 255, axis=(0, 2))[1:] > 0.05)
+    normals = estimate(stack.frames, setup, device)
+    share = rotations.clipped_share(stack.normals, setup)
+    stack = stack._replace(bound=rotations.bound(stack.normals, setup, share))
+    told = rotations.scores(normals.vectors, normals.sigma, stack)
+    assert np.all(told.ratio < 1.1), told.ratio
+    assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)[:, 0]) < 4)
+
+
+@cache
+def tilted(name, tilt):
+    setup = replace(SETUPS[name], tilt=float(np.radians(tilt)))
+    stack = rotations.draw(setup, 200, seed=7, bins=[(0, 55)] * 200)
+    return stack, rotations.tilt_bound(stack.normals, setup)
+
+
+@pytest.mark.parametrize(("name", "tilt"), [("uint8", 2.5), ("float32", 4.0)])
+def test_an_unknown_tilt_is_told_within_its_own_error(device, name, tilt):
+    stack, error = tilted(name, tilt)
+    setup = stack.setup
+    assert error < 1e-3 * setup.tilt
+    found = engine.estimate_normals(
+        stack.frames, setup.phase, None, setup.slope, setup.offset, noise=setup.spread, device=device
+    )
+    assert found.tilt == pytest.approx(setup.tilt, abs=4 * error)
+    told = rotations.scores(found.vectors.reshape(1, -1, 3), None, flat(stack))
+    assert told.ratio[0] <= 1.05
+
+
+def flat(stack):
+    return stack._replace(normals=stack.normals.reshape(1, -1, 3), bound=stack.bound.reshape(1, -1))
+
+
+def test_the_bins_cover_what_was_asked_for():
+    edges = sorted(bin_ for bin_ in BINS if bin_[1] > bin_[0])
+    assert edges[0][0] == 0
+    assert edges[-1][1] == 60
+    assert all(low == high for (_, high), (low, _) in itertools.pairwise(edges))
