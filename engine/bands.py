@@ -47,6 +47,7 @@ class Band:
         dtype: np.dtype[Any],
         maps: Mapping[str, DTypeLike | Planes],
         length: int,
+        least: int,
     ) -> None:
         shape = (rows.stop - rows.start, columns)
         self.rows = rows
@@ -64,7 +65,7 @@ class Band:
             else device.array(name, shape, kind)
             for name, kind in maps.items()
         }
-        self.frames = _longest(device, length, shape, dtype)
+        self.frames = _longest(device, length, least, shape, dtype)
         self._alone = True
         self._resident = False
 
@@ -138,6 +139,7 @@ def cut_into_bands(
     dtype: np.dtype[Any],
     maps: Mapping[str, DTypeLike | Planes],
     length: int,
+    least: int = 1,
 ) -> list[Band]:
     """Make room for a picture: one band where the device has the memory, else as few as it takes.
 
@@ -152,6 +154,8 @@ def cut_into_bands(
         The maps that are needed of each pixel.
     length : int
         Frames that a band should hold; fewer where they do not fit.
+    least : int
+        Frames that it must hold.
 
     Raises
     ------
@@ -161,7 +165,7 @@ def cut_into_bands(
 
     def cut(rows: slice) -> list[Band]:
         try:
-            return [Band(device, rows, shape[1], dtype, maps, length)]
+            return [Band(device, rows, shape[1], dtype, maps, length, least)]
         except DeviceMemoryError as error:
             if rows.stop - rows.start == 1:
                 message = f"one row of {shape[1]} pixels does not fit: {error}; use another device"
@@ -177,11 +181,11 @@ def cut_into_bands(
     return cut(slice(0, shape[0]))
 
 
-def _longest(device: Device, length: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
+def _longest(device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
     while True:
         try:
             return device.array("frames", (length, *shape), dtype)
         except DeviceMemoryError:
-            if length == 1:
+            if length <= least:
                 raise
-            length //= 2
+            length = max(least, length // 2)

@@ -1,0 +1,445 @@
+"""Surface normals from axial rotation (paper, section 4), to the statistical limit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from mirrorskin.engine.bands import Band, Planes, cut_into_bands
+from mirrorskin.engine.noise import CountNoise, noise_of_fit, thin_out, thinning
+from mirrorskin.engine.phases import Doubles, check_phases, check_weights, fit_matrix
+from mirrorskin.engine.samples import check_dtype
+from mirrorskin.engine.scale import make_scale
+from mirrorskin.engine.search import MEMORY_LIMIT
+from mirrorskin.engine.tilt import check_tilt, estimate_tilt, one_wave
+from mirrorskin.engine.turns import LONGEST, cut_into_turns
+from mirrorskin.io import Block, InputError, check_phase
+from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
+from mirrorskin.kernels.normals import MORE, contact_limits
+
+NormalMethod = Literal["exact", "paper"]
+NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
+
+_LANES = 8  # pixels that are best worked on side by side, where a word has room for as many
+_MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
+_ENOUGH = 500  # pixels to tell the noise from
+_MAP_BYTES = 33  # of a pixel, in all of them
+
+
+@dataclass(frozen=True)
+class Normals:
+    """Which way the pixels' surface faces, and how sure that is.
+
+    Attributes
+    ----------
+    vectors : ndarray, (H, W, 3), float32
+        Unit normals in the mean pose; NaN without an answer.
+    sigma : ndarray, (H, W), float32
+        Predicted RMS angle to the true normal, radians.
+    contact : ndarray, (H, W), uint8
+        1 where sheet and object touched in every frame.
+    mean, cosine, sine, residual : ndarray, (H, W), float32
+        Counts, of the samples' fit with one wave a turn; see `mirrorskin.engine.Correlation`. Of several
+        turns the mean, of the residual the root mean square.
+    noise : float
+        Standard deviation of a sample that was reckoned with, counts, at the middle of the brightness.
+    shot : float
+        By how much its square was reckoned to grow with each count.
+    tilt : float
+        Half-angle of the precession that was reckoned with, radians.
+    turns, frames : int
+        How many entered.
+    """
+
+    vectors: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    contact: NDArray[np.uint8]
+    mean: NDArray[np.float32]
+    cosine: NDArray[np.float32]
+    sine: NDArray[np.float32]
+    residual: NDArray[np.float32]
+    noise: float
+    shot: float
+    tilt: float
+    turns: int
+    frames: int
+
+    @cached_property
+    def zenith(self) -> NDArray[np.float32]:
+        """Angle to the body's axis in the mean pose, (H, W) float32, radians."""
+        x, y, z = np.moveaxis(self.vectors, -1, 0)
+        zenith: NDArray[np.float32] = np.arctan2(np.hypot(x, y), z)
+        return zenith
+
+    @cached_property
+    def azimuth(self) -> NDArray[np.float32]:
+        """Direction in which the surface faces, (H, W) float32, radians from x towards y."""
+        return np.arctan2(self.vectors[..., 1], self.vectors[..., 0])
+
+    @cached_property
+    def modulation(self) -> NDArray[np.float32]:
+        """Amplitude of the wave, (H, W) float32, counts."""
+        return np.hypot(self.cosine, self.sine)
+
+
+def estimate_normals(
+    frames: NDArray[Any],
+    phase: ArrayLike,
+    tilt: float | None,
+    gain: ArrayLike,
+    offset: ArrayLike = 0.0,
+    *,
+    method: NormalMethod = "exact",
+    noise: float | None = None,
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    device: str | Device | None = None,
+) -> Normals:
+    """Estimate the normals from a stack that fits in memory.
+
+    Parameters
+    ----------
+    frames : ndarray, (T, H, W), uint8, uint16 or float32
+        Raw counts. Whole counts at the ends of their type are taken for clipped, a NaN for missing.
+    phase : array_like, (T,)
+        Radians, one a frame, at least three different ones a turn.
+    tilt : float or None
+        Half-angle of the precession, radians; None estimates it from the first turn.
+    gain, offset : array_like, scalar or (H, W)
+        E = offset + gain zenith: counts per radian, and counts.
+    method : {"exact", "paper"}
+        The most likely normals, or the paper's equations 14 to 22.
+    noise : float, optional
+        Standard deviation of any sample, counts; by default told from the first turn's residuals, as read and
+        shot noise.
+    low, high : array_like, scalar or (H, W), optional
+        Counts between which brightness is linear in the zenith; what is expected beyond tells nothing.
+    weights : array_like, (T,), optional
+        Inverse variances of the frames, in those of ``noise``; 0 for a missing one.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Returns
+    -------
+    Normals
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Frames, phases, tilt, scale or parameters that cannot be used.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one that cannot hold a single row.
+    """
+    if frames.ndim != 3 or 0 in frames.shape:
+        raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
+    alpha = check_phase(phase, len(frames), "phase")
+    estimator = NormalEstimator(
+        frames.shape[1:],
+        frames.dtype,
+        tilt=tilt,
+        gain=gain,
+        offset=offset,
+        method=method,
+        noise=noise,
+        low=low,
+        high=high,
+        device=device,
+        memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
+    )
+    estimator.push(Block(frames, index=0, phase=alpha), weights)
+    return estimator.result()
+
+
+class NormalEstimator:
+    """Estimate normals from frames that come block by block, turn after turn.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : dtype
+        uint8, uint16 or float32.
+    tilt, gain, offset, method, noise, low, high, device
+        As for ``estimate_normals``.
+    longest : int
+        Frames of a turn at most.
+    per_turn : bool
+        Whether to tell each turn alone, in maps with a leading axis, instead of the mean over turns.
+    memory_limit : int
+        Bytes of host memory for frames on the move, where more than one turn is to be held.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Parameters that cannot be used.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+        *,
+        tilt: float | None,
+        gain: ArrayLike,
+        offset: ArrayLike = 0.0,
+        method: NormalMethod = "exact",
+        noise: float | None = None,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        longest: int = LONGEST,
+        per_turn: bool = False,
+        device: str | Device | None = None,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> None:
+        self._dtype = np.dtype(dtype)
+        check_dtype(self._dtype)
+        if method not in NORMAL_METHODS:
+            raise InputError(f"unknown method {method!r}; known are {', '.join(NORMAL_METHODS)}")
+        if noise is not None and not 0 < noise < np.inf:
+            raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
+        self._given_tilt = None if tilt is None else check_tilt(tilt)
+        self._scale = make_scale(gain, offset, low, high, shape)
+        self._shape, self._method = shape, method
+        self._given_noise = None if noise is None else CountNoise(noise**2, 0.0, noise**2)
+        self._longest, self._per_turn = min(longest, LONGEST), per_turn
+        self.device = open_device(device)
+        length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
+        self._bands = cut_into_bands(
+            self.device, shape, self._dtype, self._planes(), length, self._longest + 1
+        )
+        self._buffer = self._bands[0].frames.host
+        if len(self._bands) > 1:
+            fits = min(len(band.frames.host) for band in self._bands)
+            self._buffer = np.empty((fits, *shape), self._dtype)
+        if self._scale.per_pixel:
+            for band in self._bands:
+                for plane, values in enumerate(self._scale.planes):
+                    band.write("scale", values[band.rows], plane=plane)
+        else:
+            self._one_scale = self.device.array("scale", (4,), np.float32)
+            self._one_scale.host[:] = self._scale.planes
+            self._one_scale.upload()
+        self._table = self.device.array("turn", (6, LONGEST), np.float32)
+        self._written = b""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames so far, and be ready for another rotation of the same sensor."""
+        self._tilt, self._noise = self._given_tilt, self._given_noise
+        self._phase, self._weights = np.empty(0), np.empty(0)
+        self._turns = self._frames = 0
+        self._each: list[list[NDArray[Any]]] = []
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
+        return self._buffer[len(self._phase) :]
+
+    def push(self, block: Block, weights: ArrayLike | None = None) -> None:
+        """Take in the next frames.
+
+        Parameters
+        ----------
+        block : Block
+            With the phase of each frame.
+        weights : array_like, (n,), optional
+            Of the frames, as for ``estimate_normals``.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Frames of another type or size, phases or weights that cannot be used, or a turn of too many
+            frames.
+        """
+        frames = block.frames
+        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
+            raise InputError(
+                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
+            )
+        phase = check_phase(block.phase, len(frames), "phase")
+        weight = check_weights(weights, len(frames))
+        start = 0
+        while start < len(frames):
+            part = slice(start, start + len(self.room))
+            self._take(frames[part], phase[part], weight[part])
+            start = part.stop
+
+    def result(self) -> Normals:
+        """Return the maps of all turns: the last one ends here.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            The phases of the first turn do not determine a normal.
+        """
+        self._work(cut_into_turns(self._phase))
+        if not self._per_turn:
+            return self._normals(self._maps(), self._turns, self._frames)
+        stacked = [np.stack(maps) for maps in zip(*self._each, strict=True)]
+        return self._normals(stacked, self._turns, self._frames)
+
+    def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
+        """Take in frames that fit, and work on the turns that are then over."""
+        here = self.room[: len(frames)]
+        counts = weights > 0
+        if not counts.all():
+            frames, phase, weights = frames[counts], phase[counts], weights[counts]
+        if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
+            here[: len(frames)] = frames
+        self._phase = np.concatenate([self._phase, phase])
+        self._weights = np.concatenate([self._weights, weights])
+        turns = cut_into_turns(self._phase)
+        longest = max((turn.stop - turn.start for turn in turns), default=0)
+        if longest > self._longest:
+            told = f"a turn of {longest} frames or more: normals are told from {self._longest} at most"
+            raise InputError(f"{told}; leave some out, or use 'mirrorskin correlate'")
+        if len(turns) > 1:
+            self._work(turns[:-1])
+
+    def _work(self, turns: list[slice]) -> None:
+        """Estimate the normals of turns in the buffer, and keep the frames that come after them."""
+        told = [turn for turn in turns if self._determines(turn)]
+        if not told and self._turns == 0:
+            check_phases(self._phase, self._weights)  # says what is wrong
+        alone = len(self._bands) == 1
+        if alone:
+            self._bands[0].frames.upload(len(self._phase))
+        for turn in told:
+            self._estimate(turn)
+        if alone:
+            self._bands[0].frames.claim()
+        end = turns[-1].stop if turns else 0
+        rest = len(self._phase) - end
+        self._buffer[:rest] = self._buffer[end : end + rest].copy()
+        self._phase, self._weights = self._phase[end:], self._weights[end:]
+
+    def _determines(self, turn: slice) -> bool:
+        """Tell whether a turn's phases determine a normal; one of which too much is missing does not."""
+        try:
+            check_phases(self._phase[turn], self._weights[turn])
+        except InputError:
+            return False
+        return True
+
+    def _estimate(self, turn: slice) -> None:
+        phase, weights = self._phase[turn], self._weights[turn]
+        matrix = fit_matrix(phase, weights)
+        if self._noise is None or self._tilt is None:
+            self._settle(self._buffer[turn], phase, weights, matrix)
+        self._write_table(np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *matrix]))
+        self._turns += 1
+        self._frames += len(phase)
+        for band in self._bands:
+            start = turn.start
+            if len(self._bands) > 1:
+                band.frames.claim()
+                band.frames.host[: len(phase)] = self._buffer[turn, band.rows]
+                band.frames.upload(len(phase))
+                start = 0
+            with band.resident():
+                self._launch(band, start, len(phase), matrix @ (matrix / weights).T)
+        if self._per_turn:
+            self._each.append(self._maps())
+
+    def _settle(self, frames: NDArray[Any], phase: Doubles, weights: Doubles, matrix: Doubles) -> None:
+        """Tell from a turn what was not given: the noise, and the tilt."""
+        step = thinning(self._shape)
+        samples, scale = frames.reshape(len(frames), -1)[:, ::step], self._scale.thinned(step)
+        if self._noise is None:
+            steep = samples[:, one_wave(matrix @ samples, scale)]
+            self._noise = noise_of_fit(steep if steep.shape[1] >= _ENOUGH else samples, phase, weights)
+        if self._tilt is None:
+            self._tilt = estimate_tilt(samples, phase, weights, matrix, scale, self._noise)
+
+    def _write_table(self, rows: Doubles) -> None:
+        """Hand a turn's table to the device, unless it has it from the turn before."""
+        table = np.zeros(self._table.host.shape, np.float32)
+        table[:, : rows.shape[1]] = rows
+        key = table.tobytes()
+        if key != self._written:
+            self._table.claim()
+            self._table.host[:] = table
+            self._table.upload()
+            self._written = key
+
+    def _launch(self, band: Band, start: int, count: int, covariance: Doubles) -> None:
+        """Run the kernel over a band's samples of one turn."""
+        assert self._tilt is not None
+        assert self._noise is not None
+        shape, tilt = self.device.shape, self._tilt
+        lanes = min(_LANES, shape.lanes)
+        integer = self._dtype.kind == "u"
+        kernel = self.device.kernel(
+            "normals",
+            f"normals_{self._method}",
+            FRAME=C_TYPES[self._dtype.name],
+            COUNTED=int(integer),
+            TOP=int(np.iinfo(self._dtype).max) if integer else 0,
+            LANES=lanes,
+            COUNT=count,
+            ROOM=LONGEST,
+            MAPS=int(self._scale.per_pixel),
+            ENDS=int(self._scale.ends),
+            MORE=MORE,
+        )
+        limits = contact_limits(count - 3, tilt)
+        least_tilt = limits.still - (tilt if self._method == "exact" else 0.0)
+        whole = np.array([start, band.pixels, band.stride], np.int32)
+        turns = np.int32(1 if self._per_turn else self._turns)
+        noise = self._noise.base, self._noise.slope, self._noise.least
+        reals = (
+            math.cos(tilt),
+            math.sin(tilt),
+            *noise,
+            limits.noise,
+            limits.model,
+            least_tilt,
+            limits.rest,
+        )
+        scale = band.maps["scale"] if self._scale.per_pixel else self._one_scale
+        arguments: list[Array | np.generic] = [band.frames, self._table, scale, *whole, turns]
+        arguments += [*np.array(reals, np.float32), *(band.maps[name] for name in _MAPS)]
+        if self._method == "paper":
+            (mean, *_), (_, cosine, both), (*_, sine) = covariance
+            arguments += [*np.array([mean, cosine, both, sine], np.float32)]
+        moved = band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + 16 * self._scale.per_pixel)
+        kernel(-(-band.pixels // (lanes * shape.words)), *arguments, moved=moved)
+
+    def _maps(self) -> list[NDArray[Any]]:
+        """Return the maps of all rows, as they are listed."""
+        if len(self._bands) == 1:
+            return self._download(self._bands[0])
+        return [np.concatenate(parts) for parts in zip(*map(self._download, self._bands), strict=True)]
+
+    def _normals(self, maps: list[NDArray[Any]], turns: int, frames: int) -> Normals:
+        assert self._tilt is not None
+        assert self._noise is not None
+        vectors, sigma, contact, mean, cosine, sine, residual = maps
+        told = vectors, sigma, contact, mean, cosine, sine, residual
+        some = thin_out(mean)
+        known = some[np.isfinite(some)]
+        noise = float(self._noise.at(np.median(known) if known.size else 0.0))
+        return Normals(*told, noise, self._noise.slope, self._tilt, turns, frames)
+
+    def _download(self, band: Band) -> list[NDArray[Any]]:
+        """Return the maps of a band, as they are listed."""
+        with band.resident():
+            for name in _MAPS:
+                band.maps[name].download()
+            vectors = band.maps["vectors"].host.reshape(-1)[: 3 * band.pixels]
+            shape = (-1, self._shape[1], 3)
+            return [vectors.reshape(shape).copy(), *(band.plane(name, 0).copy() for name in _MAPS[1:])]
+
+    def _planes(self) -> dict[str, Planes]:
+        scale = {"scale": Planes(4, np.float32)} if self._scale.per_pixel else {}
+        maps = {
+            name: Planes(3 if name == "vectors" else 1, np.uint8 if name == "contact" else np.float32)
+            for name in _MAPS
+        }
+        return maps | scale

@@ -1,0 +1,486 @@
+// Surface normals from the samples of one turn of axial rotation. Specification: normals.py.
+//
+// FRAME    type of a sample
+// COUNTED  1 where samples are whole counts, clipped at 0 and at TOP; 0 where they are floats, of which NaN is missing
+// TOP      the largest count
+// LANES    pixels side by side in a vector: 8 or 4
+// WORDS    vectors of one work-item
+// COUNT    frames of the turn
+// ROOM     frames that `turn` has room for
+// MAPS     1 where each pixel has a scale of its own, 0 where `scale` holds one for all
+// ENDS     1 where brightness is linear between some zeniths only
+// MORE     Gauss-Newton steps after the first two, for pixels of which a sample is clipped, missing or out of range
+//
+// Angles are radians. Maps lie in planes of `stride` pixels, whole vectors, of which the first `pixels` are the
+// picture's:
+//
+// stack    `pixels` samples of each frame, one frame after the other; the turn begins with frame `start`
+// turn     planes of ROOM frames: cosine and sine of the phase, root of the weight, shares in mean, cosine and sine
+// scale    counts at zenith 0; radians per count; the zeniths between which brightness is linear
+// vectors  x, y and z of each pixel side by side
+//
+// All maps but those are answers; of the second turn on they are joined with those of the `turns` - 1 before.
+
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+typedef JOIN(FRAME, LANES) Raw;
+typedef JOIN(float, LANES) F;
+typedef JOIN(int, LANES) I;
+typedef JOIN(uchar, LANES) B;
+#define AS_F(x) JOIN(as_float, LANES)(x)
+#define AS_I(x) JOIN(as_int, LANES)(x)
+
+// A frame begins anywhere, so its vectors are not aligned.
+typedef struct __attribute__((packed)) { Raw samples; } Stored;
+#define LOAD(k) JOIN(convert_float, LANES)(((__global const Stored *)(frames + (size_t)(k) * pixels + p))->samples)
+#define READ(map, at) (*(__global const F *)((map) + (at)))
+#define STORE(map, at, values) (*(__global F *)((map) + (at)) = (values))
+#if MAPS
+#define SCALE(plane) READ(scale, (plane) * stride + p)
+#else
+#define SCALE(plane) ((F)scale[plane])
+#endif
+
+#define COSINE(k) turn[k]
+#define SINE(k) turn[ROOM + (k)]
+#define ROOT_WEIGHT(k) turn[2 * ROOM + (k)]
+#define IN_MEAN(k) turn[3 * ROOM + (k)]
+#define IN_COSINE(k) turn[4 * ROOM + (k)]
+#define IN_SINE(k) turn[5 * ROOM + (k)]
+
+#if LANES == 8
+#define ANY(flags) any4((flags).lo | (flags).hi)
+#else
+#define ANY(flags) any4(flags)
+#endif
+
+#define FREEDOM (COUNT - 3)
+#define REACH 0.25f     // longest step, radians
+#define NO_ANSWER 1.0f  // a standard error, radians, from which on nothing is known
+#define LEAST 3         // samples that must be there and within their range
+#define MARGIN 3.0f     // standard deviations that a sample must be from the ends of a range to be within it
+
+typedef struct { F ct, st, cp, sp; } Direction;  // cosine and sine of zenith and azimuth
+typedef struct { F mean, cosine, sine; } Wave;   // of a pixel's zeniths over the turn
+typedef struct {
+    F m11, m12, m22, b1, b2;  // normal equations of the direction: along the meridian, and across
+    F m13, m23, m33, b3;      // and of the tilt
+    F square, waves;          // sums of the squares of what the direction leaves, and of what the wave leaves
+} Sums;
+
+#if defined(__AVX__) && defined(__has_builtin)
+#if __has_builtin(__builtin_ia32_rsqrtps256)
+#define FAST_GUESS 1
+#endif
+#endif
+
+// Comparisons where the library has functions: PoCL calls those, and around a call nothing stays in registers.
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+
+int any4(const int4 flags)
+{
+    const int2 pair = flags.lo | flags.hi;
+    return (pair.x | pair.y) != 0;
+}
+
+// To 5e-7 of itself, by Newton's steps after a guess: the processor's own, where it has one, for the library's root is a call
+// in PoCL; else one from the exponent, with Kadlec's constants.
+F inverse_root(const F x)
+{
+#if LANES != 8
+    return rsqrt(x);
+#elif FAST_GUESS
+    const F y = __builtin_ia32_rsqrtps256(x);
+    return y * (1.5f - 0.5f * x * y * y);
+#else
+    F y = AS_F(0x5F1FFFF9 - (AS_I(x) >> 1));
+    y *= 0.703952253f * (2.38924456f - x * y * y);
+    return y * (1.50000036f - 0.5f * x * y * y);
+#endif
+}
+
+F root(const F x) { return x * inverse_root(GREATER(x, (F)1e-30f)); }
+
+F cosine(const F angle)
+{
+    const F y = LESSER(angle * angle, (F)4.0f);
+    return 0.99999999f + y * (-0.49999991f + y * (0.041666440f + y * (-0.0013886607f
+        + y * (2.4693838e-5f - y * 2.5153292e-7f))));
+}
+
+F sine(const F angle)
+{
+    const F y = LESSER(angle * angle, (F)4.0f);
+    return angle * (0.999999999f + y * (-0.16666666f + y * (0.0083333157f + y * (-0.000198394995f
+        + y * (2.74738174e-6f - y * 2.31926769e-8f)))));
+}
+
+// An angle by half its sine, to 2e-7, of x = sin^2(angle / 2) up to 0.45 and to 2e-5 up to 0.5; in pairs, so that one
+// need not wait for the other.
+F angle_by_half_sine(const F x)
+{
+    const F y = x * x;
+    return (1.99999977f + x * 1.33340033f) + y * ((1.06356538f + x * 0.968005666f)
+        + y * ((0.36618433f + x * 2.68428173f) + y * (-3.71582798f + x * 5.02326723f)));
+}
+
+Direction direction_of(const F x, const F y, const F z)
+{
+    const F flat = x * x + y * y, inverse = inverse_root(flat + z * z);
+    const I level = flat < 1e-20f;
+    const F across = inverse_root(level ? (F)1.0f : flat);
+    Direction found;
+    found.ct = z * inverse;
+    found.st = level ? (F)0.0f : flat * across * inverse;
+    found.cp = level ? (F)1.0f : x * across;
+    found.sp = level ? (F)0.0f : y * across;
+    return found;
+}
+
+// Half the sine of a zenith is root(x - x^2), of x = sin^2(zenith / 2); and x is base + lean cos(azimuth - phase), which
+// loses no digits that matter. By u1, u2 and u3 a zenith grows along the meridian, across it and with the tilt; all are
+// divided by the standard deviation of a sample of its weight, in those of weight 1.
+#define PREPARE                                                                                  \
+    const F apart = at.st * cos_tilt - at.ct * sin_tilt, lean = 0.5f * sin_tilt * at.st;         \
+    const F base = lean + apart * apart / (2.0f + 2.0f * (at.ct * cos_tilt + at.st * sin_tilt)); \
+    const F high_part = 0.5f * cos_tilt * at.st, low_part = 0.5f * sin_tilt * at.ct;             \
+    const F beside_x = 0.5f * sin_tilt * at.cp, beside_y = 0.5f * sin_tilt * at.sp;
+#define PREDICT(k)                                                                               \
+    const F near = at.cp * COSINE(k) + at.sp * SINE(k), beside = beside_x * SINE(k) - beside_y * COSINE(k); \
+    const F most = LESSER(base + lean * near, (F)0.5f), x = GREATER(most, (F)1e-12f);            \
+    const F rest = x - x * x, inverse = inverse_root(rest);                                      \
+    const F zenith = rest * inverse * angle_by_half_sine(x), by_sine = inverse * ROOT_WEIGHT(k); \
+    const F u1 = (low_part * near + high_part) * by_sine, u2 = beside * by_sine;                 \
+    const F u3 = (high_part * near + low_part) * by_sine;
+#define ADD_DERIVATIVES(v1, v2, v3)                                                              \
+    sums.m11 += v1 * u1; sums.m12 += v1 * u2; sums.m22 += v2 * u2;                               \
+    sums.m13 += v1 * u3; sums.m23 += v2 * u3; sums.m33 += v3 * u3;
+#define ADD_RESIDUAL(pull)                                                                       \
+    sums.b1 += u1 * (pull); sums.b2 += u2 * (pull); sums.b3 += u3 * (pull);
+#define NOTHING {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}
+
+F off_wave(const F zenith, const Wave wave, const float cosine, const float sine)
+{
+    return zenith - wave.mean - cosine * wave.cosine - sine * wave.sine;
+}
+
+// The normal equations at a direction, of samples that are all there and all within range.
+Sums look(const Direction at, const F *zeniths, const Wave wave, __global const float *turn,
+          const float cos_tilt, const float sin_tilt)
+{
+    Sums sums = NOTHING;
+    PREPARE
+    for (int k = 0; k < COUNT; ++k) {
+        PREDICT(k)
+        const F error = (zeniths[k] - zenith) * ROOT_WEIGHT(k);
+        const F off = off_wave(zeniths[k], wave, COSINE(k), SINE(k)) * ROOT_WEIGHT(k);
+        ADD_DERIVATIVES(u1, u2, u3)
+        ADD_RESIDUAL(error)
+        sums.square += error * error;
+        sums.waves += off * off;
+    }
+    return sums;
+}
+
+// The normal distribution's density by its integral; the series is good to 2e-4 where it is taken.
+F mills(const F z)
+{
+    const F y = GREATER(z, (F)-6.0f), far = 1.0f / LESSER(z * z, (F)1e30f);
+    const F near = 0.797884561f * exp(-0.5f * y * y) / erfc(-0.707106781f * y);
+    return z > -6.0f ? near : -z / (1.0f - far * (1.0f - far * (3.0f - 15.0f * far)));
+}
+
+// The same of any samples. A clipped one tells only on which side of its bound it was (a Tobit model); one that is
+// expected out of range tells nothing of the direction, and a missing one nothing at all.
+Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *frames, const int pixels, const int p,
+                  __global const float *turn, const float cos_tilt, const float sin_tilt,
+                  const F offset, const F per_count, const F low, const F high, const F error_of_one)
+{
+    Sums sums = NOTHING;
+    PREPARE
+    for (int k = 0; k < COUNT; ++k) {
+        PREDICT(k)
+        const F least = GREATER(zenith, low), seen = LESSER(least, high), error = zeniths[k] - seen, raw = LOAD(k);
+        const I inside = (zenith > low) & (zenith < high);
+        F share = 1.0f, pull = error, misfit = error * error;
+#if COUNTED
+        const I under = raw <= 0.0f, clipped = under | (raw >= TOP);
+        const F end = ((under ? (F)0.5f : (F)(TOP - 0.5f)) - offset) * per_count;
+        const F side = under == (per_count > 0.0f) ? (F)-1.0f : (F)1.0f, z = side * (seen - end) / error_of_one;
+        const F slope = mills(z), beyond = LESSER(z, (F)0.0f) * error_of_one;
+        share = clipped ? slope * (slope + z) : share;
+        pull = clipped ? side * slope * error_of_one : pull;
+        misfit = clipped ? beyond * beyond : misfit;
+#else
+        const I known = raw == raw;
+        share = known ? share : (F)0.0f;
+        pull = known ? pull : (F)0.0f;
+        misfit = known ? misfit : (F)0.0f;
+#endif
+        share = inside ? share : (F)0.0f;
+        pull = (inside ? pull : (F)0.0f) * ROOT_WEIGHT(k);
+        const F v1 = share * u1, v2 = share * u2, v3 = share * u3;
+        ADD_DERIVATIVES(v1, v2, v3)
+        ADD_RESIDUAL(pull)
+        sums.square += ROOT_WEIGHT(k) * ROOT_WEIGHT(k) * misfit;
+    }
+    return sums;
+}
+
+Direction step(const Direction at, const Sums sums)
+{
+    const F scale = 1.0f / (sums.m11 * sums.m22 - sums.m12 * sums.m12);
+    F along = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scale;
+    F across = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scale;
+    const F length = along * along + across * across, shorter = REACH * REACH / GREATER(length, (F)(REACH * REACH));
+    along *= shorter;
+    across *= shorter;
+    const F out = at.st + along * at.ct;
+    return direction_of(out * at.cp - across * at.sp, out * at.sp + across * at.cp, at.ct - along * at.st);
+}
+
+// Takes the lanes that are chosen from another.
+#define TAKE(field) mine.field = chosen ? other.field : mine.field;
+
+Sums blend_sums(Sums mine, const Sums other, const I chosen)
+{
+    TAKE(m11) TAKE(m12) TAKE(m22) TAKE(b1) TAKE(b2) TAKE(m13) TAKE(m23) TAKE(m33) TAKE(b3) TAKE(square)
+    return mine;
+}
+
+Direction blend(Direction mine, const Direction other, const I chosen)
+{
+    TAKE(ct) TAKE(st) TAKE(cp) TAKE(sp)
+    return mine;
+}
+
+// Eq. 10 is linear in the normal once the cosine of the zenith is taken: its wave is the normal. A missing sample is
+// taken for the mean of the others.
+Direction begin_at(const F *zeniths, __global const float *turn, const float cos_tilt,
+                const float sin_tilt)
+{
+    F known = 0.0f, sum = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f;
+#if !COUNTED
+    for (int k = 0; k < COUNT; ++k) {
+        const I there = zeniths[k] == zeniths[k];
+        known += there ? (F)1.0f : (F)0.0f;
+        sum += there ? cosine(zeniths[k]) : (F)0.0f;
+    }
+#endif
+    for (int k = 0; k < COUNT; ++k) {
+        F level = cosine(zeniths[k]);
+#if !COUNTED
+        level = zeniths[k] == zeniths[k] ? level : sum / known;
+#endif
+        z += IN_MEAN(k) * level;
+        x -= IN_COSINE(k) * level;
+        y -= IN_SINE(k) * level;
+    }
+    return direction_of(x * cos_tilt, y * cos_tilt, z * sin_tilt);
+}
+
+// The mean, cosine and sine of zeniths (eq. 17-22, as least squares).
+Wave fit_wave(const F *zeniths, __global const float *turn)
+{
+    Wave wave = {0.0f, 0.0f, 0.0f};
+    for (int k = 0; k < COUNT; ++k) {
+        wave.mean += IN_MEAN(k) * zeniths[k];
+        wave.cosine += IN_COSINE(k) * zeniths[k];
+        wave.sine += IN_SINE(k) * zeniths[k];
+    }
+    return wave;
+}
+
+// What all methods tell beside their normals, in counts; of several turns the mean, and the root mean square.
+#define KEEP_WAVE(square)                                                                        \
+    {                                                                                            \
+        const F gain = 1.0f / per_count, left = (square) * gain * gain;                          \
+        F now_mean = offset + wave.mean * gain, now_cosine = wave.cosine * gain, now_sine = wave.sine * gain; \
+        F now_left = left / (FREEDOM > 0 ? FREEDOM : NAN);                                       \
+        if (turns > 1) {                                                                         \
+            const float share = 1.0f / turns;                                                    \
+            const F before = READ(residual, p);                                                  \
+            now_mean = READ(mean, p) + share * (now_mean - READ(mean, p));                       \
+            now_cosine = READ(cosines, p) + share * (now_cosine - READ(cosines, p));             \
+            now_sine = READ(sines, p) + share * (now_sine - READ(sines, p));                     \
+            now_left = before * before + share * (now_left - before * before);                   \
+        }                                                                                        \
+        STORE(mean, p, now_mean);                                                                \
+        STORE(cosines, p, now_cosine);                                                           \
+        STORE(sines, p, now_sine);                                                               \
+        STORE(residual, p, root(now_left));                                                      \
+    }
+
+#if LANES == 8
+#define KEEP_VECTORS(x, y, z)                                                                    \
+    STORE(vectors, 3 * p, ((F)(x.s0, y.s0, z.s0, x.s1, y.s1, z.s1, x.s2, y.s2)));                \
+    STORE(vectors, 3L * p + 8, ((F)(z.s2, x.s3, y.s3, z.s3, x.s4, y.s4, z.s4, x.s5)));            \
+    STORE(vectors, 3L * p + 16, ((F)(y.s5, z.s5, x.s6, y.s6, z.s6, x.s7, y.s7, z.s7)));
+#define READ_VECTORS(x, y, z)                                                                    \
+    {                                                                                            \
+        const F a = READ(vectors, 3L * p), b = READ(vectors, 3L * p + 8), c = READ(vectors, 3L * p + 16); \
+        x = (F)(a.s0, a.s3, a.s6, b.s1, b.s4, b.s7, c.s2, c.s5);                                 \
+        y = (F)(a.s1, a.s4, a.s7, b.s2, b.s5, c.s0, c.s3, c.s6);                                 \
+        z = (F)(a.s2, a.s5, b.s0, b.s3, b.s6, c.s1, c.s4, c.s7);                                 \
+    }
+#else
+#define KEEP_VECTORS(x, y, z)                                                                    \
+    STORE(vectors, 3 * p, ((F)(x.s0, y.s0, z.s0, x.s1)));                                        \
+    STORE(vectors, 3L * p + 4, ((F)(y.s1, z.s1, x.s2, y.s2)));                                    \
+    STORE(vectors, 3L * p + 8, ((F)(z.s2, x.s3, y.s3, z.s3)));
+#define READ_VECTORS(x, y, z)                                                                    \
+    {                                                                                            \
+        const F a = READ(vectors, 3L * p), b = READ(vectors, 3L * p + 4), c = READ(vectors, 3L * p + 8); \
+        x = (F)(a.s0, a.s3, b.s2, c.s1);                                                         \
+        y = (F)(a.s1, b.s0, b.s3, c.s2);                                                         \
+        z = (F)(a.s2, b.s1, c.s0, c.s3);                                                         \
+    }
+#endif
+
+// Of several turns, the mean of the normals weighted by the inverse of their variances, and contact in all of them.
+#define KEEP_ANSWER(answered, x, y, z, error, touches)                                           \
+    {                                                                                            \
+        F nx = (answered) ? (x) : (F)NAN, ny = (answered) ? (y) : (F)NAN, nz = (answered) ? (z) : (F)NAN; \
+        F now = (answered) ? (error) : (F)NAN;                                                   \
+        B flags = JOIN(convert_uchar, LANES)((answered) & (touches) & 1);                        \
+        if (turns > 1) {                                                                         \
+            F ox, oy, oz;                                                                        \
+            READ_VECTORS(ox, oy, oz)                                                             \
+            const F before = READ(sigma, p);                                                     \
+            const I old = before == before, new = now == now;                                    \
+            const F own = new ? 1.0f / (now * now) : (F)0.0f, theirs = old ? 1.0f / (before * before) : (F)0.0f; \
+            nx = own * (new ? nx : (F)0.0f) + theirs * (old ? ox : (F)0.0f);                     \
+            ny = own * (new ? ny : (F)0.0f) + theirs * (old ? oy : (F)0.0f);                     \
+            nz = own * (new ? nz : (F)0.0f) + theirs * (old ? oz : (F)0.0f);                     \
+            const F length = inverse_root(nx * nx + ny * ny + nz * nz);                          \
+            nx = old | new ? nx * length : (F)NAN;                                               \
+            ny = old | new ? ny * length : (F)NAN;                                               \
+            nz = old | new ? nz * length : (F)NAN;                                               \
+            now = old | new ? inverse_root(own + theirs) : (F)NAN;                               \
+            flags &= *(__global const B *)(contact + p);                                         \
+        }                                                                                        \
+        KEEP_VECTORS(nx, ny, nz)                                                                 \
+        STORE(sigma, p, now);                                                                    \
+        *(__global B *)(contact + p) = flags;                                                    \
+    }
+
+// Whether a sum of squares is that of noise and of what the model leaves out.
+#define LIKE_NOISE(square) (FREEDOM > 0 ? (square) <= noise_limit * error_of_one * error_of_one + limit : (I)-1)
+
+// A sheet at rest shows the zenith 0 all the time; one in contact a mean of the tilt or more.
+#define AT_REST (wave.mean < rest_below)
+
+#define ARGUMENTS                                                                                \
+    __global const FRAME *restrict stack, __global const float *restrict turn,                   \
+    __global const float *restrict scale, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
+    const float sin_tilt, const float noise_base, const float noise_slope, const float noise_least, \
+    const float noise_limit, const float limit, const float still_below, const float rest_below,                         \
+    __global float *restrict vectors, __global float *restrict sigma,                            \
+    __global uchar *restrict contact, __global float *restrict mean,                             \
+    __global float *restrict cosines, __global float *restrict sines,                            \
+    __global float *restrict residual
+
+#define EACH_VECTOR                                                                              \
+    __global const FRAME *frames = stack + (size_t)start * pixels;                               \
+    const int first = (int)get_global_id(0) * WORDS * LANES;                                     \
+    for (int p = first; p < LESSER(first + WORDS * LANES, pixels); p += LANES)
+
+#if COUNTED
+#define WHOLE(raw) ((raw > 0.0f) & (raw < TOP))
+#define PRESENT(raw) raw
+#define PRESENT_COUNT ((float)COUNT)
+#else
+#define WHOLE(raw) (raw == raw)
+#define PRESENT(raw) (raw == raw ? raw : (F)0.0f)
+#define PRESENT_COUNT JOIN(convert_float, LANES)(whole)
+#endif
+#if ENDS
+#define COUNT_WITHIN                                                                             \
+    const F margin = MARGIN * error_of_one, least = low + margin, largest = high - margin;       \
+    I plain = 0;                                                                                 \
+    for (int k = 0; k < COUNT; ++k) plain -= (zeniths[k] > least) & (zeniths[k] < largest) & WHOLE(LOAD(k));
+#else
+#define COUNT_WITHIN const I plain = whole;
+#endif
+#define READ_ZENITHS                                                                             \
+    const F offset = SCALE(0), per_count = SCALE(1), low = SCALE(2), high = SCALE(3);            \
+    F zeniths[COUNT], sum = 0.0f;                                                                 \
+    I whole = 0;                                                                                 \
+    for (int k = 0; k < COUNT; ++k) {                                                            \
+        const F raw = LOAD(k);                                                                   \
+        const I there = WHOLE(raw);                                                              \
+        zeniths[k] = (raw - offset) * per_count;                                                 \
+        sum += PRESENT(raw);                                                                     \
+        whole -= there;                                                                          \
+    }                                                                                            \
+    const F level = sum / PRESENT_COUNT, variance = noise_base + noise_slope * level;            \
+    const F error_of_one = root(GREATER(variance, (F)noise_least)) * GREATER(per_count, -per_count); \
+    COUNT_WITHIN                                                                                 \
+    const Wave wave = fit_wave(zeniths, turn);
+
+__kernel void normals_exact(ARGUMENTS)
+{
+    EACH_VECTOR {
+        READ_ZENITHS
+        const Direction begin = begin_at(zeniths, turn, cos_tilt, sin_tilt);
+        Sums sums = look(begin, zeniths, wave, turn, cos_tilt, sin_tilt);
+        const Direction nearer = step(begin, sums);
+        sums = look(nearer, zeniths, wave, turn, cos_tilt, sin_tilt);
+        const F waves = sums.waves;
+        Direction found = step(nearer, sums);
+        const I odd = plain < COUNT;
+        if (ANY(odd)) {
+            Direction at = begin;
+            for (int more = 0; more < MORE; ++more) {
+                const Sums closer = look_closely(at, zeniths, frames, pixels, p, turn, cos_tilt, sin_tilt,
+                                                 offset, per_count, low, high, error_of_one);
+                sums = blend_sums(sums, closer, odd);
+                at = step(at, closer);
+            }
+            found = blend(found, at, odd);
+        }
+        const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;
+        const F error = error_of_one * root((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));
+        const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct == found.ct);
+
+        // With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
+        const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;
+        const F d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scaled;
+        const F w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) * scaled;
+        const F w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) * scaled;
+        const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);
+        const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;
+        const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;
+        const I still = AT_REST | (more_tilt + 3.0f * error_of_one * inverse_root(told) < still_below);
+        KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left) & ~still)
+        KEEP_WAVE(waves)
+    }
+}
+
+// Last come the variances of the wave's mean and cosine, the covariance of cosine and sine, and the sine's variance, in
+// those of a sample.
+__kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosine,
+                            const float of_both, const float of_sine)
+{
+    EACH_VECTOR {
+        READ_ZENITHS
+        F waves = 0.0f;
+        for (int k = 0; k < COUNT; ++k) {
+            const F off = off_wave(zeniths[k], wave, COSINE(k), SINE(k));
+            waves += ROOT_WEIGHT(k) * ROOT_WEIGHT(k) * off * off;
+        }
+        const F swing = wave.cosine * wave.cosine + wave.sine * wave.sine;
+        const I swings = swing > 1e-20f;
+        const F inverse = inverse_root(swings ? swing : (F)1.0f);
+        const F cp = swings ? wave.cosine * inverse : (F)1.0f, sp = swings ? wave.sine * inverse : (F)0.0f;
+        const F st = sine(wave.mean), ct = cosine(wave.mean), slant = st * inverse, both = 2.0f * cp * sp * of_both;
+        const F across = sp * sp * of_cosine - both + cp * cp * of_sine;
+        const F along = cp * cp * of_cosine + both + sp * sp * of_sine;
+        const F error = error_of_one * root(of_mean + slant * slant * across);
+        const I answered = swings & (ct == ct);
+        const I still = AT_REST | (swing * inverse + 3.0f * error_of_one * root(along) < still_below);
+        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves) & ~still)
+        KEEP_WAVE(waves)
+    }
+}

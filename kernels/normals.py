@@ -1,0 +1,409 @@
+"""Surface normals from one turn of axial rotation: what ``normals.cl`` computes, in NumPy with float64.
+
+At phase alpha the body's axis is a = (-sin d cos alpha, -sin d sin alpha, cos d), and what a pixel shows is
+its zenith t seen from that axis: cos t = n . a (eq. 10). So a sample is a distance on the sphere, from the
+normal n to a known point.
+
+`normals_exact` starts from the linear fit: cos t is mean + cosine cos alpha + sine sin alpha with n =
+(-cosine, -sine, mean tan d) / sin d. Two Gauss-Newton steps on the distances lead to the most likely normal:
+a third moves it by less than a hundredth of its standard error. A distance grows by u . dn when the normal
+moves, where u is the unit vector that points away from a; so sum u u' (gain / noise)^2 is Fisher's
+information, and the trace of its inverse the predicted mean square of the angle to the true normal.
+
+`normals_paper` is eq. 14-22: t is taken for theta + d cos(phi - alpha), which holds well above d only.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+Doubles = NDArray[np.float64]
+
+MORE = 12
+"""Steps after the first two, for pixels of which a sample is clipped, missing or out of range."""
+
+_REACH = 0.25  # longest step, radians
+_NO_ANSWER = 1.0  # a standard error, radians, from which on nothing is known
+_LEAST = 3  # samples that must be there and within their range
+_MARGIN = 3.0  # standard deviations that a sample must be from the ends of a range to be within it
+_MODEL = 0.2  # RMS of what the model may leave out in contact, as a share of the tilt
+_DOUBT = 2.0  # by which the variance of the noise may be wrong
+_REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
+_STILL = 0.25  # share of the tilt below which a sheet does not follow the object
+
+
+class Variance(NamedTuple):
+    """Variance of a sample of weight 1: base + slope x the mean of its pixel's samples, at least `least`.
+
+    Attributes
+    ----------
+    base, slope, least : float
+        Counts squared, counts, counts squared.
+    """
+
+    base: float
+    slope: float
+    least: float
+
+
+class Limits(NamedTuple):
+    """Up to where the residuals of a fit with free tilt are those of a lasting contact.
+
+    Attributes
+    ----------
+    noise : float
+        Sum of squares that noise explains, in variances of a sample.
+    model : float
+        Sum of squares that the model may leave out, radians squared.
+    still : float
+        Least tilt that a sheet in contact shows, less three standard errors, radians.
+    rest : float
+        Least mean of the zeniths that it shows, radians. At rest it is 0, in contact the tilt or more.
+    """
+
+    noise: float
+    model: float
+    still: float
+    rest: float
+
+
+def contact_limits(freedom: int, tilt: float) -> Limits:
+    """Return the limits for a fit with so many degrees of freedom, (frames - 3).
+
+    The noise's share is chi-square's quantile at 99.9 %, which n + 4.37 sqrt(n) + 5.7 meets within 3 %.
+    """
+    noise = _DOUBT * (freedom + 4.37 * math.sqrt(freedom) + 5.7)
+    return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _REST * tilt)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What is told of each pixel.
+
+    Attributes
+    ----------
+    vectors : ndarray, (n, 3), float64
+        Unit normals; NaN without an answer.
+    sigma : ndarray, (n,), float64
+        Predicted RMS angle to the true normal, radians.
+    contact : ndarray, (n,), bool
+    mean, cosine, sine, residual : ndarray, (n,), float64
+        Of the samples' fit with one wave a turn, counts.
+    """
+
+    vectors: Doubles
+    sigma: Doubles
+    contact: NDArray[np.bool_]
+    mean: Doubles
+    cosine: Doubles
+    sine: Doubles
+    residual: Doubles
+
+
+def normals_exact(
+    frames: NDArray[Any],
+    turn: Doubles,
+    scale: Doubles,
+    tilt: float,
+    noise: Variance,
+    limits: Limits,
+) -> Answer:
+    """Find the most likely normals.
+
+    Parameters
+    ----------
+    frames : ndarray, (N, n), uint8, uint16 or float32
+        Samples of n pixels. Whole counts at the ends of their type are clipped: their likelihood is that of
+        being beyond. A NaN is a missing sample.
+    turn : ndarray, (6, N), float64
+        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
+    scale : ndarray, (4,) or (4, n), float64
+        Counts at zenith 0, radians per count, and the zeniths between which brightness is linear. What is
+        expected out of them tells nothing of the direction.
+    tilt : float
+        Radians.
+    noise : Variance
+    limits : Limits
+
+    Returns
+    -------
+    Answer
+    """
+    samples = _Samples(frames, turn, scale, noise)
+    normal = _start(samples, turn, tilt)
+    sums = None
+    for number in range(2 + MORE):
+        # What is clipped, missing or out of range needs all steps, and only that is treated as such.
+        moves = samples.odd if number >= 2 else np.ones_like(samples.odd)
+        if number == 2:
+            normal = np.where(samples.odd[:, np.newaxis], _start(samples, turn, tilt), normal)
+        if not moves.any():
+            break
+        latest = _look(normal, samples, turn, tilt, closely=number >= 2)
+        sums = latest if sums is None or number < 2 else latest.where(moves, sums)
+        normal = np.where(moves[:, np.newaxis], _step(normal, latest), normal)
+    assert sums is not None
+    det = sums.m11 * sums.m22 - sums.m12**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
+        more_tilt, told, left = _free_tilt(sums, det)
+        still = more_tilt + 3 * samples.error / np.sqrt(told) < limits.still - tilt
+        touching = _like_noise(left, samples, limits) & ~still & ~(samples.mean < limits.rest)
+    unknown = (samples.plain < _LEAST) | ~(sigma < _NO_ANSWER)
+    return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
+
+
+def normals_paper(
+    frames: NDArray[Any],
+    turn: Doubles,
+    scale: Doubles,
+    noise: Variance,
+    limits: Limits,
+    spread: Doubles,
+) -> Answer:
+    """Find normals by the paper's approximation: the mean is the zenith, the wave's phase the azimuth.
+
+    Parameters
+    ----------
+    frames, turn, scale, noise, limits
+        As for `normals_exact`; nothing is known of clipped and missing samples here.
+    spread : ndarray, (4,), float64
+        Variances of mean and cosine, covariance of cosine and sine, and variance of the sine, in those of a
+        sample.
+
+    Returns
+    -------
+    Answer
+        The standard errors are those by noise; the approximation's own error comes on top.
+    """
+    samples = _Samples(frames, turn, scale, noise)
+    zenith, c, s = samples.mean, samples.cosine, samples.sine
+    swing = np.hypot(c, s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cp, sp = c / swing, s / swing
+        both = 2 * cp * sp * spread[2]
+        across = sp**2 * spread[1] - both + cp**2 * spread[3]
+        along = cp**2 * spread[1] + both + sp**2 * spread[3]
+        sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / swing) ** 2 * across)
+        still = swing + 3 * samples.error * np.sqrt(along) < limits.still
+        touching = _like_noise(samples.square, samples, limits) & ~still & ~(zenith < limits.rest)
+    normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
+    return _answer(normal, sigma, touching, samples)
+
+
+def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
+    """Take another turn into the mean of those before it.
+
+    Parameters
+    ----------
+    before, now : Answer
+        Normals are averaged with the inverses of their variances as weights.
+    turns : int
+        How many they are with this one.
+    """
+    own, theirs = (np.where(np.isnan(one.sigma), 0.0, 1 / one.sigma**2) for one in (now, before))
+    sums = own[:, np.newaxis] * np.nan_to_num(now.vectors) + theirs[:, np.newaxis] * np.nan_to_num(
+        before.vectors
+    )
+
+    def mean(old: Doubles, new: Doubles) -> Doubles:
+        return old + (new - old) / turns
+
+    with np.errstate(divide="ignore"):
+        sigma = 1 / np.sqrt(own + theirs)
+    return Answer(
+        vectors=_unit(sums),
+        sigma=np.where(np.isinf(sigma), np.nan, sigma),
+        contact=before.contact & now.contact,
+        mean=mean(before.mean, now.mean),
+        cosine=mean(before.cosine, now.cosine),
+        sine=mean(before.sine, now.sine),
+        residual=np.sqrt(mean(before.residual**2, now.residual**2)),
+    )
+
+
+class _Samples:
+    """Samples as zeniths, and their fit with one wave a turn."""
+
+    def __init__(self, frames: NDArray[Any], turn: Doubles, scale: Doubles, noise: Variance) -> None:
+        count, pixels = frames.shape
+        self.offset, per_count, self.low, self.high = np.broadcast_to(scale.reshape(4, -1), (4, pixels))
+        self.per_count = per_count
+        self.freedom = count - 3
+        raw = frames.astype(np.float64)
+        self.zenith = (raw - self.offset) * per_count
+        self.missing = np.isnan(raw)
+        known = np.maximum((~self.missing).sum(axis=0), 1)
+        level = np.where(self.missing, 0.0, raw).sum(axis=0) / known
+        self.error = np.sqrt(np.maximum(noise.base + noise.slope * level, noise.least)) * np.abs(per_count)
+        self.under, self.over = np.zeros((2, count, pixels), bool)
+        self.top = np.inf
+        if frames.dtype.kind == "u":
+            self.top = float(np.iinfo(frames.dtype).max)
+            self.under, self.over = raw <= 0, raw >= self.top
+        margin = _MARGIN * self.error
+        plain = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
+        self.plain = (plain & ~self.under & ~self.over).sum(axis=0)
+        self.odd = self.plain < count
+        self.mean, self.cosine, self.sine = turn[3:] @ self.zenith
+        wave = self.mean + np.multiply.outer(turn[0], self.cosine) + np.multiply.outer(turn[1], self.sine)
+        self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sums:
+    """Normal equations of the direction (along the meridian 1, across it 2) and of the tilt (3)."""
+
+    m11: Doubles
+    m12: Doubles
+    m22: Doubles
+    m13: Doubles
+    m23: Doubles
+    m33: Doubles
+    b1: Doubles
+    b2: Doubles
+    b3: Doubles
+    square: Doubles
+
+    def where(self, chosen: NDArray[np.bool_], other: _Sums) -> _Sums:
+        return _Sums(*(np.where(chosen, getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
+
+
+def _start(samples: _Samples, turn: Doubles, tilt: float) -> Doubles:
+    level = np.cos(samples.zenith)
+    if samples.missing.any():
+        known = np.maximum((~samples.missing).sum(axis=0), 1)
+        level = np.where(samples.missing, np.where(samples.missing, 0.0, level).sum(axis=0) / known, level)
+    mean, cosine, sine = turn[3:] @ level
+    return _unit(np.stack([-cosine * math.cos(tilt), -sine * math.cos(tilt), mean * math.sin(tilt)], axis=1))
+
+
+def _look(normal: Doubles, samples: _Samples, turn: Doubles, tilt: float, closely: bool) -> _Sums:
+    """Form the normal equations at a direction; closely, as clipped or missing samples demand."""
+    axes, tilting = _axes(turn, tilt)
+    chord = np.linalg.norm(normal[np.newaxis] - axes[:, np.newaxis], axis=2)
+    zenith = 2 * np.arcsin(np.clip(chord / 2, 1e-6, math.sqrt(0.5)))
+    along, across = _tangents(normal)
+    root = turn[2][:, np.newaxis]
+    # d zenith = -d(n . a) / sin(zenith)
+    by_sine = -root / np.sin(zenith)
+    u1, u2, u3 = by_sine * (axes @ along.T), by_sine * (axes @ across.T), by_sine * (tilting @ normal.T)
+    error = samples.zenith - zenith
+    share, pull, misfit = np.ones_like(error), error, error**2
+    if closely:
+        share, pull, misfit = _tell(samples, zenith)
+    pull = root * pull
+    return _Sums(
+        m11=(share * u1 * u1).sum(axis=0),
+        m12=(share * u1 * u2).sum(axis=0),
+        m22=(share * u2 * u2).sum(axis=0),
+        m13=(share * u1 * u3).sum(axis=0),
+        m23=(share * u2 * u3).sum(axis=0),
+        m33=(share * u3 * u3).sum(axis=0),
+        b1=(u1 * pull).sum(axis=0),
+        b2=(u2 * pull).sum(axis=0),
+        b3=(u3 * pull).sum(axis=0),
+        square=(root**2 * misfit).sum(axis=0),
+    )
+
+
+def _tell(samples: _Samples, zenith: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Return what each sample tells: its share of information, its pull on the zenith, its squared misfit.
+
+    A clipped sample has the likelihood of being beyond its bound (Tobin 1958): with z the bound's distance
+    in standard deviations and m the ratio of the normal distribution's density to its integral there, its
+    pull is m and its information m (m + z).
+    """
+    seen = np.clip(zenith, samples.low, samples.high)
+    inside = (zenith > samples.low) & (zenith < samples.high)
+    error = samples.zenith - seen
+    clipped = samples.under | samples.over
+    bound = (np.where(samples.under, 0.5, samples.top - 0.5) - samples.offset) * samples.per_count
+    side = np.where(samples.under == (samples.per_count > 0), -1.0, 1.0)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        z = side * (seen - bound) / samples.error
+        slope = math.sqrt(2 / math.pi) / special.erfcx(-z / math.sqrt(2))
+        share = np.where(clipped, slope * (slope + z), 1.0)
+        pull = np.where(clipped, side * slope * samples.error, error)
+        misfit = np.where(clipped, (np.minimum(z, 0) * samples.error) ** 2, error**2)
+    known = ~samples.missing
+    return (
+        np.where(inside & known, share, 0.0),
+        np.where(inside & known, pull, 0.0),
+        np.where(known, misfit, 0.0),
+    )
+
+
+def _axes(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
+    """Return the body's axis at each phase, (N, 3), and how it moves with the tilt."""
+    ones = np.ones_like(turn[0])
+    axes = np.stack([-math.sin(tilt) * turn[0], -math.sin(tilt) * turn[1], math.cos(tilt) * ones], axis=1)
+    tilting = np.stack([-math.cos(tilt) * turn[0], -math.cos(tilt) * turn[1], -math.sin(tilt) * ones], axis=1)
+    return axes, tilting
+
+
+def _tangents(normal: Doubles) -> tuple[Doubles, Doubles]:
+    """Return unit vectors along the meridian, away from the pole, and across it, (n, 3) each."""
+    x, y, z = normal.T
+    st = np.hypot(x, y)
+    level = st < 1e-10
+    cp, sp = np.where(level, [[1.0], [0.0]], normal.T[:2] / np.where(level, 1.0, st))
+    return np.stack([z * cp, z * sp, -st], axis=1), np.stack([-sp, cp, np.zeros_like(sp)], axis=1)
+
+
+def _step(normal: Doubles, sums: _Sums) -> Doubles:
+    """Take a Gauss-Newton step."""
+    along, across = _tangents(normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        det = sums.m11 * sums.m22 - sums.m12**2
+        d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det
+        d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
+        shorter = _REACH**2 / np.maximum(d1**2 + d2**2, _REACH**2)
+    moved = normal + (shorter * d1)[:, np.newaxis] * along + (shorter * d2)[:, np.newaxis] * across
+    return _unit(moved)
+
+
+def _free_tilt(sums: _Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the step of the tilt were it free, its information, and the sum of squares then left."""
+    d1, d2 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det, (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
+    w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) / det
+    w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) / det
+    told = np.maximum(sums.m33 - sums.m13 * w1 - sums.m23 * w2, 1e-12)
+    pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2
+    return pull / told, told, sums.square - sums.b1 * d1 - sums.b2 * d2 - pull**2 / told
+
+
+def _like_noise(square: Doubles, samples: _Samples, limits: Limits) -> NDArray[np.bool_]:
+    """Tell where a sum of squares is that of noise and of what the model leaves out; all, of three frames."""
+    if samples.freedom == 0:
+        return np.ones(len(square), bool)
+    found: NDArray[np.bool_] = square <= limits.noise * samples.error**2 + limits.model
+    return found
+
+
+def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], samples: _Samples) -> Answer:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        answered = np.isfinite(normal).all(axis=1) & np.isfinite(sigma)
+        gain = 1 / samples.per_count
+        freedom = samples.freedom or np.nan
+        residual = np.sqrt(samples.square / freedom) * np.abs(gain)
+    return Answer(
+        vectors=np.where(answered[:, np.newaxis], normal, np.nan),
+        sigma=np.where(answered, sigma, np.nan),
+        contact=touching & answered,
+        mean=samples.offset + samples.mean * gain,
+        cosine=samples.cosine * gain,
+        sine=samples.sine * gain,
+        residual=residual,
+    )
+
+
+def _unit(vectors: Doubles) -> Doubles:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

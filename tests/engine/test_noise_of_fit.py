@@ -1,0 +1,126 @@
+"""The noise is told from what waves of one and two a turn leave: that of reading, and that of light."""
+
+import numpy as np
+import pytest
+from rotations import EIGHTHS, UNEVEN
+
+from mirrorskin.engine.noise import CountNoise, noise_of_fit
+from mirrorskin.io import InputError
+
+PIXELS = 10_000
+LEVELS = np.array([40.0, 120.0, 200.0])
+FOUR, SIXTEEN = EIGHTHS[::2], tuple(np.arange(16) * np.pi / 8)
+
+
+def line(read, slope):
+    """The standard deviation at some levels."""
+    return np.sqrt(read**2 + slope * LEVELS)
+
+
+def samples_of(read, slope, *, phase=EIGHTHS, weights=None, second=0.0, dtype="float32", pixels=PIXELS):
+    """Waves of all brightnesses and directions, with noise whose variance grows with the light."""
+    random = np.random.default_rng(len(phase))
+    alpha, (mean, azimuth) = (
+        np.array(phase)[:, np.newaxis],
+        random.uniform([[25], [0]], [[220], [7]], (2, pixels)),
+    )
+    light = mean + 10 * np.cos(alpha - azimuth) + second * np.cos(2 * alpha - azimuth)
+    weight = np.ones(len(phase)) if weights is None else np.array(weights)
+    counts = light + random.normal(size=light.shape) * np.sqrt(
+        (read**2 + slope * light) / weight[:, np.newaxis]
+    )
+    counts = counts if dtype == "float32" else np.clip(np.rint(counts), 0, np.iinfo(dtype).max)
+    return counts.astype(dtype), np.array(phase), weight
+
+
+@pytest.mark.parametrize("phase", [FOUR, EIGHTHS[:5], EIGHTHS, UNEVEN, SIXTEEN])
+@pytest.mark.parametrize(("read", "slope"), [(1.5, 0.0), (1.0, 0.05), (0.0, 0.02), (0.01, 0.0)])
+def test_read_and_shot_noise_are_told_apart(read, slope, phase):
+    found = noise_of_fit(*samples_of(read, slope, phase=phase))
+    np.testing.assert_allclose(found.at(LEVELS), line(read, slope), rtol=0.03)
+    assert found.slope == pytest.approx(slope, rel=0.1, abs=1e-3 * read)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_rounding_is_noise(dtype):
+    found = noise_of_fit(*samples_of(1.0, 0.02, dtype=dtype))
+    np.testing.assert_allclose(found.at(LEVELS), np.hypot(line(1.0, 0.02), 1 / np.sqrt(12)), rtol=0.03)
+
+
+def test_weights_are_inverse_variances():
+    found = noise_of_fit(*samples_of(1.0, 0.05, weights=[1, 2, 0.5, 4, 1, 0.1, 1, 3]))
+    np.testing.assert_allclose(found.at(LEVELS), line(1.0, 0.05), rtol=0.03)
+
+
+def test_the_second_wave_of_a_level_surface_is_no_noise():
+    found = noise_of_fit(*samples_of(1.0, 0.0, second=5.0))
+    np.testing.assert_allclose(found.at(LEVELS), 1.0, rtol=0.03)
+
+
+@pytest.mark.parametrize("phase", [FOUR, EIGHTHS, SIXTEEN])
+@pytest.mark.parametrize(("read", "slope"), [(1.5, 0.0), (1.0, 0.05)])
+def test_pixels_that_lose_contact_are_no_noise(read, slope, phase):
+    samples, *known = samples_of(read, slope, phase=phase)
+    samples[len(phase) // 2, ::10] = 12.0
+    found = noise_of_fit(samples, *known)
+    np.testing.assert_allclose(found.at(LEVELS), line(read, slope), rtol=0.05)
+
+
+def test_a_brightness_at_which_most_lose_contact_does_not_bend_the_line():
+    samples, *known = samples_of(1.0, 0.05)
+    dark = samples.mean(axis=0) < 40
+    samples[3, dark] += np.random.default_rng(1).uniform(-100, 100, dark.sum()).astype(np.float32)
+    assert 0.05 < dark.mean() < 0.1
+    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), line(1.0, 0.05), rtol=0.1)
+
+
+def test_noise_does_not_fall_with_the_light():
+    samples, *known = samples_of(1.0, 0.0)
+    bright = samples.mean(axis=0) > 150
+    mean = samples.mean(axis=0)
+    samples[:, bright] = mean[bright] + 0.5 * (samples[:, bright] - mean[bright])
+    assert noise_of_fit(samples, *known).slope == 0.0
+
+
+def test_clipped_and_missing_samples_are_left_out():
+    samples, *known = samples_of(1.0, 0.0, dtype="uint8")
+    samples[::2, ::5], samples[::2, 1::5] = 255, 0
+    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
+    samples, *known = samples_of(1.0, 0.0)
+    samples[2, ::5], samples[2, 1::5] = np.nan, np.inf
+    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), 1.0, rtol=0.03)
+
+
+@pytest.mark.parametrize(("dtype", "floor"), [("uint8", 12**-0.5), ("uint16", 12**-0.5), ("float32", 77e-6)])
+@pytest.mark.parametrize("pixels", [1, 1000])
+def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor, pixels):
+    found = noise_of_fit(np.full((8, pixels), 77, dtype), np.array(EIGHTHS), np.ones(8))
+    np.testing.assert_allclose(found.at([0, 77, 1e5]), floor, rtol=1e-6)
+    assert found.slope == 0
+
+
+@pytest.mark.parametrize(
+    "samples", [np.zeros((8, 5), np.uint8), np.full((8, 5), np.nan, np.float32), np.zeros((8, 0), np.uint16)]
+)
+def test_nothing_that_tells_has_the_least_noise(samples):
+    found = noise_of_fit(samples, np.array(EIGHTHS), np.ones(8))
+    assert found.slope == 0
+    assert 0 < found.at(100.0) < 0.3
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 7, 300])
+def test_few_pixels_tell_roughly(pixels):
+    found = noise_of_fit(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
+    assert 0.5 < found.at(100.0) < 1.6
+    assert np.isfinite([found.base, found.slope, found.least]).all()
+
+
+def test_three_frames_tell_no_noise():
+    samples, phase, weights = samples_of(1.0, 0.0)
+    with pytest.raises(InputError, match="3 frames a turn tell no noise: give the standard deviation"):
+        noise_of_fit(samples[:3], phase[:3], weights[:3])
+
+
+def test_the_noise_at_a_level_is_that_of_the_line_but_not_below_the_least():
+    noise = CountNoise(base=-1.0, slope=0.1, least=0.25)
+    np.testing.assert_allclose(noise.at([0, 10, 50, 110]), [0.5, 0.5, 2.0, np.sqrt(10)])
