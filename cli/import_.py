@@ -19,6 +19,7 @@ def command(
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
     phase_step: options.PhaseStep = None,
+    phases: options.Phases = None,
     tilt: options.Tilt = None,
     pixel_size: options.PixelSize = None,
     compression: options.Compression = options.CompressionName.raw,
@@ -29,7 +30,7 @@ def command(
     from mirrorskin.cli.progress import progress
 
     io.check_output(output, keep=frames)
-    known = given(motion, travel_step, travel_start, phase_step, tilt, pixel_size)
+    known = given(motion, travel_step, travel_start, phase_step, phases, tilt, pixel_size)
     header = io.Header(motion.value, title=frames.stem, tilt=known["tilt"], pixel_size=known["pixel_size"])
     source = io.open_frames(frames, header, known["travel"], known["phase"])
     with (

@@ -38,9 +38,15 @@ TravelStart = Annotated[
     str | None, typer.Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
 ]
 PhaseStep = Annotated[str | None, typer.Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
+Phases = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Phases of all frames, a text of angles: 178.1deg 220.8deg ..."),
+]
 Tilt = Annotated[str | None, typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
 PixelSize = Annotated[
     str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
 ]
+Dataset = Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")]
+Memory = Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]
 NewRecording = Annotated[Path, typer.Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]

@@ -6,9 +6,27 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Result
+
+
+def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool) -> None:
+    """Write a result and say in a line what it holds, or in JSON how it came about as well."""
+    from mirrorskin import engine, io
+    from mirrorskin.kernels.device import open_device
+
+    io.save_result(result, path)
+    summary = engine.summarise(result)
+    if as_json:
+        profile = open_device(device).profile.records()
+        print_json({"output": str(path), "summary": summary, "process": result.process, "profile": profile})
+    else:
+        typer.echo(f"{path}: {summary}")
 
 
 def print_json(value: Any) -> None:

@@ -28,6 +28,7 @@ _LENGTH = _Kind("millimeter", "meter", "a length", "0.1mm")
 _ANGLE = _Kind("radian", "radian", "an angle", "2.5deg")
 _MEMORY = _Kind("byte", "bit", "an amount of memory", "512MB")
 _TIME = _Kind("second", "second", "a time", "10ms")
+_PER_ANGLE = "5.7/deg"
 
 
 def length(text: str, option: str = "") -> float:
@@ -93,6 +94,22 @@ def angle(text: str, option: str = "") -> float:
     return _read(text, option, _ANGLE)
 
 
+def per_angle(text: str, option: str = "") -> float:
+    """Read a number for each unit of angle, as in ``5.7/deg``, per radian.
+
+    Raises
+    ------
+    InputError
+        It is not a finite number over a unit of angle.
+    """
+    over, _, under = text.partition("/")
+    number, one = _QUANTITY.fullmatch(over), _QUANTITY.fullmatch(f"1 {under}")
+    if number is None or number[2] or one is None or not one[2]:
+        raise _error(text, option, "a number over a unit of angle is needed", _PER_ANGLE)
+    radians = _registry().convert(1.0, _unit(text, one[2], option, _ANGLE, _PER_ANGLE), _ANGLE.unit)
+    return _finite(float(number[1]) / radians, text, option, _PER_ANGLE)
+
+
 def memory(text: str, option: str = "") -> int:
     """Read an amount of memory, as in ``512MB`` (10^6) or ``512MiB`` (2^20), in bytes; see ``length``.
 
@@ -122,25 +139,34 @@ def frame_size(text: str, option: str = "") -> tuple[int, int]:
 
 
 def _read(text: str, option: str, kind: _Kind) -> float:
-    import pint  # takes a quarter of a second
-
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise _error(text, option, "a number and a unit are needed", kind.example)
     number, symbol = match.groups()
     if symbol is None:
         raise _error(text, option, "a unit is needed", kind.example)
+    unit = _unit(text, symbol, option, kind, kind.example)
+    return _finite(float(_registry().convert(float(number), unit, kind.unit)), text, option, kind.example)
+
+
+def _unit(text: str, symbol: str, option: str, kind: _Kind, example: str) -> Any:
+    """Return the unit of a symbol if it is of a kind."""
+    import pint  # takes a quarter of a second
+
     registry = _registry()
     try:
         unit = registry.Unit(symbol)
     except (pint.UndefinedUnitError, ValueError) as error:
-        raise _error(text, option, f"{symbol} is not a known unit", kind.example) from error
+        raise _error(text, option, f"{symbol} is not a known unit", example) from error
     # A pixel of a style sheet is a length, but nobody here means that one.
     if registry.get_root_units(unit)[1] != registry.Unit(kind.root) or unit == registry.Unit("css_pixel"):
-        raise _error(text, option, f"{unit}s are not {kind.noun}", kind.example)
-    value = float(registry.convert(float(number), unit, kind.unit))
+        raise _error(text, option, f"{unit}s are not {kind.noun}", example)
+    return unit
+
+
+def _finite(value: float, text: str, option: str, example: str) -> float:
     if not math.isfinite(value):
-        raise _error(text, option, "the number is too large", kind.example)
+        raise _error(text, option, "the number is too large", example)
     return value
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.output import print_json
+from mirrorskin.cli.options import MotionName
 
 
 class EventName(StrEnum):
@@ -20,13 +20,29 @@ class EventName(StrEnum):
 
 
 class MethodName(StrEnum):
-    """What tells a height."""
+    """What tells a height, or a normal."""
 
     threshold = "threshold"
     change_point = "change-point"
+    exact = "exact"
+    paper = "paper"
+
+
+# The options that only one motion has.
+_OWN = {
+    MotionName.vertical: {
+        *("travel_step", "travel_start", "dark", "bright", "event", "threshold", "hold", "subframe")
+    },
+    MotionName.axial: {
+        *("phase_step", "phases", "tilt", "zenith_gain", "zenith_offset", "per_turn", "heights")
+    },
+}
+_ESTIMATE = "estimate"
+_UNTOLD = "none: "  # how a result's process says that a map is missing, and why
 
 
 def command(
+    context: typer.Context,
     recording: Annotated[Path, typer.Argument(metavar="REC.h5", help="Frames in HDF5.")],
     output: Annotated[
         Path | None,
@@ -34,66 +50,112 @@ def command(
             "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"
         ),
     ] = None,
-    dataset: Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")] = None,
+    dataset: options.Dataset = None,
     motion: options.Motion = None,
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
     phase_step: options.PhaseStep = None,
-    tilt: options.Tilt = None,
+    phases: options.Phases = None,
+    tilt: Annotated[
+        str | None,
+        typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg, or 'estimate'."),
+    ] = None,
     pixel_size: options.PixelSize = None,
-    dark: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Without light; else the file's.")
-    ] = None,
-    bright: Annotated[float | None, typer.Option(metavar="COUNTS", help="With full light.")] = None,
-    event: Annotated[
-        EventName, typer.Option(help="Dark to light on the way down, or light to dark on the way up.")
-    ] = EventName.onset,
     method: Annotated[
-        MethodName, typer.Option(help="First crossing of the threshold, or most likely change.")
-    ] = MethodName.threshold,
-    threshold: Annotated[
-        float, typer.Option(help="Share of the way from dark to bright that is light.")
-    ] = 0.5,
-    hold: Annotated[int, typer.Option(help="Frames in a row that make the event.")] = 2,
-    subframe: Annotated[bool, typer.Option(help="Look between frames; without it, eq. 4 as printed.")] = True,
-    noise: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Standard deviation; else told from two frames.")
+        MethodName | None,
+        typer.Option(
+            help="Press: first crossing of the threshold, or most likely change."
+            " Rotation: most likely normal, or the paper's equations 16 to 22.",
+            show_default="threshold; of a rotation exact",
+        ),
     ] = None,
-    memory: Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")] = "256MB",
+    noise: Annotated[
+        float | None,
+        typer.Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
+    ] = None,
+    dark: Annotated[
+        float | None, typer.Option(metavar="COUNTS", help="Press: without light; else the file's.")
+    ] = None,
+    bright: Annotated[float | None, typer.Option(metavar="COUNTS", help="Press: with full light.")] = None,
+    event: Annotated[
+        EventName, typer.Option(help="Press: dark to light on the way down, or light to dark on the way up.")
+    ] = EventName.onset,
+    threshold: Annotated[
+        float, typer.Option(help="Press: share of the way from dark to bright that is light.")
+    ] = 0.5,
+    hold: Annotated[int, typer.Option(help="Press: frames in a row that make the event.")] = 2,
+    subframe: Annotated[
+        bool, typer.Option(help="Press: look between frames; without it, eq. 4 as printed.")
+    ] = True,
+    zenith_gain: Annotated[
+        str | None,
+        typer.Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
+    ] = None,
+    zenith_offset: Annotated[
+        float | None, typer.Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")
+    ] = None,
+    per_turn: Annotated[
+        bool, typer.Option("--per-turn", help="Rotation: maps of each turn, not of all together.")
+    ] = False,
+    heights: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Rotation: a result with heights, or a simulation, to keep pixels on the object.",
+        ),
+    ] = None,
+    memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct heights from a recording."""
+    """Reconstruct heights from a press, or normals from a rotation."""
     from mirrorskin import engine, io
+    from mirrorskin.cli.output import save_and_tell
     from mirrorskin.cli.positions import given
     from mirrorskin.cli.progress import progress
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.kernels.device import open_device
+    from mirrorskin.cli.quantity import per_angle
 
-    known = given(motion, travel_step, travel_start, phase_step, tilt, pixel_size)
+    told = None if tilt == _ESTIMATE else tilt
+    known = given(motion, travel_step, travel_start, phase_step, phases, told, pixel_size)
+    gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, **known) as source:
+        _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
         io.check_output(target, keep=recording)
+        asked: dict[str, Any] = {"method": method and method.value, "noise": noise}
+        if source.motion == MotionName.axial:
+            asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn}
+            asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else None
+            asked["heights"] = None if heights is None else io.open_heights(heights)
+        else:
+            asked |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
+            asked |= {"dark": dark, "bright": bright}
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 source,
-                event=event.value,
-                method=method.value,
-                threshold=threshold,
-                hold=hold,
-                subframe=subframe,
-                dark=dark,
-                bright=bright,
-                noise=noise,
+                **{name: value for name, value in asked.items() if value is not None},
                 memory_limit=limit,
                 device=device,
                 progress=show,
             )
-    io.save_result(result, target)
-    summary = engine.summarise(result)
-    if as_json:
-        profile = open_device(device).profile.records()
-        print_json({"output": str(target), "summary": summary, "process": result.process, "profile": profile})
-    else:
-        typer.echo(f"{target}: {summary}")
+    zenith = str(result.process.get("zenith"))
+    if zenith.startswith(_UNTOLD):
+        typer.echo(f"{recording}: no zenith: {zenith.removeprefix(_UNTOLD)}; give --zenith-gain", err=True)
+    save_and_tell(result, target, device, as_json)
+
+
+def _refuse_foreign(context: typer.Context, recording: Path, motion: str) -> None:
+    """Refuse options that say nothing of the recording's motion, rather than ignore them."""
+    from mirrorskin import io
+
+    if motion not in _OWN:
+        return  # the engine says that it has no method for it
+    foreign = {name for other, names in _OWN.items() if other != motion for name in names}
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        if option.name in foreign and source is not None and source.name == "COMMANDLINE":
+            raise io.InputError(
+                f"{recording} is of {motion} motion, of which {option.opts[0]} says nothing: leave it out"
+            )

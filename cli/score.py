@@ -25,6 +25,6 @@ def command(
             raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
         score = engine.score(found, recording.truth)
     if as_json:
-        print_json(score)
+        print_json(score.parts())
     else:
         print_fields(score.table())

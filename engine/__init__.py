@@ -1,25 +1,48 @@
 """The estimators: what turns frames into maps."""
 
+from mirrorskin.engine.axial import correlate_source, reconstruct_rotation
 from mirrorskin.engine.changepoint import ChangePointSearch, find_change_point
+from mirrorskin.engine.correlation import Correlation, Correlator, correlate
+from mirrorskin.engine.edges import find_edges
+from mirrorskin.engine.normals import NormalEstimator, NormalMethod, Normals, estimate_normals
 from mirrorskin.engine.onset import OnsetSearch, find_onset
 from mirrorskin.engine.reconstruct import METHODS, Method, reconstruct
-from mirrorskin.engine.score import Score, score
+from mirrorskin.engine.registration import Registered
+from mirrorskin.engine.score import AngleScore, ContactScore, EdgeScore, HeightScore, Score, score
 from mirrorskin.engine.search import EVENTS, Event, Onset
 from mirrorskin.engine.summary import Summary, summarise
+from mirrorskin.engine.vertical import PressMethod, reconstruct_press
 
 __all__ = [
     "EVENTS",
     "METHODS",
+    "AngleScore",
     "ChangePointSearch",
+    "ContactScore",
+    "Correlation",
+    "Correlator",
+    "EdgeScore",
     "Event",
+    "HeightScore",
     "Method",
+    "NormalEstimator",
+    "NormalMethod",
+    "Normals",
     "Onset",
     "OnsetSearch",
+    "PressMethod",
+    "Registered",
     "Score",
     "Summary",
+    "correlate",
+    "correlate_source",
+    "estimate_normals",
     "find_change_point",
+    "find_edges",
     "find_onset",
     "reconstruct",
+    "reconstruct_press",
+    "reconstruct_rotation",
     "score",
     "summarise",
 ]

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Result, Truth
 
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_JUMP = np.radians(10.0)  # between neighbours, from which on a change of the normal is an edge
+
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class HeightScore:
     """Errors of a height map.
 
     Attributes
@@ -51,13 +59,149 @@ class Score:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class AngleScore:
+    """Angular errors of normals, or of azimuths alone, where the sheet was in contact in every frame.
+
+    Attributes
+    ----------
+    answered : int
+        Pixels in contact, and told to be, with an answer whose truth is known; a level one has no azimuth.
+    touched : int
+        Pixels in contact.
+    coverage : float
+        Share of the touched pixels that were answered.
+    rms, median, p99, largest : float
+        Of the angle between answer and truth, degrees; NaN without answers.
+    chi_square : float
+        Mean of (error / sigma)^2: 1 where the expected errors are honest; NaN without them.
+    """
+
+    answered: int
+    touched: int
+    coverage: float
+    rms: float
+    median: float
+    p99: float
+    largest: float
+    chi_square: float
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return {
+            "answered": f"{self.answered} pixels",
+            "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
+            "RMS error": f"{self.rms:.4f} deg",
+            "median error": f"{self.median:.4f} deg",
+            "99 % error": f"{self.p99:.4f} deg",
+            "largest error": f"{self.largest:.4f} deg",
+            "mean (error/sigma)^2": f"{self.chi_square:.3f}",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ContactScore:
+    """How well it was told where the sheet was in contact in every frame.
+
+    Attributes
+    ----------
+    recall : float
+        Share of the pixels in contact that are told to be.
+    precision : float
+        Share of the pixels told to be in contact that are.
+    lost : int
+        Pixels with an answer that were out of contact in some frame.
+    lost_flagged : float
+        Share of these that are told to be out of contact.
+    wrongly_flagged : float
+        Share of the pixels with an answer and in contact that are told to be out of it.
+    """
+
+    recall: float
+    precision: float
+    lost: int
+    lost_flagged: float
+    wrongly_flagged: float
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return {
+            "recall": f"{100 * self.recall:.2f} %",
+            "precision": f"{100 * self.precision:.2f} %",
+            "lost and flagged": f"{100 * self.lost_flagged:.2f} % of {self.lost} pixels",
+            "kept but flagged": f"{100 * self.wrongly_flagged:.2f} %",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeScore:
+    """How well edges were found: the borders of contact, and jumps of the normal by more than 10 degrees.
+
+    Attributes
+    ----------
+    true, found : int
+        Pixels on either side of a true edge, and pixels told to be on one.
+    recall : float
+        Share of the true ones with a found one within a pixel.
+    precision : float
+        Share of the found ones with a true one within a pixel.
+    """
+
+    true: int
+    found: int
+    recall: float
+    precision: float
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return {
+            "recall": f"{100 * self.recall:.2f} % of {self.true} pixels",
+            "precision": f"{100 * self.precision:.2f} % of {self.found} pixels",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What can be told of a result's errors; None of a map that it does not have.
+
+    Attributes
+    ----------
+    height : HeightScore or None
+    normal : AngleScore or None
+    azimuth : AngleScore or None
+        Of a result that has azimuths but no normals.
+    contact : ContactScore or None
+    edges : EdgeScore or None
+    """
+
+    height: HeightScore | None = None
+    normal: AngleScore | None = None
+    azimuth: AngleScore | None = None
+    contact: ContactScore | None = None
+    edges: EdgeScore | None = None
+
+    def parts(self) -> dict[str, Any]:
+        """Return the scores that there are, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return {
+            f"{name} {what}": text
+            for name, part in self.parts().items()
+            for what, text in part.table().items()
+        }
+
+
 def score(result: Result, truth: Truth) -> Score:
-    """Compare the heights of a result with the truth.
+    """Compare the maps of a result with the truth.
 
     Parameters
     ----------
     result : Result
-        With ``height``, (H, W).
+        With at least one of ``height``, ``normals``, ``azimuth``, ``contact`` and ``edges``; of a result for
+        each turn, all turns are compared.
     truth : Truth
         Of the same size.
 
@@ -68,32 +212,151 @@ def score(result: Result, truth: Truth) -> Score:
     Raises
     ------
     InputError
-        There are no heights, or the sizes differ.
+        There is nothing to compare, or the sizes differ.
     """
-    if result.height is None:
-        raise InputError("the result has no heights to score")
-    if result.height.shape != truth.height.shape:
-        raise InputError(
-            f"the result is {result.height.shape} pixels, the truth {truth.height.shape}: not of one stack"
-        )
-    error = result.height.astype(np.float64) - truth.height
+    known = {name: getattr(result, name) for name in ("height", "azimuth", "normals", "contact", "edges")}
+    sizes = {
+        name: values.shape[:-1] if name == "normals" else values.shape
+        for name, values in known.items()
+        if values is not None
+    }
+    if not sizes:
+        raise InputError("the result has no heights, normals, azimuths, contact or edges to score")
+    size = next(iter(sizes.values()))[-2:]
+    if size != truth.height.shape:
+        raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
-    answered = np.isfinite(error)
-    errors = error[answered]
-    size = np.abs(errors) if errors.size else np.array([np.nan])
-    chi_square = np.nan
-    if result.height_sigma is not None and errors.size:
-        sigma = result.height_sigma[answered].astype(np.float64)
-        usable = sigma > 0
-        chi_square = float(np.mean((errors[usable] / sigma[usable]) ** 2)) if usable.any() else np.nan
+    azimuth = result.azimuth if result.normals is None else None
     return Score(
-        answered=int(errors.size),
-        touched=int(np.count_nonzero(touched)),
-        coverage=float(np.mean(answered[touched])) if touched.any() else np.nan,
-        rms=float(np.sqrt(np.mean(size**2))),
-        mean=float(np.mean(errors)) if errors.size else np.nan,
-        median=float(np.median(size)),
-        p99=float(np.percentile(size, 99)),
-        largest=float(np.max(size)),
-        chi_square=chi_square,
+        height=None if result.height is None else _score_heights(result, truth.height, touched),
+        normal=None if result.normals is None else _score_normals(result, truth, touched),
+        azimuth=None if azimuth is None else _score_angles(_turned(azimuth, truth.azimuth), None, touched),
+        contact=None if result.contact is None else _score_contact(result, touched),
+        edges=None if result.edges is None else _score_edges(result.edges, _edges_of(truth)),
     )
+
+
+def _score_heights(result: Result, truth: NDArray[np.float32], touched: Mask) -> HeightScore:
+    assert result.height is not None
+    error = result.height.astype(np.float64) - truth
+    touched = np.broadcast_to(touched, error.shape)
+    answered = np.isfinite(error)
+    return HeightScore(
+        answered=int(np.count_nonzero(answered)),
+        touched=int(np.count_nonzero(touched)),
+        coverage=_share(answered, touched),
+        mean=float(np.mean(error[answered])) if answered.any() else np.nan,
+        chi_square=_chi_square(error, result.height_sigma, answered),
+        **_spread(np.abs(error[answered])),
+    )
+
+
+def _score_normals(result: Result, truth: Truth, touched: Mask) -> AngleScore:
+    assert result.normals is not None
+    error = _between(result.normals.astype(np.float64), _normals_of(truth))
+    if result.contact is not None:  # normals of pixels that lose contact are not claimed
+        error = np.where(result.contact == 0, np.nan, error)
+    return _score_angles(error, result.normal_sigma, touched)
+
+
+def _score_angles(error: Doubles, sigma: NDArray[np.float32] | None, touched: Mask) -> AngleScore:
+    """Score angles between answers and truth, radians."""
+    touched = np.broadcast_to(touched, error.shape)
+    answered = np.isfinite(error) & touched
+    return AngleScore(
+        answered=int(np.count_nonzero(answered)),
+        touched=int(np.count_nonzero(touched)),
+        coverage=_share(answered, touched),
+        chi_square=_chi_square(error, sigma, answered),
+        **_spread(np.degrees(error[answered])),
+    )
+
+
+def _score_contact(result: Result, touched: Mask) -> ContactScore:
+    assert result.contact is not None
+    told = result.contact.astype(bool)
+    touched = np.broadcast_to(touched, told.shape)
+    answer = result.zenith if result.normals is None else result.normals[..., 2]
+    answered = np.isfinite(answer) if answer is not None else np.ones_like(told)
+    lost = answered & ~touched
+    return ContactScore(
+        recall=_share(told, touched),
+        precision=_share(touched, told),
+        lost=int(np.count_nonzero(lost)),
+        lost_flagged=_share(~told, lost),
+        wrongly_flagged=_share(~told, answered & touched),
+    )
+
+
+def _score_edges(edges: NDArray[np.uint8], truth: Mask) -> EdgeScore:
+    found = edges.astype(bool)
+    true = np.broadcast_to(truth, found.shape)
+    return EdgeScore(
+        true=int(np.count_nonzero(true)),
+        found=int(np.count_nonzero(found)),
+        recall=_share(_around(found), true),
+        precision=_share(_around(true), found),
+    )
+
+
+def _normals_of(truth: Truth) -> Doubles:
+    """Return the true normals, (H, W, 3)."""
+    zenith = truth.zenith.astype(np.float64)
+    azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # a level one has none
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
+    )
+
+
+def _between(first: Doubles, second: Doubles) -> Doubles:
+    """Return the angles between vectors, radians, as exact for small ones as for large ones."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.arctan2(across, np.sum(first * second, axis=-1)))
+
+
+def _turned(azimuth: NDArray[np.float32], truth: NDArray[np.float32]) -> Doubles:
+    """Return the angles between directions, radians, the shorter way round."""
+    error = azimuth.astype(np.float64) - truth
+    return np.abs(np.arctan2(np.sin(error), np.cos(error)))
+
+
+def _edges_of(truth: Truth) -> Mask:
+    """Mark the pixels on either side of an edge."""
+    normals, touched = _normals_of(truth), truth.contact.astype(bool)
+    edges = np.zeros_like(touched)
+    for one, other in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+        jump = touched[one] & touched[other] & (_between(normals[one], normals[other]) > _JUMP)
+        border = jump | (touched[one] != touched[other])
+        edges[one] |= border
+        edges[other] |= border
+    return edges
+
+
+def _around(marked: Mask) -> Mask:
+    """Mark the eight neighbours of what is marked, too."""
+    border = [(0, 0)] * (marked.ndim - 2) + [(1, 1), (1, 1)]
+    squares = sliding_window_view(np.pad(marked, border), (3, 3), axis=(-2, -1))
+    return np.asarray(squares.any(axis=(-2, -1)))
+
+
+def _share(part: Mask, whole: Mask) -> float:
+    return float(np.mean(part[whole])) if whole.any() else np.nan
+
+
+def _spread(size: Doubles) -> dict[str, float]:
+    """Return how large errors are, from their magnitudes."""
+    if not size.size:
+        return dict.fromkeys(("rms", "median", "p99", "largest"), np.nan)
+    return {
+        "rms": float(np.sqrt(np.mean(size**2))),
+        "median": float(np.median(size)),
+        "p99": float(np.percentile(size, 99)),
+        "largest": float(np.max(size)),
+    }
+
+
+def _chi_square(error: Doubles, sigma: NDArray[np.float32] | None, answered: Mask) -> float:
+    if sigma is None:
+        return np.nan
+    usable = answered & (sigma > 0)
+    return float(np.mean((error[usable] / sigma[usable].astype(np.float64)) ** 2)) if usable.any() else np.nan

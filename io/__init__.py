@@ -3,7 +3,8 @@
 from mirrorskin.io.atomic import check_output
 from mirrorskin.io.describe import describe
 from mirrorskin.io.frames import open_frames
-from mirrorskin.io.positions import check_phase, check_stroke, check_travel
+from mirrorskin.io.heights import open_heights
+from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
 from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
 from mirrorskin.io.recording import Recording, Steps, open_recording
 from mirrorskin.io.result import open_result, save_result
@@ -30,6 +31,7 @@ __all__ = [
     "Header",
     "InputError",
     "Motion",
+    "Positions",
     "ProcessValue",
     "Recorder",
     "Recording",
@@ -43,6 +45,7 @@ __all__ = [
     "check_travel",
     "describe",
     "open_frames",
+    "open_heights",
     "open_recording",
     "open_result",
     "pixel_axes",

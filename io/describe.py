@@ -64,18 +64,25 @@ def _recording(recording: Recording) -> dict[str, str]:
         facts["press"] = f"{header.press:g} mm"
     if header.tilt is not None:
         facts["tilt"] = f"{np.degrees(header.tilt):g} deg"
+    if recording.motion == "axial":
+        facts["zenith gain"] = _counts(header.zenith_gain, "counts/rad")
+        facts["zenith offset"] = _counts(header.zenith_offset, "counts")
     for name in ("dark", "bright"):
-        reference = getattr(header, name)
-        facts[f"{name} reference"] = "none" if reference is None else _median(reference)
+        facts[f"{name} reference"] = _counts(getattr(header, name), "counts")
     truth = recording.truth
     known = [] if truth is None else [name for name in TRUTH_UNITS if getattr(truth, name) is not None]
     facts["truth"] = ", ".join(known) or "none"
     return facts
 
 
-def _median(reference: NDArray[np.float32]) -> str:
-    known = reference[np.isfinite(reference)]
-    return f"{np.median(known):g} counts (median)" if known.size else "no pixel known"
+def _counts(values: NDArray[np.floating] | None, unit: str) -> str:
+    """Tell one number, or the middle one of a map."""
+    if values is None:
+        return "none"
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "no pixel known"
+    return f"{np.median(known):g} {unit}{' (median)' if np.ndim(values) else ''}"
 
 
 def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str, str]:

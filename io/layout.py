@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.positions import check_phase, check_stroke
@@ -72,14 +72,18 @@ class Layout:
         """Read the seconds of each frame, if they are known."""
         return self._series("time", (self._count,))
 
-    def travel(self, given: Floats | None) -> Floats:
+    def travel(self, given: ArrayLike | None) -> Floats:
         """Read the travel of each frame of a vertical motion, mm, if it is not given; check it."""
-        values = self._positions(given, "travel", "give --travel-step")
+        if given is not None:
+            return check_stroke(given, self._count, f"{self._file.path}: the travel given")
+        values = self._positions("travel", "give --travel-step")
         return check_stroke(values, self._count, f"{self._file.path}: {SERIES['travel'][0]}")
 
-    def phase(self, given: Floats | None) -> Floats:
+    def phase(self, given: ArrayLike | None) -> Floats:
         """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""
-        values = self._positions(given, "phase", "give --phase-step")
+        if given is not None:
+            return check_phase(given, self._count, f"{self._file.path}: the phase given")
+        values = self._positions("phase", "give --phase-step or --phases")
         return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}")
 
     def displacement(self) -> Floats | None:
@@ -110,9 +114,7 @@ class Layout:
         where, unit = SERIES[name]
         return self._read(where, shape, unit=unit, remedy=remedy)
 
-    def _positions(self, given: Floats | None, name: str, remedy: str) -> Floats:
-        if given is not None:
-            return given
+    def _positions(self, name: str, remedy: str) -> Floats:
         values = self._series(name, (self._count,), remedy)
         if values is None:
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")

@@ -18,7 +18,7 @@ from mirrorskin.io.picture_files import (
     read_pages,
     read_picture,
 )
-from mirrorskin.io.recording import Steps
+from mirrorskin.io.positions import Positions
 from mirrorskin.io.sequence import FrameSequence
 from mirrorskin.io.types import Header, InputError
 
@@ -36,8 +36,8 @@ class Pictures(FrameSequence):
     path : str or Path
         A folder, or a TIFF with one page a frame.
     header : Header
-    travel, phase : Steps or array_like, (T,), optional
-        Millimetres and radians, one a frame. Steps count the frames that were lost, too.
+    travel, phase : Positions or array_like, (T,), optional
+        Millimetres and radians, one a frame, or ``Steps``, which count the frames that were lost, too.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class Pictures(FrameSequence):
         self,
         path: str | Path,
         header: Header,
-        travel: ArrayLike | Steps | None = None,
-        phase: ArrayLike | Steps | None = None,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
     ) -> None:
         self._path = Path(path)
         self._folder = _find_sequence(self._path) if self._path.is_dir() else None

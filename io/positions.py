@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.types import InputError
+from mirrorskin.io.types import Floats, InputError
+
+
+@runtime_checkable
+class Positions(Protocol):
+    """Where the body was, for whoever knows how many frames there are."""
+
+    def positions(self, count: int, /) -> Floats:
+        """Return the positions of so many frames, mm or radians; InputError if they are of another number."""
 
 
 def check_travel(

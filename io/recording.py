@@ -11,11 +11,12 @@ from typing import Any, cast
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, STACK, Layout
 from mirrorskin.io.plain import plainly
+from mirrorskin.io.positions import Positions
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.storage import check_storage, describe_storage
 from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
@@ -140,8 +141,8 @@ def open_recording(
     *,
     dataset: str | None = None,
     motion: Motion | None = None,
-    travel: Steps | None = None,
-    phase: Steps | None = None,
+    travel: ArrayLike | Positions | None = None,
+    phase: ArrayLike | Positions | None = None,
     tilt: float | None = None,
     pixel_size: tuple[float, float] | None = None,
     memory_limit: int | None = None,
@@ -154,8 +155,8 @@ def open_recording(
     dataset : str, optional
         Name of the stack; needed where the file is not a recording of ours and holds several.
     motion, travel, phase, tilt, pixel_size
-        What the file does not say, or what to believe instead: positions in mm or radians, half-angle
-        in radians, mm.
+        What the file does not say, or what to believe instead: positions in mm or radians, one a frame or as
+        ``Steps``; half-angle in radians; mm.
     memory_limit : int, optional
         Bytes that a packed chunk of frames may take when it is unpacked.
 
@@ -188,8 +189,8 @@ def open_recording(
     return recording
 
 
-def _along(steps: Steps | None, count: int) -> Floats | None:
-    return None if steps is None else steps.positions(count)
+def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
+    return given.positions(count) if isinstance(given, Positions) else given
 
 
 def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> h5py.Dataset:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
-from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.plain import legible
 from mirrorskin.io.types import InputError, Result
 
 MARK = "mirrorskin_result"
-_UNITS = {"height": "mm", "height_sigma": "mm"}
-_DTYPES = {"status": np.uint8, "x": np.float64, "y": np.float64}
+_UNITS = (
+    dict.fromkeys(("height", "height_sigma"), "mm")
+    | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
+    | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
+)
+_DTYPES = dict.fromkeys(("status", "edges", "contact"), np.uint8) | dict.fromkeys(("x", "y"), np.float64)
 _MAPS = [field.name for field in fields(Result) if field.name not in ("x", "y", "process")]
+_VECTORS = "normals"
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 
 
@@ -29,28 +36,51 @@ def save_result(result: Result, path: str | Path) -> None:
     InputError
         It cannot be written there.
     """
-    maps = result.maps()
     with new_hdf5(Path(path)) as new:
         file = new.root
         file.attrs.update(NX_class="NXroot", default="entry")
         entry = file.create_group("entry")
         entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
-        data = entry.create_group("result")
-        data.attrs.update(NX_class="NXdata", signal=next(iter(maps)), auxiliary_signals=list(maps)[1:])
-        for name, values in maps.items():
-            data[name] = values
-            data[name].attrs["interpretation"] = "image"
-            if name in _UNITS:
-                data[name].attrs["units"] = _UNITS[name]
-        if result.x is not None and result.y is not None:
-            data.attrs["axes"] = ["y", "x"]
-            for axis, positions in (("x", result.x), ("y", result.y)):
-                data[axis] = positions
-                data[axis].attrs["units"] = "mm"
+        _write_maps(entry.create_group("result"), result)
         process = entry.create_group("process")
         process.attrs["NX_class"] = "NXprocess"
         for name, value in result.process.items():
             process[name] = legible(value) if isinstance(value, str) else value
+
+
+def _write_maps(data: h5py.Group, result: Result) -> None:
+    """Write the maps, and what a viewer should plot of them unasked.
+
+    What is plotted together must be of one shape, so vectors are not. How to show them is left open: NeXus
+    has no word for a picture of vectors, and of one of colours viewers expect numbers from 0 to 1.
+    """
+    maps = result.maps()
+    plotted = [name for name in maps if name != _VECTORS]
+    data.attrs["NX_class"] = "NXdata"
+    if plotted:
+        data.attrs.update(signal=plotted[0], auxiliary_signals=plotted[1:])
+    for name, values in maps.items():
+        data[name] = values
+        if name in plotted:
+            data[name].attrs["interpretation"] = "image"
+        if name in _UNITS:
+            data[name].attrs["units"] = _UNITS[name]
+    _write_axes(data, result, maps[plotted[0]].shape if plotted else ())
+
+
+def _write_axes(data: h5py.Group, result: Result, plotted: Shape) -> None:
+    """Write what is known of a plot's axes: the turns, and where the pixels are."""
+    axes: dict[str, tuple[NDArray[Any], str | None]] = {}
+    if len(plotted) == 3:
+        axes["turn"] = np.arange(plotted[0], dtype=np.int32), None
+    if result.x is not None and result.y is not None:
+        axes |= {"y": (result.y, "mm"), "x": (result.x, "mm")}
+    for name, (positions, unit) in axes.items():
+        data[name] = positions
+        if unit is not None:
+            data[name].attrs["units"] = unit
+    if axes:
+        data.attrs["axes"] = [*axes, *["."] * (len(plotted) - len(axes))]
 
 
 def open_result(path: str | Path) -> Result:
@@ -74,16 +104,26 @@ def open_result(path: str | Path) -> Result:
 
 
 def _read_maps(file: Hdf5File) -> dict[str, NDArray[Any]]:
-    """Read the maps and axes that are there, all of one size."""
+    """Read the maps and axes that are there, all of one size, or of one for each turn."""
     found = {name: file.find(f"{_RESULT}/{name}") for name in (*_MAPS, "x", "y")}
     found = {name: node for name, node in found.items() if node is not None}
-    size = next((getattr(node, "shape", None) for name, node in found.items() if name in _MAPS), None)
-    if size is None or len(size) != 2:
+    size = _size_of(found)
+    if size is None:
         raise InputError(f"{file.path}: {_RESULT} holds no maps: reconstruct it again")
-    shapes = {"x": size[1:], "y": size[:1]}
+    shapes = {"x": size[-1:], "y": size[-2:-1], _VECTORS: (*size, 3)}
     return {
         name: file.read(node, shapes.get(name, size), remedy="reconstruct it again").astype(
             _DTYPES.get(name, np.float32)
         )
         for name, node in found.items()
     }
+
+
+def _size_of(found: Mapping[str, Node]) -> Shape | None:
+    """Return (H, W) or (turns, H, W), the size of the first map, if it is one."""
+    for name in _MAPS:
+        if name in found:
+            shape: Shape = getattr(found[name], "shape", None) or ()
+            size = shape[:-1] if name == _VECTORS else shape
+            return size if len(size) in (2, 3) else None
+    return None

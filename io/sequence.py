@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.positions import check_phase, check_stroke
+from mirrorskin.io.positions import Positions, check_phase, check_stroke
 from mirrorskin.io.recording import Steps
 from mirrorskin.io.types import Block, Closing, Floats, Header
 
@@ -28,8 +28,8 @@ class FrameSequence(Closing, ABC):
         Frames, rows and columns.
     dtype : dtype
         uint8, uint16 or float32.
-    travel, phase : Steps or array_like, (T,), optional
-        Millimetres and radians, one a frame. Steps count the frames that were lost, too.
+    travel, phase : Positions or array_like, (T,), optional
+        Millimetres and radians, one a frame, or ``Steps``, which count the frames that were lost, too.
     time : ndarray, (T,), float64, optional
         Seconds since the first frame.
     lost : sequence of int, (T,), optional
@@ -52,8 +52,8 @@ class FrameSequence(Closing, ABC):
         shape: tuple[int, int, int],
         dtype: np.dtype[Any],
         *,
-        travel: ArrayLike | Steps | None = None,
-        phase: ArrayLike | Steps | None = None,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
         time: Floats | None = None,
         lost: Sequence[int] | None = None,
         left_out: tuple[str, ...] = (),
@@ -117,12 +117,12 @@ class FrameSequence(Closing, ABC):
         """Stop before the first frame that others were lost before."""
         return next((k for k in range(start + 1, stop) if self._lost[k]), stop)
 
-    def _along(self, positions: ArrayLike | Steps | None) -> ArrayLike | None:
-        """Write out steps, of which a lost frame is one as well."""
-        if not isinstance(positions, Steps):
-            return positions
-        taken = np.arange(self.shape[0]) + np.cumsum(self._lost)
-        return np.asarray(positions.start + positions.step * taken)
+    def _along(self, given: ArrayLike | Positions | None) -> ArrayLike | None:
+        """Write out positions; of steps, a lost frame is one as well."""
+        if isinstance(given, Steps):
+            taken = np.arange(self.shape[0]) + np.cumsum(self._lost)
+            return np.asarray(given.start + given.step * taken)
+        return given.positions(self.shape[0]) if isinstance(given, Positions) else given
 
 
 @contextmanager

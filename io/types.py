@@ -182,6 +182,8 @@ class Truth:
 class Result:
     """The maps of a reconstruction; one that was not computed is None.
 
+    Of a result for each turn of a rotation all maps have a leading axis, (turns, H, W) and (turns, H, W, 3).
+
     Attributes
     ----------
     height, height_sigma : ndarray, (H, W), float32
@@ -189,6 +191,19 @@ class Result:
     status : ndarray, (H, W), uint8
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
         2 dark at start, 3 light to the end.
+    normals : ndarray, (H, W, 3), float32
+        Unit vectors along x, y and z in the mean pose; NaN where there is no answer.
+    zenith, azimuth : ndarray, (H, W), float32
+        Radians, of the normal; NaN where there is no answer.
+    normal_sigma : ndarray, (H, W), float32
+        Radians: the RMS angular error that is expected of the normal.
+    mean, cosine, sine, modulation, residual : ndarray, (H, W), float32
+        Counts, of the fit of mean + cosine cos(phase) + sine sin(phase) to a pixel's brightness: the
+        modulation is its amplitude, the residual the standard deviation that is left.
+    edges : ndarray, (H, W), uint8
+        1 on thin lines where the normal jumps or contact ends.
+    contact : ndarray, (H, W), uint8
+        1 where the sheet was in contact in every frame.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
     process : mapping
@@ -198,6 +213,17 @@ class Result:
     height: NDArray[np.float32] | None = None
     height_sigma: NDArray[np.float32] | None = None
     status: NDArray[np.uint8] | None = None
+    normals: NDArray[np.float32] | None = None
+    zenith: NDArray[np.float32] | None = None
+    azimuth: NDArray[np.float32] | None = None
+    normal_sigma: NDArray[np.float32] | None = None
+    mean: NDArray[np.float32] | None = None
+    cosine: NDArray[np.float32] | None = None
+    sine: NDArray[np.float32] | None = None
+    modulation: NDArray[np.float32] | None = None
+    residual: NDArray[np.float32] | None = None
+    edges: NDArray[np.uint8] | None = None
+    contact: NDArray[np.uint8] | None = None
     x: Floats | None = None
     y: Floats | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.recording import Steps
+from mirrorskin.io.positions import Positions
 from mirrorskin.io.sequence import FrameSequence, quiet_opencv
 from mirrorskin.io.types import Floats, Header, InputError
 
@@ -31,8 +31,8 @@ class Video(FrameSequence):
     ----------
     path : str or Path
     header : Header
-    travel, phase : Steps or array_like, (T,), optional
-        Millimetres and radians, one a frame.
+    travel, phase : Positions or array_like, (T,), optional
+        Millimetres and radians, one a frame, or ``Steps``.
 
     Raises
     ------
@@ -45,8 +45,8 @@ class Video(FrameSequence):
         self,
         path: str | Path,
         header: Header,
-        travel: ArrayLike | Steps | None = None,
-        phase: ArrayLike | Steps | None = None,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
     ) -> None:
         self._path = Path(path)
         if not self._path.is_file():

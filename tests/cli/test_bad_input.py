@@ -74,8 +74,8 @@ def change(name, value=None):
     return make
 
 
-def other_motion(motion):
-    return lambda: record(MadeUp(random_stack(), io.Header(motion, tilt=0.1), phase=PHASE), Path("bad.h5"))
+def other_motion(motion, **header):
+    return lambda: record(MadeUp(random_stack(), io.Header(motion, **header), phase=PHASE), Path("bad.h5"))
 
 
 def stack(**storage):
@@ -133,7 +133,7 @@ def typed(dtype):
 DETECTOR, STAGE = "instrument/detector", "instrument/stage"
 NAMED = [*GIVEN, "--dataset", "x"]
 CASES = {
-    "axial": (other_motion("axial"), [], "axial"),
+    "axial, of no known tilt": (other_motion("axial", zenith_gain=np.array(50.0)), [], "tilt"),
     "horizontal": (other_motion("horizontal"), [], "horizontal"),
     "a result": (a_result, [], "is a result: give the recording that it was made from"),
     "no data": (change(f"{DETECTOR}/data"), [], "name the stack with --dataset"),

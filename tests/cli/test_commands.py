@@ -55,7 +55,8 @@ def help_of(*words):
 
 def test_help_imports_nothing_heavy():
     said = help_of()
-    for command in ("reconstruct", "simulate", "score", "import", "demo", "devices", "info", "bench"):
+    commands = ("reconstruct", "correlate", "simulate", "score", "import", "demo", "devices", "info", "bench")
+    for command in commands:
         assert f"\n  {command} " in said
 
 
@@ -66,9 +67,9 @@ def test_a_command_s_help_imports_nothing_heavy(command, word):
 
 def test_a_sphere_is_pressed_reconstructed_and_scored(folder):
     score = json.loads(mirrorskin("score", "sphere-result.h5", "--truth", "sphere.h5", "--json", cwd=folder))
-    assert score["answered"] > 1000
-    assert score["median"] < 0.05
-    assert "RMS error" in mirrorskin("score", "sphere-result.h5", "--truth", "sphere.h5", cwd=folder)
+    assert score["height"]["answered"] > 1000
+    assert score["height"]["median"] < 0.05
+    assert "height RMS error" in mirrorskin("score", "sphere-result.h5", "--truth", "sphere.h5", cwd=folder)
 
 
 def test_a_result_tells_how_it_came_about(folder):

@@ -8,12 +8,13 @@ import json
 import cv2
 import numpy as np
 import pytest
-from commands import run, small_experiments
+from commands import run, small_experiments, small_rotations
 
 from mirrorskin import io, view
-from mirrorskin.cli import demo
+from mirrorskin.cli.demo import presses, rotation
 
-FULL = demo._EXPERIMENTS
+FULL, ROTATIONS = presses.EXPERIMENTS, rotation.EXPERIMENTS
+WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
@@ -30,15 +31,21 @@ EXPECTED = [
 def shown(tmp_path_factory):
     """What a small demo printed, the folder that it made, and what its figures were drawn of."""
     folder = tmp_path_factory.mktemp("demo") / "made"
-    figures, draw = {}, view.height_figure
+    figures, draw, turned = {}, view.height_figure, view.normal_figure
 
     def watch(results, truth, title, path, *, surface):
         figures[path.name] = (list(results), title, surface)
         draw(results, truth, title, path, surface=surface)
 
+    def watch_normals(results, truth, title, path):
+        figures[path.name] = (list(results), title)
+        turned(results, truth, title, path)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "_EXPERIMENTS", small_experiments())
+        patch.setattr(presses, "EXPERIMENTS", small_experiments())
+        patch.setattr(rotation, "EXPERIMENTS", small_rotations())
         patch.setattr(view, "height_figure", watch)
+        patch.setattr(view, "normal_figure", watch_normals)
         ended = run("demo", "-o", folder)
     assert (ended.code, ended.said) == (0, "")
     return ended.out.splitlines(), folder, figures
@@ -66,16 +73,44 @@ def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
     _, folder, _ = shown
     files = {f"{name}-{sensor}{end}" for name, each in MADE.items() for sensor in each for end in
              (".h5", "-result.h5")}  # fmt: skip
-    assert {path.name for path in folder.iterdir()} == files | {f"{name}.png" for name in MADE}
-    for name in MADE:
+    files |= {"fig10a.h5"} | {f"fig10a-{way.replace(', ', '-')}-result.h5" for way in WAYS}
+    assert {path.name for path in folder.iterdir()} == files | {f"{name}.png" for name in (*MADE, "fig10a")}
+    for name in (*MADE, "fig10a"):
         assert cv2.imread(str(folder / f"{name}.png")).shape[0] > 300
 
 
 def test_the_ball_is_drawn_in_space_and_the_coins_by_brightness_and_all_sensors_are_cut(shown):
     names = {name: [sensor.replace("-", ", ") for sensor in each] for name, each in MADE.items()}
-    assert shown[2] == {
-        f"{full.name}.png": (names[full.name], full.title, full.thing == "sphere") for full in FULL
+    drawn = {f"{full.name}.png": (names[full.name], full.title, full.thing == "sphere") for full in FULL}
+    assert {name: shown[2][name] for name in drawn} == drawn
+
+
+def test_the_normals_are_drawn_by_both_methods(shown):
+    (full,) = ROTATIONS
+    assert shown[2]["fig10a.png"] == (["paper", "exact", "exact, registered"], full.title)
+
+
+def test_the_rotation_is_that_of_the_paper():
+    (full,) = ROTATIONS
+    assert (full.thing, full.tilt, full.steps) == ("sphere", 2.5, 8)
+    assert "10 mm" in full.title
+
+
+def test_the_table_of_normals_tells_of_both_methods_before_and_after_registration(shown):
+    start = next(number for number, line in enumerate(shown[0]) if "lost and flagged" in line)
+    head, rows = cells(shown[0][start]), [cells(line) for line in shown[0][start + 1 : start + 5]]
+    assert [row[:2] for row in rows] == [["fig10a", way] for way in WAYS]
+    found = {
+        row[1]: dict(zip(head[2:], (float(one.split()[0]) for one in row[2:]), strict=True)) for row in rows
     }
+    for told in found.values():
+        assert 20 < told["answered"] <= 100
+        assert 0 < told["median"] <= told["RMS"] <= told["99 %"] < 120
+    for method in ("paper", "exact"):
+        assert found[f"{method}, registered"]["median"] < found[method]["median"]
+    legend = " ".join(shown[0][start + 5 : -1])
+    for word in ("answered", "chi2", "registered"):
+        assert f"{word}: " in legend
 
 
 def test_the_table_tells_of_each_sensor_and_what_it_costs(shown):
@@ -97,7 +132,7 @@ def test_the_table_tells_of_each_sensor_and_what_it_costs(shown):
         share = told["untouched"] / told["answered"]
         assert share < 0.02 if sensor.startswith("conform") else share > 0.05
     assert max(map(len, rows)) <= 110
-    *legend, last = shown[0][1 + len(EXPECTED) :]
+    legend, last = shown[0][1 + len(EXPECTED) : shown[0].index("")], shown[0][-1]
     for word in names[:2] + names[5:]:
         assert f"{word}: " in " ".join(legend)
     assert last.endswith("fig5.png")
@@ -131,8 +166,9 @@ def test_the_recordings_are_of_those_sensors_and_presses(shown):
 
 
 def test_json_tells_the_scores(tmp_path, monkeypatch):
-    only = dataclasses.replace(small_experiments()[1], sensors=demo._SENSORS[:1])
-    monkeypatch.setattr(demo, "_EXPERIMENTS", (only,))
+    only = dataclasses.replace(small_experiments()[1], sensors=presses.SENSORS[:1])
+    monkeypatch.setattr(presses, "EXPERIMENTS", (only,))
+    monkeypatch.setattr(rotation, "EXPERIMENTS", small_rotations())
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
     assert {name: list(scores) for name, scores in told["fig6"].items()} == {
@@ -143,6 +179,8 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     assert ours["rms"] < papers["rms"]
     assert ours["shared_rms"] == pytest.approx(ours["rms"])  # one sensor shares all it answers
     assert papers["mean"] < -0.3 * only.step
+    assert list(told["fig10a"]) == list(WAYS)
+    assert told["fig10a"]["exact"]["normal"]["rms"] > 0
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
@@ -154,7 +192,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
 
 
 def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):
-    monkeypatch.setattr("mirrorskin.view.figures.find_spec", lambda name: None)
+    monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
     code, _, said = run("demo", "-o", tmp_path / "demo")
     assert (code, said.count("\n")) == (2, 1)
     assert "pip install 'mirrorskin" in said

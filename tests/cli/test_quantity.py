@@ -8,7 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mirrorskin.cli.quantity import angle, compliance, duration, frame_size, length, lengths, memory, vector
+from mirrorskin.cli.quantity import (
+    angle,
+    compliance,
+    duration,
+    frame_size,
+    length,
+    lengths,
+    memory,
+    per_angle,
+    vector,
+)
 from mirrorskin.io import InputError
 
 
@@ -20,7 +30,7 @@ def three(text, option=""):
     return vector(text, 3, option)
 
 
-READERS = [angle, compliance, duration, frame_size, length, lengths, memory, two, three]
+READERS = [angle, compliance, duration, frame_size, length, lengths, memory, per_angle, two, three]
 
 
 @pytest.mark.parametrize(
@@ -117,6 +127,21 @@ def test_compliance_is_in_millimetres_a_newton(text, millimetres_per_newton):
 
 
 @pytest.mark.parametrize(
+    ("text", "each_radian"),
+    [
+        ("5.7/deg", 5.7 * 180 / np.pi),
+        ("5.7/rad", 5.7),
+        (" 5.7 / mrad ", 5700.0),
+        ("-2e3/\u00b0", -360000 / np.pi),
+        ("10/turn", 10 / (2 * np.pi)),
+        ("0/deg", 0.0),
+    ],
+)
+def test_numbers_over_an_angle_are_those_of_a_radian(text, each_radian):
+    assert per_angle(text) == pytest.approx(each_radian, rel=1e-12)
+
+
+@pytest.mark.parametrize(
     ("text", "seconds"), [("10ms", 0.01), ("0s", 0.0), ("250 us", 2.5e-4), ("1min", 60.0), ("-1s", -1.0)]
 )
 def test_durations_are_in_seconds(text, seconds):
@@ -173,6 +198,16 @@ def test_frame_sizes_that_are_none(text):
         (compliance, "/N", "--o: a number and a unit are needed; write e.g. 0.1mm"),
         (compliance, "1N/N", "--o 1N: newtons are not a length; write e.g. 0.1mm"),
         (compliance, "1mm/N/N", "--o 1mm/N: a number and a unit are needed; write e.g. 0.1mm"),
+        (per_angle, "5.7", "--o 5.7: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5.7deg", "--o 5.7deg: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "nan/deg", "--o nan/deg: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5/2deg", "--o 5/2deg: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5/deg/s", "--o 5/deg/s: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5/deg**9", "--o 5/deg**9: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5V/deg", "--o 5V/deg: a number over a unit of angle is needed; write e.g. 5.7/deg"),
+        (per_angle, "5/mm", "--o 5/mm: millimeters are not an angle; write e.g. 5.7/deg"),
+        (per_angle, "5/foo", "--o 5/foo: foo is not a known unit; write e.g. 5.7/deg"),
+        (per_angle, "1e308/deg", "--o 1e308/deg: the number is too large; write e.g. 5.7/deg"),
         (duration, "10", "--o 10: a unit is needed; write e.g. 10ms"),
         (duration, "10mm", "--o 10mm: millimeters are not a time; write e.g. 10ms"),
         (duration, "10Hz", "--o 10Hz: hertzs are not a time; write e.g. 10ms"),
@@ -232,7 +267,13 @@ ONE = st.builds("{}{}".format, NUMBERS, WORDS | st.sampled_from(["mm", "deg", "s
 
 
 @settings(deadline=None, max_examples=400)
-@given(st.text(max_size=12) | ONE | ONE.map("{}/N".format) | st.lists(ONE, max_size=4).map(",".join))
+@given(
+    st.text(max_size=12)
+    | ONE
+    | ONE.map("{}/N".format)
+    | ONE.map("3/{}".format)
+    | st.lists(ONE, max_size=4).map(",".join)
+)
 def test_any_text_is_a_finite_number_or_an_input_error(text):
     for read in READERS:
         with contextlib.suppress(InputError):

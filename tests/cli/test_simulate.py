@@ -599,10 +599,7 @@ def test_frames_are_packed_as_asked(packing):
     assert (recording.storage == "in one piece") == (packing == "raw")
 
 
-NO_METHOD = {"axial": "axial", "horizontal": "horizontal", "twist": "twist"}
-
-
-@pytest.mark.parametrize("motion", NO_METHOD)
+@pytest.mark.parametrize("motion", ["horizontal", "twist"])
 def test_what_has_no_method_yet_is_recorded_and_told(motion):
     assert run("simulate", motion, *SMALL, "--frames", "3", *EXACT, "-o", "a.h5").code == 0
     facts = run("info", "a.h5")

@@ -450,7 +450,7 @@ def test_a_source_is_reconstructed_by_its_change_points():
     threshold = engine.reconstruct(twin())
     assert threshold.process["method"] == "threshold"
     truth = twin().truth
-    assert engine.score(result, truth).rms < engine.score(threshold, truth).rms
+    assert engine.score(result, truth).height.rms < engine.score(threshold, truth).height.rms
 
 
 @pytest.mark.parametrize("missing", [{"dark": None}, {"bright": None}, {"dark": None, "bright": None}])

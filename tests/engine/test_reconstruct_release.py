@@ -44,7 +44,7 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
 def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method, noise):
     source = twin(noise=noise)
     press, release = (
-        engine.score(engine.reconstruct(source, event=event, method=method), source.truth)
+        engine.score(engine.reconstruct(source, event=event, method=method), source.truth).height
         for event in ("onset", "release")
     )
     # Noise decides of the few pixels whose light barely reaches the threshold.

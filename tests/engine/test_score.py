@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rotations import direction
 
 from mirrorskin import engine, io
 
@@ -14,11 +15,23 @@ def truth_of(height, contact=None):
     return io.Truth(height, flat, flat, touched)
 
 
+def truth_of_normals(zenith, azimuth, contact=None):
+    """Take degrees."""
+    zenith, azimuth = (np.radians(np.array(angle, np.float32)) for angle in (zenith, azimuth))
+    touched = np.ones(zenith.shape, np.uint8) if contact is None else np.array(contact, np.uint8)
+    return io.Truth(np.zeros_like(zenith), zenith, azimuth, touched)
+
+
+def normals(zenith, azimuth):
+    """Take degrees."""
+    return direction(np.radians(zenith), np.radians(azimuth)).astype(np.float32)
+
+
 def test_errors_are_what_they_are():
     truth = truth_of(np.zeros((2, 3), np.float32), [[1, 1, 1], [1, 0, 0]])
     height = np.array([[0.3, -0.1, NAN], [0.1, 0.1, NAN]], np.float32)
     sigma = np.full((2, 3), 0.1, np.float32)
-    score = engine.score(io.Result(height=height, height_sigma=sigma), truth)
+    score = engine.score(io.Result(height=height, height_sigma=sigma), truth).height
     assert (score.answered, score.touched) == (4, 4)
     assert score.coverage == pytest.approx(0.75)
     assert score.rms == pytest.approx(np.sqrt(0.03))
@@ -30,7 +43,7 @@ def test_errors_are_what_they_are():
 
 def test_no_answer_at_all_is_scored_too():
     height = np.full((2, 2), NAN)
-    score = engine.score(io.Result(height=height), truth_of(np.zeros((2, 2), np.float32)))
+    score = engine.score(io.Result(height=height), truth_of(np.zeros((2, 2), np.float32))).height
     assert score.answered == 0
     assert score.coverage == 0
     assert np.isnan([score.rms, score.mean, score.chi_square]).all()
@@ -39,19 +52,175 @@ def test_no_answer_at_all_is_scored_too():
 
 def test_what_cannot_be_compared_is_refused():
     truth = truth_of(np.zeros((2, 2), np.float32))
-    with pytest.raises(io.InputError, match="no heights"):
-        engine.score(io.Result(), truth)
-    with pytest.raises(io.InputError, match="not of one stack"):
-        engine.score(io.Result(height=np.zeros((2, 3), np.float32)), truth)
+    for nothing in (io.Result(), io.Result(mean=np.zeros((2, 2), np.float32))):
+        with pytest.raises(io.InputError, match="no heights, normals, azimuths, contact or edges to score"):
+            engine.score(nothing, truth)
+    flat = np.zeros((2, 3), np.float32)
+    maps = {"height": flat, "azimuth": flat, "normals": flat[..., np.newaxis] * np.ones(3), "contact": flat}
+    for name, values in maps.items():
+        with pytest.raises(io.InputError, match=r"\(2, 3\) pixels, the truth \(2, 2\): not of one stack"):
+            engine.score(io.Result(**{name: values}), truth)
 
 
 def test_the_far_end_is_the_99th_percentile():
     height = np.arange(1, 102, dtype=np.float32).reshape(1, 101)
     sigma = np.where(height > 50, 0, height).astype(np.float32)  # of a sigma of 0 no ratio can be told
     truth = truth_of(np.zeros_like(height), np.zeros_like(height))
-    score = engine.score(io.Result(height=height, height_sigma=sigma), truth)
+    score = engine.score(io.Result(height=height, height_sigma=sigma), truth).height
     assert score.p99 == pytest.approx(100)
     assert score.chi_square == pytest.approx(1)
     assert np.isnan(score.coverage)
     summary = engine.summarise(io.Result(height=height))
     assert (summary.lowest, summary.highest, summary.answered) == (1, 101, 101)
+
+
+def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
+    # Errors of 3, 4, 0 and 5 degrees, and of 90 where there is no contact and so no truth to compare with.
+    truth = truth_of_normals(
+        [[30, 30, 0], [80, 45, 45]], [[50, -170, np.nan], [10, 45, 45]], [[1, 1, 1], [1, 0, 1]]
+    )
+    found = normals([[33, 26, 0], [85, 45, 45]], [[50, 190, 77], [10, 225, np.nan]])
+    sigma = np.full((2, 3), np.radians(2), np.float32)
+    score = engine.score(io.Result(normals=found, normal_sigma=sigma), truth)
+    assert score.parts().keys() == {"normal"}
+    part = score.normal
+    assert (part.answered, part.touched) == (4, 5)
+    assert part.coverage == pytest.approx(0.8)
+    assert part.rms == pytest.approx(np.sqrt(50 / 4), rel=1e-5)
+    assert part.median == pytest.approx(3.5, rel=1e-5)
+    assert part.largest == pytest.approx(5, rel=1e-5)
+    assert part.p99 == pytest.approx(4.97, rel=1e-5)
+    assert part.chi_square == pytest.approx(50 / 4 / 4, rel=1e-5)
+
+
+@pytest.mark.parametrize("error", [2e-5, 1e-3, 1.0, 179.0, 179.999])
+def test_small_angles_and_large_ones_are_told_alike(error):
+    across = np.linspace(0, 360, 24, endpoint=False, dtype=np.float32)[np.newaxis]
+    truth = truth_of_normals(np.full_like(across, 0.0), across)
+    found = normals(np.full(across.shape, error), across)
+    part = engine.score(io.Result(normals=found), truth).normal
+    assert part.largest == pytest.approx(error, rel=1e-5)
+    assert part.rms == pytest.approx(error, rel=1e-5)
+
+
+def test_a_normal_s_length_does_not_matter():
+    truth = truth_of_normals([[40]], [[10]])
+    found = 7 * normals([[42]], [[10]])
+    assert engine.score(io.Result(normals=found), truth).normal.rms == pytest.approx(2, rel=1e-5)
+
+
+def test_azimuths_alone_are_scored_the_shorter_way_round():
+    truth = truth_of_normals([[30, 30, 0, 30]], [[179, -90, np.nan, 0]], [[1, 1, 1, 0]])
+    azimuth = np.radians(np.array([[-179, 90, 5, 77]], np.float32))
+    score = engine.score(io.Result(azimuth=azimuth), truth)
+    assert score.parts().keys() == {"azimuth"}
+    part = score.azimuth
+    assert (part.answered, part.touched) == (2, 3)  # what is level has no azimuth
+    assert part.largest == pytest.approx(180, rel=1e-5)
+    assert part.rms == pytest.approx(np.sqrt((4 + 180**2) / 2), rel=1e-5)
+    assert np.isnan(part.chi_square)
+
+
+def test_of_normals_the_azimuth_is_not_scored_again():
+    truth = truth_of_normals([[30]], [[20]])
+    result = io.Result(normals=normals([[30]], [[20]]), azimuth=np.zeros((1, 1), np.float32))
+    assert engine.score(result, truth).azimuth is None
+
+
+def test_contact_is_scored_where_there_is_an_answer_and_as_a_whole():
+    touched = [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0]]
+    told = [[1, 1, 1, 0, 0], [1, 0, 0, 0, 0]]
+    truth = truth_of_normals(np.full((2, 5), 20), np.full((2, 5), 20), touched)
+    found = normals(np.full((2, 5), 20), np.full((2, 5), 20))
+    found[0, 4] = found[1, 4] = np.nan  # without an answer there is nothing to flag
+    part = engine.score(io.Result(normals=found, contact=np.array(told, np.uint8)), truth).contact
+    assert part.recall == pytest.approx(3 / 5)
+    assert part.precision == pytest.approx(3 / 4)
+    assert part.lost == 4
+    assert part.lost_flagged == pytest.approx(3 / 4)
+    assert part.wrongly_flagged == pytest.approx(1 / 4)
+
+
+def roof(jump, rows=9, columns=12):
+    """Return the truth of a roof with its ridge between the columns 5 and 6, in contact but for two rows."""
+    azimuth = np.tile(np.where(np.arange(columns) < 6, 180.0, 0.0), (rows, 1))
+    contact = np.ones((rows, columns))
+    contact[-2:] = 0
+    return truth_of_normals(np.full((rows, columns), jump / 2), azimuth, contact)
+
+
+def marked(*places, shape=(9, 12)):
+    edges = np.zeros(shape, np.uint8)
+    for place in places:
+        edges[place] = 1
+    return edges
+
+
+@pytest.mark.parametrize(
+    ("jump", "edges", "recall", "precision"),
+    [
+        (20, marked(np.s_[:7, 5], np.s_[6]), 1, 1),
+        (20, marked(np.s_[:7, 7], np.s_[7]), 1 - 6 / 36, 1),  # a pixel beside the right one
+        (20, marked(np.s_[:7, 5], np.s_[3], np.s_[6]), 1, 1 - 8 / 29),  # a line that is not there
+        (20, marked(np.s_[6]), 1 - 10 / 36, 1),
+        (9, marked(np.s_[6]), 1, 1),
+        (9, marked(np.s_[:6, 5]), 3 / 24, 1 / 6),
+    ],
+)
+def test_edges_are_found_within_a_pixel(jump, edges, recall, precision):
+    part = engine.score(io.Result(edges=edges), roof(jump)).edges
+    assert part.found == np.count_nonzero(edges)
+    assert part.true == (24 + 12 if jump > 10 else 24)
+    assert part.recall == pytest.approx(recall)
+    assert part.precision == pytest.approx(precision)
+
+
+def test_a_result_for_each_turn_is_scored_over_all_turns():
+    truth = truth_of_normals([[30, 40]], [[20, 20]], [[1, 0]])
+    found = np.stack([normals([[30 + error, 40]], [[20, 20]]) for error in (3, 4, 5)])
+    flags = np.array([[[1, 0]], [[1, 1]], [[0, 0]]], np.uint8)
+    height = np.array([[[0.1, 0.1]], [[0.1, NAN]], [[0.1, 0.1]]], np.float32)
+    score = engine.score(io.Result(height=height, normals=found, contact=flags, edges=flags), truth)
+    assert (score.normal.answered, score.normal.touched) == (3, 3)
+    assert score.normal.rms == pytest.approx(np.sqrt(50 / 3), rel=1e-5)
+    assert (score.height.answered, score.height.touched) == (5, 3)
+    assert score.contact.recall == pytest.approx(2 / 3)
+    assert (score.contact.lost, score.contact.lost_flagged) == (3, pytest.approx(2 / 3))
+    assert (score.edges.true, score.edges.recall) == (6, pytest.approx(4 / 6))
+
+
+def test_a_score_prints_what_there_is():
+    truth = truth_of_normals([[30, 40]], [[20, 20]], [[1, 0]])
+    result = io.Result(height=np.zeros((1, 2), np.float32), normals=normals([[32, 40]], [[20, 20]]))
+    table = engine.score(result, truth).table()
+    assert table["height RMS error"] == "0.0000 mm"
+    assert table["normal RMS error"] == "2.0000 deg"
+    assert table["normal coverage"] == "100.00 % of the 1 pixels in contact"
+    assert {name.split()[0] for name in table} == {"height", "normal"}
+
+
+ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("maps", "line"),
+    [
+        ({"zenith": ZENITH}, "normals at 4 of 6 pixels, zenith from 0.000 to 45.500 deg"),
+        (
+            {"zenith": ZENITH, "contact": (ZENITH > 0).astype(np.uint8)},
+            "normals at 4 of 6 pixels, zenith from 0.000 to 45.500 deg, in contact at 3",
+        ),
+        (
+            {"zenith": np.stack([ZENITH, ZENITH])},
+            "normals at 8 of 12 pixels in 2 turns, zenith from 0.000 to 45.500 deg",
+        ),
+        ({"zenith": ZENITH * NAN}, "no normals at any of 6 pixels"),
+        (
+            {"azimuth": ZENITH, "modulation": np.full((2, 3), 7.25, np.float32)},
+            "azimuth at 4 of 6 pixels, modulation from 7.250 to 7.250 counts",
+        ),
+        ({"height": ZENITH * 0 - 1, "zenith": ZENITH}, "height at 4 of 6 pixels, from -1.000 to -1.000 mm"),
+    ],
+)
+def test_a_result_in_one_line(maps, line):
+    assert str(engine.summarise(io.Result(**maps))) == line

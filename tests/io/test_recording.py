@@ -119,6 +119,45 @@ def test_what_is_given_overrides_the_file(press):
         assert (recording.travel, recording.phase) == (None, None)
 
 
+@pytest.mark.parametrize("phase", [PHASE[::-1] ** 2, list(PHASE), PHASE.astype(np.float32), range(8)])
+def test_phases_may_be_given_one_by_one(press, turn, phase):
+    for path in (press, turn):
+        with io.open_recording(path, motion="axial", phase=phase) as recording:
+            np.testing.assert_array_equal(recording.phase, np.asarray(phase, float))
+            assert recording.phase.dtype == np.float64
+            np.testing.assert_array_equal(recording.read().phase, recording.phase[:1])
+
+
+def test_travel_may_be_given_one_by_one(press):
+    travel = np.arange(8) ** 2
+    with io.open_recording(press, travel=travel) as recording:
+        np.testing.assert_array_equal(recording.travel, travel)
+
+
+def test_positions_may_depend_on_the_number_of_frames(turn):
+    class Halves:
+        def positions(self, count, /):
+            return np.arange(count) / 2
+
+    with io.open_recording(turn, phase=Halves()) as recording:
+        np.testing.assert_array_equal(recording.phase, np.arange(8) / 2)
+
+
+@pytest.mark.parametrize(
+    ("phase", "line"),
+    [
+        (PHASE[:7], "the phase given has shape (7,) for 8 frames: one number a frame is needed"),
+        (PHASE[:, None], "the phase given has shape (8, 1) for 8 frames: one number a frame is needed"),
+        (1.0, "the phase given has shape () for 8 frames: one number a frame is needed"),
+        (["1deg"] * 8, "the phase given is of type <U4: numbers are needed"),
+        (np.where(PHASE > 3, np.inf, PHASE), "the phase given is inf at frame 4: every frame needs a finite"),
+    ],
+)
+def test_given_phases_that_do_not_fit_are_told(turn, phase, line):
+    with pytest.raises(io.InputError, match=re.escape(f"{turn}: {line}")):
+        io.open_recording(turn, phase=phase)
+
+
 def test_what_is_given_need_not_be_right_in_the_file(press):
     put(press, f"{STAGE}/travel", None)
     put(press, f"{DETECTOR}/x_pixel_size", -1.0, "furlong/fortnight")
@@ -301,7 +340,7 @@ def test_what_an_axial_recording_says_wrongly_is_told(turn):
 
 @pytest.mark.parametrize("step", [np.nan, np.inf])
 def test_steps_that_cannot_be_are_told(press, step):
-    with pytest.raises(io.InputError, match=re.escape(f"{press}: /entry/instrument/stage/travel ")):
+    with pytest.raises(io.InputError, match=re.escape(f"{press}: the travel given is ")):
         io.open_recording(press, travel=io.Steps(step))
 
 
@@ -335,6 +374,17 @@ def test_a_recording_is_described(press):
         "bright reference": "224 counts (median)",
         "truth": "height, zenith, azimuth, contact",
     }
+
+
+def test_the_scale_of_a_rotation_s_brightness_is_described(press, turn):
+    facts = io.describe(turn)
+    assert (facts["zenith gain"], facts["zenith offset"]) == ("50 counts/rad (median)", "none")
+    put(turn, f"{DETECTOR}/zenith_gain", 5.5, "1/deg")
+    put(turn, f"{DETECTOR}/zenith_offset", 20.0)
+    facts = io.describe(turn)
+    gain = f"{np.degrees(5.5):g} counts/rad"
+    assert (facts["zenith gain"], facts["zenith offset"]) == (gain, "20 counts")
+    assert "zenith gain" not in io.describe(press)
 
 
 @pytest.mark.parametrize(

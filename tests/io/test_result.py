@@ -30,6 +30,24 @@ def a_result(**changes):
     return io.Result(**maps | changes)
 
 
+def a_turn(*size, only=None, **changes):
+    """Return a result with every map of a rotation, of so many turns, rows and columns, or with some maps."""
+    rng = np.random.default_rng(5)
+    floats = ("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual")
+    maps = {name: rng.normal(size=size).astype(np.float32) for name in floats}
+    maps["normals"] = rng.normal(size=(*size, 3)).astype(np.float32)
+    maps["normals"][..., 1, 2, :] = np.nan
+    maps |= {name: rng.integers(0, 2, size).astype(np.uint8) for name in ("edges", "contact")}
+    return io.Result(**{name: maps[name] for name in only or maps} | {"process": PROCESS} | changes)
+
+
+PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
+PLOTTED = [
+    *("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual"),
+    *("edges", "contact"),
+]
+
+
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "result.h5"
@@ -84,6 +102,117 @@ def test_a_result_comes_back_as_it_was(path, changes):
     assert axes == ([] if result.x is None else ["y", "x"])
     np.testing.assert_array_equal(signal, result.height)
     assert group.name == "/entry/result"
+
+
+@pytest.mark.parametrize(
+    ("turns", "places", "axes"),
+    [
+        ((), {}, []),
+        ((), PLACES, ["y", "x"]),
+        ((3,), {}, ["turn", ".", "."]),
+        ((3,), PLACES, ["turn", "y", "x"]),
+        ((1,), PLACES, ["turn", "y", "x"]),
+    ],
+)
+def test_a_rotation_s_result_comes_back_and_its_zenith_is_plotted(path, turns, places, axes):
+    result = a_turn(*turns, 5, 7, **places)
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    group, signal, plotted_along = plot_of(path)
+    assert plotted_along == axes
+    assert signal.name == "/entry/result/zenith"
+    assert list(group.attrs["auxiliary_signals"]) == PLOTTED[1:]
+    np.testing.assert_array_equal(signal, result.zenith)
+    if turns:
+        np.testing.assert_array_equal(group["turn"], range(turns[0]))
+
+
+def test_a_rotation_s_maps_say_their_units(path):
+    io.save_result(a_turn(2, 5, 7), path)
+    with h5py.File(path) as file:
+        maps = file["entry/result"]
+        assert list(maps) == sorted([*PLOTTED, "normals", "turn"])
+        units = {name: node.attrs.get("units") for name, node in maps.items()}
+        assert {name for name, unit in units.items() if unit == "rad"} == {*PLOTTED[:3]}
+        assert {name for name, unit in units.items() if unit == "counts"} == {*PLOTTED[3:8]}
+        assert {name for name, unit in units.items() if unit is None} == {
+            "normals",
+            "edges",
+            "contact",
+            "turn",
+        }
+        # Of pictures viewers are told; a picture of vectors they would take for colours, or for a stack.
+        pictures = {name for name, node in maps.items() if node.attrs.get("interpretation") == "image"}
+        assert pictures == {*PLOTTED}
+        assert {maps[name].dtype.str[1:] for name in ("edges", "contact")} == {"u1"}
+        assert (maps["normals"].shape, maps["normals"].dtype.str[1:]) == ((2, 5, 7, 3), "f4")
+
+
+@pytest.mark.parametrize(
+    ("names", "signal"),
+    [
+        (["azimuth", "mean", "modulation"], "azimuth"),
+        (["mean", "contact"], "mean"),
+        (["normals", "contact"], "contact"),
+    ],
+)
+def test_what_is_plotted_without_a_zenith(path, names, signal):
+    result = a_turn(5, 7, only=names)
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    assert plot_of(path)[1].name == f"/entry/result/{signal}"
+
+
+def test_heights_are_plotted_before_normals(path):
+    result = a_turn(5, 7, height=a_result().height, **PLACES)
+    io.save_result(result, path)
+    group, signal, _ = plot_of(path)
+    assert signal.name == "/entry/result/height"
+    assert list(group.attrs["auxiliary_signals"]) == PLOTTED
+
+
+@pytest.mark.parametrize("size", [(5, 7), (3, 5, 7)])
+def test_vectors_alone_are_kept_but_not_plotted(path, size):
+    result = a_turn(*size, only=["normals"], **PLACES)
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    with h5py.File(path) as file:
+        assert "signal" not in file["entry/result"].attrs
+
+
+@pytest.mark.parametrize(
+    ("turns", "name", "value", "line"),
+    [
+        ((), "normals", np.zeros((5, 7)), "/entry/result holds no maps"),
+        ((), "normals", np.zeros((5, 7, 2)), r"normals has shape \(5, 7, 2\) where \(5, 7, 3\) is needed"),
+        ((), "zenith", np.zeros((5, 7, 3)), r"zenith has shape \(5, 7, 3\) where \(5, 7\) is needed"),
+        ((), "azimuth", np.zeros((1, 5, 7)), r"azimuth has shape \(1, 5, 7\) where \(5, 7\) is needed"),
+        ((), "edges", np.zeros(7), r"edges has shape \(7,\) where \(5, 7\) is needed"),
+        ((3,), "contact", np.zeros((5, 7)), r"contact has shape \(5, 7\) where \(3, 5, 7\) is needed"),
+        ((3,), "residual", np.zeros((2, 5, 7)), r"residual has shape \(2, 5, 7\) where \(3, 5, 7\) is"),
+        ((3,), "normals", np.zeros((3, 5, 7, 4)), r"normals has shape \(3, 5, 7, 4\) where \(3, 5, 7, 3\)"),
+        ((3,), "normals", np.zeros((2, 3, 5, 7, 3)), "/entry/result holds no maps"),
+        ((3,), "x", np.zeros(5), r"x has shape \(5,\) where \(7,\) is needed"),
+    ],
+)
+def test_a_damaged_rotation_s_result_is_one_line(path, turns, name, value, line):
+    io.save_result(a_turn(*turns, 5, 7, **PLACES), path)
+    with h5py.File(path, "r+") as file:
+        del file[f"entry/result/{name}"]
+        file[f"entry/result/{name}"] = value
+    for read in (io.open_result, io.describe):
+        with pytest.raises(io.InputError, match=line) as caught:
+            read(path)
+        assert str(caught.value).startswith(str(path))
+        assert str(caught.value).endswith("reconstruct it again")
+
+
+def test_a_rotation_s_result_is_described(path):
+    io.save_result(a_turn(3, 5, 7), path)
+    facts = io.describe(path)
+    assert facts["map normals"] == "3 x 5 x 7 x 3 float32"
+    assert facts["map zenith"] == "3 x 5 x 7 float32"
+    assert facts["map contact"] == "3 x 5 x 7 uint8"
 
 
 def test_parameters_keep_their_types(path):

@@ -1,0 +1,43 @@
+"""``mirrorskin correlate``: the raw correlation of any stack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+
+def command(
+    stack: Annotated[Path, typer.Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="STACK-correlation.h5"
+        ),
+    ] = None,
+    dataset: options.Dataset = None,
+    phase_step: options.PhaseStep = None,
+    phases: options.Phases = None,
+    pixel_size: options.PixelSize = None,
+    memory: options.Memory = "256MB",
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Fit mean, cosine and sine of the phase to each pixel's brightness."""
+    from mirrorskin import engine, io
+    from mirrorskin.cli.output import save_and_tell
+    from mirrorskin.cli.positions import given
+    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.quantity import memory as bytes_of
+
+    known = given(options.MotionName.axial, None, None, phase_step, phases, None, pixel_size)
+    limit = bytes_of(memory, "--memory")
+    with io.open_recording(stack, dataset=dataset, memory_limit=limit, **known) as source:
+        target = output or stack.with_name(f"{stack.stem}-correlation.h5")
+        io.check_output(target, keep=stack)
+        with progress("correlating", source.shape[0]) as show:
+            result = engine.correlate_source(source, memory_limit=limit, device=device, progress=show)
+    save_and_tell(result, target, device, as_json)

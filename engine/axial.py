@@ -1,0 +1,237 @@
+"""Normals, contact and edges from an axial rotation; or its wave alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from mirrorskin.engine.correlation import Correlator
+from mirrorskin.engine.edges import find_edges
+from mirrorskin.engine.feed import Progress, feed
+from mirrorskin.engine.normals import NORMAL_METHODS, NormalEstimator, NormalMethod, Normals
+from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.engine.registration import Registered
+from mirrorskin.engine.search import MEMORY_LIMIT
+from mirrorskin.engine.turns import LONGEST, longest_turn
+from mirrorskin.io import InputError, ProcessValue, Result, Source
+from mirrorskin.kernels.device import Device, open_device
+
+_NO_GAIN = "none: the recording has no zenith gain"
+
+_REACH = 5  # pixels across, of which a registered sample may be made
+
+
+def reconstruct_rotation(
+    source: Source,
+    *,
+    method: NormalMethod = "exact",
+    tilt: float | Literal["estimate"] | None = None,
+    gain: ArrayLike | None = None,
+    offset: ArrayLike | None = None,
+    noise: float | None = None,
+    per_turn: bool = False,
+    heights: ArrayLike | None = None,
+    memory_limit: int = MEMORY_LIMIT,
+    device: str | Device | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Reconstruct normals from an axial rotation of one turn or more.
+
+    Brightness is taken to be linear in the zenith between the source's dark and bright references, where it
+    has them. Without a zenith gain, there are azimuth, mean, modulation and residual only.
+
+    Parameters
+    ----------
+    source : Source
+        Of axial motion. It is rewound first, if it can be.
+    method : {"exact", "paper"}
+        See ``estimate_normals``.
+    tilt : float or "estimate", optional
+        Half-angle of the precession, radians; by default the source's own. It is estimated from the first
+        turn on request only: where the pivot is far from the object's surface, that is wrong.
+    gain, offset : array_like, scalar or (H, W), optional
+        Counts per radian of zenith, and counts at zenith 0, instead of the source's own; an offset that
+        nobody knows is 0.
+    noise : float, optional
+        Standard deviation of a sample, counts; by default told from the first turn.
+    per_turn : bool
+        Whether to tell each turn alone, in maps with a leading axis, instead of the mean over turns.
+    heights : array_like, (H, W), optional
+        Millimetres of the surface: frames are registered for the pivot's shift with them first; see
+        ``Registered``.
+    memory_limit : int
+        Bytes of host memory for frames on the move.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+    progress : callable, optional
+        Told the number of frames so far.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Phases, tilt, scale or heights that are missing or cannot be used.
+    """
+    header = source.header
+    if method not in NORMAL_METHODS:
+        raise InputError(f"unknown method {method!r}; of a rotation, known are {', '.join(NORMAL_METHODS)}")
+    used_gain = header.zenith_gain if gain is None else gain
+    if used_gain is None:
+        if per_turn or heights is not None:
+            raise InputError(f"{source.name} has no zenith gain: without it, no normals of turns or heights")
+        return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
+    used_offset = _first(offset, header.zenith_offset, 0.0)
+    opened = open_device(device)
+    frames: Source = source if heights is None else Registered(source, heights, opened)
+    with naming(source):
+        estimator = NormalEstimator(
+            frames.shape[1:],
+            frames.dtype,
+            tilt=_tilt(source, tilt),
+            gain=used_gain,
+            offset=used_offset,
+            method=method,
+            noise=noise,
+            low=header.dark,
+            high=header.bright,
+            longest=_longest_turn(source),
+            per_turn=per_turn,
+            device=opened,
+            memory_limit=min(memory_limit, 2 * math.prod(frames.shape) * frames.dtype.itemsize),
+        )
+        if frames.rewindable:
+            frames.rewind()
+        feed(frames, estimator, range(frames.shape[0]), progress)
+        normals = estimator.result()
+    edges = _edges(normals, opened)
+    if isinstance(frames, Registered):
+        normals = _mend(normals, frames.noise_gain, given=noise is not None)
+    process: dict[str, ProcessValue] = {
+        "method": method,
+        "tilt": normals.tilt,
+        "tilt_from": "estimate" if tilt == "estimate" else "given" if tilt is not None else "recording",
+        "zenith_gain": told(gain, header.zenith_gain, "none"),
+        "zenith_offset": told(offset, header.zenith_offset, "0"),
+        "low": told(None, header.dark, "range of the type"),
+        "high": told(None, header.bright, "range of the type"),
+        "noise": normals.noise,
+        "shot_noise": normals.shot,
+        "turns": normals.turns,
+        "frames": normals.frames,
+        "per_turn": per_turn,
+        "heights": "none" if heights is None else "given",
+    }
+    return sign(_result(normals, edges), source, opened, process)
+
+
+def correlate_source(
+    source: Source,
+    *,
+    memory_limit: int = MEMORY_LIMIT,
+    device: str | Device | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Fit mean, cosine and sine of the phase to each pixel's brightness, over all frames of a source.
+
+    Parameters
+    ----------
+    source : Source
+        Of axial motion. It is rewound first, if it can be.
+    memory_limit, device, progress
+        As for `reconstruct_rotation`.
+
+    Returns
+    -------
+    Result
+        With azimuth, mean, cosine, sine, modulation and residual.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The phases do not determine the fit.
+    """
+    opened = open_device(device)
+    size = math.prod(source.shape) * source.dtype.itemsize
+    with naming(source):
+        correlator = Correlator(
+            source.shape[1:], source.dtype, device=opened, memory_limit=min(memory_limit, 2 * size)
+        )
+        if source.rewindable:
+            source.rewind()
+        feed(source, correlator, range(source.shape[0]), progress)
+        wave = correlator.result()
+    result = Result(
+        azimuth=wave.azimuth,
+        mean=wave.mean,
+        cosine=wave.cosine,
+        sine=wave.sine,
+        modulation=wave.modulation,
+        residual=wave.residual,
+    )
+    return sign(result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN})
+
+
+def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
+    """Find the edges of each turn, or of their mean."""
+    maps = normals.vectors, normals.sigma, normals.contact
+    if normals.contact.ndim == 2:
+        return find_edges(*maps, device=device)
+    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
+
+
+def _result(normals: Normals, edges: NDArray[np.uint8]) -> Result:
+    """Put together what is told."""
+    return Result(
+        normals=normals.vectors,
+        zenith=normals.zenith,
+        azimuth=normals.azimuth,
+        normal_sigma=normals.sigma,
+        mean=normals.mean,
+        modulation=normals.modulation,
+        residual=normals.residual,
+        edges=edges,
+        contact=normals.contact,
+    )
+
+
+def _tilt(source: Source, given: float | Literal["estimate"] | None) -> float | None:
+    if given == "estimate":
+        return None
+    tilt = source.header.tilt if given is None else given
+    if tilt is None:
+        raise InputError(
+            "it does not say how far the body leaned: give the tilt, such as 2.5deg, or have it estimated"
+        )
+    return tilt
+
+
+def _longest_turn(source: Source) -> int:
+    """Return how many frames a turn may have: as many as they have, where that is known beforehand."""
+    phase: NDArray[np.float64] | None = getattr(source, "phase", None)
+    return LONGEST if phase is None else longest_turn(phase)
+
+
+def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Normals:
+    """Account for what interpolation did to a pixel's noise, and where it reached beyond the contact.
+
+    Noise that was told from the frames themselves has the mean of that already. Samples are made of 4 x 4, of
+    which two on either side may have lost contact.
+    """
+    typical = 1.0 if given else np.sqrt(np.nanmean(noise_gain.astype(np.float64) ** 2))
+    reach = np.ones((1,) * (normals.contact.ndim - 2) + (_REACH, _REACH), bool)
+    lost = np.isfinite(normals.sigma) & (normals.contact == 0)
+    inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
+    sigma = normals.sigma * (noise_gain / typical).astype(np.float32)
+    return replace(normals, sigma=sigma, contact=inside)
+
+
+def _first(*values: ArrayLike | None) -> ArrayLike:
+    return next(value for value in values if value is not None)

@@ -1,0 +1,115 @@
+"""Heights from a vertical press or its release."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.changepoint import ChangePointSearch
+from mirrorskin.engine.feed import Progress, feed
+from mirrorskin.engine.onset import OnsetSearch
+from mirrorskin.engine.provenance import sign, told
+from mirrorskin.engine.search import MEMORY_LIMIT, Event
+from mirrorskin.io import InputError, ProcessValue, Result, Source
+from mirrorskin.kernels.device import Device
+
+PressMethod = Literal["threshold", "change-point"]
+METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
+
+_RANGE = "range of the type"
+
+
+def reconstruct_press(
+    source: Source,
+    *,
+    event: Event = "onset",
+    method: PressMethod = "threshold",
+    threshold: float = 0.5,
+    hold: int = 2,
+    subframe: bool = True,
+    dark: ArrayLike | None = None,
+    bright: ArrayLike | None = None,
+    noise: float | None = None,
+    memory_limit: int = MEMORY_LIMIT,
+    device: str | Device | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Reconstruct heights from a press or a release; see ``mirrorskin.engine.reconstruct``."""
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}; of a press, known are {', '.join(METHODS)}")
+    header = source.header
+    frames = _frames_of(source, event)
+    size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
+    search = _search(
+        source,
+        method,
+        subframe,
+        dark=header.dark if dark is None else dark,
+        bright=header.bright if bright is None else bright,
+        threshold=threshold,
+        hold=hold,
+        noise=noise,
+        event=event,
+        device=device,
+        memory_limit=min(memory_limit, 2 * size),
+    )
+    if source.rewindable:
+        source.rewind()
+    feed(source, search, frames, progress)
+    twice = False
+    if isinstance(search, ChangePointSearch) and search.passes == 2:
+        twice = True
+        source.rewind()
+        search.rewind()
+        feed(source, search, frames, progress)
+    onset = search.result()
+    process: dict[str, ProcessValue] = {
+        "first_frame": frames.start,
+        "frames": len(frames),
+        "event": event,
+        "method": method,
+        "threshold": threshold,
+        "hold": hold,
+        "subframe": subframe,
+        "noise": onset.noise,
+        "dark": "each pixel's own" if twice else told(dark, header.dark, _RANGE),
+        "bright": "each pixel's own" if twice else told(bright, header.bright, _RANGE),
+    }
+    result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
+    return sign(result, source, search.device, process)
+
+
+def _frames_of(source: Source, event: Event) -> range:
+    """Tell in which frames a source was pressed, or lifted; all, where it does not know beforehand."""
+    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+    if travel is None:
+        return range(source.shape[0])
+    deepest = np.flatnonzero(travel == travel.max())
+    rises, falls = travel[0] < travel[deepest[0]], travel[-1] < travel[deepest[0]]
+    if event == "release":
+        if rises and not falls:
+            raise InputError(f"{source.name}: travel only rises: that is a press; give event onset")
+        return range(int(deepest[0]), source.shape[0])
+    if falls and not rises:
+        raise InputError(f"{source.name}: travel only falls: that is a release; give event release")
+    return range(int(deepest[-1]) + 1)
+
+
+def _search(
+    source: Source, method: PressMethod, subframe: bool, **options: Any
+) -> OnsetSearch | ChangePointSearch:
+    """Make the search that was asked for, if the source can feed it."""
+    shape, dtype = source.shape[1:], source.dtype
+    if method == "threshold":
+        return OnsetSearch(shape, dtype, subframe=subframe, **options)
+    if not subframe:
+        raise InputError("a change-point lies between frames: equation 4 as printed needs method 'threshold'")
+    if not source.rewindable and (options["dark"] is None or options["bright"] is None):
+        raise InputError(
+            f"{source.name} cannot be read twice, as a change between unknown levels needs: "
+            "give dark and bright"
+        )
+    return ChangePointSearch(shape, dtype, **options)

@@ -1,0 +1,44 @@
+"""Heights that are known already, for what needs them: from a result, or from a simulation's truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.layout import MARK
+from mirrorskin.io.recording import open_recording
+from mirrorskin.io.result import open_result
+from mirrorskin.io.types import InputError
+
+
+def open_heights(path: str | Path) -> NDArray[np.float32]:
+    """Read the heights of a result, or the true ones of a simulated recording.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    ndarray, (H, W), float32
+        Millimetres; NaN where none is known.
+
+    Raises
+    ------
+    InputError
+        There is no such file, it holds no heights, or it is damaged.
+    """
+    path = Path(path)
+    with Hdf5File(path) as file:
+        ours = file.marked(MARK)
+    if ours:
+        with open_recording(path) as recording:
+            height = None if recording.truth is None else recording.truth.height
+    else:
+        height = open_result(path).height
+    if height is None:
+        raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
+    return height

@@ -1,0 +1,149 @@
+"""The raw correlation of any stack, from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from commands import run
+from rotations import UNEVEN
+from stacks import MadeUp, plot_of, random_stack, record, sphere
+
+from mirrorskin import io
+
+PHASES = " ".join(f"{np.degrees(phase)}deg" for phase in UNEVEN)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "phases.txt").write_text(PHASES)
+
+
+def theirs(name="theirs.h5", dtype="uint8"):
+    with h5py.File(name, "w") as file:
+        file["some/stack"] = random_stack(dtype)
+    return name
+
+
+def fitted(frames, phase):
+    """Fit by NumPy's least squares: mean, cosine, sine, and what is left."""
+    table = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)], axis=1)
+    counts = frames.reshape(len(frames), -1).astype(float)
+    found = np.linalg.lstsq(table, counts, rcond=None)[0]
+    left = np.sqrt(np.sum((counts - table @ found) ** 2, axis=0) / (len(frames) - 3))
+    return [values.reshape(frames.shape[1:]) for values in (*found, left)]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize(
+    ("words", "phase"),
+    [
+        (["--phases", "phases.txt"], np.array(UNEVEN)),
+        (["--phase-step", "45deg"], np.arange(8) * np.pi / 4),
+        (["--phase-step=-40deg", "--memory", "100B"], -np.arange(8) * np.pi / 4.5),
+    ],
+)
+def test_any_stack_is_fitted_by_least_squares(dtype, words, phase):
+    ended = run("correlate", theirs(dtype=dtype), *words)
+    assert ended.code == 0, ended.said
+    result = io.open_result("theirs-correlation.h5")
+    assert set(result.maps()) == {"mean", "cosine", "sine", "modulation", "azimuth", "residual"}
+    mean, cosine, sine, residual = fitted(random_stack(dtype), phase)
+    scale = np.iinfo(dtype).max
+    for name, expected in {"mean": mean, "cosine": cosine, "sine": sine, "residual": residual}.items():
+        np.testing.assert_allclose(getattr(result, name), expected, atol=2e-6 * scale, err_msg=name)
+    np.testing.assert_allclose(result.modulation, np.hypot(cosine, sine), atol=2e-6 * scale)
+    turned = result.azimuth - np.arctan2(sine, cosine)
+    assert np.max(np.hypot(cosine, sine) * np.abs(np.sin(turned / 2))) < 2e-6 * scale
+
+
+def test_what_was_written_is_told_in_a_line_and_plotted():
+    ended = run("correlate", theirs(), "--phases", "phases.txt", "-o", "out.h5")
+    reach = io.open_result("out.h5").modulation
+    assert ended.out == (
+        f"out.h5: azimuth at 35 of 35 pixels, modulation from {reach.min():.3f} to {reach.max():.3f} counts\n"
+    )
+    assert ended.said == ""
+    assert plot_of("out.h5")[1].name == "/entry/result/azimuth"
+
+
+def test_it_is_told_how_it_came_about():
+    ended = run("correlate", theirs(), "--phases", "phases.txt", "--pixel-size", "0.5mm", "--json")
+    told = json.loads(ended.out)
+    assert told["output"] == "theirs-correlation.h5"
+    assert told["summary"]["answered"] == 35
+    assert told["profile"]
+    process = io.open_result("theirs-correlation.h5").process
+    assert told["process"] == process
+    assert (process["source"], process["dataset"], process["frames"]) == ("theirs.h5", "/some/stack", 8)
+    assert {"program", "version", "date", "device", "driver", "source_sha256"} <= set(process)
+    assert io.open_result("theirs-correlation.h5").x[1] == -1.0
+
+
+def test_a_recording_of_a_rotation_knows_its_phases_and_one_of_a_press_is_told_them():
+    record(MadeUp(random_stack(), io.Header("axial"), phase=np.array(UNEVEN)), Path("turn.h5"))
+    assert run("correlate", "turn.h5").code == 0
+    assert run("correlate", theirs(), "--phases", "phases.txt").code == 0
+    own, given = (io.open_result(f"{name}-correlation.h5").cosine for name in ("turn", "theirs"))
+    np.testing.assert_array_equal(own, given)
+    record(sphere(), Path("press.h5"))
+    assert run("correlate", "press.h5", "--phase-step", "45deg").code == 0
+
+
+def test_pictures_are_imported_with_their_phases():
+    for number, frame in enumerate(random_stack()):
+        cv2.imwrite(f"light{number}.png", frame)
+    words = ["--motion", "axial", "--phases", "phases.txt"]
+    assert run("import", ".", *words, "-o", "lights.h5").code == 0
+    with io.open_recording("lights.h5") as recording:
+        np.testing.assert_allclose(recording.phase, UNEVEN)
+    Path("phases.txt").write_text("1deg 2deg 3deg")
+    ended = run("import", ".", *words, "-o", "no.h5")
+    assert ended == (2, "", "mirrorskin: phases.txt lists 3 phases for 8 frames: one a frame is needed\n")
+
+
+def several():
+    with h5py.File("theirs.h5", "w") as file:
+        file["one"], file["two"] = random_stack(), random_stack()
+
+
+CASES = {
+    "no phases": (
+        theirs,
+        [],
+        "theirs.h5 does not say where the body was in each frame: give --phase-step or --ph",
+    ),
+    "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "give one of them"),
+    "seven phases": (theirs, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
+    "no such phases": (theirs, ["--phases", "gone.txt"], "gone.txt cannot be read: No such file"),
+    "a number": (theirs, ["--phases", "number.txt"], "number.txt, line 2: 45: a unit is needed"),
+    "a length": (theirs, ["--phase-step", "45mm"], "--phase-step 45mm: millimeters are not an angle"),
+    "one phase": (theirs, ["--phase-step", "0deg"], "1 different phases"),
+    "the same again": (theirs, ["--phase-step", "360deg"], "1 different phases"),
+    "two phases": (theirs, ["--phase-step", "180deg"], "2 different phases"),
+    "almost one phase": (theirs, ["--phase-step", "0.001deg"], "too close together"),
+    "several stacks": (several, ["--phase-step", "45deg"], "choose with --dataset"),
+    "no such stack": (theirs, ["--phase-step", "45deg", "--dataset", "gone"], "there is no gone"),
+    "its own output": (theirs, ["--phase-step", "45deg", "-o", "theirs.h5"], "is the input"),
+    "no file": (lambda: None, ["--phase-step", "45deg"], "no such file"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_line(case):
+    make, words, said_of = CASES[case]
+    make()
+    Path("seven.txt").write_text(PHASES.rpartition(" ")[0])
+    Path("number.txt").write_text("0deg\n45\n90deg")
+    before = set(Path().iterdir())
+    ended = run("correlate", "theirs.h5", *words)
+    assert (ended.code, ended.out) == (2, "")
+    assert said_of in ended.said
+    assert ended.said.startswith("mirrorskin: ")
+    assert ended.said.count("\n") == 1
+    assert set(Path().iterdir()) == before

@@ -1,0 +1,68 @@
+"""Files of phases: what is read of them, and what is refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin.cli.phases import read_phases
+from mirrorskin.io import InputError, Positions
+
+MEASURED = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]
+
+
+@pytest.mark.parametrize(
+    ("text", "degrees"),
+    [
+        ("\n".join(f"{angle}deg" for angle in MEASURED), MEASURED),
+        (" ".join(f"{angle}deg" for angle in MEASURED) + "\n", MEASURED),
+        ("# lights, as measured\n\n 10deg 20deg # two\n#30deg\n\t40deg\r\n", [10, 20, 40]),
+        ("0rad 3.141592653589793rad 1turn -90\u00b0", [0, 180, 360, -90]),
+    ],
+)
+def test_angles_stand_between_blanks_in_any_unit(tmp_path, text, degrees):
+    path = tmp_path / "phases.txt"
+    path.write_bytes(text.encode())
+    found = read_phases(path)
+    assert isinstance(found, Positions)
+    phases = found.positions(len(degrees))
+    assert phases.dtype == np.float64
+    np.testing.assert_allclose(np.degrees(phases), degrees, rtol=1e-14, atol=1e-12)
+
+
+def test_another_number_of_phases_than_of_frames_is_refused(tmp_path):
+    path = tmp_path / "phases.txt"
+    path.write_text("10deg 20deg 30deg")
+    for count in (2, 4):
+        with pytest.raises(InputError) as caught:
+            read_phases(path).positions(count)
+        assert str(caught.value) == f"{path} lists 3 phases for {count} frames: one a frame is needed"
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (b"10deg\n20deg\n\n# three\n30\n", ", line 5: 30: a unit is needed; write e.g. 2.5deg"),
+        (b"10deg, 20deg", ", line 1: 10deg,: a number and a unit are needed; write e.g. 2.5deg"),
+        (b"10 deg", ", line 1: 10: a unit is needed; write e.g. 2.5deg"),
+        (b"10mm", ", line 1: 10mm: millimeters are not an angle; write e.g. 2.5deg"),
+        (b"nandeg", ", line 1: nandeg: a number and a unit are needed; write e.g. 2.5deg"),
+        (b"1e999deg", ", line 1: 1e999deg: the number is too large; write e.g. 2.5deg"),
+        (b"", " lists no phases: write one angle a frame in it, such as 178.1deg"),
+        (b"# 10deg\n", " lists no phases: write one angle a frame in it, such as 178.1deg"),
+        (b"\x89HDF\r\n\xff", " is no text: write one angle a frame in it, such as 178.1deg"),
+        (None, " cannot be read: No such file or directory; write one angle a frame in it, such as 178.1deg"),
+    ],
+)
+def test_a_file_that_lists_no_angles_is_one_line(tmp_path, content, line):
+    path = tmp_path / "phases.txt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_phases(path)
+    assert str(caught.value) == f"{path}{line}"
+
+
+def test_a_folder_is_no_file_of_phases(tmp_path):
+    with pytest.raises(InputError, match="cannot be read: Is a directory; write one angle"):
+        read_phases(tmp_path)

@@ -1,0 +1,247 @@
+"""`mirrorskin reconstruct` on a rotation: what each option does, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from commands import run
+from rotations import TILT, Setup, between, direction, expose
+from stacks import MadeUp, read_all, record, sphere
+
+from mirrorskin import io
+
+SHAPE = (9, 11)
+X, Y = np.meshgrid(np.linspace(-1, 1, 11), np.linspace(1, -1, 9))
+ZENITH, AZIMUTH = np.radians(10 + 40 * np.hypot(X, Y) / np.sqrt(2)), np.arctan2(Y, X)
+SETUP = Setup(gain=400.0, noise=10.0, offset=2000.0, dtype="uint16")
+TWO_TURNS = np.tile(SETUP.phase, 2)
+HEADER = io.Header(
+    "axial",
+    pixel_size=(0.1, 0.1),
+    press=1.0,
+    tilt=TILT,
+    pivot=(0.0, 0.0, 0.0),
+    zenith_gain=np.array(SETUP.slope),
+    zenith_offset=np.array(SETUP.offset),
+)
+TRUTH = io.Truth(
+    height=np.full(SHAPE, -1.0, np.float32),
+    zenith=ZENITH.astype(np.float32),
+    azimuth=AZIMUTH.astype(np.float32),
+    contact=np.ones(SHAPE, np.uint8),
+)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def turn(name="turn.h5", phase=SETUP.phase, **changes):
+    """Record a rotation over a dome; the changes are the header's."""
+    frames = expose(direction(ZENITH, AZIMUTH), replace(SETUP, phase=tuple(phase)), seed=3)
+    return record(MadeUp(frames, replace(HEADER, **changes), phase=np.array(phase)), Path(name), truth=TRUTH)
+
+
+def reconstruct(*words, name="turn.h5"):
+    """Return the result, and what was said."""
+    ended = run("reconstruct", name, "-o", "out.h5", *words)
+    assert ended.code == 0, ended.said
+    return io.open_result("out.h5"), ended
+
+
+def errors(result):
+    """Return the angles between the normals and the true ones, degrees."""
+    return np.degrees(between(result.normals, direction(ZENITH, AZIMUTH)))
+
+
+def test_a_rotation_becomes_normals_that_are_scored():
+    turn()
+    ended = run("reconstruct", "turn.h5")
+    assert (ended.code, ended.said) == (0, "")
+    assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
+    assert ended.out.count("\n") == 1
+    result = io.open_result("turn-result.h5")
+    assert np.max(errors(result)) < 2
+    assert result.x is not None
+    score = json.loads(run("score", "turn-result.h5", "--truth", "turn.h5", "--json").out)
+    assert {"normal", "contact", "edges"} <= set(score)
+    assert score["normal"]["answered"] == 99
+    assert score["normal"]["rms"] < 0.5
+    assert "normal RMS error" in run("score", "turn-result.h5", "--truth", "turn.h5").out
+    assert "map normals" in run("info", "turn-result.h5").out
+
+
+def test_the_paper_s_method_is_another():
+    turn()
+    exact, ended = reconstruct("--json")
+    assert json.loads(ended.out)["process"]["method"] == "exact"
+    paper, ended = reconstruct("--method", "paper", "--json")
+    assert json.loads(ended.out)["process"]["method"] == "paper"
+    assert not np.array_equal(exact.normals, paper.normals)
+    assert np.max(errors(paper)) < 5
+
+
+def test_each_turn_has_maps_of_its_own():
+    turn(phase=TWO_TURNS)
+    together, _ = reconstruct()
+    assert together.zenith.shape == SHAPE
+    each, ended = reconstruct("--per-turn")
+    assert each.normals.shape == (2, *SHAPE, 3)
+    assert {values.shape for name, values in each.maps().items() if name != "normals"} == {(2, *SHAPE)}
+    assert "198 of 198 pixels in 2 turns" in ended.out
+    assert np.max(errors(each)) < 2
+
+
+def test_phases_from_a_file_replace_the_recording_s():
+    turn("right.h5", phase=np.array(SETUP.phase) ** 1.1)
+    with io.open_recording("right.h5") as recording:
+        found = read_all(recording, 8)
+    record(MadeUp(found.frames, HEADER, phase=np.zeros(8)), Path("wrong.h5"))
+    Path("phases.txt").write_text(" ".join(f"{phase!r}rad" for phase in found.phase.tolist()))
+    given, _ = reconstruct("--phases", "phases.txt", name="wrong.h5")
+    own, _ = reconstruct(name="right.h5")
+    np.testing.assert_array_equal(given.normals, own.normals)
+
+
+def test_gain_offset_and_tilt_on_the_command_line_replace_the_recording_s():
+    turn("right.h5")
+    turn("wrong.h5", zenith_gain=np.array(7.0), zenith_offset=np.array(700.0), tilt=0.2)
+    words = ["--zenith-gain", "400/deg", "--zenith-offset", "2000", "--tilt", "2.5deg"]
+    given, _ = reconstruct(*words, name="wrong.h5")
+    own, _ = reconstruct(name="right.h5")
+    np.testing.assert_allclose(given.normals, own.normals, atol=1e-5)
+
+
+def test_a_tilt_that_nobody_knows_is_estimated():
+    turn("unknown.h5", tilt=None)
+    result, _ = reconstruct("--tilt", "estimate", name="unknown.h5")
+    assert np.mean(errors(result)) < 2
+    turn("wrong.h5", tilt=0.2)
+    again, _ = reconstruct("--tilt", "estimate", name="wrong.h5")
+    np.testing.assert_array_equal(again.normals, result.normals)
+
+
+def test_heights_come_from_a_simulation_or_a_result():
+    turn()
+    io.save_result(io.Result(height=TRUTH.height), "heights.h5")
+    plain, _ = reconstruct()
+    by_truth, _ = reconstruct("--heights", "turn.h5")
+    by_result, _ = reconstruct("--heights", "heights.h5")
+    np.testing.assert_array_equal(by_truth.normals, by_result.normals)
+    assert by_truth.process["heights"] != plain.process["heights"]
+
+
+def test_without_a_gain_there_is_no_zenith_and_a_line_says_why():
+    turn(zenith_gain=None)
+    result, ended = reconstruct()
+    assert ended.said == "turn.h5: no zenith: the recording has no zenith gain; give --zenith-gain\n"
+    assert ended.out.startswith("out.h5: azimuth at 99 of 99 pixels, modulation from ")
+    assert {"azimuth", "modulation"} <= set(result.maps())
+    assert not {"zenith", "normals", "normal_sigma"} & set(result.maps())
+    np.testing.assert_allclose(np.cos(result.azimuth - AZIMUTH), 1, atol=0.01)
+    json.loads(reconstruct("--json")[1].out)
+    score = json.loads(run("score", "out.h5", "--truth", "turn.h5", "--json").out)
+    assert "normal" not in score
+    assert score["azimuth"]["rms"] < 5
+
+
+PRESS = {
+    "--travel-step": ["0.1mm"],
+    "--dark": ["3"],
+    "--bright": ["3"],
+    "--event": ["onset"],  # the default, but given
+    "--threshold": ["0.5"],
+    "--hold": ["2"],
+    "--subframe": [],
+    "--no-subframe": [],
+}
+ROTATION = {
+    "--phase-step": ["45deg"],
+    "--phases": ["phases.txt"],
+    "--tilt": ["estimate"],
+    "--zenith-gain": ["4/deg"],
+    "--zenith-offset": ["10"],
+    "--per-turn": [],
+    "--heights": ["turn.h5"],
+}
+
+
+def refused(*words):
+    """Return the line of a call that is refused, and writes nothing."""
+    before = set(Path().iterdir())
+    ended = run(*words)
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.said.count("\n") == 1
+    assert set(Path().iterdir()) == before
+    return ended.said.removeprefix("mirrorskin: ").rstrip("\n")
+
+
+@pytest.mark.parametrize("option", PRESS)
+def test_options_of_a_press_are_refused_for_a_rotation(option):
+    turn()
+    told = refused("reconstruct", "turn.h5", option, *PRESS[option])
+    # Of a pair of opposites the first is named.
+    name = option.replace("--no-", "--")
+    assert told == f"turn.h5 is of axial motion, of which {name} says nothing: leave it out"
+
+
+@pytest.mark.parametrize("option", ROTATION)
+def test_options_of_a_rotation_are_refused_for_a_press(option):
+    record(sphere(), Path("press.h5"))
+    Path("phases.txt").write_text("1deg")
+    told = refused("reconstruct", "press.h5", option, *ROTATION[option])
+    assert told == f"press.h5 is of vertical motion, of which {option} says nothing: leave it out"
+
+
+@pytest.mark.parametrize("motion", ["horizontal", "twist"])
+def test_a_motion_without_a_method_is_refused_whatever_the_options(motion):
+    record(sphere(), Path("press.h5"))
+    assert motion in refused("reconstruct", "press.h5", "--motion", motion, "--threshold", "0.3")
+
+
+CASES = {
+    "a method of the other motion": ({}, ["--method", "threshold"], "threshold"),
+    "no tilt": ({"tilt": None}, [], "tilt"),
+    "a tilt of 0": ({}, ["--tilt", "0deg"], "tilt"),
+    "a tilt without a unit": ({}, ["--tilt", "2.5"], "--tilt 2.5: a unit is needed"),
+    "a gain of 0": ({"zenith_gain": np.array(0.0)}, [], "gain"),
+    "a gain of NaN": ({"zenith_gain": np.array(np.nan)}, [], "gain"),
+    "gains of NaN": ({"zenith_gain": np.full(SHAPE, np.nan)}, [], "gain"),
+    "a given gain of 0": ({}, ["--zenith-gain", "0/deg"], "gain"),
+    "a gain without an angle": ({}, ["--zenith-gain", "4"], "a number over a unit of angle is needed"),
+    "a gain of no number": ({}, ["--zenith-gain", "nan/deg"], "--zenith-gain nan/deg"),
+    "an offset of NaN": ({}, ["--zenith-offset", "nan"], "offset"),
+    "a noise of 0": ({}, ["--noise", "0"], "noise"),
+    "two phases": ({}, ["--phase-step", "180deg"], "2 different phases"),
+    "one phase": ({}, ["--phase-step", "360deg"], "1 different phases"),
+    "phases side by side": ({}, ["--phase-step", "0.001deg"], "too close together"),
+    "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
+    "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "give one of them"),
+    "heights from nowhere": ({}, ["--heights", "gone.h5"], "gone.h5: no such file"),
+    "no heights": ({}, ["--heights", "flat.h5"], "flat.h5 holds no heights"),
+    "heights of another size": ({}, ["--heights", "small.h5"], "(2, 3)"),
+    "heights without a pivot": ({"pivot": None}, ["--heights", "turn.h5"], "pivot"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_line(case):
+    changes, words, said_of = CASES[case]
+    turn(**changes)
+    Path("seven.txt").write_text("0deg 45deg 90deg 135deg 180deg 225deg 270deg")
+    io.save_result(io.Result(zenith=np.zeros(SHAPE, np.float32)), "flat.h5")
+    io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "small.h5")
+    assert said_of in refused("reconstruct", "turn.h5", *words)
+
+
+def test_two_frames_are_no_rotation():
+    with h5py.File("two.h5", "w") as file:
+        file["frames"] = np.zeros((2, *SHAPE), np.uint8)
+    words = ["--motion", "axial", "--phase-step", "45deg", "--tilt", "2.5deg", "--zenith-gain", "4/deg"]
+    assert "2 different phases" in refused("reconstruct", "two.h5", *words)

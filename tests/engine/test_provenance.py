@@ -1,0 +1,82 @@
+"""What a result says of how it came about, and how complaints name their source."""
+
+import numpy as np
+import pytest
+from stacks import MadeUp, record, sphere
+
+from mirrorskin import io
+from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.kernels.device import open_device
+
+
+class Source:
+    name = "turn.h5"
+
+
+def made_up(**header):
+    return MadeUp(np.zeros((4, 3, 5), np.uint8), io.Header("axial", **header))
+
+
+@pytest.mark.parametrize(
+    ("given", "own", "expected"),
+    [
+        (2.5, None, 2.5),
+        (0, np.ones((3, 5)), 0.0),
+        (np.float32(0.5), 7.0, 0.5),
+        (np.ones((3, 5)), 7.0, "map given"),
+        (None, 7.0, 7.0),
+        (None, np.array(7), 7.0),
+        (None, np.ones((3, 5)), "map of the recording"),
+        (None, None, "range of the type"),
+    ],
+)
+def test_a_number_is_told_and_a_map_is_named(given, own, expected):
+    value = told(given, own, "range of the type")
+    assert value == expected
+    assert isinstance(value, str | float)
+
+
+def test_a_complaint_is_made_in_the_sources_name():
+    with pytest.raises(io.InputError, match=r"^turn\.h5: tilt 0 deg$") as caught, naming(Source()):
+        raise io.InputError("tilt 0 deg")
+    assert str(caught.value.__cause__) == "tilt 0 deg"
+
+
+def test_a_complaint_that_has_the_name_keeps_its_words():
+    with pytest.raises(io.InputError, match=r"^phase is missing in turn\.h5$"), naming(Source()):
+        raise io.InputError("phase is missing in turn.h5")
+
+
+def test_other_errors_and_none_pass():
+    with naming(Source()):
+        pass
+    with pytest.raises(ZeroDivisionError), naming(Source()):
+        raise ZeroDivisionError
+
+
+def test_a_result_is_signed_with_its_source_and_its_device(device):
+    bare = io.Result(mean=np.zeros((3, 5), np.float32))
+    signed = sign(bare, made_up(pixel_size=(0.1, 0.2)), device, {"method": "exact", "tilt": 0.1})
+    assert signed.mean is bare.mean
+    np.testing.assert_allclose(signed.x, [-0.2, -0.1, 0, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_allclose(signed.y, [0.2, 0, -0.2], atol=1e-12)
+    process = dict(signed.process)
+    assert process.pop("version")
+    assert process.pop("date").endswith("+00:00")
+    expected = {"program": "mirrorskin", "device": device.info.title, "driver": device.info.driver}
+    assert process == {**expected, "source": "made up", "method": "exact", "tilt": 0.1}
+
+
+def test_pixels_of_unknown_size_have_no_place():
+    signed = sign(io.Result(), made_up(), open_device(None), {})
+    assert signed.x is None
+    assert signed.y is None
+
+
+def test_a_recording_is_told_by_its_hash(tmp_path):
+    path = record(sphere(), tmp_path / "ball.h5")
+    with io.open_recording(path) as recording:
+        process = sign(io.Result(), recording, open_device(None), {}).process
+        assert process["source_sha256"] == recording.sha256()
+        assert process["dataset"] == recording.dataset
+        assert process["source"] == recording.name

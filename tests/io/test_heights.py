@@ -1,0 +1,62 @@
+"""Heights that are known already, from results and simulations."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from stacks import random_stack, record, sphere
+
+from mirrorskin import io
+
+
+def heights():
+    values = np.linspace(-1, 0, 35, dtype=np.float32).reshape(5, 7)
+    values[2, 3] = np.nan
+    return values
+
+
+def test_the_heights_of_a_result(tmp_path):
+    io.save_result(io.Result(height=heights()), tmp_path / "r.h5")
+    found = io.open_heights(tmp_path / "r.h5")
+    np.testing.assert_array_equal(found, heights())
+    assert found.dtype == np.float32
+
+
+def test_the_true_heights_of_a_simulation(tmp_path):
+    twin = sphere()
+    record(twin, tmp_path / "r.h5", truth=twin.truth)
+    found = io.open_heights(str(tmp_path / "r.h5"))
+    np.testing.assert_array_equal(found, twin.truth.height)
+    assert np.isfinite(found).any()
+
+
+def nothing(path):
+    path.unlink(missing_ok=True)
+
+
+def stack(path):
+    with h5py.File(path, "w") as file:
+        file["x"] = random_stack()
+
+
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (
+            lambda path: io.save_result(io.Result(zenith=heights()), path),
+            "holds no heights: give a result of a",
+        ),
+        (lambda path: record(sphere(), path), "holds no heights: give a result of a press, or a simulation"),
+        (stack, "is no result: 'mirrorskin reconstruct' makes one from a recording"),
+        (nothing, "no such file"),
+        (lambda path: path.write_text("-0.1 -0.2"), "is not an HDF5 file"),
+    ],
+)
+def test_a_file_without_heights_is_one_line(tmp_path, make, line):
+    path = tmp_path / "bad.h5"
+    make(path)
+    with pytest.raises(io.InputError, match=line) as caught:
+        io.open_heights(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
