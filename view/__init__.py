@@ -1,5 +1,7 @@
 """Pictures for people."""
 
-from mirrorskin.view.figures import check_drawing, height_figure
+from mirrorskin.view.canvas import check_drawing
+from mirrorskin.view.heights import height_figure
+from mirrorskin.view.normals import normal_figure
 
-__all__ = ["check_drawing", "height_figure"]
+__all__ = ["check_drawing", "height_figure", "normal_figure"]

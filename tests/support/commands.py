@@ -9,7 +9,7 @@ import sys
 from typing import NamedTuple
 from unittest import mock
 
-from mirrorskin.cli import demo
+from mirrorskin.cli.demo import presses, rotation
 from mirrorskin.cli.main import main
 
 
@@ -33,7 +33,7 @@ def run(*words: object) -> Ended:
     return Ended(code, out.getvalue(), said.getvalue())
 
 
-def small_experiments() -> tuple[demo._Experiment, ...]:
+def small_experiments() -> tuple[presses.Experiment, ...]:
     """Return the demo's own experiments over the same fields and travels, of few pixels and frames."""
     size, frames = 24, 8
     return tuple(
@@ -44,11 +44,20 @@ def small_experiments() -> tuple[demo._Experiment, ...]:
             frames=frames,
             step=one.step * one.frames / frames,
         )
-        for one in demo._EXPERIMENTS
+        for one in presses.EXPERIMENTS
+    )
+
+
+def small_rotations() -> tuple[rotation.Experiment, ...]:
+    """Return the demo's own rotations over the same fields, of few pixels."""
+    size = 48
+    return tuple(
+        dataclasses.replace(one, size=size, pixel_size=one.pixel_size * one.size / size)
+        for one in rotation.EXPERIMENTS
     )
 
 
 def main_with_a_small_demo() -> None:
     """Run the command line of a process, with `mirrorskin demo` small."""
-    demo._EXPERIMENTS = small_experiments()
+    presses.EXPERIMENTS, rotation.EXPERIMENTS = small_experiments(), small_rotations()
     main()

@@ -1,15 +1,15 @@
-"""``mirrorskin demo``: the paper's experiments, on the digital twin."""
+"""The paper's vertical experiments, section 3.2, from its idealisations to a real sensor."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from mirrorskin.cli import options
-from mirrorskin.cli.output import print_json, print_table
+from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.twin import ContactName, OpticsName
 
 
-class _Sensor(NamedTuple):
+class Sensor(NamedTuple):
     """How true to life the twin is."""
 
     contact: ContactName
@@ -31,17 +31,17 @@ class _Sensor(NamedTuple):
         return f"{self.contact}, {self.optics}"
 
 
-_PAPERS = _Sensor("conform", "ideal")
-_SENSORS = (
-    _PAPERS,
-    _Sensor("conform", "cylinder"),
-    _Sensor("elastic", "ideal"),
-    _Sensor("elastic", "cylinder"),
+PAPERS = Sensor("conform", "ideal")
+SENSORS = (
+    PAPERS,
+    Sensor("conform", "cylinder"),
+    Sensor("elastic", "ideal"),
+    Sensor("elastic", "cylinder"),
 )
 
 
 @dataclass(frozen=True)
-class _Experiment:
+class Experiment:
     """One press of the paper, section 3.2, on several sensors."""
 
     name: str
@@ -51,16 +51,14 @@ class _Experiment:
     pixel_size: float
     frames: int
     step: float
-    sensors: tuple[_Sensor, ...] = _SENSORS
+    sensors: tuple[Sensor, ...] = SENSORS
     surface: bool = False
 
 
-_EXPERIMENTS = (
-    _Experiment("fig5", "sphere", "Fig. 5: sphere, 10 mm, 30 x 0.1 mm", 240, 0.05, 30, 0.1, surface=True),
-    _Experiment(
-        "fig6", "coin", "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm", 640, 0.041, 90, 0.02, _SENSORS[:2]
-    ),
-    _Experiment(
+EXPERIMENTS = (
+    Experiment("fig5", "sphere", "Fig. 5: sphere, 10 mm, 30 x 0.1 mm", 240, 0.05, 30, 0.1, surface=True),
+    Experiment("fig6", "coin", "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm", 640, 0.041, 90, 0.02, SENSORS[:2]),
+    Experiment(
         "fig6-soft",
         "coin",
         "5 yen coin, 30 x 0.12 mm: an elastic body needs more depth",
@@ -89,37 +87,17 @@ much that is above that of the paper's idealisations, conform and ideal."""
 
 # Of a sensor and a method: the fields of a Score, pixels answered without contact, and the RMS error on
 # the pixels that all sensors answer.
-_Outcome = dict[str, float]
-_Outcomes = dict[str, dict[str, _Outcome]]
+Outcome = dict[str, float]
+Outcomes = dict[str, dict[str, Outcome]]
 
 
-def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for all files.")
-    ] = Path("demo"),
-    device: options.Device = None,
-    as_json: options.Json = False,
-) -> None:
-    """Repeat the paper's vertical experiments on the twin, from its idealisations to a real sensor."""
-    from mirrorskin import io, view
-
-    view.check_drawing()
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise io.InputError(
-            f"{output} cannot be made: {error.strerror}; choose another folder with -o"
-        ) from error
-    outcomes = {experiment.name: _run(experiment, output, device) for experiment in _EXPERIMENTS}
-    if as_json:
-        print_json(outcomes)
-        return
+def tell(outcomes: Mapping[str, Outcomes]) -> None:
+    """Print the errors of all presses, and what the columns are."""
     print_table(_HEAD, [row for name, by_sensor in outcomes.items() for row in _rows(name, by_sensor)])
     typer.echo(_LEGEND)
-    typer.echo(f"recordings, results and figures are in {output}: look at {output / 'fig5.png'}")
 
 
-def _run(experiment: _Experiment, folder: Path, device: str | None) -> _Outcomes:
+def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
     """Press on the object with each sensor, and draw what comes out; return outcomes by sensor and method."""
     import numpy as np
 
@@ -132,7 +110,7 @@ def _run(experiment: _Experiment, folder: Path, device: str | None) -> _Outcomes
         results[sensor] = _reconstruct(base, sensor, device)
     best = {sensor.name: by_method["sub-frame"] for sensor, by_method in results.items()}
     path = (folder / experiment.name).with_suffix(".png")
-    view.height_figure(best, truths[_PAPERS], experiment.title, path, surface=experiment.surface)
+    view.height_figure(best, truths[PAPERS], experiment.title, path, surface=experiment.surface)
     shared = np.logical_and.reduce([np.isfinite(_height(result)) for result in best.values()])
     return {
         sensor.name: {method: _judge(result, truths[sensor], shared) for method, result in by_method.items()}
@@ -140,7 +118,7 @@ def _run(experiment: _Experiment, folder: Path, device: str | None) -> _Outcomes
     }
 
 
-def _record(experiment: _Experiment, sensor: _Sensor, path: Path, device: str | None) -> io.Truth:
+def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | None) -> io.Truth:
     """Press with a camera as labs have it: read and shot noise, deviations of the pixels, a lens."""
     from mirrorskin import hw, io
     from mirrorskin.cli.progress import progress
@@ -165,12 +143,12 @@ def _record(experiment: _Experiment, sensor: _Sensor, path: Path, device: str | 
     return twin.truth
 
 
-def _reconstruct(base: Path, sensor: _Sensor, device: str | None) -> dict[str, io.Result]:
+def _reconstruct(base: Path, sensor: Sensor, device: str | None) -> dict[str, io.Result]:
     """Reconstruct from the recording; of the paper's own sensor by eq. 4 as well."""
     from mirrorskin import engine, io
     from mirrorskin.cli.progress import progress
 
-    methods = {"eq. 4": False, "sub-frame": True} if sensor == _PAPERS else {"sub-frame": True}
+    methods = {"eq. 4": False, "sub-frame": True} if sensor == PAPERS else {"sub-frame": True}
     results = {}
     with io.open_recording(base.with_suffix(".h5")) as recording:
         for method, subframe in methods.items():
@@ -182,17 +160,20 @@ def _reconstruct(base: Path, sensor: _Sensor, device: str | None) -> dict[str, i
     return results
 
 
-def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> _Outcome:
+def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Outcome:
     import numpy as np
 
     from mirrorskin import engine
 
     height = _height(result)
     common = replace(result, height=np.where(shared, height, np.float32(np.nan)))
+    whole, shared_part = engine.score(result, truth).height, engine.score(common, truth).height
+    assert whole is not None
+    assert shared_part is not None
     return {
-        **asdict(engine.score(result, truth)),
+        **asdict(whole),
         "untouched": int(np.count_nonzero(np.isfinite(height) & (truth.contact == 0))),
-        "shared_rms": engine.score(common, truth).rms,
+        "shared_rms": shared_part.rms,
     }
 
 
@@ -201,8 +182,8 @@ def _height(result: io.Result) -> NDArray[np.float32]:
     return result.height
 
 
-def _rows(name: str, by_sensor: _Outcomes) -> list[list[str]]:
-    ideal = by_sensor[_PAPERS.name]["sub-frame"]["shared_rms"]
+def _rows(name: str, by_sensor: Outcomes) -> list[list[str]]:
+    ideal = by_sensor[PAPERS.name]["sub-frame"]["shared_rms"]
     return [
         [name, sensor, method, *_cells(outcome, ideal)]
         for sensor, methods in by_sensor.items()
@@ -210,7 +191,7 @@ def _rows(name: str, by_sensor: _Outcomes) -> list[list[str]]:
     ]
 
 
-def _cells(outcome: _Outcome, ideal: float) -> list[str]:
+def _cells(outcome: Outcome, ideal: float) -> list[str]:
     return [
         f"{outcome['answered']} px",
         f"{outcome['untouched']} px",

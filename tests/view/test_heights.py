@@ -27,7 +27,7 @@ def truth_of(height):
 
 def draw(results, truth, surface=False):
     """Draw a figure; return the axes of the whole, and those of the cuts."""
-    figure = view.figures._draw(results, truth, surface)
+    figure = view.heights._draw(results, truth, surface)
     return figure.axes[0], next(axes for axes in figure.axes if "cut" in axes.get_title())
 
 
@@ -76,7 +76,7 @@ def test_a_figure_needs_heights_and_a_place_to_go(tmp_path):
 
 
 def test_without_matplotlib_the_remedy_is_named(monkeypatch):
-    monkeypatch.setattr(view.figures, "find_spec", lambda name: None)
+    monkeypatch.setattr(view.canvas, "find_spec", lambda name: None)
     with pytest.raises(io.InputError, match="pip install 'mirrorskin"):
         view.check_drawing()
 
@@ -105,7 +105,7 @@ def test_the_first_map_lies_as_the_picture_does():
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_the_first_and_the_last_are_drawn_as_a_whole(surfaces, surface, count):
     results = {f"sensor {k}": result_of(slope() - np.float32(0.1 * k)) for k in range(count)}
-    figure = view.figures._draw(results, truth_of(slope()), surface)
+    figure = view.heights._draw(results, truth_of(slope()), surface)
     wholes = [axes for axes in figure.axes if axes.get_title().startswith("sensor")]
     names = [axes.get_title().split(";")[0].removesuffix(" (mm)") for axes in wholes]
     expected = ["sensor 0"] if count == 1 else ["sensor 0", f"sensor {count - 1}"]

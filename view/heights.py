@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,13 +11,13 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
+from mirrorskin.view.canvas import MISSING, check_same_size, extent, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-_MISSING = "lightsteelblue"
 _MESH = 120  # samples of a surface along its longer side
 
 
@@ -45,12 +44,7 @@ def height_figure(
     InputError
         Matplotlib is not installed, a result has no heights or axes, or the file cannot be written.
     """
-    figure = _draw(results, truth, surface)
-    figure.suptitle(title, x=0.02, ha="left", weight="bold")
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
+    save_figure(_draw(results, truth, surface), title, path)
 
 
 def _draw(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
@@ -58,7 +52,7 @@ def _draw(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
         _check(result, truth)
     names = list(results)
     whole = dict.fromkeys([names[0], names[-1]])
-    figure = _new_figure()
+    figure = new_figure(14, 4.6)
     grid = figure.add_gridspec(1, len(whole) + 1, width_ratios=[1] * len(whole) + [1.2])
     for place, name in enumerate(whole):
         if surface:
@@ -74,10 +68,7 @@ def _check(result: Result, truth: Truth) -> None:
     height, x, y = result.height, result.x, result.y
     if height is None or x is None or y is None or min(height.shape) < 2:
         raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")
-    if truth.height.shape != height.shape:
-        raise InputError(
-            f"the result is {height.shape} pixels, the truth {truth.height.shape}: not of one stack"
-        )
+    check_same_size(height.shape, truth.height)
 
 
 def _heights(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
@@ -87,26 +78,11 @@ def _heights(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
     return result.height, result.x, result.y
 
 
-def check_drawing() -> None:
-    """Raise InputError if nothing can be drawn, before any work is done for a figure."""
-    if find_spec("matplotlib") is None:
-        raise InputError("figures need Matplotlib: pip install 'mirrorskin[view]'")
-
-
-def _new_figure() -> Figure:
-    check_drawing()
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(14, 4.6), layout="constrained")
-
-
 def _draw_map(axes: Axes, name: str, height: NDArray[np.float32], x: Floats, y: Floats) -> None:
-    half = (abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2)
-    extent = (x[0] - half[0], x[-1] + half[0], y[-1] - half[1], y[0] + half[1])
-    axes.set_facecolor(_MISSING)
+    axes.set_facecolor(MISSING)
     lowest, highest = _span(height)
     picture = axes.imshow(
-        height, extent=extent, cmap="gray", interpolation="nearest", vmin=lowest, vmax=highest
+        height, extent=extent(x, y), cmap="gray", interpolation="nearest", vmin=lowest, vmax=highest
     )
     axes.figure.colorbar(picture, ax=axes, label="height (mm)", shrink=0.85)
     axes.axhline(0, color="tab:red", lw=0.8, ls=":")

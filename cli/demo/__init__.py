@@ -1,0 +1,41 @@
+"""``mirrorskin demo``: the paper's experiments, on the digital twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.demo import presses, rotation
+from mirrorskin.cli.output import print_json
+
+
+def command(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for all files.")
+    ] = Path("demo"),
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Repeat the paper's experiments on the twin, from its idealisations to a real sensor."""
+    from mirrorskin import io, view
+
+    view.check_drawing()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise io.InputError(
+            f"{output} cannot be made: {error.strerror}; choose another folder with -o"
+        ) from error
+    pressed = {one.name: presses.run(one, output, device) for one in presses.EXPERIMENTS}
+    turned = {one.name: rotation.run(one, output, device) for one in rotation.EXPERIMENTS}
+    if as_json:
+        print_json(pressed | turned)
+        return
+    presses.tell(pressed)
+    typer.echo()
+    rotation.tell(turned)
+    first = presses.EXPERIMENTS[0].name
+    typer.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

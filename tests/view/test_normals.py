@@ -1,0 +1,97 @@
+"""The figure of normals: colours, needles and errors are those of the result."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mirrorskin import io, view
+
+SHAPE = (20, 30)
+ZENITH = np.radians(30)
+
+
+def result_of(azimuth=0.5, zenith=ZENITH, **maps):
+    """A slope that faces one way."""
+    x, y = io.pixel_axes(SHAPE, (0.1, 0.1))
+    facing = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    normals = np.broadcast_to(np.array(facing, np.float32), (*SHAPE, 3)).copy()
+    return io.Result(normals=normals, x=x, y=y, **{"contact": np.ones(SHAPE, np.uint8), **maps})
+
+
+def truth_of(azimuth=0.5, contact=None):
+    flat = np.ones(SHAPE, np.float32)
+    touched = np.ones(SHAPE, np.uint8) if contact is None else contact
+    return io.Truth(flat, flat * np.float32(ZENITH), flat * np.float32(azimuth), touched)
+
+
+def drawn(results, truth, tmp_path, monkeypatch):
+    """Draw; return the axes, row by row, and the file."""
+    kept = []
+    monkeypatch.setattr(view.normals, "save_figure", lambda figure, title, path: kept.append(figure))
+    view.normal_figure(results, truth, "title", tmp_path / "x.png")
+    axes = [one for one in kept[0].axes if one.get_label() != "<colorbar>"]
+    return np.array(axes).reshape(-1, 3)
+
+
+def test_normals_become_a_picture(tmp_path):
+    path = tmp_path / "normals.png"
+    view.normal_figure({"one": result_of(), "two": result_of(0.6)}, truth_of(), "title", path)
+    assert cv2.imread(str(path)).shape[0] > 600
+
+
+def test_colours_are_the_customary_ones_and_edges_are_black(tmp_path, monkeypatch):
+    edges = np.zeros(SHAPE, np.uint8)
+    edges[3] = 1
+    result = result_of(edges=edges)
+    result.normals[7, 8] = np.nan
+    (axes,) = drawn({"one": result}, truth_of(), tmp_path, monkeypatch)
+    picture = axes[0].images[0].get_array()
+    x, y, z = result.normals[0, 0]
+    np.testing.assert_allclose(picture[0, 0], [(x + 1) / 2, (y + 1) / 2, (z + 1) / 2, 1], atol=1e-6)
+    np.testing.assert_array_equal(picture[3, 5], [0, 0, 0, 1])
+    assert picture[7, 8, 3] == 0
+
+
+def test_needles_point_where_the_surface_faces_and_only_in_contact(tmp_path, monkeypatch):
+    contact = np.ones(SHAPE, np.uint8)
+    contact[:, :15] = 0
+    (axes,) = drawn({"one": result_of(np.pi / 2, contact=contact)}, truth_of(), tmp_path, monkeypatch)
+    (needles,) = axes[1].collections
+    assert len(needles.U) == SHAPE[0] * 15
+    np.testing.assert_allclose(needles.U, 0, atol=1e-6)
+    assert np.all(needles.V > 0)  # y is up
+    low, high = axes[1].get_ylim()
+    assert low < 0 < high
+    assert needles.X.min() > 0
+
+
+def test_errors_are_angles_where_contact_is_told_and_true(tmp_path, monkeypatch):
+    touched, told = np.ones((2, *SHAPE), np.uint8)
+    touched[0], told[1] = 0, 0
+    results = {"right": result_of(contact=told), "turned": result_of(0.5, ZENITH + np.radians(2))}
+    rows = drawn(results, truth_of(contact=touched), tmp_path, monkeypatch)
+    right, turned = (row[2].images[0].get_array() for row in rows)
+    np.testing.assert_allclose(right[2:], 0, atol=1e-4)
+    assert np.isnan(np.ma.filled(right, np.nan)[:2]).all()
+    np.testing.assert_allclose(turned[1:], 2, rtol=1e-4)
+    assert "median 2.00 deg" in rows[1][2].get_title()
+
+
+@pytest.mark.parametrize("kind", ["heights", "turns", "no axes", "truth"])
+def test_what_cannot_be_drawn_is_said(tmp_path, kind):
+    results = {
+        "heights": io.Result(height=np.zeros(SHAPE, np.float32)),
+        "turns": io.Result(normals=np.zeros((2, *SHAPE, 3), np.float32), x=np.arange(30), y=np.arange(20)),
+        "no axes": io.Result(normals=np.zeros((*SHAPE, 3), np.float32)),
+        "truth": io.Result(normals=np.zeros((4, 5, 3), np.float32), x=np.arange(5.0), y=np.arange(4.0)),
+    }
+    with pytest.raises(io.InputError, match=r"normals of one turn|not of one stack"):
+        view.normal_figure({"one": results[kind]}, truth_of(), "title", tmp_path / "x.png")
+
+
+def test_nothing_in_contact_is_drawn_too(tmp_path):
+    none = np.zeros(SHAPE, np.uint8)
+    view.normal_figure({"one": result_of(contact=none)}, truth_of(), "title", tmp_path / "x.png")
+    assert (tmp_path / "x.png").exists()
