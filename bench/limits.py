@@ -1,4 +1,4 @@
-"""The limits of a device's memory: as many bytes as a case's frames, read, copied and combined."""
+"""The limits of a device: as many bytes as a case's frames, read, copied and combined; multiply-adds."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ class Shape:
 
 CORES = (Shape(16, 256, 1), Shape(16, 1024, 1), Shape(16, 4096, 1))
 LANES = (Shape(4, 16, 128), Shape(4, 64, 128), Shape(4, 256, 128))
+CHAINS = (Shape(4, 8, 1), Shape(8, 8, 1), Shape(16, 8, 1)), (Shape(2, 8, 128), Shape(4, 8, 128))
 
 
 class Limits:
@@ -65,10 +66,10 @@ class Limits:
             _name(limit, shape): partial(self._run, limit, shape) for limit in _RUNS for shape in self._shapes
         }
 
-    def rows(self, measured: Mapping[str, Measured]) -> list[Row]:
-        """Return read, copy and triad limit, each in the shape that was the quickest."""
+    def rows(self, measured: Mapping[str, Measured], first: str = "read") -> list[Row]:
+        """Return read, copy and triad limit, each in the shape that was the quickest; `first` leads."""
         rows = []
-        for limit in _RUNS:
+        for limit in sorted(_RUNS, key=lambda limit: limit != first):
             best = min(self._shapes, key=lambda shape: measured[_name(limit, shape)].wall.median)
             rows.append(Row(f"{limit} limit", measured[_name(limit, best)], self._moved(limit, best)))
         return rows
@@ -90,6 +91,44 @@ class Limits:
 
     def _moved(self, limit: str, shape: Shape) -> int:
         return 4 * shape.lanes * self._count(limit, shape) * _RUNS[limit]
+
+
+class Arithmetic:
+    """Multiply-adds that wait for nothing, on numbers that stay in registers; the best of several shapes.
+
+    Parameters
+    ----------
+    device : Device
+    pixels : int
+        Of the case, which takes as long in order of magnitude.
+    """
+
+    def __init__(self, device: Device, pixels: int) -> None:
+        on_cores = device.info.kind == "cpu"
+        self._device = device
+        self._shapes = CHAINS[0] if on_cores else CHAINS[1]
+        self._steps = max(1, pixels // 256)
+        numbers = 128 * max(1, pixels // 8192) if on_cores else 4096 * max(1, pixels // 2048)
+        self._data = device.array("numbers", (numbers,), np.float32)
+        self._data.host[:] = 0
+        self._data.upload()
+
+    def works(self) -> dict[str, Work]:
+        """Return the works to be timed."""
+        return {_name("multiply-add", shape): partial(self._run, shape) for shape in self._shapes}
+
+    def row(self, measured: Mapping[str, Measured]) -> Row:
+        """Return the limit in the shape that was the quickest."""
+        best = min((measured[name] for name in self.works()), key=lambda one: one.wall.median)
+        return Row("multiply-add limit", best, 0, operations=len(self._data.host) * self._steps)
+
+    def _run(self, shape: Shape) -> None:
+        macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
+        kernel = self._device.kernel("limits", "multiply_all", **macros)
+        count = len(self._data.host) // shape.lanes
+        steps, factor, summand = np.int32(self._steps), np.float32(0.5), np.float32(1)
+        kernel(shape.items(count), self._data, np.int32(count), steps, factor, summand, moved=0)
+        self._device.finish()
 
 
 def _name(limit: str, shape: Shape) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from mirrorskin.bench.harness import Work, take_turns
 from mirrorskin.bench.limits import Limits
 from mirrorskin.bench.onset import OnsetCase
-from mirrorskin.bench.peers.numpy_ import PEER, first_light, heights
+from mirrorskin.bench.peers.onset.numpy_ import PEER, first_light, heights
 from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_frames, check_heights
 from mirrorskin.bench.stacks import fill

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.harness import Work, take_turns
 from mirrorskin.bench.limits import Limits
 from mirrorskin.bench.memory import check_memory
-from mirrorskin.bench.peers import Peer, References, find_peers
+from mirrorskin.bench.peers.onset import Peer, References, find_peers
 from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_frames, check_heights
 from mirrorskin.bench.stacks import LEVELS, StackName, fill, noise_of, references

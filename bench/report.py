@@ -16,8 +16,8 @@ Data = Mapping[str, Any]
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
 LEGEND = (
     "ms: median by the host's clock, from the call to its return; kernels and copies: the device's own "
-    "account of that time. of limit: bandwidth as a share of the read limit's, by the clock; then the same "
-    "of kernels alone. Bytes are those of the frames, each once."
+    "account of that time. of limit: bandwidth as a share of the first row's, by the clock; then the same "
+    "of kernels alone. Bytes are those of the frames, each once, and of axial rotation those of the maps too."
 )
 
 
@@ -37,7 +37,7 @@ def as_notes(case: Data) -> list[str]:
     firsts = [f"{row['name']} {row['first']:.2f} s" for row in case["rows"] if "limit" not in row["name"]]
     compiling = sum(row["compile"] for row in case["rows"])
     notes = [f"first call: {', '.join(firsts)}; {compiling:.2f} s in all went into building OpenCL kernels"]
-    return notes + [f"{name}: {why}" for name, why in case["absent"].items()]
+    return [*notes, *case["notes"], *(f"{name}: {why}" for name, why in case["absent"].items())]
 
 
 def as_title(data: Data) -> str:
@@ -61,7 +61,8 @@ def as_markdown(data: Data) -> str:
 
 def _case(case: Case) -> dict[str, Any]:
     rows = [_row(case, row) for row in case.rows]
-    return {"name": case.name, "title": case.title, "rows": rows, "absent": case.absent}
+    told = {"absent": case.absent, "notes": list(case.notes)}
+    return {"name": case.name, "title": case.title, "rows": rows, **told}
 
 
 def _row(case: Case, row: Row) -> dict[str, Any]:
@@ -69,6 +70,7 @@ def _row(case: Case, row: Row) -> dict[str, Any]:
         "name": row.name,
         "bytes": row.bytes,
         "frames": row.frames,
+        "operations": row.operations,
         **asdict(row.measured),
         "bandwidth": row.bandwidth,
         "share": case.share(row),
@@ -86,10 +88,10 @@ def _cells(row: Data) -> list[str]:
         f"{_ms(wall['lower'])}-{_ms(wall['upper'])}",
         _ms(device["kernel"]) if "kernel" in device else "",
         _ms(sum(copies)) if copies else "",
-        f"{row['bandwidth'] / 1e9:.2f}",
+        f"{row['bandwidth'] / 1e9:.2f}" if row["bytes"] else "",
         f"{row['frames'] / wall['median']:.0f}" if row["frames"] else "",
-        f"{100 * row['share']:.0f} %",
-        "" if row["kernel_share"] is None else f"{100 * row['kernel_share']:.0f} %",
+        f"{100 * row['share']:.0f} %" if row["bytes"] else "",
+        f"{100 * row['kernel_share']:.0f} %" if row["bytes"] and row["kernel_share"] is not None else "",
     ]
 
 

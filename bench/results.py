@@ -16,15 +16,19 @@ class Row:
     name : str
     measured : Measured
     bytes : int
-        That a turn must move: for the onset the frames, each once, and nothing else.
+        That a turn must move: for the onset the frames, each once, and nothing else; for axial rotation the
+        maps that are asked for besides. 0 where none are.
     frames : int
         That a turn handles; 0 where it handles no frames.
+    operations : int
+        Multiply-adds of a turn, where they are what is measured.
     """
 
     name: str
     measured: Measured
     bytes: int
     frames: int = 0
+    operations: int = 0
 
     @property
     def bandwidth(self) -> float:
@@ -45,18 +49,21 @@ class Case:
     ----------
     name, title : str
     rows : list of Row
-        The read limit first.
+        First the limit of which the others are a share.
     absent : dict of str
         Peers that were not run, and why.
+    notes : tuple of str
+        What else was found.
     """
 
     name: str
     title: str
     rows: list[Row]
     absent: dict[str, str]
+    notes: tuple[str, ...] = ()
 
     def share(self, row: Row) -> float:
-        """Return a work's bandwidth as a share of the read limit's, both by the host's clock."""
+        """Return a work's bandwidth as a share of the limit's, both by the host's clock."""
         return row.bandwidth / self.rows[0].bandwidth
 
     def kernel_share(self, row: Row) -> float:

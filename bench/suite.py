@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mirrorskin.bench.correlation import CorrelationCase, run_correlation, run_sliding
 from mirrorskin.bench.live import run_live
+from mirrorskin.bench.normals import NormalsCase, run_normals
 from mirrorskin.bench.onset import OnsetCase, run_onset
 from mirrorskin.bench.results import Case
 from mirrorskin.bench.stacks import StackName
@@ -16,9 +18,12 @@ from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 
 _HD, _MEMORY, _LIVE = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640)
-_RENDERED = (128, 480, 640)
+_RENDERED, _WINDOW = (128, 480, 640), (64, 480, 640)
 _QUICK = (12, 48, 64)
+_TURNS = 16  # frames of a quick correlation, whole turns
 _ROUNDS = 15
+
+_Run = Callable[[Device, bool], Case]
 
 
 def _case(
@@ -55,10 +60,58 @@ _PUSHED = {
     "live": _pushed("live", "press"),
     "live-random": _pushed("live-random", "random"),
 }
+_NORMALS = [
+    NormalsCase("normals-uint8", _HD[1:], np.dtype(np.uint8)),
+    NormalsCase("normals-uint16", _HD[1:], np.dtype(np.uint16)),
+    NormalsCase("normals-float32", _HD[1:], np.dtype(np.float32)),
+]
+_CORRELATE = CorrelationCase("correlate-uint8", _HD)
+_SLIDING = CorrelationCase("sliding", _WINDOW)
 
-_TWIN = "twin"
 
-NAMES = (*(case.name for case in _ONSET), *_PUSHED, _TWIN)
+def _onset(case: OnsetCase) -> _Run:
+    return lambda device, quick: run_onset(_sized(case, quick), device, _rounds(quick))
+
+
+def _live(cases: dict[str, OnsetCase]) -> _Run:
+    return lambda device, quick: run_live(
+        {row: _sized(case, quick) for row, case in cases.items()}, device, _rounds(quick)
+    )
+
+
+def _sized(case: OnsetCase, quick: bool) -> OnsetCase:
+    return replace(case, shape=_QUICK) if quick else case
+
+
+def _twin(device: Device, quick: bool) -> Case:
+    return run_twin(_QUICK if quick else _RENDERED, device, _rounds(quick))
+
+
+def _normals(case: NormalsCase) -> _Run:
+    return lambda device, quick: run_normals(
+        replace(case, shape=_QUICK[1:]) if quick else case, device, _rounds(quick)
+    )
+
+
+def _correlation(case: CorrelationCase, run: Callable[[CorrelationCase, Device, int], Case]) -> _Run:
+    return lambda device, quick: run(
+        replace(case, shape=(_TURNS, *_QUICK[1:])) if quick else case, device, _rounds(quick)
+    )
+
+
+def _rounds(quick: bool) -> int:
+    return 1 if quick else _ROUNDS
+
+
+_RUNS: dict[str, _Run] = {
+    **{case.name: _onset(case) for case in _ONSET},
+    **{name: _live(cases) for name, cases in _PUSHED.items()},
+    "twin": _twin,
+    **{case.name: _normals(case) for case in _NORMALS},
+    _CORRELATE.name: _correlation(_CORRELATE, run_correlation),
+    _SLIDING.name: _correlation(_SLIDING, run_sliding),
+}
+NAMES = tuple(_RUNS)
 
 
 def run_suite(
@@ -92,18 +145,6 @@ def run_suite(
     cases = []
     for name in NAMES:
         if name in wanted:
-            cases.append(_run(name, device, quick))
+            cases.append(_RUNS[name](device, quick))
             progress(len(cases))
     return cases
-
-
-def _run(name: str, device: Device, quick: bool) -> Case:
-    def sized(case: OnsetCase) -> OnsetCase:
-        return replace(case, shape=_QUICK) if quick else case
-
-    rounds = 1 if quick else _ROUNDS
-    if name == _TWIN:
-        return run_twin(_QUICK if quick else _RENDERED, device, rounds)
-    if name in _PUSHED:
-        return run_live({row: sized(case) for row, case in _PUSHED[name].items()}, device, rounds)
-    return run_onset(sized(next(case for case in _ONSET if case.name == name)), device, rounds)

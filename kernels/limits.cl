@@ -1,4 +1,4 @@
-// What memory can give: the least that any kernel does. Specification: limits.py.
+// What memory and arithmetic can give: the least that any kernel does. Specification: limits.py.
 //
 // LANES   4-byte numbers of a word, which is one load: 4 or 16
 // WORDS   words of one work-item
@@ -8,6 +8,7 @@
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
 typedef JOIN(uint, LANES) WORD;
+typedef JOIN(float, LANES) NUMBERS;
 
 // An item's words are this one and each STRIDE-th after it.
 long first_word(void)
@@ -46,4 +47,33 @@ __kernel void triad_all(__global WORD *words, const int count, const uint scale)
     const long first = first_word();
     const long end = min((long)count, first + STRIDE * WORDS);
     for (long i = first; i < end; i += STRIDE) words[2L * count + i] = words[i] + scale * words[count + i];
+}
+
+// WORDS is 8 here: as many sums that do not wait for each other.
+__kernel void multiply_all(__global NUMBERS *restrict numbers, const int count, const int steps, const float factor,
+                           const float summand)
+{
+    const long first = first_word();
+    if (first + 7 * STRIDE >= count) return;
+    __global NUMBERS *restrict mine = numbers + first;
+    NUMBERS a = mine[0], b = mine[STRIDE], c = mine[2 * STRIDE], d = mine[3 * STRIDE];
+    NUMBERS e = mine[4 * STRIDE], f = mine[5 * STRIDE], g = mine[6 * STRIDE], h = mine[7 * STRIDE];
+    for (int i = 0; i < steps; ++i) {
+        a = a * factor + summand;
+        b = b * factor + summand;
+        c = c * factor + summand;
+        d = d * factor + summand;
+        e = e * factor + summand;
+        f = f * factor + summand;
+        g = g * factor + summand;
+        h = h * factor + summand;
+    }
+    mine[0] = a;
+    mine[STRIDE] = b;
+    mine[2 * STRIDE] = c;
+    mine[3 * STRIDE] = d;
+    mine[4 * STRIDE] = e;
+    mine[5 * STRIDE] = f;
+    mine[6 * STRIDE] = g;
+    mine[7 * STRIDE] = h;
 }

@@ -1,4 +1,4 @@
-"""What memory can give: what ``limits.cl`` computes, in plain NumPy."""
+"""What memory and arithmetic can give: what ``limits.cl`` computes, in plain NumPy."""
 
 from __future__ import annotations
 
@@ -36,3 +36,22 @@ def copy_all(words: NDArray[np.uint32], count: int) -> None:
 def triad_all(words: NDArray[np.uint32], count: int, scale: int) -> None:
     """Add two runs of ``count`` words, the second one scaled, into the run after them; modulo 2^32."""
     words[2 * count : 3 * count] = words[:count] + np.uint32(scale) * words[count : 2 * count]
+
+
+def multiply_all(
+    numbers: NDArray[np.float32], stride: int, steps: int, factor: float, summand: float
+) -> None:
+    """Multiply and add so many times, in place, as eight independent chains an item.
+
+    Parameters
+    ----------
+    numbers : ndarray, (n, lanes), float32
+        The kernel is told ``n`` after it, and no ``stride``. What does not fill an item's eight words, every
+        ``stride``-th one, is left alone.
+    stride, steps : int
+    factor, summand : float
+    """
+    first = np.arange(len(numbers)) // (8 * stride) * 8 * stride + np.arange(len(numbers)) % stride
+    whole = first + 7 * stride < len(numbers)
+    for _ in range(steps):
+        numbers[whole] = numbers[whole] * np.float32(factor) + np.float32(summand)

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mirrorskin.bench import NAMES, as_data, as_markdown, as_rows, memory, onset, run_suite, twin
-from mirrorskin.bench.peers import Peer, numpy_
+from mirrorskin.bench import NAMES, as_data, as_markdown, as_notes, as_rows, memory, onset, run_suite, twin
+from mirrorskin.bench.peers.onset import Peer, numpy_
 from mirrorskin.bench.same import DisagreementError
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
@@ -15,23 +15,44 @@ from mirrorskin.kernels.errors import DeviceError
 TWIN = ["mirrorskin, vertical", "mirrorskin, rotation", "NumPy, vertical"]
 
 
+FRAME = 48 * 64  # pixels of a quick run
+
+
+def moved(name, row):
+    """Return the bytes that a row of a quick run should count."""
+    size = {"uint16": 2, "float32": 4}.get(name.split("-")[-1], 1)
+    limit = "limit" in row
+    if name.startswith("normals"):
+        return 0 if "multiply" in row else FRAME * (8 * size + 21)
+    if name == "sliding":
+        return FRAME * 34 * (1 if limit else 16)
+    if name.startswith("correlate"):
+        return FRAME * (16 if "push only" in row else 32)
+    if "elastic" in row:
+        return 64 * 64
+    return FRAME * size * (1 if limit and name.startswith("live") else 12)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_case_agrees_on_every_device(device, name):
     (case,) = run_suite(device, [name], quick=True)
     names = [row.name for row in case.rows]
-    assert names[:3] == ["read limit", "copy limit", "triad limit"]
+    rotation = name.startswith(("normals", "correlate", "sliding"))
+    limits = ["read limit", "copy limit", "triad limit"]
+    assert names[:3] == (["triad limit", "read limit", "copy limit"] if rotation else limits)
     assert case.name == name
     assert case.share(case.rows[0]) == case.kernel_share(case.rows[0]) == 1
     if name == "twin":
         assert names[3:] == [*TWIN, "mirrorskin, elastic 64 x 64"]
+    elif rotation:
+        assert {"mirrorskin", "NumPy"} <= set(names)
     elif not name.startswith("live"):
         assert {"mirrorskin", "mirrorskin, push only", "NumPy", "OpenCV"} <= set(names)
     for row in case.rows:
         limit, elastic = "limit" in row.name, "elastic" in row.name
-        frame = 48 * 64 * {"uint16": 2, "float32": 4}.get(name.split("-")[-1], 1)
-        moved = frame if limit and name.startswith("live") else 12 * frame
-        assert row.bytes == pytest.approx(64 * 64 if elastic else moved, rel=0.02)
-        assert row.frames == (0 if limit else 1 if elastic else 12)
+        assert row.bytes == pytest.approx(moved(name, row.name), rel=0.02)
+        frames = 8 if name.startswith("normals") else 16 if rotation else 12
+        assert row.frames == (0 if limit else 1 if elastic else frames)
         on_device = limit or ("mirrorskin" in row.name and not elastic)
         assert ("kernel" in row.measured.device) == on_device
 
@@ -147,14 +168,18 @@ def test_progress_is_told_case_by_case(device):
 
 
 def test_a_run_becomes_json_and_a_page(device):
-    data = as_data(device, run_suite(device, ["equation4-uint8", "live"], quick=True), quick=True)
+    data = as_data(
+        device, run_suite(device, ["equation4-uint8", "live", "normals-uint8"], quick=True), quick=True
+    )
     assert json.loads(json.dumps(data, allow_nan=False)) == data
     assert data["versions"]["numpy"] == np.__version__
     assert data["commit"] is None or len(data["commit"].removesuffix("-dirty")) == 40
     page = as_markdown(data)
     assert page.startswith(f"# {device.info.title} (driver {device.info.driver})")
+    assert any("binds" in note for note in as_notes(data["cases"][-1]))
     for case in data["cases"]:
         assert f"## {case['name']}: {case['title']}\n\n| work | ms |" in page
+        assert all(note in page for note in as_notes(case))
         for cells in as_rows(case):
             assert f"| {' | '.join(cells)} |" in page
             assert len(cells) == 9

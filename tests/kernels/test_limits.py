@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.bench.limits import CORES, LANES
+from mirrorskin.bench.limits import CHAINS, CORES, LANES
 from mirrorskin.kernels import limits
 
 SHAPES = pytest.mark.parametrize("shape", [*CORES, *LANES], ids=str)
@@ -51,3 +51,25 @@ def test_the_triad_is_a_sum_with_a_scaled_part():
     words = np.array([[1], [2], [10], [2**31], [0], [0], [7]], np.uint32)
     limits.triad_all(words, 2, 3)
     np.testing.assert_array_equal(words[4:, 0], [31, 2 + 2**31, 7])
+
+
+@pytest.mark.parametrize("shape", [*CHAINS[0], *CHAINS[1]], ids=str)
+@pytest.mark.parametrize("count", [1, 8, 500, 2049])
+def test_multiply_adds_are_all_done(device, shape, count):
+    numbers = np.arange(count * shape.lanes, dtype=np.float32).reshape(count, shape.lanes) % 97
+    data = device.array("numbers", numbers.shape, np.float32)
+    data.host[:] = numbers
+    data.upload()
+    kernel = device.kernel(
+        "limits", "multiply_all", LANES=shape.lanes, WORDS=shape.words, STRIDE=shape.stride
+    )
+    given = np.int32(7), np.float32(-2), np.float32(3)
+    kernel(shape.items(count), data, np.int32(count), *given, moved=0)
+    limits.multiply_all(numbers, shape.stride, 7, -2.0, 3.0)
+    np.testing.assert_array_equal(data.download(), numbers)
+
+
+def test_a_chain_is_as_long_as_said():
+    numbers = np.array([[5.0]] * 8 + [[6.0]], np.float32)
+    limits.multiply_all(numbers, 1, 3, 2.0, 1.0)
+    assert numbers[:, 0].tolist() == [47.0] * 8 + [6.0]

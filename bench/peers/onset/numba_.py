@@ -10,9 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import THREADS, Heights, Levels, Peer, References
-from mirrorskin.bench.peers.samples import PLATEAU, SURELY
-from mirrorskin.bench.peers.suspects import INVALID
+from mirrorskin.bench.peers import THREADS
+from mirrorskin.bench.peers.onset.peer import Heights, Levels, Peer, References
+from mirrorskin.bench.peers.onset.samples import PLATEAU, SURELY
+from mirrorskin.bench.peers.onset.suspects import INVALID
 
 _TILE = 16_384  # pixels
 _COUNTABLE = 255  # frames that a byte counts

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import Heights, Levels, Peer, References
-from mirrorskin.bench.peers.samples import heights_of
-from mirrorskin.bench.peers.suspects import settle_suspects
+from mirrorskin.bench.peers.onset.peer import Heights, Levels, Peer, References
+from mirrorskin.bench.peers.onset.samples import heights_of
+from mirrorskin.bench.peers.onset.suspects import settle_suspects
 
 _PIXELS = 262_144  # of a tile; more leave the cache, fewer pay more for each call
 _COUNTABLE = 255  # frames that a byte counts

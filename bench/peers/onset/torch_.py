@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import THREADS, Heights, Levels, Peer, References
-from mirrorskin.bench.peers.samples import PLATEAU, SURELY
-from mirrorskin.bench.peers.suspects import INVALID, settle_suspects
+from mirrorskin.bench.peers import THREADS
+from mirrorskin.bench.peers.onset.peer import Heights, Levels, Peer, References
+from mirrorskin.bench.peers.onset.samples import PLATEAU, SURELY
+from mirrorskin.bench.peers.onset.suspects import INVALID, settle_suspects
 
 Tensor = Any  # torch.Tensor; the library is not there where types are checked
 

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import THREADS, Heights, Levels, Peer, References
-from mirrorskin.bench.peers.samples import heights_of
-from mirrorskin.bench.peers.suspects import settle_suspects
+from mirrorskin.bench.peers import THREADS
+from mirrorskin.bench.peers.onset.peer import Heights, Levels, Peer, References
+from mirrorskin.bench.peers.onset.samples import heights_of
+from mirrorskin.bench.peers.onset.suspects import settle_suspects
 
 _SEARCHED = 1_200_000  # pixels of a stripe at most, where onsets are all that is wanted
 _ANSWERED = 200_000  # where heights are, which take more memory a pixel

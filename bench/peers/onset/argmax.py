@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import Levels, Peer
-from mirrorskin.bench.peers.suspects import settle_suspects
+from mirrorskin.bench.peers.onset.peer import Levels, Peer
+from mirrorskin.bench.peers.onset.suspects import settle_suspects
 
 
 def first_light(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import Levels
+from mirrorskin.bench.peers.onset.peer import Levels
 
 INVALID = -2
 

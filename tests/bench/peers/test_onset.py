@@ -1,13 +1,10 @@
 """The peers that are installed: each against a loop over pixels and against the kernels' references."""
 
-import sys
-
 import numpy as np
 import pytest
 from presses import SPEC, first_run, numpy_onset, random_press
 
-from mirrorskin.bench import peers
-from mirrorskin.bench.peers import References, find_peers
+from mirrorskin.bench.peers.onset import References, find_peers
 from mirrorskin.engine.references import reference_maps
 from mirrorskin.kernels.onset import onset_levels
 
@@ -88,19 +85,3 @@ def test_a_peer_answers_as_the_references_do(peer, dtype):
     assert {0, 1, 2, 3} == set(found.status.flat)
     np.testing.assert_allclose(found.height, expected.height, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-5)
-
-
-def test_a_peer_that_is_missing_is_named(monkeypatch):
-    monkeypatch.setattr(peers, "LIBRARIES", {"numpy_": "numpy", "numba_": "numba"})
-    monkeypatch.setitem(sys.modules, "numba", None)
-    found, absent = find_peers()
-    assert [peer.name for peer in found] == ["NumPy"]
-    assert absent == {"numba": "not installed"}
-
-
-def test_a_library_that_is_broken_is_not_taken_for_missing(monkeypatch, tmp_path):
-    (tmp_path / "half_there.py").write_text("import what_it_needs", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(peers, "LIBRARIES", {"numba_": "half_there"})
-    with pytest.raises(ModuleNotFoundError, match="what_it_needs"):
-        find_peers()

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.peers.peer import Heights, References
-from mirrorskin.bench.peers.suspects import INVALID
+from mirrorskin.bench.peers.onset.peer import Heights, References
+from mirrorskin.bench.peers.onset.suspects import INVALID
 
 Indices = NDArray[np.intp]
 Doubles = NDArray[np.float64]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -12,8 +11,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
-
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Heights(NamedTuple):
