@@ -5,6 +5,7 @@
 // Maps are (rows, columns). `vectors` holds x, y and z of each pixel side by side; of `jumps`, the first plane tells of a
 // pixel and its neighbour to the right, the second of it and the one below.
 
+#define SURELY_LESS 0.99f  // cosine of 8 degrees
 #define WIDEST 3  // means of windows: 1 pixel deep and 1 across, then 2 and 3, then 3 and 5
 
 #define EACH_PIXEL                                                                               \
@@ -56,6 +57,25 @@ Side gather(__global const float *vectors, __global const float *sigma, __global
     return side;
 }
 
+// The angle between two sides if it is an edge, else 0. Cosines first: hardly any pixel needs the angle itself.
+float jump_between(const Side a, const Side b, const float noise, const float least, const float sure)
+{
+    const float dot = a.x * b.x + a.y * b.y + a.z * b.z;
+    const float lengths = sqrt((a.x * a.x + a.y * a.y + a.z * a.z) * (b.x * b.x + b.y * b.y + b.z * b.z));
+    if (dot > SURELY_LESS * lengths) return 0.0f;
+    const float x = a.y * b.z - a.z * b.y, y = a.z * b.x - a.x * b.z, z = a.x * b.y - a.y * b.x;
+    const float angle = atan2(sqrt(x * x + y * y + z * z), dot);
+    return angle > least && angle > sure * noise ? angle : 0.0f;
+}
+
+// Whether two normals are so sure that no mean of more is needed, and hardly differ.
+int alike(__global const float *vectors, __global const float *sigma, const int p, const int q, const float quiet)
+{
+    const float dot = vectors[3 * p] * vectors[3 * q] + vectors[3 * p + 1] * vectors[3 * q + 1]
+        + vectors[3 * p + 2] * vectors[3 * q + 2];
+    return sigma[p] * sigma[p] + sigma[q] * sigma[q] <= quiet * quiet && dot > SURELY_LESS;
+}
+
 __kernel void edges_jumps(__global const float *restrict vectors, __global const float *restrict sigma,
                           __global const uchar *restrict clean, __global float *restrict jumps, const int rows,
                           const int columns, const float least, const float quiet, const float sure)
@@ -64,17 +84,18 @@ __kernel void edges_jumps(__global const float *restrict vectors, __global const
         const int row = p / columns, column = p % columns;
         for (int down = 0; down < 2; ++down) {
             float found = 0.0f;
-            const int last = down ? row + 1 >= rows : column + 1 >= columns;
-            for (int deep = 1; deep <= WIDEST && !last; ++deep) {
+            const int last = down ? row + 1 >= rows : column + 1 >= columns, next = p + (down ? columns : 1);
+            // Quiet and alike, as nearly all are, or of no contact: that needs no window.
+            const int plain = last || !clean[p] || !clean[next] || alike(vectors, sigma, p, next, quiet);
+            for (int deep = 1; deep <= WIDEST && !plain; ++deep) {
                 const int wide = deep - 1, enough = (deep * (2 * wide + 1) + 1) / 2;
                 const Side a = gather(vectors, sigma, clean, rows, columns, row, column, down, -1, deep, wide);
-                const Side b = gather(vectors, sigma, clean, rows, columns, row + down, column + 1 - down, down, 1, deep, wide);
+                const Side b = gather(vectors, sigma, clean, rows, columns, row + down, column + 1 - down, down, 1,
+                                      deep, wide);
                 if (a.known < enough || b.known < enough) continue;
                 const float noise = sqrt(a.variance / (a.known * a.known) + b.variance / (b.known * b.known));
                 if (noise > quiet && deep < WIDEST) continue;
-                const float cx = a.y * b.z - a.z * b.y, cy = a.z * b.x - a.x * b.z, cz = a.x * b.y - a.y * b.x;
-                const float angle = atan2(sqrt(cx * cx + cy * cy + cz * cz), a.x * b.x + a.y * b.y + a.z * b.z);
-                found = angle > least && angle > sure * noise ? angle : 0.0f;
+                found = jump_between(a, b, noise, least, sure);
                 break;
             }
             jumps[down * all + p] = found;

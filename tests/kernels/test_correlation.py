@@ -123,11 +123,13 @@ def test_counts_tell_the_fit(device: Device, dtype: str, wide: int, pixels: int)
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("pixels", PIXELS)
-def test_counts_become_pairs(device: Device, dtype: str, pixels: int) -> None:
+@pytest.mark.parametrize("turns", [1, 50000])
+def test_counts_become_pairs(device: Device, dtype: str, pixels: int, turns: int) -> None:
     frames, rows = samples(dtype, pixels), steps(dtype)
     sums = np.zeros((4, pixels), np.int64)
     correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, *sums)
-    known = len(rows), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
+    sums *= turns
+    known = len(rows) * turns, *(np.int64(n) * turns for n in rows.astype(np.int64).sum(axis=0)[1:])
     unit = np.float32(1 / STEPS[dtype])
     given = [pixels, *known, unit, np.zeros(pixels, np.float32), *sums]
     reference, *found = launch(device, "correlation_convert", pixels, given, 1, dtype)
