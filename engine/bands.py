@@ -59,12 +59,8 @@ class Band:
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
         self._shape = shape
-        self.maps = {
-            name: device.array(name, (kind.count, self.stride), kind.dtype)
-            if isinstance(kind, Planes)
-            else device.array(name, shape, kind)
-            for name, kind in maps.items()
-        }
+        self._device, self._kinds = device, maps
+        self.maps = {name: self._make(name) for name in maps}
         self.frames = _longest(device, length, least, shape, dtype)
         self._alone = True
         self._resident = False
@@ -89,6 +85,12 @@ class Band:
         """Return one of several planes, (rows, W), as the host sees it."""
         found: NDArray[Any] = self.maps[name].host[plane, : self.pixels].reshape(self._shape)
         return found
+
+    def hand_over(self, name: str) -> NDArray[Any]:
+        """Give away what a map holds, (count, stride) or (rows, W), without a copy, and make a new one."""
+        given = self.maps[name].hand_over()
+        self.maps[name] = self._make(name)
+        return given
 
     @contextmanager
     def resident(self) -> Iterator[None]:
@@ -125,6 +127,12 @@ class Band:
             self.frames.upload(len(part))
             yield start, len(part)
             self.frames.claim()
+
+    def _make(self, name: str) -> Array:
+        kind = self._kinds[name]
+        if isinstance(kind, Planes):
+            return self._device.array(name, (kind.count, self.stride), kind.dtype)
+        return self._device.array(name, self._shape, kind)
 
     def _park(self) -> None:
         for array in self.maps.values():

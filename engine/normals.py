@@ -271,7 +271,7 @@ class NormalEstimator:
             start = part.stop
 
     def result(self) -> Normals:
-        """Return the maps of all turns: the last one ends here.
+        """Return the maps of all turns, and be ready for another rotation: the last turn ends here.
 
         Raises
         ------
@@ -279,10 +279,13 @@ class NormalEstimator:
             The phases of the first turn do not determine a normal.
         """
         self._work(cut_into_turns(self._phase))
-        if not self._per_turn:
-            return self._normals(self._maps(), self._turns, self._frames)
-        stacked = [np.stack(maps) for maps in zip(*self._each, strict=True)]
-        return self._normals(stacked, self._turns, self._frames)
+        if self._per_turn:
+            maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
+        else:
+            maps = self._maps()
+        normals = self._normals(maps)
+        self.reset()
+        return normals
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
         """Take in frames that fit, and work on the turns that are then over."""
@@ -343,7 +346,9 @@ class NormalEstimator:
                 band.frames.upload(len(phase))
                 start = 0
             with band.resident():
-                self._launch(band, start, len(phase), matrix @ (matrix / weights).T)
+                self._launch(
+                    band, start, len(phase), bool(np.any(weights != 1)), matrix @ (matrix / weights).T
+                )
         if self._per_turn:
             self._each.append(self._maps())
 
@@ -368,7 +373,7 @@ class NormalEstimator:
             self._table.upload()
             self._written = key
 
-    def _launch(self, band: Band, start: int, count: int, covariance: Doubles) -> None:
+    def _launch(self, band: Band, start: int, count: int, weighted: bool, covariance: Doubles) -> None:
         """Run the kernel over a band's samples of one turn."""
         assert self._tilt is not None
         assert self._noise is not None
@@ -383,6 +388,7 @@ class NormalEstimator:
             TOP=int(np.iinfo(self._dtype).max) if integer else 0,
             LANES=lanes,
             COUNT=count,
+            WEIGHTED=int(weighted),
             ROOM=LONGEST,
             MAPS=int(self._scale.per_pixel),
             ENDS=int(self._scale.ends),
@@ -417,7 +423,7 @@ class NormalEstimator:
             return self._download(self._bands[0])
         return [np.concatenate(parts) for parts in zip(*map(self._download, self._bands), strict=True)]
 
-    def _normals(self, maps: list[NDArray[Any]], turns: int, frames: int) -> Normals:
+    def _normals(self, maps: list[NDArray[Any]]) -> Normals:
         assert self._tilt is not None
         assert self._noise is not None
         vectors, sigma, contact, mean, cosine, sine, residual = maps
@@ -425,16 +431,15 @@ class NormalEstimator:
         some = thin_out(mean)
         known = some[np.isfinite(some)]
         noise = float(self._noise.at(np.median(known) if known.size else 0.0))
-        return Normals(*told, noise, self._noise.slope, self._tilt, turns, frames)
+        return Normals(*told, noise, self._noise.slope, self._tilt, self._turns, self._frames)
 
     def _download(self, band: Band) -> list[NDArray[Any]]:
-        """Return the maps of a band, as they are listed."""
+        """Return the maps of a band, as they are listed; it has new ones then."""
+        rows = (-1, self._shape[1])
         with band.resident():
-            for name in _MAPS:
-                band.maps[name].download()
-            vectors = band.maps["vectors"].host.reshape(-1)[: 3 * band.pixels]
-            shape = (-1, self._shape[1], 3)
-            return [vectors.reshape(shape).copy(), *(band.plane(name, 0).copy() for name in _MAPS[1:])]
+            vectors, *others = (band.hand_over(name).reshape(-1) for name in _MAPS)
+        flat = [one[: band.pixels].reshape(rows) for one in others]
+        return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
 
     def _planes(self) -> dict[str, Planes]:
         scale = {"scale": Planes(4, np.float32)} if self._scale.per_pixel else {}

@@ -263,6 +263,18 @@ class Array:
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
         return self.host
 
+    def hand_over(self) -> NDArray[Any]:
+        """Wait for the device and give away what it wrote, without a copy; the array is no more of use."""
+        host = self.download()
+        if self._mapped is not None:
+            self._mapped.release()
+            self._mapped = None
+            self._device.finish()
+        if self._buffer is not None:
+            self._buffer.release()
+            self._buffer = None
+        return host
+
     def park(self) -> None:
         """Make room on the device: keep the content on the host until the next upload."""
         if not self._shared and self._buffer is not None:

@@ -7,6 +7,7 @@
 // WORDS    vectors of one work-item
 // COUNT    frames of the turn
 // ROOM     frames that `turn` has room for
+// WEIGHTED 1 where frames have weights of their own
 // MAPS     1 where each pixel has a scale of its own, 0 where `scale` holds one for all
 // ENDS     1 where brightness is linear between some zeniths only
 // MORE     Gauss-Newton steps after the first two, for pixels of which a sample is clipped, missing or out of range
@@ -43,7 +44,12 @@ typedef struct __attribute__((packed)) { Raw samples; } Stored;
 
 #define COSINE(k) turn[k]
 #define SINE(k) turn[ROOM + (k)]
+#if WEIGHTED
 #define ROOT_WEIGHT(k) turn[2 * ROOM + (k)]
+#define WEIGH(x, k) ((x) * ROOT_WEIGHT(k))
+#else
+#define WEIGH(x, k) (x)
+#endif
 #define IN_MEAN(k) turn[3 * ROOM + (k)]
 #define IN_COSINE(k) turn[4 * ROOM + (k)]
 #define IN_SINE(k) turn[5 * ROOM + (k)]
@@ -150,7 +156,7 @@ Direction direction_of(const F x, const F y, const F z)
     const F near = at.cp * COSINE(k) + at.sp * SINE(k), beside = beside_x * SINE(k) - beside_y * COSINE(k); \
     const F most = LESSER(base + lean * near, (F)0.5f), x = GREATER(most, (F)1e-12f);            \
     const F rest = x - x * x, inverse = inverse_root(rest);                                      \
-    const F zenith = rest * inverse * angle_by_half_sine(x), by_sine = inverse * ROOT_WEIGHT(k); \
+    const F zenith = rest * inverse * angle_by_half_sine(x), by_sine = WEIGH(inverse, k); \
     const F u1 = (low_part * near + high_part) * by_sine, u2 = beside * by_sine;                 \
     const F u3 = (high_part * near + low_part) * by_sine;
 #define ADD_DERIVATIVES(v1, v2, v3)                                                              \
@@ -173,8 +179,8 @@ Sums look(const Direction at, const F *zeniths, const Wave wave, __global const 
     PREPARE
     for (int k = 0; k < COUNT; ++k) {
         PREDICT(k)
-        const F error = (zeniths[k] - zenith) * ROOT_WEIGHT(k);
-        const F off = off_wave(zeniths[k], wave, COSINE(k), SINE(k)) * ROOT_WEIGHT(k);
+        const F error = WEIGH(zeniths[k] - zenith, k);
+        const F off = WEIGH(off_wave(zeniths[k], wave, COSINE(k), SINE(k)), k);
         ADD_DERIVATIVES(u1, u2, u3)
         ADD_RESIDUAL(error)
         sums.square += error * error;
@@ -219,11 +225,11 @@ Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *fr
         misfit = known ? misfit : (F)0.0f;
 #endif
         share = inside ? share : (F)0.0f;
-        pull = (inside ? pull : (F)0.0f) * ROOT_WEIGHT(k);
+        pull = WEIGH(inside ? pull : (F)0.0f, k);
         const F v1 = share * u1, v2 = share * u2, v3 = share * u3;
         ADD_DERIVATIVES(v1, v2, v3)
         ADD_RESIDUAL(pull)
-        sums.square += ROOT_WEIGHT(k) * ROOT_WEIGHT(k) * misfit;
+        sums.square += WEIGH(WEIGH(misfit, k), k);
     }
     return sums;
 }
@@ -468,7 +474,7 @@ __kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosin
         F waves = 0.0f;
         for (int k = 0; k < COUNT; ++k) {
             const F off = off_wave(zeniths[k], wave, COSINE(k), SINE(k));
-            waves += ROOT_WEIGHT(k) * ROOT_WEIGHT(k) * off * off;
+            waves += WEIGH(WEIGH(off * off, k), k);
         }
         const F swing = wave.cosine * wave.cosine + wave.sine * wave.sine;
         const I swings = swing > 1e-20f;

@@ -112,6 +112,7 @@ class Answers:
             TOP=int(np.iinfo(dtype).max) if dtype.kind == "u" else 0,
             LANES=lanes,
             COUNT=count,
+            WEIGHTED=int(np.any(turn.weights != 1)),
             ROOM=ROOM,
             MAPS=int(turn.scale.ndim == 2),
             ENDS=int(np.isfinite(turn.scale[2:]).any()),
@@ -225,28 +226,47 @@ def test_kernel_and_reference_agree_at_any_tilt(device, tilt):
     assert np.isfinite(expected.sigma).all()
 
 
+# Clipped far from the axes as well: next to them, not much can be compared.
 CLIPPED = {
-    "uint8": replace(UINT8, gain=4.6, offset=-4.0, noise=1.0),
-    "uint16": replace(UINT16, gain=1200.0, offset=-2000.0),
-    "uint16, darker where steeper": replace(UINT16, gain=-1250.0, offset=67_500.0),
+    "uint8": (replace(UINT8, gain=4.6, offset=-30.0, noise=1.0), [(6, 12), (58, 64)]),
+    "uint16": (replace(UINT16, gain=1200.0, offset=-12_000.0), [(8, 12), (62, 67)]),
+    "uint16, darker where steeper": (replace(UINT16, gain=-1250.0, offset=78_000.0), [(8, 12), (60, 65)]),
 }
 
 
 @pytest.mark.parametrize("case", CLIPPED)
 def test_kernel_and_reference_agree_on_clipped_counts(device, case):
-    setup = CLIPPED[case]
-    bins = [(0, 8), (50, 58)]
+    setup, bins = CLIPPED[case]
     frames = rotations.draw(setup, 20, seed=2, bins=bins).frames.reshape(8, -1)
     top = np.iinfo(setup.dtype).max
-    assert np.any(frames == 0)
-    assert np.any(frames == top)
+    for end in (0, top):
+        some = np.sum(frames == end, axis=0)
+        assert np.count_nonzero((some > 0) & (some < 5)) >= 5
     frames[:, -3:] = np.array([[0, top, 1]])
     frames[::2, -1] = top
     clipped = np.sum((frames == 0) | (frames == top), axis=0)
-    assert np.count_nonzero((clipped > 0) & (clipped < 6)) > 10
     expected = check(device, "exact", Turn(frames, setup), 0.02)
     assert np.all(np.isnan(expected.sigma[clipped > 5]))
     assert np.isfinite(expected.sigma[clipped < 4]).all()
+
+
+def test_noise_alone_is_no_loss_of_contact(device):
+    setup = replace(UINT16, noise=2000.0)  # of which the wave's amplitude has half; it is 2250 counts
+    turn = Turn(rotations.draw(setup, 400, seed=5, bins=[(20, 30)]).frames[:, 0], setup)
+    expected = turn.answer("exact")
+    found = Answers(device, 400).take("exact", turn).read()
+    told = np.isfinite(expected.sigma)
+    assert told.mean() > 0.9
+    for contact in (found.contact, expected.contact):
+        assert np.mean(contact[told]) > 0.99
+
+
+def test_noise_alone_is_no_contact(device):
+    setup = replace(UINT8, noise=1.5, tilt=np.radians(2.5))
+    level = rotations.expose(np.broadcast_to([0, 0, 1.0], (400, 3)), replace(setup, tilt=0.0), seed=4)
+    turn = Turn(level, setup)
+    for contact in (Answers(device, 400).take("exact", turn).read().contact, turn.answer("exact").contact):
+        assert np.mean(contact) < 0.02
 
 
 def test_kernel_and_reference_agree_on_missing_samples(device):
@@ -360,8 +380,8 @@ LIKELY = {
     "nothing missing": (replace(UINT8, noise=1.0), {}),
     "weights": (replace(UINT16, noise=40.0), {"weights": [1, 4, 0.2, 1, 1, 1, 3, 0.1]}),
     "darker where steeper": (TURNED, {}),
-    "clipped by the camera": (replace(CLIPPED["uint16"], noise=60.0), {}),
-    "clipped, darker where steeper": (replace(CLIPPED["uint16, darker where steeper"], noise=60.0), {}),
+    "clipped by the camera": (replace(CLIPPED["uint16"][0], noise=60.0), {}),
+    "clipped, darker where steeper": (replace(CLIPPED["uint16, darker where steeper"][0], noise=60.0), {}),
     "missing": (replace(FLOAT32, noise=0.2), {}),
     "beyond an end": (replace(FLOAT32, noise=0.2, high=270.0), {"ends": (None, 270.0)}),
 }
@@ -370,7 +390,8 @@ LIKELY = {
 @pytest.mark.parametrize("case", LIKELY)
 def test_the_reference_finds_the_likeliest_normal(case):
     setup, options = LIKELY[case]
-    true = rotations.random_normals(3, seed=6, bins=[(1, 5), (50, 55)]).reshape(-1, 3)
+    bins = [(8, 11), (61, 64)] if "clipped" in case else [(1, 5), (50, 55)]
+    true = rotations.random_normals(3, seed=6, bins=bins).reshape(-1, 3)
     frames = rotations.expose(true, setup, seed=6)
     if case == "missing":
         frames[range(6), range(6)] = np.nan
