@@ -37,7 +37,7 @@ def command(
     limit = bytes_of(memory, "--memory")
     with io.open_recording(stack, dataset=dataset, memory_limit=limit, **known) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
-        io.check_output(target, keep=stack)
+        io.check_output(target, stack, phases)
         with progress("correlating", source.shape[0]) as show:
             result = engine.correlate_source(source, memory_limit=limit, device=device, progress=show)
     save_and_tell(result, target, device, as_json)

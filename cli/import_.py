@@ -29,7 +29,7 @@ def command(
     from mirrorskin.cli.positions import given
     from mirrorskin.cli.progress import progress
 
-    io.check_output(output, keep=frames)
+    io.check_output(output, frames, phases)
     known = given(motion, travel_step, travel_start, phase_step, phases, tilt, pixel_size)
     header = io.Header(motion.value, title=frames.stem, tilt=known["tilt"], pixel_size=known["pixel_size"])
     source = io.open_frames(frames, header, known["travel"], known["phase"])

@@ -123,7 +123,7 @@ def command(
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, keep=recording)
+        io.check_output(target, recording, phases, heights)
         asked: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if source.motion == MotionName.axial:
             asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn}

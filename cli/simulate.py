@@ -156,7 +156,7 @@ def command(
     from mirrorskin.hw.twin import Body, Camera
 
     for given in map(Path, (thing, pattern)):
-        io.check_output(output, keep=given if given.suffix else None)  # a name is no file to keep
+        io.check_output(output, given if given.suffix else None)  # a name is no file to keep
     words = {
         "travel-step": travel_step,
         "travel-start": travel_start,

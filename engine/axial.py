@@ -18,7 +18,7 @@ from mirrorskin.engine.provenance import naming, sign, told
 from mirrorskin.engine.registration import Registered
 from mirrorskin.engine.search import MEMORY_LIMIT
 from mirrorskin.engine.turns import LONGEST, longest_turn
-from mirrorskin.io import InputError, ProcessValue, Result, Source
+from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
@@ -80,24 +80,26 @@ def reconstruct_rotation(
     mirrorskin.io.InputError
         Phases, tilt, scale or heights that are missing or cannot be used.
     """
-    header = source.header
     if method not in NORMAL_METHODS:
-        raise InputError(f"unknown method {method!r}; of a rotation, known are {', '.join(NORMAL_METHODS)}")
-    used_gain = header.zenith_gain if gain is None else gain
-    if used_gain is None:
-        if per_turn or heights is not None:
-            raise InputError(f"{source.name} has no zenith gain: without it, no normals of turns or heights")
+        known = ", ".join(NORMAL_METHODS)
+        raise InputError(f"{source.name} is a rotation, which method {method!r} cannot do: take {known}")
+    if gain is None and source.header.zenith_gain is None:
+        _need_no_gain(source, per_turn, heights)
         return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
-    used_offset = _first(offset, header.zenith_offset, 0.0)
+    header = _believe(source, tilt, gain, offset)
     opened = open_device(device)
-    frames: Source = source if heights is None else Registered(source, heights, opened)
+    frames: Source = source
+    if heights is not None:
+        if tilt == "estimate":
+            raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
+        frames = Registered(source, heights, opened, header)
     with naming(source):
         estimator = NormalEstimator(
             frames.shape[1:],
             frames.dtype,
-            tilt=_tilt(source, tilt),
-            gain=used_gain,
-            offset=used_offset,
+            tilt=header.tilt,
+            gain=_first(header.zenith_gain),
+            offset=_first(header.zenith_offset, 0.0),
             method=method,
             noise=noise,
             low=header.dark,
@@ -111,15 +113,15 @@ def reconstruct_rotation(
             frames.rewind()
         feed(frames, estimator, range(frames.shape[0]), progress)
         normals = estimator.result()
-    edges = _edges(normals, opened)
+    edges = _edges(normals, opened)  # where contact ends, before that is moved inwards
     if isinstance(frames, Registered):
         normals = _mend(normals, frames.noise_gain, given=noise is not None)
     process: dict[str, ProcessValue] = {
         "method": method,
         "tilt": normals.tilt,
         "tilt_from": "estimate" if tilt == "estimate" else "given" if tilt is not None else "recording",
-        "zenith_gain": told(gain, header.zenith_gain, "none"),
-        "zenith_offset": told(offset, header.zenith_offset, "0"),
+        "zenith_gain": told(gain, source.header.zenith_gain, "none"),
+        "zenith_offset": told(offset, source.header.zenith_offset, "0"),
         "low": told(None, header.dark, "range of the type"),
         "high": told(None, header.bright, "range of the type"),
         "noise": normals.noise,
@@ -202,15 +204,30 @@ def _result(normals: Normals, edges: NDArray[np.uint8]) -> Result:
     )
 
 
-def _tilt(source: Source, given: float | Literal["estimate"] | None) -> float | None:
-    if given == "estimate":
-        return None
-    tilt = source.header.tilt if given is None else given
-    if tilt is None:
+def _believe(
+    source: Source,
+    tilt: float | Literal["estimate"] | None,
+    gain: ArrayLike | None,
+    offset: ArrayLike | None,
+) -> Header:
+    """Return the source's header with what is given instead; a tilt of None is one to estimate."""
+    header = source.header
+    used = header.tilt if tilt is None else None if tilt == "estimate" else tilt
+    if used is None and tilt != "estimate":
         raise InputError(
-            "it does not say how far the body leaned: give the tilt, such as 2.5deg, or have it estimated"
+            f"{source.name} does not say how far the body leaned: give the tilt, such as 2.5deg,"
+            " or have it estimated"
         )
-    return tilt
+    known_gain = header.zenith_gain if gain is None else np.asarray(gain, np.float64)
+    known_offset = header.zenith_offset if offset is None else np.asarray(offset, np.float64)
+    return replace(header, tilt=used, zenith_gain=known_gain, zenith_offset=known_offset)
+
+
+def _need_no_gain(source: Source, per_turn: bool, heights: ArrayLike | None) -> None:
+    """Refuse what only normals have, of a source without a zenith gain."""
+    if per_turn or heights is not None:
+        asked = "turns of their own" if per_turn else "use for heights"
+        raise InputError(f"{source.name} has no zenith gain, so no normals, and no {asked}: give the gain")
 
 
 def _longest_turn(source: Source) -> int:
@@ -222,14 +239,13 @@ def _longest_turn(source: Source) -> int:
 def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Normals:
     """Account for what interpolation did to a pixel's noise, and where it reached beyond the contact.
 
-    Noise that was told from the frames themselves has the mean of that already. Samples are made of 4 x 4, of
-    which two on either side may have lost contact.
+    Noise that was told from the frames themselves knows of the former. Samples are made of 4 x 4, of which
+    two on either side may have lost contact.
     """
-    typical = 1.0 if given else np.sqrt(np.nanmean(noise_gain.astype(np.float64) ** 2))
     reach = np.ones((1,) * (normals.contact.ndim - 2) + (_REACH, _REACH), bool)
     lost = np.isfinite(normals.sigma) & (normals.contact == 0)
     inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
-    sigma = normals.sigma * (noise_gain / typical).astype(np.float32)
+    sigma = normals.sigma * noise_gain if given else normals.sigma
     return replace(normals, sigma=sigma, contact=inside)
 
 

@@ -44,8 +44,10 @@ class Correlation:
 
     @property
     def azimuth(self) -> NDArray[np.float32]:
-        """Phase at which the pixel is brightest, atan2(sine, cosine), (H, W) float32, radians."""
-        return np.arctan2(self.sine, self.cosine)
+        """Phase at which the pixel is brightest, atan2(sine, cosine), (H, W) float32, radians, or NaN."""
+        still = (self.cosine == 0) & (self.sine == 0)
+        phase: NDArray[np.float32] = np.where(still, np.float32(np.nan), np.arctan2(self.sine, self.cosine))
+        return phase
 
 
 def correlate(

@@ -99,7 +99,8 @@ def noise_of_fit(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> Cou
     Parameters
     ----------
     samples : ndarray, (N, n), uint8, uint16 or float32
-        Of n pixels. Those with a sample that is clipped or no number are left out.
+        Of n pixels. Frames that have less than half as many whole samples as others are left out, and then
+        pixels of which a sample is clipped by its type or no number.
     phase, weights : ndarray, (N,), float64
         Radians, and weights above 0.
 
@@ -111,19 +112,28 @@ def noise_of_fit(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> Cou
     Raises
     ------
     InputError
-        Three frames, of which a fit leaves nothing.
+        Three frames, of which a fit leaves nothing, or no pixel that is whole.
     """
     if len(samples) == 3:
         raise InputError("3 frames a turn tell no noise: give the standard deviation of a sample in counts")
-    counts = samples[:, within_type(samples)].astype(np.float64)
-    floor = _QUANTUM if samples.dtype.kind == "u" else _FLOAT * float(np.max(np.abs(counts), initial=1.0))
-    if counts.size == 0:
-        return CountNoise(floor**2, 0.0, floor**2)
+    good = whole(samples)
+    quantum = _QUANTUM if samples.dtype.kind == "u" else _FLOAT
+    if not (good.sum(axis=0) >= 3).any():  # no pixel will have an answer
+        return CountNoise(quantum**2, 0.0, quantum**2)
+    share = good.mean(axis=1)
+    frames = share > share.max() / 2  # one that is missing or clipped tells nothing
+    pixels = good[frames].all(axis=0)
+    if np.count_nonzero(frames) <= 3 or not pixels.any():
+        raise InputError(
+            "too few samples are whole to tell the noise: give the standard deviation of a sample in counts"
+        )
+    counts, phase, weights = samples[frames][:, pixels].astype(np.float64), phase[frames], weights[frames]
+    floor = quantum * (1.0 if samples.dtype.kind == "u" else float(np.max(np.abs(counts))))
     root = np.sqrt(weights)[:, np.newaxis]
     waves = root * _waves(phase)
     left = root * counts - waves @ (np.linalg.pinv(waves) @ (root * counts))
     squares, level = np.sum(left**2, axis=0), counts.mean(axis=0)
-    freedom = len(samples) - waves.shape[1]
+    freedom = len(counts) - waves.shape[1]
     order = np.argsort(level, kind="stable")
     parts = np.array_split(order, max(1, min(_PARTS, len(order) // _ENOUGH)))
     variances = np.array([_variance(squares[part], freedom) for part in parts])
@@ -168,8 +178,8 @@ def _waves(phase: Doubles) -> Doubles:
     return both if len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _APART else one
 
 
-def within_type(samples: NDArray[Any]) -> NDArray[np.bool_]:
-    """Tell of which pixels no sample, (N, n), is clipped by its type or no number."""
+def whole(samples: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which samples, of any shape, are neither clipped by their type nor no number."""
     if samples.dtype.kind == "f":
-        return np.asarray(np.isfinite(samples).all(axis=0))
-    return np.asarray(((samples > 0) & (samples < np.iinfo(samples.dtype).max)).all(axis=0))
+        return np.asarray(np.isfinite(samples))
+    return np.asarray((samples > 0) & (samples < np.iinfo(samples.dtype).max))

@@ -17,7 +17,7 @@ from mirrorskin.engine.samples import check_dtype
 from mirrorskin.engine.scale import make_scale
 from mirrorskin.engine.search import MEMORY_LIMIT
 from mirrorskin.engine.tilt import check_tilt, estimate_tilt, one_wave
-from mirrorskin.engine.turns import LONGEST, cut_into_turns
+from mirrorskin.engine.turns import LONGEST, cut_into_turns, goes_round
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
 from mirrorskin.kernels.normals import MORE, contact_limits
@@ -45,7 +45,7 @@ class Normals:
         1 where sheet and object touched in every frame.
     mean, cosine, sine, residual : ndarray, (H, W), float32
         Counts, of the samples' fit with one wave a turn; see `mirrorskin.engine.Correlation`. Of several
-        turns the mean, of the residual the root mean square.
+        turns the mean, of the residual the root mean square. NaN where a sample is missing in each turn.
     noise : float
         Standard deviation of a sample that was reckoned with, counts, at the middle of the brightness.
     shot : float
@@ -78,8 +78,10 @@ class Normals:
 
     @cached_property
     def azimuth(self) -> NDArray[np.float32]:
-        """Direction in which the surface faces, (H, W) float32, radians from x towards y."""
-        return np.arctan2(self.vectors[..., 1], self.vectors[..., 0])
+        """Direction in which the surface faces, (H, W) float32, radians from x towards y; NaN where level."""
+        x, y = self.vectors[..., 0], self.vectors[..., 1]
+        azimuth: NDArray[np.float32] = np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))
+        return azimuth
 
     @cached_property
     def modulation(self) -> NDArray[np.float32]:
@@ -234,6 +236,7 @@ class NormalEstimator:
         self._tilt, self._noise = self._given_tilt, self._given_noise
         self._phase, self._weights = np.empty(0), np.empty(0)
         self._turns = self._frames = 0
+        self._told_any = False
         self._each: list[list[NDArray[Any]]] = []
 
     @property
@@ -278,7 +281,10 @@ class NormalEstimator:
         mirrorskin.io.InputError
             The phases of the first turn do not determine a normal.
         """
-        self._work(cut_into_turns(self._phase))
+        phase, weights = self._phase.copy(), self._weights.copy()
+        self._work(cut_into_turns(phase))
+        if self._turns == 0:
+            check_phases(phase, weights)  # says what is wrong
         if self._per_turn:
             maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
         else:
@@ -289,29 +295,25 @@ class NormalEstimator:
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
         """Take in frames that fit, and work on the turns that are then over."""
-        here = self.room[: len(frames)]
-        counts = weights > 0
-        if not counts.all():
-            frames, phase, weights = frames[counts], phase[counts], weights[counts]
-        if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
-            here[: len(frames)] = frames
-        self._phase = np.concatenate([self._phase, phase])
-        self._weights = np.concatenate([self._weights, weights])
-        turns = cut_into_turns(self._phase)
-        longest = max((turn.stop - turn.start for turn in turns), default=0)
+        turns = cut_into_turns(np.concatenate([self._phase, phase]))
+        longest = max(turn.stop - turn.start for turn in turns)
         if longest > self._longest:
             told = f"a turn of {longest} frames or more: normals are told from {self._longest} at most"
             raise InputError(f"{told}; leave some out, or use 'mirrorskin correlate'")
+        here = self.room[: len(frames)]
+        if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
+            here[:] = frames
+        self._phase = np.concatenate([self._phase, phase])
+        self._weights = np.concatenate([self._weights, weights])
         if len(turns) > 1:
             self._work(turns[:-1])
 
     def _work(self, turns: list[slice]) -> None:
         """Estimate the normals of turns in the buffer, and keep the frames that come after them."""
-        told = [turn for turn in turns if self._determines(turn)]
-        if not told and self._turns == 0:
-            check_phases(self._phase, self._weights)  # says what is wrong
+        known = [self._close_up(turn) for turn in turns]
+        told = [turn for turn in known if self._tells(turn)]
         alone = len(self._bands) == 1
-        if alone:
+        if alone and told:
             self._bands[0].frames.upload(len(self._phase))
         for turn in told:
             self._estimate(turn)
@@ -322,13 +324,24 @@ class NormalEstimator:
         self._buffer[:rest] = self._buffer[end : end + rest].copy()
         self._phase, self._weights = self._phase[end:], self._weights[end:]
 
-    def _determines(self, turn: slice) -> bool:
-        """Tell whether a turn's phases determine a normal; one of which too much is missing does not."""
+    def _close_up(self, turn: slice) -> slice:
+        """Move the frames of a turn that are not missing to its begin."""
+        there = turn.start + np.flatnonzero(self._weights[turn] > 0)
+        known = slice(turn.start, turn.start + len(there))
+        if known != turn:
+            for values in (self._buffer, self._phase, self._weights):
+                values[known] = values[there]
+        return known
+
+    def _tells(self, turn: slice) -> bool:
+        """Tell whether a turn's phases determine a normal, and, after the first that does, go all round."""
+        phase = self._phase[turn]
         try:
-            check_phases(self._phase[turn], self._weights[turn])
+            check_phases(phase, self._weights[turn])
         except InputError:
             return False
-        return True
+        first, self._told_any = not self._told_any, True
+        return first or goes_round(phase)
 
     def _estimate(self, turn: slice) -> None:
         phase, weights = self._phase[turn], self._weights[turn]
@@ -357,7 +370,8 @@ class NormalEstimator:
         step = thinning(self._shape)
         samples, scale = frames.reshape(len(frames), -1)[:, ::step], self._scale.thinned(step)
         if self._noise is None:
-            steep = samples[:, one_wave(matrix @ samples, scale)]
+            with np.errstate(invalid="ignore"):
+                steep = samples[:, one_wave(matrix @ samples, scale)]
             self._noise = noise_of_fit(steep if steep.shape[1] >= _ENOUGH else samples, phase, weights)
         if self._tilt is None:
             self._tilt = estimate_tilt(samples, phase, weights, matrix, scale, self._noise)
@@ -395,7 +409,7 @@ class NormalEstimator:
             MORE=MORE,
         )
         limits = contact_limits(count - 3, tilt)
-        least_tilt = limits.still - (tilt if self._method == "exact" else 0.0)
+        apart = tilt if self._method == "exact" else 0.0  # what is told is how much more it is, or all
         whole = np.array([start, band.pixels, band.stride], np.int32)
         turns = np.int32(1 if self._per_turn else self._turns)
         noise = self._noise.base, self._noise.slope, self._noise.least
@@ -405,7 +419,8 @@ class NormalEstimator:
             *noise,
             limits.noise,
             limits.model,
-            least_tilt,
+            limits.still - apart,
+            limits.most - apart,
             limits.rest,
         )
         scale = band.maps["scale"] if self._scale.per_pixel else self._one_scale

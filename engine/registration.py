@@ -55,6 +55,9 @@ class Registered:
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``. It holds five maps and a frame.
 
+    header : Header, optional
+        What to believe instead of the source's own.
+
     Attributes
     ----------
     name, header, motion, shape, rewindable
@@ -74,11 +77,18 @@ class Registered:
 
     dtype = _FRAME
 
-    def __init__(self, source: Source, heights: ArrayLike, device: str | Device | None = None) -> None:
+    def __init__(
+        self,
+        source: Source,
+        heights: ArrayLike,
+        device: str | Device | None = None,
+        header: Header | None = None,
+    ) -> None:
         check_dtype(source.dtype)
-        self._geometry = _Geometry.of(source)
+        header = source.header if header is None else header
+        self._geometry = _Geometry.of(source, header)
         heights = _check_heights(heights, source.shape[1:])
-        self.name, self.header, self.shape = source.name, source.header, source.shape
+        self.name, self.header, self.shape = source.name, header, source.shape
         self.motion: Motion = source.motion
         self.rewindable = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
@@ -160,12 +170,12 @@ class _Geometry:
     pivot: tuple[float, float, float]
 
     @classmethod
-    def of(cls, source: Source) -> Self:
-        """Take what a source's header says, or raise InputError."""
+    def of(cls, source: Source, header: Header) -> Self:
+        """Take what a header says of a source, or raise InputError."""
         if source.motion != "axial":
             raise InputError(f"{source.name} is of {source.motion} motion: only axial ones can be registered")
         pixel_size, tilt, press, pivot = (
-            _known(source, name) for name in ("pixel_size", "tilt", "press", "pivot")
+            _known(source, header, name) for name in ("pixel_size", "tilt", "press", "pivot")
         )
         x, y = pixel_axes(source.shape[1:], pixel_size)
         return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot)
@@ -265,9 +275,9 @@ def _macros(dtype: np.dtype[Any], levels: bool) -> dict[str, str | int]:
     return {"FRAME": C_TYPES[dtype.name], "LEVELS": int(levels), **top}
 
 
-def _known(source: Source, name: str) -> Any:
+def _known(source: Source, header: Header, name: str) -> Any:
     """Return what a header says, or raise InputError where it says nothing, or no number."""
-    value = getattr(source.header, name)
+    value = getattr(header, name)
     words = name.replace("_", " ")
     if value is None:
         raise InputError(

@@ -73,6 +73,11 @@ def make_scale(
         raise InputError(f"{told}: counts per radian other than 0 are needed; calibrate, or leave it out")
     if not np.isfinite(zero).any():
         raise InputError("the zenith offset is no number: give the counts at zenith 0, such as 10")
+    for name in ("low", "high"):
+        if name in known and not np.isfinite(known[name]).any():
+            raise InputError(
+                f"{name} is no number: give the counts at which brightness ends, or leave it out"
+            )
     with np.errstate(divide="ignore", invalid="ignore"):
         per_count = np.where(np.isfinite(rate) & np.isfinite(zero) & (rate != 0), 1 / rate, np.nan)
         ends = [(known.get(name, np.asarray(end)) - zero) * per_count for name, end in _OPEN.items()]

@@ -172,6 +172,8 @@ class Score:
         Of a result that has azimuths but no normals.
     contact : ContactScore or None
     edges : EdgeScore or None
+        Neither is told of frames that were registered: what follows the object has another contact than what
+        stays with the picture.
     """
 
     height: HeightScore | None = None
@@ -227,12 +229,15 @@ def score(result: Result, truth: Truth) -> Score:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
+    # Registered frames tell of the object's points, the truth of the picture's pixels.
+    follows = result.process.get("heights", "none") != "none"
+    contact, edges = (None, None) if follows else (result.contact, result.edges)
     return Score(
         height=None if result.height is None else _score_heights(result, truth.height, touched),
         normal=None if result.normals is None else _score_normals(result, truth, touched),
         azimuth=None if azimuth is None else _score_angles(_turned(azimuth, truth.azimuth), None, touched),
-        contact=None if result.contact is None else _score_contact(result, touched),
-        edges=None if result.edges is None else _score_edges(result.edges, _edges_of(truth)),
+        contact=None if contact is None else _score_contact(result, touched),
+        edges=None if edges is None else _score_edges(edges, _edges_of(truth)),
     )
 
 

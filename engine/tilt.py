@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mirrorskin.engine.noise import CountNoise, within_type
+from mirrorskin.engine.noise import CountNoise, whole
 from mirrorskin.engine.phases import Doubles, basis
 from mirrorskin.io import InputError
 
@@ -39,11 +39,8 @@ def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
         See `mirrorskin.engine.scale.Scale`.
     """
     offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
-    with np.errstate(invalid="ignore"):
-        told: NDArray[np.bool_] = (wave[0] - offset) * per_count > _CLEAR * np.hypot(*wave[1:]) * np.abs(
-            per_count
-        )
-    return told
+    told = (wave[0] - offset) * per_count > _CLEAR * np.hypot(*wave[1:]) * np.abs(per_count)
+    return np.asarray(told)
 
 
 def estimate_tilt(
@@ -90,7 +87,7 @@ def estimate_tilt(
     error = noise.at(samples.mean(axis=0)) * np.abs(per_count)
     with np.errstate(invalid="ignore"):
         inside = ((zeniths > low + 3 * error) & (zeniths < high - 3 * error)).all(axis=0)
-    usable = within_type(samples) & inside
+    usable = whole(samples).all(axis=0) & inside
     zeniths, error = zeniths[:, usable], error[usable]
     mean, cosine, sine = matrix @ zeniths
     left = np.sum(weights[:, np.newaxis] * (zeniths - basis(phase) @ (matrix @ zeniths)) ** 2, axis=0)

@@ -28,12 +28,23 @@ def cut_into_turns(phase: Doubles) -> list[slice]:
     list of slice
         They meet, and the last one holds the last frame; none without frames.
     """
-    way = np.unwrap(phase)
-    starts = [0] if len(way) else []
+    if len(phase) == 0:
+        return []
+    steps = np.diff(phase)
+    forward = 1.0 if (np.median(steps) if len(steps) else 0.0) >= 0 else -1.0
+    steps = np.where(forward * steps < -np.pi, steps + forward * 2 * np.pi, steps)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    starts = [0]
     for frame, angle in enumerate(way):
         if abs(angle - way[starts[-1]]) >= _WHOLE:
             starts.append(frame)
     return [slice(start, stop) for start, stop in zip(starts, [*starts[1:], len(way)], strict=True)]
+
+
+def goes_round(phase: Doubles) -> bool:
+    """Tell whether no gap between phases is above half a turn."""
+    points = np.sort(np.mod(phase, 2 * np.pi))
+    return bool(np.max(np.diff(points, append=points[0] + 2 * np.pi)) <= np.pi + 1e-6)
 
 
 def longest_turn(phase: Doubles) -> int:

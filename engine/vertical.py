@@ -39,7 +39,8 @@ def reconstruct_press(
 ) -> Result:
     """Reconstruct heights from a press or a release; see ``mirrorskin.engine.reconstruct``."""
     if method not in METHODS:
-        raise InputError(f"unknown method {method!r}; of a press, known are {', '.join(METHODS)}")
+        known = ", ".join(METHODS)
+        raise InputError(f"{source.name} is a press, which method {method!r} cannot do: take {known}")
     header = source.header
     frames = _frames_of(source, event)
     size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize

@@ -16,15 +16,15 @@ from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import InputError
 
 
-def check_output(path: Path, keep: Path | None = None) -> None:
+def check_output(path: Path, *keep: Path | None) -> None:
     """Refuse an output that could not be written, before any work is done for it.
 
     Parameters
     ----------
     path : Path
         File to write.
-    keep : Path, optional
-        The input, a file or a folder of files, which must not be overwritten.
+    *keep : Path or None
+        Inputs, files or folders of files, which must not be overwritten.
 
     Raises
     ------
@@ -39,7 +39,8 @@ def check_output(path: Path, keep: Path | None = None) -> None:
         if path.exists():
             if not path.is_file():
                 raise InputError(f"{path} is no regular file: choose another place with -o")
-            if keep is not None and keep.exists() and (path.samefile(keep) or path.parent.samefile(keep)):
+            inputs = [one for one in keep if one is not None and one.exists()]
+            if any(path.samefile(one) or path.parent.samefile(one) for one in inputs):
                 raise InputError(f"{path} is the input, or part of it: name another output with -o")
         with tempfile.TemporaryFile(dir=path.parent):
             pass

@@ -47,9 +47,9 @@ Side gather(__global const float *vectors, __global const float *sigma, __global
             if (y < 0 || y >= rows || x < 0 || x >= columns) continue;
             const int q = y * columns + x;
             if (!clean[q] || !(sigma[q] >= 0.0f)) continue;
-            side.x += vectors[3 * q];
-            side.y += vectors[3 * q + 1];
-            side.z += vectors[3 * q + 2];
+            side.x += vectors[3L * q];
+            side.y += vectors[3L * q + 1];
+            side.z += vectors[3L * q + 2];
             side.variance += sigma[q] * sigma[q];
             ++side.known;
         }
@@ -71,8 +71,8 @@ float jump_between(const Side a, const Side b, const float noise, const float le
 // Whether two normals are so sure that no mean of more is needed, and hardly differ.
 int alike(__global const float *vectors, __global const float *sigma, const int p, const int q, const float quiet)
 {
-    const float dot = vectors[3 * p] * vectors[3 * q] + vectors[3 * p + 1] * vectors[3 * q + 1]
-        + vectors[3 * p + 2] * vectors[3 * q + 2];
+    const float dot = vectors[3L * p] * vectors[3L * q] + vectors[3L * p + 1] * vectors[3L * q + 1]
+        + vectors[3L * p + 2] * vectors[3L * q + 2];
     return sigma[p] * sigma[p] + sigma[q] * sigma[q] <= quiet * quiet && dot > SURELY_LESS;
 }
 
@@ -98,7 +98,7 @@ __kernel void edges_jumps(__global const float *restrict vectors, __global const
                 found = jump_between(a, b, noise, least, sure);
                 break;
             }
-            jumps[down * all + p] = found;
+            jumps[(long)down * all + p] = found;
         }
     }
 }

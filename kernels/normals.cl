@@ -37,7 +37,7 @@ typedef struct __attribute__((packed)) { Raw samples; } Stored;
 #define READ(map, at) (*(__global const F *)((map) + (at)))
 #define STORE(map, at, values) (*(__global F *)((map) + (at)) = (values))
 #if MAPS
-#define SCALE(plane) READ(scale, (plane) * stride + p)
+#define SCALE(plane) READ(scale, (long)(plane) * stride + p)
 #else
 #define SCALE(plane) ((F)scale[plane])
 #endif
@@ -213,10 +213,11 @@ Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *fr
 #if COUNTED
         const I under = raw <= 0.0f, clipped = under | (raw >= TOP);
         const F end = ((under ? (F)0.5f : (F)(TOP - 0.5f)) - offset) * per_count;
-        const F side = under == (per_count > 0.0f) ? (F)-1.0f : (F)1.0f, z = side * (seen - end) / error_of_one;
-        const F slope = mills(z), beyond = LESSER(z, (F)0.0f) * error_of_one;
+        const F error_of_this = error_of_one * (1.0f / WEIGH(1.0f, k));
+        const F side = under == (per_count > 0.0f) ? (F)-1.0f : (F)1.0f, z = side * (seen - end) / error_of_this;
+        const F slope = mills(z), beyond = LESSER(z, (F)0.0f) * error_of_this;
         share = clipped ? slope * (slope + z) : share;
-        pull = clipped ? side * slope * error_of_one : pull;
+        pull = clipped ? side * slope * error_of_this : pull;
         misfit = clipped ? beyond * beyond : misfit;
 #else
         const I known = raw == raw;
@@ -298,6 +299,9 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     return wave;
 }
 
+// The mean over turns so far, of those that tell something.
+#define JOINED(old, now) (now != now ? old : old != old ? now : old + (1.0f / turns) * (now - old))
+
 // What all methods tell beside their normals, in counts; of several turns the mean, and the root mean square.
 #define KEEP_WAVE(square)                                                                        \
     {                                                                                            \
@@ -305,12 +309,11 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
         F now_mean = offset + wave.mean * gain, now_cosine = wave.cosine * gain, now_sine = wave.sine * gain; \
         F now_left = left / (FREEDOM > 0 ? FREEDOM : NAN);                                       \
         if (turns > 1) {                                                                         \
-            const float share = 1.0f / turns;                                                    \
             const F before = READ(residual, p);                                                  \
-            now_mean = READ(mean, p) + share * (now_mean - READ(mean, p));                       \
-            now_cosine = READ(cosines, p) + share * (now_cosine - READ(cosines, p));             \
-            now_sine = READ(sines, p) + share * (now_sine - READ(sines, p));                     \
-            now_left = before * before + share * (now_left - before * before);                   \
+            now_mean = JOINED(READ(mean, p), now_mean);                                          \
+            now_cosine = JOINED(READ(cosines, p), now_cosine);                                   \
+            now_sine = JOINED(READ(sines, p), now_sine);                                         \
+            now_left = JOINED(before * before, now_left);                                        \
         }                                                                                        \
         STORE(mean, p, now_mean);                                                                \
         STORE(cosines, p, now_cosine);                                                           \
@@ -320,7 +323,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 
 #if LANES == 8
 #define KEEP_VECTORS(x, y, z)                                                                    \
-    STORE(vectors, 3 * p, ((F)(x.s0, y.s0, z.s0, x.s1, y.s1, z.s1, x.s2, y.s2)));                \
+    STORE(vectors, 3L * p, ((F)(x.s0, y.s0, z.s0, x.s1, y.s1, z.s1, x.s2, y.s2)));                \
     STORE(vectors, 3L * p + 8, ((F)(z.s2, x.s3, y.s3, z.s3, x.s4, y.s4, z.s4, x.s5)));            \
     STORE(vectors, 3L * p + 16, ((F)(y.s5, z.s5, x.s6, y.s6, z.s6, x.s7, y.s7, z.s7)));
 #define READ_VECTORS(x, y, z)                                                                    \
@@ -332,7 +335,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     }
 #else
 #define KEEP_VECTORS(x, y, z)                                                                    \
-    STORE(vectors, 3 * p, ((F)(x.s0, y.s0, z.s0, x.s1)));                                        \
+    STORE(vectors, 3L * p, ((F)(x.s0, y.s0, z.s0, x.s1)));                                        \
     STORE(vectors, 3L * p + 4, ((F)(y.s1, z.s1, x.s2, y.s2)));                                    \
     STORE(vectors, 3L * p + 8, ((F)(z.s2, x.s3, y.s3, z.s3)));
 #define READ_VECTORS(x, y, z)                                                                    \
@@ -381,7 +384,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     __global const FRAME *restrict stack, __global const float *restrict turn,                   \
     __global const float *restrict scale, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
     const float sin_tilt, const float noise_base, const float noise_slope, const float noise_least, \
-    const float noise_limit, const float limit, const float still_below, const float rest_below,                         \
+    const float noise_limit, const float limit, const float still_below, const float wild_above, const float rest_below,                         \
     __global float *restrict vectors, __global float *restrict sigma,                            \
     __global uchar *restrict contact, __global float *restrict mean,                             \
     __global float *restrict cosines, __global float *restrict sines,                            \
@@ -403,9 +406,11 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 #endif
 #if ENDS
 #define COUNT_WITHIN                                                                             \
-    const F margin = MARGIN * error_of_one, least = low + margin, largest = high - margin;       \
     I plain = 0;                                                                                 \
-    for (int k = 0; k < COUNT; ++k) plain -= (zeniths[k] > least) & (zeniths[k] < largest) & WHOLE(LOAD(k));
+    for (int k = 0; k < COUNT; ++k) {                                                            \
+        const F margin = MARGIN * error_of_one * (1.0f / WEIGH(1.0f, k));                        \
+        plain -= (zeniths[k] > low + margin) & (zeniths[k] < high - margin) & WHOLE(LOAD(k));    \
+    }
 #else
 #define COUNT_WITHIN const I plain = whole;
 #endif
@@ -448,7 +453,7 @@ __kernel void normals_exact(ARGUMENTS)
         }
         const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;
         const F error = error_of_one * root((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));
-        const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct == found.ct);
+        const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f);
 
         // With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
         const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;
@@ -458,8 +463,9 @@ __kernel void normals_exact(ARGUMENTS)
         const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);
         const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;
         const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;
-        const I still = AT_REST | (more_tilt + 3.0f * error_of_one * inverse_root(told) < still_below);
-        KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left) & ~still)
+        const F doubt = 3.0f * error_of_one * inverse_root(told);
+        const I apart = AT_REST | (more_tilt + doubt < still_below) | (more_tilt - doubt > wild_above);
+        KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left) & ~apart)
         KEEP_WAVE(waves)
     }
 }
@@ -484,9 +490,10 @@ __kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosin
         const F across = sp * sp * of_cosine - both + cp * cp * of_sine;
         const F along = cp * cp * of_cosine + both + sp * sp * of_sine;
         const F error = error_of_one * root(of_mean + slant * slant * across);
-        const I answered = swings & (ct == ct);
-        const I still = AT_REST | (swing * inverse + 3.0f * error_of_one * root(along) < still_below);
-        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves) & ~still)
+        const I answered = swings & (ct > 0.0f);
+        const F swung = swing * inverse, doubt = 3.0f * error_of_one * root(along);
+        const I apart = AT_REST | (swung + doubt < still_below) | (swung - doubt > wild_above);
+        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves) & ~apart)
         KEEP_WAVE(waves)
     }
 }

@@ -35,6 +35,9 @@ _MARGIN = 3.0  # standard deviations that a sample must be from the ends of a ra
 _MODEL = 0.2  # RMS of what the model may leave out in contact, as a share of the tilt
 _DOUBT = 2.0  # by which the variance of the noise may be wrong
 _REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
+_MOST = (
+    2.0  # tilts above which a pixel shows no wave of the body's: one that is constant looks level and tilted
+)
 _STILL = 0.25  # share of the tilt below which a sheet does not follow the object
 
 
@@ -63,6 +66,8 @@ class Limits(NamedTuple):
         Sum of squares that the model may leave out, radians squared.
     still : float
         Least tilt that a sheet in contact shows, less three standard errors, radians.
+    most : float
+        Largest tilt that it shows, more three standard errors, radians.
     rest : float
         Least mean of the zeniths that it shows, radians. At rest it is 0, in contact the tilt or more.
     """
@@ -70,6 +75,7 @@ class Limits(NamedTuple):
     noise: float
     model: float
     still: float
+    most: float
     rest: float
 
 
@@ -79,7 +85,7 @@ def contact_limits(freedom: int, tilt: float) -> Limits:
     The noise's share is chi-square's quantile at 99.9 %, which n + 4.37 sqrt(n) + 5.7 meets within 3 %.
     """
     noise = _DOUBT * (freedom + 4.37 * math.sqrt(freedom) + 5.7)
-    return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _REST * tilt)
+    return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _MOST * tilt, _REST * tilt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +159,9 @@ def normals_exact(
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
         more_tilt, told, left = _free_tilt(sums, det)
-        still = more_tilt + 3 * samples.error / np.sqrt(told) < limits.still - tilt
-        touching = _like_noise(left, samples, limits) & ~still & ~(samples.mean < limits.rest)
+        doubt = 3 * samples.error / np.sqrt(told)
+        apart = (tilt + more_tilt + doubt < limits.still) | (tilt + more_tilt - doubt > limits.most)
+        touching = _like_noise(left, samples, limits) & ~apart & ~(samples.mean < limits.rest)
     unknown = (samples.plain < _LEAST) | ~(sigma < _NO_ANSWER)
     return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
 
@@ -191,8 +198,9 @@ def normals_paper(
         across = sp**2 * spread[1] - both + cp**2 * spread[3]
         along = cp**2 * spread[1] + both + sp**2 * spread[3]
         sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / swing) ** 2 * across)
-        still = swing + 3 * samples.error * np.sqrt(along) < limits.still
-        touching = _like_noise(samples.square, samples, limits) & ~still & ~(zenith < limits.rest)
+        doubt = 3 * samples.error * np.sqrt(along)
+        apart = (swing + doubt < limits.still) | (swing - doubt > limits.most)
+        touching = _like_noise(samples.square, samples, limits) & ~apart & ~(zenith < limits.rest)
     normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
     return _answer(normal, sigma, touching, samples)
 
@@ -213,7 +221,8 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
     )
 
     def mean(old: Doubles, new: Doubles) -> Doubles:
-        return old + (new - old) / turns
+        joined = old + (new - old) / turns
+        return np.where(np.isnan(new), old, np.where(np.isnan(old), new, joined))
 
     with np.errstate(divide="ignore"):
         sigma = 1 / np.sqrt(own + theirs)
@@ -247,7 +256,8 @@ class _Samples:
         if frames.dtype.kind == "u":
             self.top = float(np.iinfo(frames.dtype).max)
             self.under, self.over = raw <= 0, raw >= self.top
-        margin = _MARGIN * self.error
+        self.each = self.error / turn[2][:, np.newaxis]  # standard deviation of each sample
+        margin = _MARGIN * self.each
         plain = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
         self.plain = (plain & ~self.under & ~self.over).sum(axis=0)
         self.odd = self.plain < count
@@ -327,11 +337,11 @@ def _tell(samples: _Samples, zenith: Doubles) -> tuple[Doubles, Doubles, Doubles
     bound = (np.where(samples.under, 0.5, samples.top - 0.5) - samples.offset) * samples.per_count
     side = np.where(samples.under == (samples.per_count > 0), -1.0, 1.0)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        z = side * (seen - bound) / samples.error
+        z = side * (seen - bound) / samples.each
         slope = math.sqrt(2 / math.pi) / special.erfcx(-z / math.sqrt(2))
         share = np.where(clipped, slope * (slope + z), 1.0)
-        pull = np.where(clipped, side * slope * samples.error, error)
-        misfit = np.where(clipped, (np.minimum(z, 0) * samples.error) ** 2, error**2)
+        pull = np.where(clipped, side * slope * samples.each, error)
+        misfit = np.where(clipped, (np.minimum(z, 0) * samples.each) ** 2, error**2)
     known = ~samples.missing
     return (
         np.where(inside & known, share, 0.0),
@@ -365,7 +375,7 @@ def _step(normal: Doubles, sums: _Sums) -> Doubles:
         d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det
         d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
         shorter = _REACH**2 / np.maximum(d1**2 + d2**2, _REACH**2)
-    moved = normal + (shorter * d1)[:, np.newaxis] * along + (shorter * d2)[:, np.newaxis] * across
+        moved = normal + (shorter * d1)[:, np.newaxis] * along + (shorter * d2)[:, np.newaxis] * across
     return _unit(moved)
 
 
@@ -389,7 +399,7 @@ def _like_noise(square: Doubles, samples: _Samples, limits: Limits) -> NDArray[n
 
 def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], samples: _Samples) -> Answer:
     with np.errstate(divide="ignore", invalid="ignore"):
-        answered = np.isfinite(normal).all(axis=1) & np.isfinite(sigma)
+        answered = np.isfinite(sigma) & (normal[:, 2] > 0)  # a sheet does not face away
         gain = 1 / samples.per_count
         freedom = samples.freedom or np.nan
         residual = np.sqrt(samples.square / freedom) * np.abs(gain)

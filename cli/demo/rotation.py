@@ -119,13 +119,14 @@ def tell(outcomes: Mapping[str, Outcomes]) -> None:
 def _cells(score: Score) -> list[str]:
     normal, contact = score.normal, score.contact
     assert normal is not None
-    assert contact is not None
+    flags = ["-", "-"]
+    if contact is not None:
+        flags = [f"{100 * contact.lost_flagged:.1f} %", f"{100 * contact.wrongly_flagged:.1f} %"]
     return [
         f"{100 * normal.coverage:.1f} %",
         f"{normal.median:.2f}",
         f"{normal.rms:.2f}",
         f"{normal.p99:.2f}",
         f"{normal.chi_square:.2f}",
-        f"{100 * contact.lost_flagged:.1f} %",
-        f"{100 * contact.wrongly_flagged:.1f} %",
+        *flags,
     ]

@@ -101,8 +101,9 @@ def test_the_table_of_normals_tells_of_both_methods_before_and_after_registratio
     head, rows = cells(shown[0][start]), [cells(line) for line in shown[0][start + 1 : start + 5]]
     assert [row[:2] for row in rows] == [["fig10a", way] for way in WAYS]
     found = {
-        row[1]: dict(zip(head[2:], (float(one.split()[0]) for one in row[2:]), strict=True)) for row in rows
+        row[1]: dict(zip(head[2:7], (float(one.split()[0]) for one in row[2:7]), strict=True)) for row in rows
     }
+    assert [row[7:] == ["-", "-"] for row in rows] == ["registered" in way for way in WAYS]
     for told in found.values():
         assert 20 < told["answered"] <= 100
         assert 0 < told["median"] <= told["RMS"] <= told["99 %"] < 120

@@ -135,7 +135,7 @@ def test_without_a_gain_there_is_the_wave_alone():
 
 @pytest.mark.parametrize("options", [{"per_turn": True}, {"heights": FLAT}])
 def test_without_a_gain_there_are_no_normals_to_ask_for(options):
-    with pytest.raises(io.InputError, match="made up has no zenith gain: without it, no normals"):
+    with pytest.raises(io.InputError, match="made up has no zenith gain, so no normals"):
         reconstruct(NO_GAIN, **options)
 
 
@@ -181,9 +181,7 @@ def test_maps_of_the_recording_are_used_and_said_so():
 
 def test_the_tilt_is_estimated_on_request_only():
     unknown = replace(HEADER, tilt=None)
-    with pytest.raises(
-        io.InputError, match=r"^made up: it does not say how far the body leaned: give the tilt"
-    ):
+    with pytest.raises(io.InputError, match=r"^made up does not say how far the body leaned: give the tilt"):
         reconstruct(unknown)
     result = reconstruct(unknown, tilt="estimate")
     assert result.process["tilt_from"] == "estimate"
@@ -252,7 +250,7 @@ REFUSED = {
     "a press's method": (
         {},
         {"method": "threshold"},
-        "unknown method 'threshold'; of a rotation, known are exact",
+        "made up is a rotation, which method 'threshold' cannot do: take exact",
     ),
     "two frames": ({"frames": slice(2)}, {}, "^made up: 2 frames at 2 different phases"),
     "no phases": ({"phase": None}, {}, "^made up: phase is missing"),

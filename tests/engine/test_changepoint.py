@@ -480,7 +480,9 @@ def test_a_change_point_has_no_equation_4():
 
 
 def test_an_unknown_method_is_refused():
-    with pytest.raises(InputError, match="unknown method 'guess'; known are threshold, change-point"):
+    with pytest.raises(
+        InputError, match="is a press, which method 'guess' cannot do: take threshold, change-point"
+    ):
         engine.reconstruct(twin(), method="guess")
 
 

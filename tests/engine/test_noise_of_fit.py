@@ -102,10 +102,26 @@ def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor, pixels)
 @pytest.mark.parametrize(
     "samples", [np.zeros((8, 5), np.uint8), np.full((8, 5), np.nan, np.float32), np.zeros((8, 0), np.uint16)]
 )
-def test_nothing_that_tells_has_the_least_noise(samples):
+def test_where_nothing_will_be_answered_any_noise_will_do(samples):
     found = noise_of_fit(samples, np.array(EIGHTHS), np.ones(8))
     assert found.slope == 0
     assert 0 < found.at(100.0) < 0.3
+
+
+def test_without_a_whole_pixel_noise_is_not_made_up():
+    samples, *known = samples_of(1.0, 0.0, dtype="uint8")
+    samples[np.arange(PIXELS) % 8, np.arange(PIXELS)] = 255
+    with pytest.raises(InputError, match="too few samples are whole to tell the noise"):
+        noise_of_fit(samples, *known)
+
+
+def test_a_frame_that_is_missing_or_clipped_throughout_is_left_out():
+    samples, *known = samples_of(1.0, 0.0)
+    samples[2] = np.nan
+    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), 1.0, rtol=0.03)
+    samples, *known = samples_of(1.0, 0.0, dtype="uint8")
+    samples[5] = 255
+    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 7, 300])

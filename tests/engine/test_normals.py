@@ -126,8 +126,8 @@ def test_the_mean_is_weighted_by_the_inverse_of_the_variance(device):
     frames[8, 2, 3:5] = 65_535  # which leaves less to tell the second turn
     each = push(estimator_of(device, per_turn=True), frames, phases(SETUP, 2)).result()
     both = estimate_normals(frames, phases(SETUP, 2), **known(), device=device)
-    share = each.sigma[..., np.newaxis].astype(float) ** -2
-    mean = np.sum(share * each.vectors, axis=0)
+    share = np.nan_to_num(each.sigma[..., np.newaxis].astype(float) ** -2)  # 0 without an answer
+    mean = np.sum(share * np.nan_to_num(each.vectors), axis=0)
     mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
     np.testing.assert_allclose(both.vectors, mean, atol=1e-6)
     np.testing.assert_allclose(both.sigma, np.sum(share[..., 0], axis=0) ** -0.5, rtol=1e-5)
@@ -157,14 +157,33 @@ def test_the_body_may_turn_clockwise(device):
     close(found, estimate_normals(frames, phase, **known(), device=device), 1e-3)
 
 
+def test_a_result_ends_the_rotation(device):
+    frames, phase = frames_of(turns=2), phases(SETUP, 2)
+    for given in ({"noise": None}, {"per_turn": True}):
+        estimator = push(estimator_of(device, **given), frames[:, ::-1], phase + 1)
+        estimator.result()
+        with pytest.raises(InputError, match="0 frames at 0 different phases"):
+            estimator.result()
+        again = push(estimator, frames, phase).result()
+        same(again, push(estimator_of(device, **given), frames, phase).result())
+
+
+def test_without_frames_there_is_no_result(device):
+    with pytest.raises(InputError, match="0 frames at 0 different phases"):
+        estimator_of(device).result()
+    with pytest.raises(InputError, match=r"all 8 frames have weight 0|0 frames"):
+        estimate_normals(frames_of(), EIGHTHS, **known(), weights=np.zeros(8), device=device)
+
+
 def test_an_incomplete_last_turn_counts_as_far_as_it_goes(device):
     frames, phase = frames_of(turns=3), phases(SETUP, 3)
     found = estimate_normals(frames[:21], phase[:21], **known(), device=device)
     assert (found.turns, found.frames) == (3, 21)
     complete = estimate_normals(frames[:16], phase[:16], **known(), device=device)
     assert np.all(found.sigma < complete.sigma)
-    # Two frames more determine nothing.
-    same(estimate_normals(frames[:18], phase[:18], **known(), device=device), complete)
+    # Frames that do not go round tell too little: two, three or four.
+    for count in (18, 19, 20):
+        same(estimate_normals(frames[:count], phase[:count], **known(), device=device), complete)
 
 
 def test_a_turn_of_which_too_much_is_missing_does_not_count(device):
@@ -312,6 +331,17 @@ def test_frames_that_are_all_the_same_show_an_upright_sheet_or_none(device, dtyp
     assert found.contact.tolist() == [[1, 0]]
     np.testing.assert_allclose(found.mean, levels, rtol=1e-6)
     np.testing.assert_allclose([found.modulation, found.residual], 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
+def test_brightness_that_does_not_change_is_no_contact(device, noise):
+    for level in (50, 100, 200):  # zeniths of 11 to 52 degrees
+        setup = Setup(gain=3.6, offset=12.0, dtype="float32", noise=noise)
+        frames = np.random.default_rng(0).normal(level, noise, (8, 10, 10)).astype(np.float32)
+        found = estimate_normals(frames, EIGHTHS, **known(setup), device=device)
+        assert np.mean(found.contact) < 0.02
+        frames = np.full((8, 1, 2), level, np.uint8)
+        assert not estimate_normals(frames, EIGHTHS, **known(setup), device=device).contact.any()
 
 
 @pytest.mark.parametrize("value", [0, 255])

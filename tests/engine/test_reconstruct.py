@@ -52,9 +52,9 @@ def test_float_frames_and_16_bits_go_the_same_way():
 class Other:
     """A source of another motion."""
 
-    motion, name = "axial", "turning.h5"
+    motion, name = "twist", "turning.h5"
 
 
 def test_a_motion_without_a_method_is_refused():
-    with pytest.raises(io.InputError, match=r"turning\.h5 is of axial motion"):
+    with pytest.raises(io.InputError, match=r"turning\.h5 is of twist motion"):
         engine.reconstruct(Other())

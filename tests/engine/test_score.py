@@ -181,8 +181,8 @@ def test_a_result_for_each_turn_is_scored_over_all_turns():
     flags = np.array([[[1, 0]], [[1, 1]], [[0, 0]]], np.uint8)
     height = np.array([[[0.1, 0.1]], [[0.1, NAN]], [[0.1, 0.1]]], np.float32)
     score = engine.score(io.Result(height=height, normals=found, contact=flags, edges=flags), truth)
-    assert (score.normal.answered, score.normal.touched) == (3, 3)
-    assert score.normal.rms == pytest.approx(np.sqrt(50 / 3), rel=1e-5)
+    assert (score.normal.answered, score.normal.touched) == (2, 3)  # the third turn claims no contact
+    assert score.normal.rms == pytest.approx(np.sqrt(25 / 2), rel=1e-5)
     assert (score.height.answered, score.height.touched) == (5, 3)
     assert score.contact.recall == pytest.approx(2 / 3)
     assert (score.contact.lost, score.contact.lost_flagged) == (3, pytest.approx(2 / 3))

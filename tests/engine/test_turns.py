@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.turns import cut_into_turns, longest_turn
+from mirrorskin.engine.turns import cut_into_turns, goes_round, longest_turn
 
 EIGHTHS = np.arange(8) * np.pi / 4
 THREE = np.concatenate([EIGHTHS + turn * 2 * np.pi for turn in range(3)])
@@ -60,6 +60,36 @@ def test_missing_frames_leave_their_turn():
 
 def test_frames_that_stand_still_are_one_turn():
     assert lengths(np.zeros(40)) == [40]
+
+
+def test_a_gap_of_more_than_half_a_turn_is_a_gap():
+    for way in (1, -1):
+        kept = np.delete(THREE, [*range(3, 8), *range(12, 18)])
+        assert lengths(way * kept) == [3, 4, 6]
+        whole = np.delete(THREE, range(8, 16))
+        assert lengths(way * whole) == [8, 8]
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [
+        (range(0, 360, 45), True),
+        ([0, 120, 240], True),
+        ([0, 180], True),
+        ([0, 90, 180], True),
+        ([0, 90, 170], False),
+        ([350, 10, 30, 400], False),
+        ([720, 480, 240], True),
+        ([5], False),
+    ],
+)
+def test_phases_go_round_where_no_gap_is_above_half_a_turn(degrees, expected):
+    assert goes_round(np.radians(degrees)) == expected
+
+
+def test_without_frames_there_is_no_turn():
+    assert cut_into_turns(np.empty(0)) == []
+    assert longest_turn(np.empty(0)) == 0
 
 
 def test_the_longest_turn_is_counted_in_frames():

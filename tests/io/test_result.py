@@ -292,9 +292,9 @@ def test_the_input_is_not_overwritten(tmp_path):
     (tmp_path / "link.h5").symlink_to("a.h5")
     for path in (original, tmp_path / "link.h5", tmp_path / "." / "a.h5"):
         with pytest.raises(io.InputError, match="is the input, or part of it: name another output"):
-            io.check_output(path, keep=original)
-    io.check_output(other, keep=original)
-    io.check_output(original, keep=other)
+            io.check_output(path, other, original)
+    io.check_output(other, original)
+    io.check_output(original, other)
 
 
 def test_what_is_no_result_is_refused(tmp_path, path):

@@ -20,7 +20,7 @@ RANDOM = tuple(float(step) for step in np.cumsum(np.random.default_rng(3).unifor
 # Noise far below the tilt, so that what is compared is arithmetic and no lack of convergence.
 UINT8 = Setup(gain=3.6, noise=0.5, offset=12.0, phase=UNEVEN, tilt=np.radians(6))
 UINT16 = Setup(gain=900.0, noise=20.0, offset=300.0, dtype="uint16", phase=UNEVEN)
-FLOAT32 = Setup(gain=5.0, noise=0.05, offset=3.0, dtype="float32", phase=UNEVEN)
+FLOAT32 = Setup(gain=5.0, noise=0.3, offset=3.0, dtype="float32", phase=UNEVEN)
 TURNED = replace(UINT16, gain=-900.0, offset=60_000.0)
 
 
@@ -90,6 +90,7 @@ class Answers:
             *turn.noise,
             *turn.limits[:2],
             still,
+            turn.limits.most - (turn.tilt if method == "exact" else 0),
             turn.limits.rest,
         )
         whole = np.array([start, self.pixels, self.stride, self.turns], np.int32)
@@ -144,7 +145,7 @@ def compare(found, expected, turn, share=0.0):
     near = np.min(rotations.between(vectors[:, np.newaxis], turn.axes), axis=1) < 5 * sigma
     error = rotations.between(found.vectors[told].astype(float), vectors)
     slant = np.hypot(vectors[:, 0], vectors[:, 1]) / np.sin(turn.tilt)
-    limit = 2e-6 * (1 + slant) + np.where(near, 0.5, share) * sigma
+    limit = 2e-6 * (1 + slant) + np.where(near, 0.3, share) * sigma
     assert np.all(error <= limit), np.max(error / limit)
     assert np.all(np.abs(found.sigma[told] / sigma - 1) < np.where(near, 0.2, 1e-3 + share))
     np.testing.assert_allclose(np.linalg.norm(found.vectors[told], axis=1), 1, atol=1e-6)
@@ -275,7 +276,8 @@ def test_kernel_and_reference_agree_on_missing_samples(device):
         frames[:missing, -1 - missing] = np.nan
     frames[1::2, -20] = np.nan
     turn = Turn(frames, FLOAT32)
-    expected = check(device, "exact", turn, 2e-3)
+    with np.errstate(invalid="ignore"):  # where two samples are left
+        expected = check(device, "exact", turn, 2e-3)
     gone = np.isnan(frames).sum(axis=0)
     np.testing.assert_array_equal(np.isfinite(expected.sigma), gone <= 5)
     np.testing.assert_array_equal(np.isfinite(expected.mean), gone == 0)
