@@ -5,14 +5,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Array, Device, open_device
+from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
 
-_LEAST = math.radians(10.0)  # jump that is an edge
-_QUIET = math.radians(1.6)  # standard error of a jump, of which that is six
-_SURE = 4.0  # standard errors: one pixel in 3000 of a smooth surface has as much by chance
+LIMITS = Limits(
+    jump=math.radians(10.0),
+    bend=math.radians(5.0),
+    sure=3.5,
+    quiet=math.radians(1.2),
+    floor=math.radians(0.05),
+    lowest=math.radians(5.0),
+)
+"""What the device and its reference are told."""
+
+_FLAGS = ("clean", "lines", "more", "ways")
 
 
 def find_edges(
@@ -22,24 +31,22 @@ def find_edges(
     *,
     device: str | Device | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw thin lines where the normal jumps by more than 10 degrees, and round the contact.
+    """Draw thin lines where the normal jumps by more than 10 degrees, and where contact ends.
 
-    A pixel is compared with its neighbour to the right and below. Where their standard errors make a jump
-    uncertain by more than 1.6 degrees, means of 2 x 3 pixels on either side are compared, or of 3 x 5. A
-    jump must be 4 of its standard errors. Lines are where it is largest; where contact ends, the first pixels
-    outside. The picture's border is no edge, nor is a pixel that nearly all neighbours contradict about
-    contact. A surface that bends by 3 degrees a pixel looks like an edge to the widest means.
+    A steady bend is no jump, and a jump must be 3.5 of its standard errors. Flags of contact that nearly
+    all neighbours contradict are mistakes. Where contact ends, the last pixels in contact are drawn:
+    those with one of four neighbours out of it. The picture's border is no edge.
 
     Parameters
     ----------
     vectors : ndarray, (H, W, 3), float32
         Unit normals; NaN where there is none.
     sigma : ndarray, (H, W), float32
-        Their standard error, radians.
+        Their predicted RMS angular error, radians.
     contact : ndarray, (H, W), uint8
         1 where there is contact in every frame.
     device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 28 bytes a pixel.
+        See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 74 bytes a pixel.
 
     Returns
     -------
@@ -57,29 +64,85 @@ def find_edges(
     if contact.ndim != 2 or vectors.shape != (*shape, 3) or sigma.shape != shape or 0 in shape:
         told = f"vectors {vectors.shape}, sigma {sigma.shape} and contact {shape}"
         raise InputError(f"{told} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
-    opened = open_device(device)
-    normals, error = _put(opened, "vectors", vectors, np.float32), _put(opened, "sigma", sigma, np.float32)
-    touched = _put(opened, "contact", contact != 0, np.uint8)
-    clean, edges = (_put(opened, name, np.zeros(shape, np.uint8), np.uint8) for name in ("clean", "edges"))
-    jumps = opened.array("jumps", (2, *shape), np.float32)
-    jumps.upload()
-    size = np.int32(shape[0]), np.int32(shape[1])
-    limits = np.float32(_LEAST), np.float32(_QUIET), np.float32(_SURE)
-    _run(opened, "edges_clean", touched, clean, *size)
-    _run(opened, "edges_jumps", normals, error, clean, jumps, *size, *limits)
-    _run(opened, "edges_thin", jumps, clean, edges, *size)
-    return edges.download().copy()
+    return _Drawing(open_device(device), vectors, sigma, contact).draw()
 
 
-def _put(device: Device, name: str, values: NDArray[np.generic], dtype: type[np.generic]) -> Array:
-    array = device.array(name, values.shape, dtype)
-    array.host[:] = values
-    array.upload()
-    return array
+class _Drawing:
+    """The maps of one picture on a device, and the kernels over them."""
 
+    def __init__(
+        self,
+        device: Device,
+        vectors: NDArray[np.float32],
+        sigma: NDArray[np.float32],
+        contact: NDArray[np.uint8],
+    ) -> None:
+        rows, columns = contact.shape
+        self._device, self._shape = device, (rows, columns)
+        cells = (6, rows + 2 * MARGIN, columns + 2 * MARGIN)
+        self._maps = {
+            "vectors": self._put("vectors", vectors, np.float32),
+            "sigma": self._put("sigma", sigma, np.float32),
+            "contact": self._put("contact", contact != 0, np.uint8),
+            "doubt": self._put("doubt", np.ones(contact.shape), np.uint8),
+            **{name: self._room(name, contact.shape, np.uint8) for name in _FLAGS},
+            "strength": self._room("strength", contact.shape, np.float32),
+            **{name: self._room(name, cells, np.float32) for name in ("cells", "joined")},
+        }
 
-def _run(device: Device, name: str, *arguments: Array | np.generic) -> None:
-    maps = [one.host for one in arguments if isinstance(one, Array)]
-    pixels = maps[-1].shape[-2] * maps[-1].shape[-1]
-    kernel = device.kernel("edges", name)
-    kernel(-(-pixels // device.shape.tile), *arguments, moved=sum(one.nbytes for one in maps))
+    def draw(self) -> NDArray[np.uint8]:
+        """Return the edges."""
+        rows = self._shape[0] + 2 * MARGIN
+        self._run("edges_clean", self._tiles, "contact", "clean")
+        self._run("edges_cells", rows, "vectors", "sigma", "contact", "clean", "cells")
+        self._look(NEAR, "cells", "lines", "more")
+        self._look(FINE, "cells", "more", "lines")
+        self._run("edges_join", rows, "cells", "lines", "joined")
+        self._look(COARSE, "joined", "lines", "more")
+        self._run("edges_bound", self._tiles, "clean", "more", "lines")
+        return self._maps["lines"].download().copy()
+
+    def _look(self, chosen: Pass, cells: str, before: str, after: str) -> None:
+        """Add the lines of one pass."""
+        macros: dict[str, str | int] = {
+            "SPACING": chosen.spacing,
+            "STEPS": chosen.steps,
+            "LEAST": f"{chosen.least}f",
+            "REACH": chosen.reach,
+            "GUARD": chosen.guard,
+            "PART": f"{chosen.part}f",
+            "LAST": int(chosen is COARSE),
+        }
+        places, distances = pairs(chosen)
+        table = self._put("places", places, np.int32), self._put("distances", distances, np.float32)
+        limits = LIMITS.jump, LIMITS.bend, LIMITS.sure, LIMITS.quiet, LIMITS.floor, LIMITS.lowest
+        rows, columns = self._shape
+        run = min(self._device.shape.tile, 64)
+        found = "doubt", "strength", "ways"
+        self._run("edges_jumps", rows * -(-columns // run), cells, *table, *limits, *found, **macros)
+        self._run("edges_thin", self._tiles, "strength", "ways", before, after, **macros)
+
+    @property
+    def _tiles(self) -> int:
+        rows, columns = self._shape
+        return int(-(-rows * columns // self._device.shape.tile))
+
+    def _put(self, name: str, values: ArrayLike, dtype: type[np.generic]) -> Array:
+        array = self._room(name, np.shape(values), dtype)
+        array.claim()
+        array.host[:] = values
+        array.upload()
+        return array
+
+    def _room(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
+        array = self._device.array(name, shape, dtype)
+        array.upload()
+        return array
+
+    def _run(self, name: str, items: int, *arguments: str | float | Array, **macros: str | int) -> None:
+        values: list[Array | np.generic] = [np.int32(size) for size in self._shape]
+        for one in arguments:
+            kept = self._maps[one] if isinstance(one, str) else one
+            values.append(kept if isinstance(kept, Array) else np.float32(kept))
+        moved = sum(one.host.nbytes for one in values if isinstance(one, Array))
+        self._device.kernel("edges", name, **macros)(items, *values, moved=moved)

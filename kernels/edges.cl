@@ -1,154 +1,274 @@
 // Where the normal jumps, and where contact ends. Specification: edges.py.
 //
-// TILE     pixels of one work-item
+// TILE      pixels of one work-item, at most CHUNK of them side by side; 1 where an item is a lane
+// SPACING   pixels from place to place, and along the side of a cell
+// STEPS     distances from the pixel at which there are pairs: 3, or 2 that must agree
+// LEAST     pairs that must be known
+// REACH     pixels across a line over which it must be the highest
+// GUARD     pixels from the lines of the passes before within which there is no other
+// PART      of the mean difference that the jump must be
+// LAST      1 in the last pass
 //
-// Maps are (rows, columns). `vectors` holds x, y and z of each pixel side by side; of `jumps`, the first plane tells of a
-// pixel and its neighbour to the right, the second of it and the one below.
+// Cells are six planes (x, y, z, variance, share known, 1 where no line is drawn), with a margin so that no pair leaves
+// them. PoCL makes vector code of loops over pixels without calls, branches and loops inside.
 
-#define SURELY_LESS 0.99f  // cosine of 8 degrees
-#define WIDEST 3  // means of windows: 1 pixel deep and 1 across, then 2 and 3, then 3 and 5
+#define WAYS 8
+#define MARGIN 10
+#define LINES 3
+
+#if TILE < 64
+#define CHUNK TILE
+#else
+#define CHUNK 64
+#endif
+
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
 
 #define EACH_PIXEL                                                                               \
-    const int first = (int)get_global_id(0) * TILE;                                              \
-    const int all = rows * columns;                                                              \
-    for (int p = first; p < (first + TILE < all ? first + TILE : all); ++p)
+    const int begin = (int)get_global_id(0) * TILE, all = rows * columns;                        \
+    for (int p = begin; p < LESSER(begin + TILE, all); ++p)
 
-// A pixel that nearly all of its neighbours contradict is a mistake.
-__kernel void edges_clean(__global const uchar *restrict contact, __global uchar *restrict clean, const int rows,
-                          const int columns)
+__kernel void edges_clean(
+    const int rows, const int columns, __global const uchar *restrict contact, __global uchar *restrict clean)
 {
     EACH_PIXEL {
         const int row = p / columns, column = p % columns;
-        int others = 0, known = 0;
-        for (int dy = -1; dy <= 1; ++dy) {
-            for (int dx = -1; dx <= 1; ++dx) {
-                const int y = row + dy, x = column + dx;
-                if ((dx || dy) && y >= 0 && y < rows && x >= 0 && x < columns) {
-                    ++known;
-                    others += (contact[y * columns + x] != 0) != (contact[p] != 0);
+        int near = 0, known = 0;
+        for (int y = GREATER(row - 1, 0); y <= LESSER(row + 1, rows - 1); ++y) {
+            for (int x = GREATER(column - 1, 0); x <= LESSER(column + 1, columns - 1); ++x) {
+                const int other = y != row || x != column;
+                near += other && contact[y * columns + x];
+                known += other;
+            }
+        }
+        clean[p] = contact[p] ? near > 1 || known < 2 : 4 * near >= 3 * known && known > 0;
+    }
+}
+
+// One item a row, of the cells with their margin.
+__kernel void edges_cells(
+    const int rows, const int columns, __global const float *restrict vectors, __global const float *restrict sigma,
+    __global const uchar *restrict contact, __global const uchar *restrict clean, __global float *restrict cells)
+{
+    const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
+    if (y >= rows + 2 * MARGIN) return;
+    const int row = y - MARGIN, outside = row < 0 || row >= rows;
+    for (int x = 0; x < stride; ++x) {
+        const int column = x - MARGIN, q = y * stride + x;
+        const int p = outside || column < 0 || column >= columns ? -1 : row * columns + column;
+        float part[4] = {0, 0, 0, 0};
+        int known = 0;
+        if (p >= 0 && clean[p] && contact[p]) {
+            part[3] = sigma[p] * sigma[p];
+            known = sigma[p] >= 0 && sigma[p] < INFINITY;
+            for (int i = 0; i < 3; ++i) {
+                part[i] = vectors[3 * p + i];
+                known &= isfinite(part[i]) != 0;
+            }
+        }
+        for (int i = 0; i < 4; ++i) cells[i * plane + q] = known ? part[i] : 0;
+        cells[4 * plane + q] = known;
+        cells[5 * plane + q] = 1;
+    }
+}
+
+// One item a row, of the cells with their margin.
+__kernel void edges_join(
+    const int rows, const int columns, __global const float *restrict cells, __global const uchar *restrict edges,
+    __global float *restrict joined)
+{
+    const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
+    if (y >= rows + 2 * MARGIN) return;
+    const int rim = y == 0 || y == rows + 2 * MARGIN - 1;
+    for (int x = 0; x < stride; ++x) {
+        float sum[4] = {0, 0, 0, 0}, count = 0;
+        int drawn = 0;
+        for (int k = 0; k < 9 && !rim && x > 0 && x < stride - 1; ++k) {
+            const int down = y + k / 3 - 1, right = x + k % 3 - 1, q = down * stride + right;
+            const int row = down - MARGIN, column = right - MARGIN;
+            for (int i = 0; i < 4; ++i) sum[i] += cells[i * plane + q];
+            count += cells[4 * plane + q];
+            if (row >= 0 && row < rows && column >= 0 && column < columns) drawn |= edges[row * columns + column];
+        }
+        for (int i = 0; i < 4; ++i) joined[i * plane + y * stride + x] = sum[i] / GREATER(count, 1);
+        joined[4 * plane + y * stride + x] = count / 9;
+        joined[5 * plane + y * stride + x] = !rim && x > 0 && x < stride - 1 && !drawn;
+    }
+}
+
+#ifdef SPACING
+// Runs of CHUNK pixels of a row, one an item.
+__kernel void edges_jumps(
+    const int rows, const int columns, __global const float *restrict cells, __global const int *restrict places,
+    __global const float *restrict distances, const float jump, const float bend, const float sure, const float quiet,
+    const float floor_, const float lowest, __global uchar *restrict doubt, __global float *restrict strength,
+    __global uchar *restrict ways)
+{
+    const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
+    const int first = (int)get_global_id(0) % runs * CHUNK;
+    if (row >= rows) return;
+    const int width = LESSER(CHUNK, columns - first), target = row * columns + first;
+    int busy = 0;
+    for (int i = 0; i < width; ++i) busy |= doubt[target + i];
+    if (!busy) {
+        for (int i = 0; i < width; ++i) strength[target + i] = 0;
+        return;
+    }
+    const int stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
+    __global const float *x = cells + (row + MARGIN) * stride + first + MARGIN, *y = x + plane, *z = y + plane;
+    __global const float *variance = z + plane, *share = variance + plane, *unbarred = share + plane;
+
+    float best[CHUNK], square[CHUNK], error[CHUNK], least[CHUNK];
+    int way[CHUNK];
+    for (int i = 0; i < width; ++i) {
+        best[i] = square[i] = error[i] = 0;
+        least[i] = 1e30f;
+        way[i] = 0;
+    }
+    for (int w = 0; w < WAYS; ++w) {
+        float n[CHUNK], u1[CHUNK], u2[CHUNK], v[CHUNK];
+        float x0[CHUNK], y0[CHUNK], z0[CHUNK], x1[CHUNK], y1[CHUNK], z1[CHUNK];
+        for (int i = 0; i < width; ++i) n[i] = u1[i] = u2[i] = v[i] = x0[i] = y0[i] = z0[i] = x1[i] = y1[i] = z1[i] = 0;
+        for (int line = 0; line < LINES; ++line) {
+            float open[CHUNK];
+            for (int i = 0; i < width; ++i) open[i] = 1;
+            for (int step = 0; step < STEPS; ++step) {
+                const int pair = (w * LINES + line) * STEPS + step;
+                const int away = places[2 * pair + 1] * stride + places[2 * pair];
+                const float u = distances[pair], there = u > 0;
+#if SPACING > 1
+                if (step > 0) {
+                    for (int i = 0; i < width; ++i) open[i] *= unbarred[i + away] * unbarred[i - away];
+                }
+#endif
+                for (int i = 0; i < width; ++i) {
+                    const float both = share[i + away] * share[i - away] * open[i] * there;
+#if STEPS == 2
+                    const float weight = step == 0 ? both : 0, moment = step == 0 ? 0 : both;
+#else
+                    const float weight = both, moment = both * u;
+#endif
+                    const float dx = x[i + away] - x[i - away], dy = y[i + away] - y[i - away];
+                    const float dz = z[i + away] - z[i - away];
+                    n[i] += weight;
+                    u1[i] += moment;
+                    u2[i] += moment * u;
+                    v[i] += weight * (variance[i + away] + variance[i - away]);
+                    x0[i] += weight * dx;
+                    y0[i] += weight * dy;
+                    z0[i] += weight * dz;
+                    x1[i] += moment * dx;
+                    y1[i] += moment * dy;
+                    z1[i] += moment * dz;
                 }
             }
         }
-        clean[p] = (contact[p] != 0) != (known > 1 && others >= known - 1);
-    }
-}
-
-typedef struct { float x, y, z, variance; int known; } Side;
-
-// The sum of normals on one side of a border: `deep` pixels from p on along `along`, as many as `wide` to either side.
-Side gather(__global const float *vectors, __global const float *sigma, __global const uchar *clean, const int rows,
-            const int columns, const int row, const int column, const int down, const int way, const int deep,
-            const int wide)
-{
-    Side side = {0.0f, 0.0f, 0.0f, 0.0f, 0};
-    for (int i = 0; i < deep; ++i) {
-        for (int j = -wide; j <= wide; ++j) {
-            const int y = row + (down ? way * i : j), x = column + (down ? j : way * i);
-            if (y < 0 || y >= rows || x < 0 || x >= columns) continue;
-            const int q = y * columns + x;
-            if (!clean[q] || !(sigma[q] >= 0.0f)) continue;
-            side.x += vectors[3L * q];
-            side.y += vectors[3L * q + 1];
-            side.z += vectors[3L * q + 2];
-            side.variance += sigma[q] * sigma[q];
-            ++side.known;
+        for (int i = 0; i < width; ++i) {
+            int usable = n[i] >= LEAST;
+            const float per_n = 1 / GREATER(n[i], 0.1f);
+            const float mean = (x0[i] * x0[i] + y0[i] * y0[i] + z0[i] * z0[i]) * per_n * per_n;
+#if STEPS == 2
+            usable &= u1[i] >= LEAST;
+            const float part = per_n, per_far = 1 / GREATER(u1[i], 0.1f);
+            const float far = (x1[i] * x1[i] + y1[i] * y1[i] + z1[i] * z1[i]) * per_far * per_far;
+            const float common = (x0[i] * x1[i] + y0[i] * y1[i] + z0[i] * z1[i]) * per_n * per_far;
+            const float found = common * common / GREATER(GREATER(mean, far), 1e-30f);
+            const int real = usable & (common > 0);
+#else
+            const float spread = n[i] * u2[i] - u1[i] * u1[i];
+            usable &= spread > 1e-3f * n[i] * u2[i];
+            const float per_spread = 1 / (usable ? spread : 1), part = u2[i] * per_spread;
+            const float jump_x = (u2[i] * x0[i] - u1[i] * x1[i]) * per_spread;
+            const float jump_y = (u2[i] * y0[i] - u1[i] * y1[i]) * per_spread;
+            const float jump_z = (u2[i] * z0[i] - u1[i] * z1[i]) * per_spread;
+            const float found = jump_x * jump_x + jump_y * jump_y + jump_z * jump_z;
+            const float both = (jump_x * x0[i] + jump_y * y0[i] + jump_z * z0[i]) * per_n;
+            const int real = usable & (found >= PART * PART * mean) & (2 * both >= found);
+#endif
+            const float noise = part * v[i] * per_n * (1.0f / (SPACING * SPACING)) + floor_ * floor_;
+            const float told = real ? found / noise : 0;
+            const int better = told > best[i];
+            least[i] = (usable & (noise < least[i])) ? noise : least[i];
+            best[i] = better ? told : best[i];
+            square[i] = better ? found : square[i];
+            error[i] = better ? noise : error[i];
+            way[i] = better ? w : way[i];
         }
     }
-    return side;
+    for (int i = 0; i < width; ++i) {
+        const int unclear = (STEPS == 2) | (least[i] > quiet * quiet);
+        const int clear = LAST | !unclear;
+        const float deviation = sqrt(error[i]), wanted = jump + (clear ? -1 : 0.5f) * deviation;
+        const float enough = GREATER(GREATER(wanted, lowest), sure * deviation) + (STEPS == 2 ? bend : 0);
+        const int edge = doubt[target + i] && best[i] > 0 && sqrt(square[i]) >= enough;
+        strength[target + i] = edge ? sqrt(best[i]) : 0;
+        ways[target + i] = way[i];
+        doubt[target + i] &= unclear;
+    }
 }
 
-// The angle between two sides if it is an edge, else 0. Cosines first: hardly any pixel needs the angle itself.
-float jump_between(const Side a, const Side b, const float noise, const float least, const float sure)
+float at(__global const float *strength, const int rows, const int columns, const int row, const int column)
 {
-    const float dot = a.x * b.x + a.y * b.y + a.z * b.z;
-    const float lengths = sqrt((a.x * a.x + a.y * a.y + a.z * a.z) * (b.x * b.x + b.y * b.y + b.z * b.z));
-    if (dot > SURELY_LESS * lengths) return 0.0f;
-    const float x = a.y * b.z - a.z * b.y, y = a.z * b.x - a.x * b.z, z = a.x * b.y - a.y * b.x;
-    const float angle = atan2(sqrt(x * x + y * y + z * z), dot);
-    return angle > least && angle > sure * noise ? angle : 0.0f;
+    return row >= 0 && row < rows && column >= 0 && column < columns ? strength[row * columns + column] : 0;
 }
 
-// Whether two normals are so sure that no mean of more is needed, and hardly differ.
-int alike(__global const float *vectors, __global const float *sigma, const int p, const int q, const float quiet)
+// Whether a line of the passes before lies beside a pixel, or on it.
+int guarded(__global const uchar *edges, const int rows, const int columns, const int row, const int column,
+            const float cosine, const float sine)
 {
-    const float dot = vectors[3L * p] * vectors[3L * q] + vectors[3L * p + 1] * vectors[3L * q + 1]
-        + vectors[3L * p + 2] * vectors[3L * q + 2];
-    return sigma[p] * sigma[p] + sigma[q] * sigma[q] <= quiet * quiet && dot > SURELY_LESS;
+    for (int y = GREATER(row - GUARD, 0); y <= LESSER(row + GUARD, rows - 1); ++y) {
+        for (int x = GREATER(column - GUARD, 0); x <= LESSER(column + GUARD, columns - 1); ++x) {
+            const int down = y - row, right = x - column;
+            const float along = fabs(right * cosine + down * sine), across = fabs(down * cosine - right * sine);
+            if (edges[y * columns + x] && along <= GUARD + 0.2f && across <= along + 0.1f) return 1;
+        }
+    }
+    return 0;
 }
 
-__kernel void edges_jumps(__global const float *restrict vectors, __global const float *restrict sigma,
-                          __global const uchar *restrict clean, __global float *restrict jumps, const int rows,
-                          const int columns, const float least, const float quiet, const float sure)
+__kernel void edges_thin(
+    const int rows, const int columns, __global const float *restrict strength, __global const uchar *restrict ways,
+    __global const uchar *restrict edges, __global uchar *restrict added)
+{
+    EACH_PIXEL {
+        float here = strength[p];
+        added[p] = edges[p];
+        if (!(here > 0)) continue;
+        const int row = p / columns, column = p % columns;
+        const float angle = M_PI_F / WAYS * ways[p], cosine = cos(angle), sine = sin(angle);
+        for (int step = 1; step <= REACH; ++step) {
+            const int right = (int)floor(step * cosine + 0.5f), down = (int)floor(step * sine + 0.5f);
+            if (at(strength, rows, columns, row + down, column + right) > here) here = 0;
+            if (at(strength, rows, columns, row - down, column - right) >= here) here = 0;
+        }
+        if (here > 0 && !guarded(edges, rows, columns, row, column, cosine, sine)) added[p] = 1;
+    }
+}
+#endif
+
+// Whether a pixel in contact has one of four neighbours out of it; the picture's end is no end of contact.
+int ends(__global const uchar *clean, const int rows, const int columns, const int row, const int column)
+{
+    const int p = row * columns + column;
+    return clean[p] && ((row > 0 && !clean[p - columns]) || (row + 1 < rows && !clean[p + columns])
+        || (column > 0 && !clean[p - 1]) || (column + 1 < columns && !clean[p + 1]));
+}
+
+__kernel void edges_bound(
+    const int rows, const int columns, __global const uchar *restrict clean, __global const uchar *restrict edges,
+    __global uchar *restrict drawn)
 {
     EACH_PIXEL {
         const int row = p / columns, column = p % columns;
-        for (int down = 0; down < 2; ++down) {
-            float found = 0.0f;
-            const int last = down ? row + 1 >= rows : column + 1 >= columns, next = p + (down ? columns : 1);
-            // Quiet and alike, as nearly all are, or of no contact: that needs no window.
-            const int plain = last || !clean[p] || !clean[next] || alike(vectors, sigma, p, next, quiet);
-            for (int deep = 1; deep <= WIDEST && !plain; ++deep) {
-                const int wide = deep - 1, enough = (deep * (2 * wide + 1) + 1) / 2;
-                const Side a = gather(vectors, sigma, clean, rows, columns, row, column, down, -1, deep, wide);
-                const Side b = gather(vectors, sigma, clean, rows, columns, row + down, column + 1 - down, down, 1,
-                                      deep, wide);
-                if (a.known < enough || b.known < enough) continue;
-                const float noise = sqrt(a.variance / (a.known * a.known) + b.variance / (b.known * b.known));
-                if (noise > quiet && deep < WIDEST) continue;
-                found = jump_between(a, b, noise, least, sure);
-                break;
+        int edge = ends(clean, rows, columns, row, column);
+        if (!edge && edges[p] && clean[p]) {
+            edge = 1;
+            for (int y = GREATER(row - 1, 0); y <= LESSER(row + 1, rows - 1); ++y) {
+                for (int x = GREATER(column - 1, 0); x <= LESSER(column + 1, columns - 1); ++x)
+                    edge &= !ends(clean, rows, columns, y, x);
             }
-            jumps[(long)down * all + p] = found;
         }
-    }
-}
-
-// A jump in a row or column of them; 0 beyond its ends.
-float jump_at(__global const float *jumps, const int place, const int length, const int stride)
-{
-    return place >= 0 && place < length ? jumps[place * stride] : 0.0f;
-}
-
-// Whether the jump between a pixel and the next is the largest around, and which of the two is nearer to it: 0 neither.
-int side_of(__global const float *jumps, const int place, const int length, const int stride)
-{
-    const float mine = jump_at(jumps, place, length, stride);
-    if (!(mine > 0.0f)) return 0;
-    for (int step = 1; step <= WIDEST; ++step) {
-        if (jump_at(jumps, place + step, length, stride) > mine) return 0;
-        if (jump_at(jumps, place - step, length, stride) >= mine) return 0;
-    }
-    return jump_at(jumps, place + 1, length, stride) > jump_at(jumps, place - 1, length, stride) ? 2 : 1;
-}
-
-// The jump of a line that crosses a row or column at a place; 0 without one.
-float crossed(__global const float *jumps, const int place, const int length, const int stride)
-{
-    if (side_of(jumps, place, length, stride) == 1) return jump_at(jumps, place, length, stride);
-    return side_of(jumps, place - 1, length, stride) == 2 ? jump_at(jumps, place - 1, length, stride) : 0.0f;
-}
-
-// The larger of the jumps on either side of a place.
-float beside(__global const float *jumps, const int place, const int length, const int stride)
-{
-    const float before = jump_at(jumps, place - 1, length, stride), after = jump_at(jumps, place, length, stride);
-    return before > after ? before : after;
-}
-
-__kernel void edges_thin(__global const float *restrict jumps, __global const uchar *restrict clean,
-                         __global uchar *restrict edges, const int rows, const int columns)
-{
-    EACH_PIXEL {
-        const int row = p / columns, column = p % columns;
-        __global const float *right = jumps + row * columns, *below = jumps + all + column;
-        // Of a slanting line, that way tells best on which it is crossed more steeply.
-        const float across = crossed(right, column, columns, 1), down = crossed(below, row, rows, columns);
-        int edge = (across > 0.0f && across >= beside(below, row, rows, columns))
-            || (down > 0.0f && down >= beside(right, column, columns, 1));
-        if (!clean[p]) {
-            edge = (column > 0 && clean[p - 1]) || (column + 1 < columns && clean[p + 1])
-                || (row > 0 && clean[p - columns]) || (row + 1 < rows && clean[p + columns]);
-        }
-        edges[p] = edge;
+        drawn[p] = edge;
     }
 }

@@ -1,150 +1,326 @@
-"""Edges of what is touched: what ``edges.cl`` computes, in NumPy with float64.
+"""Edges of what is touched: what ``edges.cl`` computes, in plain NumPy with float64 inside.
 
-Between a pixel and its neighbour, to the right or below, the means of the normals on either side are
-compared: of one pixel each where these are quiet, else of two or three deep and three or five across. The
-first that is quiet enough counts.
+At a pixel and in eight directions, pairs of places that lie point-symmetric about it are compared. What is
+even about the pixel cancels in their differences; what is left is a straight line over the distance: its
+slope is the surface's bend, its height at distance 0 is the jump (least squares). Three passes look for ever
+smaller jumps in ever more noise: `NEAR` wants two distances to agree and bears with some bend, `FINE` fits
+lines to three distances, `COARSE` to three distances of means of 3 x 3 pixels. A pass decides where jumps are
+clear; the last looks where they are not, and not across the lines that are drawn already.
 """
 
 from __future__ import annotations
 
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-T = TypeVar("T", bound=np.generic)
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WIDEST = 3
-"""Pixels that the widest window is deep; it is one less than twice as many across."""
+WAYS = 8  # directions, over half a turn
+MARGIN = 10  # pixels round the cells, so that no pair leaves them
+CELLS = ("x", "y", "z", "variance", "share", "free")
+"""Planes of the cells: mean normal, mean square sigma, share of pixels known, 1 where no line is drawn."""
 
 
-def edges_clean(contact: Mask) -> Mask:
-    """Turn over the pixels that all neighbours but one, or all, contradict.
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """How one pass compares.
 
-    Parameters
+    Attributes
     ----------
-    contact : ndarray, (H, W), bool
+    spacing : int
+        Pixels from place to place, and along the side of a cell.
+    steps : int
+        Distances from the pixel at which there are pairs; of two, no bend is told.
+    least : float
+        Pairs that must be known, at each distance where there are two, else in all.
+    reach : int
+        Pixels across a line over which it must be the highest.
+    guard : int
+        Pixels from the lines of the passes before within which there is no other.
+    part : float
+        Of the mean difference that the jump must be: what is less is a bend.
+    """
+
+    spacing: int
+    steps: int
+    least: float
+    reach: int
+    guard: int
+    part: float = 0.0
+
+
+NEAR = Pass(spacing=1, steps=2, least=1.5, reach=2, guard=0)
+FINE = Pass(spacing=1, steps=3, least=4.5, reach=2, guard=2, part=0.5)
+COARSE = Pass(spacing=3, steps=3, least=5.4, reach=3, guard=5, part=0.6)
+PASSES = (NEAR, FINE, COARSE)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When a jump is an edge; angles in radians.
+
+    Attributes
+    ----------
+    jump : float
+        Angle to look for.
+    bend : float
+        What `NEAR` adds, as it takes bends for jumps.
+    sure : float
+        Standard errors that a jump must have.
+    quiet : float
+        Standard error of a jump with which no coarser pass is needed.
+    floor : float
+        Standard error of a jump that there always is.
+    lowest : float
+        Angle below which nothing is an edge.
+    """
+
+    jump: float
+    bend: float
+    sure: float
+    quiet: float
+    floor: float
+    lowest: float
+
+
+def pairs(chosen: Pass) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return where the pairs of a pass lie.
 
     Returns
     -------
-    ndarray, (H, W), bool
+    places : ndarray, (WAYS, 3, steps, 2), int32
+        Columns to the right and rows down, of three lines side by side; the other place is the negative.
+    distances : ndarray, (WAYS, 3, steps), float32
+        From the pixel along the direction; 0 for a place that is there already.
     """
-    inside = np.ones_like(contact, np.int64)
-    around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
-    known = sum(_moved(inside, *way) for way in around)
-    same = sum(
-        _moved((contact == one).astype(np.int64), *way) * (contact == one)
-        for one in (False, True)
-        for way in around
-    )
-    wrong: Mask = (np.asarray(known) > 1) & (np.asarray(known) - np.asarray(same) >= np.asarray(known) - 1)
-    return np.asarray(contact != wrong)
+    angle = np.pi / WAYS * np.arange(WAYS)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, np.newaxis, np.newaxis]
+    across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)[:, np.newaxis, np.newaxis]
+    away = chosen.spacing * np.arange(chosen.steps) + (chosen.spacing + 1) / 2
+    aside = chosen.spacing * np.array([0, -1, 1])
+    exact = away[:, np.newaxis] * along + aside[:, np.newaxis, np.newaxis] * across
+    places = np.floor(exact + 0.5 + 1e-9).astype(np.int32)
+    distances = np.sum(places * along, axis=-1).astype(np.float32)
+    for way in range(WAYS):
+        flat = places[way].reshape(-1, 2)
+        again = [any((one == flat[:k]).all(axis=1)) for k, one in enumerate(flat)]
+        distances[way].reshape(-1)[again] = 0
+    return places, distances
+
+
+def edges_clean(contact: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Turn over the flags, (H, W), that a pixel's neighbours contradict.
+
+    A pixel out of contact needs three quarters of them in contact to be so, too: of eight, six, which fills
+    lines one pixel wide and no corner. One in contact needs all but one of them out of it.
+    """
+    touched = np.pad((contact != 0).astype(np.int64), 1)
+    inside = np.pad(np.ones(contact.shape, np.int64), 1)
+    rows, columns = contact.shape
+    around = [np.s_[y : y + rows, x : x + columns] for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+    near, known = (np.sum([one[place] for place in around], axis=0) for one in (touched, inside))
+    stays, fills = (near > 1) | (known < 2), (4 * near >= 3 * known) & (known > 0)
+    return np.asarray(np.where(contact != 0, stays, fills), np.uint8)
+
+
+def edges_cells(
+    vectors: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    contact: NDArray[np.uint8],
+    clean: NDArray[np.uint8],
+) -> Doubles:
+    """Return the cells of one pixel each, (6, H + 2 MARGIN, W + 2 MARGIN), nothing known in the margin.
+
+    Parameters
+    ----------
+    vectors : ndarray, (H, W, 3), float32
+        Unit normals; NaN where there is none.
+    sigma : ndarray, (H, W), float32
+        Their standard error, radians.
+    contact, clean : ndarray, (H, W), uint8
+        1 where there is contact. A normal counts only where both say so: what is flagged along a crease saw
+        both of its sides in turn.
+    """
+    known = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
+    known &= sigma < np.inf
+    maps = [*np.moveaxis(vectors.astype(np.float64), -1, 0), sigma.astype(np.float64) ** 2]
+    planes = [*(np.where(known, one, 0.0) for one in maps), known.astype(np.float64)]
+    cells = np.pad(np.stack(planes), ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
+    return np.concatenate([cells, np.ones((1, *cells.shape[1:]))])
+
+
+def edges_join(cells: Doubles, edges: NDArray[np.uint8]) -> Doubles:
+    """Return cells of 3 x 3 pixels about each pixel, from those of one pixel and the lines so far."""
+    known, drawn = cells[4], np.pad(edges != 0, MARGIN)
+    joined = np.zeros_like(cells)
+    rows, columns = (slice(1, size - 1) for size in known.shape)
+    last = known.shape[0] - 2, known.shape[1] - 2
+    around = [np.s_[y : y + last[0], x : x + last[1]] for y in range(3) for x in range(3)]
+    count = np.sum([known[place] for place in around], axis=0)
+    for number in range(4):
+        total = np.sum([(known * cells[number])[place] for place in around], axis=0)
+        joined[number, rows, columns] = total / np.maximum(count, 1)
+    joined[4, rows, columns] = count / 9
+    joined[5, rows, columns] = ~np.any([drawn[place] for place in around], axis=0)
+    return joined
 
 
 def edges_jumps(
-    vectors: Doubles, sigma: Doubles, clean: Mask, least: float, quiet: float, sure: float
-) -> Doubles:
-    """Tell by which angle the normal jumps between neighbours.
+    cells: Doubles, chosen: Pass, limits: Limits, doubt: NDArray[np.uint8]
+) -> tuple[Doubles, NDArray[np.uint8]]:
+    """Look for jumps of the normal; ``doubt`` is changed in place.
 
     Parameters
     ----------
-    vectors : ndarray, (H, W, 3), float64
-    sigma : ndarray, (H, W), float64
-        Standard error of the normals, radians; NaN where there is none.
-    clean : ndarray, (H, W), bool
-        Where there is contact.
-    least : float
-        Smallest jump that counts, radians.
-    quiet : float
-        Standard error of a jump with which no wider window is needed, radians.
-    sure : float
-        Standard errors that a jump must have.
+    cells : ndarray, (6, H + 2 MARGIN, W + 2 MARGIN), float64
+    chosen : Pass
+    limits : Limits
+    doubt : ndarray, (H, W), uint8
+        1 where the passes so far are not quiet enough to decide; pixels without doubt have no jump.
 
     Returns
     -------
-    ndarray, (2, H, W), float64
-        Between a pixel and its neighbour to the right, and below; 0 where there is none.
+    strength : ndarray, (H, W), float64
+        Jump in standard errors, in the direction where that is largest; 0 where it is no edge.
+    way : ndarray, (H, W), uint8
+        Number of that direction, clockwise from x as seen in the picture.
     """
-    known = clean & (sigma >= 0)
-    maps = [known.astype(np.float64), np.where(known, sigma, 0.0) ** 2]
-    maps += [np.where(known, vectors[..., axis], 0.0) for axis in range(3)]
-    jumps = np.zeros((2, *clean.shape))
-    for down, jump in enumerate(jumps):
-        open_ = np.ones_like(clean)
-        open_[(slice(None), -1) if not down else -1] = False
-        for deep in range(1, WIDEST + 1):
-            here, there = ([_side(one, down, way, deep) for one in maps] for way in (-1, 1))
-            enough = (deep * (2 * deep - 1) + 1) // 2
-            seen = open_ & (here[0] >= enough) & (there[0] >= enough)
-            noise = np.sqrt(sum(side[1] / np.maximum(side[0], 1) ** 2 for side in (here, there)))
-            told = seen & ((noise <= quiet) | (deep == WIDEST))
-            a, b = np.stack(here[2:], axis=-1), np.stack(there[2:], axis=-1)
-            angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
-            jump[told] = np.where((angle > least) & (angle > sure * noise), angle, 0.0)[told]
-            open_ &= ~told
-    return jumps
+    strength, way = np.zeros(doubt.shape), np.zeros(doubt.shape, np.uint8)
+    jump, error, least = np.zeros(doubt.shape), np.zeros(doubt.shape), np.full(doubt.shape, np.inf)
+    for number, (places, distances) in enumerate(zip(*pairs(chosen), strict=True)):
+        fitted = _fit(cells, chosen, places, distances, limits.floor)
+        least = np.fmin(least, fitted[1])
+        told = np.where(fitted[2], fitted[0] / fitted[1], 0)
+        better = told > strength
+        strength[better], way[better] = told[better], number
+        jump[better], error[better] = fitted[0][better], fitted[1][better]
+    unclear = (least > limits.quiet) | (chosen is NEAR)
+    clear = (chosen is COARSE) | ~unclear
+    wanted = limits.jump + np.where(clear, -1.0, 0.5) * error
+    bend = limits.bend if chosen is NEAR else 0.0
+    enough = np.maximum(np.maximum(wanted, limits.lowest), limits.sure * error) + bend
+    strength[(jump < enough) | (doubt == 0)] = 0
+    doubt &= unclear
+    return strength, way
 
 
-def edges_thin(jumps: Doubles, clean: Mask) -> Mask:
-    """Draw thin lines: at the largest jumps across them, and the first pixels out of contact.
+def _fit(
+    cells: Doubles, chosen: Pass, places: NDArray[np.int32], distances: NDArray[np.float32], floor: float
+) -> tuple[Doubles, Doubles, Mask]:
+    """Fit the jump in one direction: return it, its standard error, and where it is one and no bend."""
+    rows, columns = (size - 2 * MARGIN for size in cells.shape[1:])
 
-    Of the two pixels that a jump is between, that one is drawn which is next to the larger of the jumps
-    beside. A slanting line is drawn where rows cross it, or columns, whichever tell of the larger jump.
+    def at(right: int, down: int) -> Doubles:
+        return cells[:, MARGIN + down : MARGIN + down + rows, MARGIN + right : MARGIN + right + columns]
+
+    sums = np.zeros((10, rows, columns))  # of 1, u, u^2, variance, difference, u times difference
+    for line, away in zip(places, distances, strict=True):
+        open_ = np.ones((rows, columns))
+        for step, ((right, down), u) in enumerate(zip(line.tolist(), away.tolist(), strict=True)):
+            here, there = at(right, down), at(-right, -down)
+            if step > 0:
+                open_ = open_ * here[5] * there[5]
+            weight = here[4] * there[4] * open_ * (u > 0)
+            # Of two distances each is summed by itself.
+            once, moment = (step == 0, step == 1) if chosen.steps == 2 else (1.0, u)
+            difference = here[:3] - there[:3]
+            parts = [once, moment, moment * u, once * (here[3] + there[3])]
+            parts += [*(once * difference), *(moment * difference)]
+            sums += np.stack([weight * part for part in parts])
+    jump, share, usable, real = (_agreed if chosen.steps == 2 else _straight)(sums, chosen)
+    variance = sums[3] / np.where(usable, sums[0], 1.0) / chosen.spacing**2
+    error = np.where(usable, np.sqrt(share * variance + floor**2), np.inf)
+    return jump, error, usable & real
+
+
+def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
+    """Return the jump that differences at two distances agree on, its share of the variance, and flags."""
+    usable = (sums[0] >= chosen.least) & (sums[1] >= chosen.least)
+    near, far = (np.where(usable, part, 1.0) for part in sums[:2])
+    first, second = sums[4:7] / near, sums[7:] / far
+    longer = np.sqrt(np.maximum(np.sum(first**2, axis=0), np.sum(second**2, axis=0)))
+    common = np.sum(first * second, axis=0)
+    jump = np.where(usable & (common > 0), common / np.maximum(longer, 1e-15), 0.0)
+    return jump, 1 / near, usable, jump > 0
+
+
+def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
+    """Return the jump of straight lines, its share of the variance, and where it is told and is no bend."""
+    n, u1, u2 = sums[:3]
+    usable = n >= chosen.least
+    spread = n * u2 - u1 * u1
+    usable &= spread > 1e-3 * n * u2
+    n, spread = np.where(usable, n, 1.0), np.where(usable, spread, 1.0)
+    mean = sums[4:7] / n
+    jump = (u2 * sums[4:7] - u1 * sums[7:]) / spread
+    square, both = np.sum(jump**2, axis=0), np.sum(jump * mean, axis=0)
+    # Next to an edge the line overshoots, to the other side; where the surface bends the mean is larger.
+    real = (2 * both >= square) & (square >= chosen.part**2 * np.sum(mean**2, axis=0))
+    return np.sqrt(square), u2 / spread, usable, real
+
+
+def edges_thin(
+    strength: Doubles, way: NDArray[np.uint8], chosen: Pass, edges: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Add lines, where the strength is highest across them, to those drawn so far.
+
+    A pixel is not drawn where a line of the passes before lies within ``guard`` of it, in the direction of
+    its jump or up to 45 degrees from that: it would be the same one.
 
     Parameters
     ----------
-    jumps : ndarray, (2, H, W), float64
-    clean : ndarray, (H, W), bool
+    strength, way : ndarray, (H, W)
+        Of ``edges_jumps``.
+    chosen : Pass
+    edges : ndarray, (H, W), uint8
 
     Returns
     -------
-    ndarray, (H, W), bool
+    ndarray, (H, W), uint8
     """
-    edges = np.zeros_like(clean)
-    for down, jump in enumerate(jumps):
-        other = jumps[1 - down]
-        beside = np.maximum(other, _moved(other, *((0, -1) if down else (-1, 0))))
-        crossed = _crossed(jump, bool(down))
-        edges |= (crossed > 0) & (crossed >= beside)
-    out = np.zeros_like(clean)
-    for way in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        out |= _moved(clean, *way)
-    return np.where(clean, edges, out)
+    added = np.array(edges)
+    for row, column in np.argwhere(strength > 0):
+        angle = np.pi / WAYS * way[row, column]
+        cosine, sine = np.cos(angle), np.sin(angle)
+        here = strength[row, column]
+        for step in range(1, chosen.reach + 1):
+            right, down = int(np.floor(step * cosine + 0.5)), int(np.floor(step * sine + 0.5))
+            if _value(strength, row + down, column + right) > here:
+                here = 0.0
+            if _value(strength, row - down, column - right) >= here:
+                here = 0.0
+        if here > 0 and not _guarded(edges, row, column, cosine, sine, chosen.guard):
+            added[row, column] = 1
+    return added
 
 
-def _crossed(jump: Doubles, down: bool) -> Doubles:
-    """Return the jump at the pixels where a row or a column crosses a line, 0 elsewhere."""
-    highest = jump > 0
-    for step in range(1, WIDEST + 1):
-        highest &= _moved(jump, *_along(down, step)) <= jump
-        highest &= _moved(jump, *_along(down, -step)) < jump
-    later = _moved(jump, *_along(down, 1)) > _moved(jump, *_along(down, -1))
-    first = np.where(highest & ~later, jump, 0.0)
-    return np.where(first > 0, first, _moved(np.where(highest & later, jump, 0.0), *_along(down, -1)))
+def _value(values: NDArray[np.generic], row: int, column: int) -> float:
+    inside = 0 <= row < values.shape[0] and 0 <= column < values.shape[1]
+    return float(values[row, column]) if inside else 0.0
 
 
-def _along(down: bool, step: int) -> tuple[int, int]:
-    return (step, 0) if down else (0, step)
+def _guarded(edges: NDArray[np.uint8], row: int, column: int, cosine: float, sine: float, guard: int) -> bool:
+    """Tell whether a line lies beside a pixel, or on it."""
+    for down in range(-guard, guard + 1):
+        for right in range(-guard, guard + 1):
+            along = abs(right * cosine + down * sine)
+            across = abs(down * cosine - right * sine)
+            beside = along <= guard + 0.2 and across <= along + 0.1
+            if beside and _value(edges, row + down, column + right) > 0:
+                return True
+    return False
 
 
-def _moved(values: NDArray[T], down: int, right: int) -> NDArray[T]:
-    """Return at each pixel the value so far below and to the right of it, 0 beyond the picture."""
-    moved = np.zeros_like(values)
-    rows, columns = values.shape
-    to = (slice(max(0, -down), min(rows, rows - down)), slice(max(0, -right), min(columns, columns - right)))
-    from_ = (slice(max(0, down), min(rows, rows + down)), slice(max(0, right), min(columns, columns + right)))
-    if abs(down) < rows and abs(right) < columns:
-        moved[to] = values[from_]
-    return moved
-
-
-def _side(values: Doubles, down: int, way: int, deep: int) -> Doubles:
-    """Sum values on one side of the border to the right of each pixel, or below it."""
-    total = np.zeros_like(values)
-    for i in range(deep):
-        away = -i if way < 0 else i + 1
-        for j in range(1 - deep, deep):
-            total += _moved(values, *((away, j) if down else (j, away)))
-    return total
+def edges_bound(clean: NDArray[np.uint8], edges: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Draw the pixels in contact with one of four neighbours out of it; what is next to them makes way."""
+    touched = np.pad(clean != 0, 1, constant_values=True)
+    inner = touched[:-2, 1:-1] & touched[2:, 1:-1] & touched[1:-1, :-2] & touched[1:-1, 2:]
+    # The picture's end is no end of contact: beyond it all counts as touched.
+    bound = (clean != 0) & ~inner
+    around = np.pad(bound, 1)
+    rows, columns = clean.shape
+    near = np.any([around[y : y + rows, x : x + columns] for y in range(3) for x in range(3)], axis=0)
+    return np.asarray(bound | ((edges != 0) & (clean != 0) & ~near), np.uint8)
