@@ -205,6 +205,15 @@ def test_heights_register_the_frames():
     np.testing.assert_array_equal(np.isfinite(each.zenith[0]), inside)
 
 
+@pytest.mark.parametrize("shape", [(3, 3), SHAPE])
+def test_heights_at_which_nothing_is_seen_leave_no_answer(shape):
+    far = replace(HEADER, pivot=(0.0, 0.0, 400.0))
+    made = source(far, frames=frames()[:, : shape[0], : shape[1]])
+    result = engine.reconstruct(made, heights=np.full(shape, -1.0))
+    assert np.isnan(result.zenith).all()
+    assert not result.contact.any()
+
+
 @cache
 def twin(**camera):
     """A ball, pressed and turned about the sheet's centre; its brightness is linear from zenith 0 on."""
@@ -240,10 +249,12 @@ def test_registered_frames_have_honest_errors_where_the_noise_is_known():
     assert np.sqrt(np.mean(error**2)) < 0.8 * np.sqrt(np.mean(on_twin(made, None, **known)[1] ** 2))
 
 
-def test_the_shot_noise_of_a_camera_is_told():
+def test_registered_frames_have_honest_errors_where_the_noise_is_told():
     made = twin(electrons=40.0, gain_deviation=0.02, offset_deviation=0.5)
-    *_, result = on_twin(made, None)
+    square, _, zenith, result = on_twin(made, made.truth.height)
     assert result.process["shot_noise"] == pytest.approx(1 / 40, rel=0.15)
+    for low, high in ((8, 15), (15, 22), (22, 29)):
+        assert np.mean(square[(zenith > low) & (zenith < high)]) == pytest.approx(1, abs=0.25)
 
 
 REFUSED = {

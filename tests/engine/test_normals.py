@@ -81,6 +81,17 @@ def test_blocks_make_no_difference(device, dtype, per_turn):
     same(push(estimator_of(setup=setup, **given), every_other, phase, [5]).result(), whole)
 
 
+@pytest.mark.parametrize("kept", [[0, 4], [0], []])
+def test_blocks_make_no_difference_where_the_first_turn_tells_nothing(device, kept):
+    frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.ones(24)
+    weights[:8] = 0
+    weights[kept] = 1
+    whole = push(estimator_of(device, noise=None), frames, phase, weights=weights).result()
+    assert (whole.turns, whole.frames) == (2, 16)
+    single = push(estimator_of(device, noise=None), frames, phase, range(1, 24), weights)
+    same(single.result(), whole)
+
+
 @pytest.mark.parametrize("weights", [None, np.array([1, 1, 0, 1, 0.5, 0, 0, 1] * 3)])
 def test_frames_may_be_written_into_the_room(device, weights):
     frames, phase = frames_of(turns=3), phases(SETUP, 3)
@@ -356,8 +367,9 @@ def test_frames_without_light_or_full_of_it_have_no_answer(device, value):
     np.testing.assert_allclose(found.mean, value, atol=1e-4)
 
 
-def test_frames_of_no_numbers_have_no_answer(device):
-    frames = np.full((8, 1, 2), np.nan, np.float32)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_frames_of_no_numbers_have_no_answer(device, bad):
+    frames = np.full((8, 1, 2), bad, np.float32)
     for noise in (None, 1.0):
         found = estimate_normals(frames, EIGHTHS, TILT, 200.0, noise=noise, device=device)
         assert np.isnan(found.vectors).all()
@@ -456,5 +468,7 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     for block, weights, message in wrong:
         with pytest.raises(InputError, match=message):
             estimator.push(block, weights)
+    with pytest.raises(InputError, match="a turn of 72 frames or more"):
+        push(estimator, np.repeat(frames, 5, axis=0)[:70], phase[9] + 1e-3 * np.arange(70))
     push(estimator, frames[10:], phase[10:])
     same(estimator.result(), estimate_normals(frames, phase, **known()))

@@ -49,7 +49,7 @@ def normals(frames: NDArray[Any], turn: Turn) -> Normals:
     phase = np.stack([np.cos(turn.phase), np.sin(turn.phase)]).astype(np.float32)
     numbers = turn.offset, 1 / turn.gain, np.cos(turn.tilt), np.sin(turn.tilt), turn.low, turn.high
     known = tuple(np.float32(number) for number in numbers)
-    ends = turn.tilt, turn.error, turn.most, turn.still, turn.rest
+    ends = turn.tilt, turn.error, turn.most, turn.still, turn.wild, turn.rest
     limits = tuple(np.float32(number) for number in ends)
     _normals()(frames.reshape(len(frames), -1), fit, phase, known, limits, *maps.flat())
     settle_odd(frames, turn, maps)
@@ -172,7 +172,7 @@ def _step(pixels, count, work):  # type: ignore[no-untyped-def]
 def _judge(pixels, count, known, limits, work):  # type: ignore[no-untyped-def]
     """Find sigma, and whether noise is what is left once direction and tilt are free."""
     offset, per_count = known[0], known[1]
-    tilt, error, most, still, rest = limits
+    tilt, error, most, still, wild, rest = limits
     all_ = np.float32(count)
     for p in range(pixels):
         m11, m12, b1, b2 = work[_M11 + p], work[_M12 + p], work[_B1 + p], work[_B2 + p]
@@ -185,7 +185,8 @@ def _judge(pixels, count, known, limits, work):  # type: ignore[no-untyped-def]
         pull = work[_B3 + p] - m13 * d1 - m23 * d2
         more = pull / told
         left = work[_SQUARE + p] - b1 * d1 - b2 * d2 - pull * more
-        follows = tilt + more + _THREE * error / math.sqrt(told) >= still
+        doubt = _THREE * error / math.sqrt(told)
+        follows = (tilt + more + doubt >= still) & (tilt + more - doubt <= wild)
         raised = (work[_MEAN + p] - offset) * per_count >= rest
         work[_CONTACT + p] = _ONE if (left <= most) & follows & raised else _ZERO
         work[_SIGMA + p] = error * math.sqrt(all_ * scale)

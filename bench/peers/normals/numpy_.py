@@ -129,7 +129,9 @@ class _Tile:
         pull = _sum(by_tilt, error) - m13 * d1 - m23 * d2
         more = pull / told
         left = _sum(error, error) - sums.b1 * d1 - sums.b2 * d2 - pull * more
-        follows = more + 3 * np.float32(turn.error) / np.sqrt(told) >= np.float32(turn.still - turn.tilt)
+        doubt = 3 * np.float32(turn.error) / np.sqrt(told)
+        follows = more + doubt >= np.float32(turn.still - turn.tilt)
+        follows &= more - doubt <= np.float32(turn.wild - turn.tilt)
         follows &= (out.mean - np.float32(turn.offset)) * np.float32(1 / turn.gain) >= np.float32(turn.rest)
         np.logical_and(left <= np.float32(turn.most), follows, out=out.contact.view(bool))
         np.multiply(np.sqrt(len(self._axes) * scale), np.float32(turn.error), out=out.sigma)

@@ -34,8 +34,8 @@ def answer(frames: NDArray[Any], turn: Turn, pixels: NDArray[np.intp], slack: fl
     phase = turn.phase
     table = np.stack([np.cos(phase), np.sin(phase), np.ones_like(phase), *turn.fit])
     scale = np.array([turn.offset, 1 / turn.gain, -np.inf, np.inf])
-    noise, model, still, rest = turn.limits
-    limits = Limits(slack * noise, slack * model, still / slack, rest / slack)
+    noise, model, still, wild, rest = turn.limits
+    limits = Limits(slack * noise, slack * model, still / slack, slack * wild, rest / slack)
     samples = frames.reshape(len(frames), -1)[:, pixels]
     variance = Variance(turn.noise**2, 0.0, 0.0)
     return normals_exact(samples, table, scale, turn.tilt, variance, limits)

@@ -118,6 +118,11 @@ class Turn:
         return self.limits.still
 
     @property
+    def wild(self) -> float:
+        """The largest tilt that shows in contact, radians."""
+        return self.limits.most
+
+    @property
     def rest(self) -> float:
         """The least mean of the zeniths in contact, radians."""
         return self.limits.rest

@@ -157,7 +157,9 @@ class _Tile:
         pull = b3 - m13 * d1 - m23 * d2
         more = pull / told
         left = square - sums.b1 * d1 - sums.b2 * d2 - pull * more
-        follows = told.rsqrt_().mul_(3 * turn.error).add_(more) >= turn.still - turn.tilt
+        doubt = told.rsqrt_().mul_(3 * turn.error)
+        follows = (more - doubt) <= turn.wild - turn.tilt
+        follows &= doubt.add_(more) >= turn.still - turn.tilt
         follows &= (out.mean - turn.offset).mul_(1 / turn.gain) >= turn.rest
         torch.sqrt(scale.mul_(len(u1)), out=out.sigma).mul_(turn.error)
         known = out.sigma < float(NO_ANSWER)
