@@ -16,8 +16,9 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo
 
+# A process for each core, each with files of its own: much of a test is compiling kernels, on one core.
 test: lint types
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet
