@@ -63,6 +63,7 @@ typedef struct __attribute__((packed)) { Raw samples; } Stored;
 #define FREEDOM (COUNT - 3)
 #define REACH 0.25f     // longest step, radians
 #define NO_ANSWER 1.0f  // a standard error, radians, from which on nothing is known
+#define STEADY 1e-6f    // amplitude, radians, up to which rounding makes the azimuth
 #define LEAST 3         // samples that must be there and within their range
 #define MARGIN 3.0f     // standard deviations that a sample must be from the ends of a range to be within it
 
@@ -483,7 +484,7 @@ __kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosin
             waves += WEIGH(WEIGH(off * off, k), k);
         }
         const F swing = wave.cosine * wave.cosine + wave.sine * wave.sine;
-        const I swings = swing > 1e-20f;
+        const I swings = swing > STEADY * STEADY;
         const F inverse = inverse_root(swings ? swing : (F)1.0f);
         const F cp = swings ? wave.cosine * inverse : (F)1.0f, sp = swings ? wave.sine * inverse : (F)0.0f;
         const F st = sine(wave.mean), ct = cosine(wave.mean), slant = st * inverse, both = 2.0f * cp * sp * of_both;

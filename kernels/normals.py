@@ -31,6 +31,7 @@ MORE = 12
 _REACH = 0.25  # longest step, radians
 _NO_ANSWER = 1.0  # a standard error, radians, from which on nothing is known
 _LEAST = 3  # samples that must be there and within their range
+_STEADY = 1e-6  # amplitude, radians, up to which rounding makes the azimuth
 _MARGIN = 3.0  # standard deviations that a sample must be from the ends of a range to be within it
 _MODEL = 0.2  # RMS of what the model may leave out in contact, as a share of the tilt
 _DOUBT = 2.0  # by which the variance of the noise may be wrong
@@ -202,7 +203,7 @@ def normals_paper(
         apart = (swing + doubt < limits.still) | (swing - doubt > limits.most)
         touching = _like_noise(samples.square, samples, limits) & ~apart & ~(zenith < limits.rest)
     normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
-    return _answer(normal, sigma, touching, samples)
+    return _answer(normal, np.where(swing > _STEADY, sigma, np.nan), touching, samples)
 
 
 def add_turn(before: Answer, now: Answer, turns: int) -> Answer:

@@ -473,3 +473,12 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
         push(estimator, np.repeat(frames, 5, axis=0)[:70], phase[9] + 1e-3 * np.arange(70))
     push(estimator, frames[10:], phase[10:])
     same(estimator.result(), estimate_normals(frames, phase, **known()))
+
+
+@pytest.mark.parametrize("level", [12, 50, 77, 200])
+def test_the_paper_tells_no_azimuth_where_nothing_swings(device, level):
+    frames = np.full((8, 1, 2), level, np.uint8)
+    found = estimate_normals(frames, EIGHTHS, TILT, 206.0, 12.0, noise=1.0, method="paper", device=device)
+    assert np.isnan(found.sigma).all()
+    assert np.isnan(found.azimuth).all()
+    assert not found.contact.any()
