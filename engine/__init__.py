@@ -6,7 +6,7 @@ from mirrorskin.engine.correlation import Correlation, Correlator, correlate
 from mirrorskin.engine.edges import find_edges
 from mirrorskin.engine.normals import NormalEstimator, NormalMethod, Normals, estimate_normals
 from mirrorskin.engine.onset import OnsetSearch, find_onset
-from mirrorskin.engine.reconstruct import METHODS, Method, reconstruct
+from mirrorskin.engine.reconstruct import reconstruct
 from mirrorskin.engine.registration import Registered
 from mirrorskin.engine.score import AngleScore, ContactScore, EdgeScore, HeightScore, Score, score
 from mirrorskin.engine.search import EVENTS, Event, Onset
@@ -15,7 +15,6 @@ from mirrorskin.engine.vertical import PressMethod, reconstruct_press
 
 __all__ = [
     "EVENTS",
-    "METHODS",
     "AngleScore",
     "ChangePointSearch",
     "ContactScore",
@@ -24,7 +23,6 @@ __all__ = [
     "EdgeScore",
     "Event",
     "HeightScore",
-    "Method",
     "NormalEstimator",
     "NormalMethod",
     "Normals",

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 from mirrorskin.engine.axial import reconstruct_rotation
-from mirrorskin.engine.normals import NormalMethod
-from mirrorskin.engine.vertical import PressMethod, reconstruct_press
+from mirrorskin.engine.vertical import reconstruct_press
 from mirrorskin.io import InputError, Result, Source
-
-Method = PressMethod | NormalMethod
-METHODS: tuple[Method, ...] = (*get_args(PressMethod), *get_args(NormalMethod))
 
 
 def reconstruct(source: Source, **options: Any) -> Result:

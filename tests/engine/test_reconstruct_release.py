@@ -1,6 +1,7 @@
 """A recording of a press, of its release, or of both: which frames are used, and that both are as good."""
 
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def used(result):
     return result.process["event"], result.process["first_frame"], result.process["frames"]
 
 
-@pytest.mark.parametrize("method", engine.METHODS)
+@pytest.mark.parametrize("method", get_args(engine.PressMethod))
 def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
     source = twin()
     frames, header = frames_of(source), source.header
@@ -39,7 +40,7 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
             assert used(result) == (event, part.start, 31)
 
 
-@pytest.mark.parametrize("method", engine.METHODS)
+@pytest.mark.parametrize("method", get_args(engine.PressMethod))
 @pytest.mark.parametrize("noise", [0.0, 1.5, 6.0])
 def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method, noise):
     source = twin(noise=noise)
@@ -78,7 +79,7 @@ def test_a_body_that_rests_may_be_asked_for_either(event):
     assert set(np.unique(result.status)) == {2, 3}
 
 
-@pytest.mark.parametrize("method", engine.METHODS)
+@pytest.mark.parametrize("method", get_args(engine.PressMethod))
 @pytest.mark.parametrize(
     ("travel", "event", "words"),
     [
