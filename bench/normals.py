@@ -25,7 +25,7 @@ OURS, CACHED = "mirrorskin", "mirrorskin, in the cache"
 
 _MAPS = 3 * 4 + 4 + 1 + 4  # bytes of a pixel: normal, sigma, contact and mean
 _ROOM = 160  # bytes of a pixel for what all works keep
-_SMALL = (64, 1024)  # rows and columns of a stack that stays in the cache
+_SMALL = (256, 1024)  # rows and columns of a stack that stays in the cache, and is no trifle to launch
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def run_normals(case: NormalsCase, device: Device, rounds: int) -> Case:
     frames, ours = _prepare(case, device)
     small = replace(case, shape=(min(case.shape[0], _SMALL[0]), min(case.shape[1], _SMALL[1])))
     repeats = -(-case.pixels // small.pixels)
-    cached = partial(_repeat, _prepare(small, device)[1], repeats)
+    cached = partial(_repeat, _kernel_alone(small, device), repeats)
     limits = Limits(device, np.resize(frames.view(np.uint8), case.bytes))
     arithmetic = Arithmetic(device, case.pixels)
     peers, absent = find_peers()
@@ -102,8 +102,38 @@ def run_normals(case: NormalsCase, device: Device, rounds: int) -> Case:
 
 def _prepare(case: NormalsCase, device: Device) -> tuple[NDArray[Any], Callable[[], Normals]]:
     """Return a stack in the estimator's room, and the work that answers it."""
+    estimator = _estimator(case, device)
+    frames = estimator.room[:STEPS]
+    fill(frames)
+    block = Block(frames, 0, phase=case.turn.phase)
+
+    def work() -> Normals:
+        estimator.reset()
+        estimator.push(block)
+        return estimator.result()
+
+    return frames, work
+
+
+def _kernel_alone(case: NormalsCase, device: Device) -> Work:
+    """Return a work whose maps stay where they are: a turn that is over, because the next one begins."""
+    estimator = _estimator(case, device)
+    frames = estimator.room[: STEPS + 1]
+    fill(frames[:STEPS])
+    frames[STEPS] = frames[0]
+    block = Block(frames, 0, phase=np.append(case.turn.phase, case.turn.phase[0] + 2 * np.pi))
+
+    def work() -> None:
+        estimator.reset()
+        estimator.push(block)
+        device.finish()
+
+    return work
+
+
+def _estimator(case: NormalsCase, device: Device) -> NormalEstimator:
     turn = case.turn
-    estimator = NormalEstimator(
+    return NormalEstimator(
         case.shape,
         case.dtype,
         tilt=turn.tilt,
@@ -114,16 +144,6 @@ def _prepare(case: NormalsCase, device: Device) -> tuple[NDArray[Any], Callable[
         device=device,
         memory_limit=0,
     )
-    frames = estimator.room[:STEPS]
-    fill(frames)
-    block = Block(frames, 0, phase=turn.phase)
-
-    def work() -> Normals:
-        estimator.reset()
-        estimator.push(block)
-        return estimator.result()
-
-    return frames, work
 
 
 def _repeat(work: Work, times: int) -> None:
