@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.harness import Work, take_turns
 from mirrorskin.bench.limits import Limits
 from mirrorskin.bench.memory import check_memory
+from mirrorskin.bench.ours import OURS, our_works
 from mirrorskin.bench.peers.correlation import Peer, Wave, find_peers
 from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_correlation
@@ -22,8 +23,6 @@ from mirrorskin.engine.phases import basis
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
-
-OURS = "mirrorskin"
 
 _MAPS = 4 * 4  # bytes of a pixel: mean, cosine, sine and residual
 _ROOM = 128  # bytes of a pixel for what all works keep
@@ -80,7 +79,7 @@ def run_correlation(case: CorrelationCase, device: Device, rounds: int) -> Case:
     fill(frames)
     phase = phases(count)
     limits = Limits(device, np.resize(frames, (count + _MAPS) * pixels))
-    ours = _our_works(correlator, Block(frames, 0, phase=phase))
+    ours = our_works(correlator, Block(frames, 0, phase=phase))
     peers, absent = find_peers()
     theirs: dict[str, Work] = {peer.name: partial(peer.correlate, frames, phase) for peer in peers}
 
@@ -157,20 +156,6 @@ class _Window:
         told = np.sum(wave * np.tensordot(model.T @ model, wave, 1), axis=0)
         left = np.maximum(square - told, 0)
         return Wave(*np.stack([*wave, np.sqrt(left / (STEPS - 3))]).astype(np.float32))
-
-
-def _our_works(correlator: Correlator, block: Block) -> dict[str, Work]:
-    def push() -> None:
-        correlator.reset()
-        correlator.push(block)
-        correlator.device.finish()
-
-    def whole() -> object:
-        correlator.reset()
-        correlator.push(block)
-        return correlator.result()
-
-    return {f"{OURS}, push only": push, OURS: whole}
 
 
 def _push_all(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,15 +12,16 @@ from numpy.typing import NDArray
 from mirrorskin.bench.harness import Measured, Work, take_turns
 from mirrorskin.bench.limits import Arithmetic, Limits
 from mirrorskin.bench.memory import check_memory
+from mirrorskin.bench.ours import OURS, our_works
 from mirrorskin.bench.peers.normals import Turn, find_peers
 from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_normals
 from mirrorskin.bench.turns import SCALES, STEPS, TILT, fill, noise_of, phases
-from mirrorskin.engine import NormalEstimator, Normals
+from mirrorskin.engine import NormalEstimator
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 
-OURS, CACHED = "mirrorskin", "mirrorskin, in the cache"
+CACHED = f"{OURS}, in the cache"
 
 _MAPS = 3 * 4 + 4 + 1 + 4  # bytes of a pixel: normal, sigma, contact and mean
 _ROOM = 160  # bytes of a pixel for what all works keep
@@ -100,19 +100,12 @@ def run_normals(case: NormalsCase, device: Device, rounds: int) -> Case:
     return Case(case.name, case.title, rows, absent, _notes(case, {row.name: row for row in rows}))
 
 
-def _prepare(case: NormalsCase, device: Device) -> tuple[NDArray[Any], Callable[[], Normals]]:
+def _prepare(case: NormalsCase, device: Device) -> tuple[NDArray[Any], Work]:
     """Return a stack in the estimator's room, and the work that answers it."""
     estimator = _estimator(case, device)
     frames = estimator.room[:STEPS]
     fill(frames)
-    block = Block(frames, 0, phase=case.turn.phase)
-
-    def work() -> Normals:
-        estimator.reset()
-        estimator.push(block)
-        return estimator.result()
-
-    return frames, work
+    return frames, our_works(estimator, Block(frames, 0, phase=case.turn.phase))[OURS]
 
 
 def _kernel_alone(case: NormalsCase, device: Device) -> Work:
@@ -122,13 +115,7 @@ def _kernel_alone(case: NormalsCase, device: Device) -> Work:
     fill(frames[:STEPS])
     frames[STEPS] = frames[0]
     block = Block(frames, 0, phase=np.append(case.turn.phase, case.turn.phase[0] + 2 * np.pi))
-
-    def work() -> None:
-        estimator.reset()
-        estimator.push(block)
-        device.finish()
-
-    return work
+    return our_works(estimator, block)[f"{OURS}, push only"]
 
 
 def _estimator(case: NormalsCase, device: Device) -> NormalEstimator:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.harness import Work, take_turns
 from mirrorskin.bench.limits import Limits
 from mirrorskin.bench.memory import check_memory
+from mirrorskin.bench.ours import OURS, our_works
 from mirrorskin.bench.peers.onset import Peer, References, find_peers
 from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_frames, check_heights
@@ -23,8 +24,6 @@ from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.onset import onset_levels
-
-OURS = "mirrorskin"
 
 _THRESHOLD = 0.5
 _MAPS = 64  # bytes a pixel for all maps
@@ -106,7 +105,7 @@ def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
     fill(frames, case.stack)
     travel = np.arange(len(frames), dtype=np.float64) * 0.05
     limits = Limits(device, frames)
-    ours = _our_works(search, Block(frames, 0, travel=travel))
+    ours = our_works(search, Block(frames, 0, travel=travel))
     theirs, absent = _peer_works(case, frames, travel)
 
     def check(results: dict[str, Any]) -> None:
@@ -117,20 +116,6 @@ def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
     measured = take_turns(works, rounds, device.profile, check)
     rows = [Row(name, measured[name], case.bytes, len(frames)) for name in (*ours, *theirs)]
     return Case(case.name, case.title, limits.rows(measured) + rows, absent)
-
-
-def _our_works(search: OnsetSearch, block: Block) -> dict[str, Work]:
-    def push() -> None:
-        search.reset()
-        search.push(block)
-        search.device.finish()
-
-    def whole() -> object:
-        search.reset()
-        search.push(block)
-        return search.result()
-
-    return {f"{OURS}, push only": push, OURS: whole}
 
 
 def _peer_works(

@@ -93,13 +93,15 @@ def reconstruct_rotation(
         if tilt == "estimate":
             raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
         frames = Registered(source, heights, opened, header)
+    assert header.zenith_gain is not None
+    assert header.zenith_offset is not None
     with naming(source):
         estimator = NormalEstimator(
             frames.shape[1:],
             frames.dtype,
             tilt=header.tilt,
-            gain=_first(header.zenith_gain),
-            offset=_first(header.zenith_offset, 0.0),
+            gain=header.zenith_gain,
+            offset=header.zenith_offset,
             method=method,
             noise=noise,
             low=header.dark,
@@ -109,8 +111,6 @@ def reconstruct_rotation(
             device=opened,
             memory_limit=min(memory_limit, 2 * math.prod(frames.shape) * frames.dtype.itemsize),
         )
-        if frames.rewindable:
-            frames.rewind()
         feed(frames, estimator, range(frames.shape[0]), progress)
         normals = estimator.result()
     edges = _edges(normals, opened)  # where contact ends, before that is moved inwards
@@ -166,8 +166,6 @@ def correlate_source(
         correlator = Correlator(
             source.shape[1:], source.dtype, device=opened, memory_limit=min(memory_limit, 2 * size)
         )
-        if source.rewindable:
-            source.rewind()
         feed(source, correlator, range(source.shape[0]), progress)
         wave = correlator.result()
     result = Result(
@@ -220,6 +218,7 @@ def _believe(
         )
     known_gain = header.zenith_gain if gain is None else np.asarray(gain, np.float64)
     known_offset = header.zenith_offset if offset is None else np.asarray(offset, np.float64)
+    known_offset = np.zeros(()) if known_offset is None else known_offset
     return replace(header, tilt=used, zenith_gain=known_gain, zenith_offset=known_offset)
 
 
@@ -247,7 +246,3 @@ def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Nor
     inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
     sigma = normals.sigma * noise_gain if given else normals.sigma
     return replace(normals, sigma=sigma, contact=inside)
-
-
-def _first(*values: ArrayLike | None) -> ArrayLike:
-    return next(value for value in values if value is not None)

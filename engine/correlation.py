@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.phases import check_phases, check_weights
-from mirrorskin.engine.samples import check_dtype
+from mirrorskin.engine.samples import check_dtype, check_frames
 from mirrorskin.engine.search import MEMORY_LIMIT
 from mirrorskin.engine.sums import TurnSums, WindowSums
 from mirrorskin.io import Block, InputError, check_phase
@@ -158,10 +158,7 @@ class Correlator:
             the sums hold.
         """
         frames = block.frames
-        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
-            raise InputError(
-                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
-            )
+        check_frames(frames, self._dtype, self._shape)
         phase = check_phase(block.phase, len(frames), "phase")
         self._sums.push(frames, phase, check_weights(weights, len(frames)))
 

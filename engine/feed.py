@@ -30,13 +30,15 @@ def feed(source: Source, estimator: Estimator, frames: range, progress: Progress
     Parameters
     ----------
     source : Source
-        Before its first frame.
+        It is rewound first, if it can be.
     estimator : Estimator
     frames : range
         Which of them, in steps of 1; those before are read and dropped.
     progress : callable, optional
         Told the number of frames so far.
     """
+    if source.rewindable:
+        source.rewind()
     done = 0
     while done < frames.stop:
         wanted = done >= frames.start

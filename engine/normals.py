@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.bands import Band, Planes, cut_into_bands
 from mirrorskin.engine.noise import CountNoise, noise_of_fit, thin_out, thinning
 from mirrorskin.engine.phases import Doubles, check_phases, check_weights, fit_matrix
-from mirrorskin.engine.samples import check_dtype
+from mirrorskin.engine.samples import check_dtype, check_frames
 from mirrorskin.engine.scale import make_scale
 from mirrorskin.engine.search import MEMORY_LIMIT
 from mirrorskin.engine.tilt import check_tilt, estimate_tilt, one_wave
@@ -236,7 +236,6 @@ class NormalEstimator:
         self._tilt, self._noise = self._given_tilt, self._given_noise
         self._phase, self._weights = np.empty(0), np.empty(0)
         self._turns = self._frames = 0
-        self._told_any = False
         self._each: list[list[NDArray[Any]]] = []
 
     @property
@@ -261,10 +260,7 @@ class NormalEstimator:
             frames.
         """
         frames = block.frames
-        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
-            raise InputError(
-                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
-            )
+        check_frames(frames, self._dtype, self._shape)
         phase = check_phase(block.phase, len(frames), "phase")
         weight = check_weights(weights, len(frames))
         start = 0
@@ -310,13 +306,13 @@ class NormalEstimator:
 
     def _work(self, turns: list[slice]) -> None:
         """Estimate the normals of turns in the buffer, and keep the frames that come after them."""
-        known = [self._close_up(turn) for turn in turns]
-        told = [turn for turn in known if self._tells(turn)]
+        closed = [self._close_up(turn) for turn in turns]
         alone = len(self._bands) == 1
-        if alone and told:
+        if alone and turns:
             self._bands[0].frames.upload(len(self._phase))
-        for turn in told:
-            self._estimate(turn)
+        for turn in closed:
+            if self._tells(turn):
+                self._estimate(turn)
         if alone:
             self._bands[0].frames.claim()
         end = turns[-1].stop if turns else 0
@@ -340,8 +336,7 @@ class NormalEstimator:
             check_phases(phase, self._weights[turn])
         except InputError:
             return False
-        first, self._told_any = not self._told_any, True
-        return first or goes_round(phase)
+        return self._turns == 0 or goes_round(phase)
 
     def _estimate(self, turn: slice) -> None:
         phase, weights = self._phase[turn], self._weights[turn]
@@ -442,11 +437,23 @@ class NormalEstimator:
         assert self._tilt is not None
         assert self._noise is not None
         vectors, sigma, contact, mean, cosine, sine, residual = maps
-        told = vectors, sigma, contact, mean, cosine, sine, residual
         some = thin_out(mean)
         known = some[np.isfinite(some)]
         noise = float(self._noise.at(np.median(known) if known.size else 0.0))
-        return Normals(*told, noise, self._noise.slope, self._tilt, self._turns, self._frames)
+        return Normals(
+            vectors,
+            sigma,
+            contact,
+            mean,
+            cosine,
+            sine,
+            residual,
+            noise,
+            self._noise.slope,
+            self._tilt,
+            self._turns,
+            self._frames,
+        )
 
     def _download(self, band: Band) -> list[NDArray[Any]]:
         """Return the maps of a band, as they are listed; it has new ones then."""

@@ -50,6 +50,12 @@ def check_dtype(dtype: np.dtype[Any]) -> None:
         raise InputError(f"frames of type {dtype}: uint8, uint16 or float32 are needed")
 
 
+def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> None:
+    """Raise InputError unless frames are one or more of a type and size, (n, *shape)."""
+    if frames.dtype != dtype or frames.shape[1:] != shape or len(frames) == 0:
+        raise InputError(f"frames of {frames.dtype} {frames.shape}: expected {dtype} (n, *{shape})")
+
+
 def travel_pairs(device: Device, travel: ArrayLike) -> Array:
     """Hand travel, (T,), mm, to a device as (T, 2) floats, whose sums are as good as float64."""
     exact = np.asarray(travel, np.float64)

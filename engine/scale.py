@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mirrorskin.engine.phases import Doubles
 from mirrorskin.io import InputError
 
-Doubles = NDArray[np.float64]
+_OPEN = {"low": -np.inf, "high": np.inf}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Scale:
     """How brightness goes with the zenith: E = offset + gain zenith, between two zeniths.
 
@@ -30,7 +32,7 @@ class Scale:
         """Whether each pixel has a scale of its own."""
         return self.planes.ndim == 3
 
-    @property
+    @cached_property
     def ends(self) -> bool:
         """Whether brightness is linear between some zeniths only."""
         return bool(np.isfinite(self.planes[2:]).any())
@@ -85,9 +87,6 @@ def make_scale(
         raise InputError("low is not below high at any pixel: are they swapped?")
     lowest, highest = np.fmin(*ends), np.fmax(*ends)
     return Scale(np.stack(np.broadcast_arrays(zero, per_count, lowest, highest)).astype(np.float64))
-
-
-_OPEN = {"low": -np.inf, "high": np.inf}
 
 
 def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> Doubles:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from mirrorskin.engine.angles import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 
 Doubles = NDArray[np.float64]
@@ -47,16 +48,7 @@ class HeightScore:
 
     def table(self) -> dict[str, str]:
         """Return names and values to print."""
-        return {
-            "answered": f"{self.answered} pixels",
-            "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
-            "RMS error": f"{self.rms:.4f} mm",
-            "mean error": f"{self.mean:+.4f} mm",
-            "median |error|": f"{self.median:.4f} mm",
-            "99 % |error|": f"{self.p99:.4f} mm",
-            "largest |error|": f"{self.largest:.4f} mm",
-            "mean (error/sigma)^2": f"{self.chi_square:.3f}",
-        }
+        return _table_of_errors(self, "mm", "|error|", {"mean error": f"{self.mean:+.4f} mm"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +80,7 @@ class AngleScore:
 
     def table(self) -> dict[str, str]:
         """Return names and values to print."""
-        return {
-            "answered": f"{self.answered} pixels",
-            "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
-            "RMS error": f"{self.rms:.4f} deg",
-            "median error": f"{self.median:.4f} deg",
-            "99 % error": f"{self.p99:.4f} deg",
-            "largest error": f"{self.largest:.4f} deg",
-            "mean (error/sigma)^2": f"{self.chi_square:.3f}",
-        }
+        return _table_of_errors(self, "deg", "error", {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,6 +225,22 @@ def score(result: Result, truth: Truth) -> Score:
     )
 
 
+def _table_of_errors(
+    part: HeightScore | AngleScore, unit: str, error: str, mean: dict[str, str]
+) -> dict[str, str]:
+    """Return names and values to print of what errors of both kinds have; the mean stands after the RMS."""
+    return {
+        "answered": f"{part.answered} pixels",
+        "coverage": f"{100 * part.coverage:.2f} % of the {part.touched} pixels in contact",
+        "RMS error": f"{part.rms:.4f} {unit}",
+        **mean,
+        f"median {error}": f"{part.median:.4f} {unit}",
+        f"99 % {error}": f"{part.p99:.4f} {unit}",
+        f"largest {error}": f"{part.largest:.4f} {unit}",
+        "mean (error/sigma)^2": f"{part.chi_square:.3f}",
+    }
+
+
 def _score_heights(result: Result, truth: NDArray[np.float32], touched: Mask) -> HeightScore:
     assert result.height is not None
     error = result.height.astype(np.float64) - truth
@@ -258,7 +258,7 @@ def _score_heights(result: Result, truth: NDArray[np.float32], touched: Mask) ->
 
 def _score_normals(result: Result, truth: Truth, touched: Mask) -> AngleScore:
     assert result.normals is not None
-    error = _between(result.normals.astype(np.float64), _normals_of(truth))
+    error = angle_between(result.normals.astype(np.float64), true_normals(truth))
     if result.contact is not None:  # normals of pixels that lose contact are not claimed
         error = np.where(result.contact == 0, np.nan, error)
     return _score_angles(error, result.normal_sigma, touched)
@@ -304,21 +304,6 @@ def _score_edges(edges: NDArray[np.uint8], truth: Mask) -> EdgeScore:
     )
 
 
-def _normals_of(truth: Truth) -> Doubles:
-    """Return the true normals, (H, W, 3)."""
-    zenith = truth.zenith.astype(np.float64)
-    azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # a level one has none
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
-
-
-def _between(first: Doubles, second: Doubles) -> Doubles:
-    """Return the angles between vectors, radians, as exact for small ones as for large ones."""
-    across = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.asarray(np.arctan2(across, np.sum(first * second, axis=-1)))
-
-
 def _turned(azimuth: NDArray[np.float32], truth: NDArray[np.float32]) -> Doubles:
     """Return the angles between directions, radians, the shorter way round."""
     error = azimuth.astype(np.float64) - truth
@@ -327,10 +312,10 @@ def _turned(azimuth: NDArray[np.float32], truth: NDArray[np.float32]) -> Doubles
 
 def _edges_of(truth: Truth) -> Mask:
     """Mark the pixels on either side of an edge."""
-    normals, touched = _normals_of(truth), truth.contact.astype(bool)
+    normals, touched = true_normals(truth), truth.contact.astype(bool)
     edges = np.zeros_like(touched)
     for one, other in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
-        jump = touched[one] & touched[other] & (_between(normals[one], normals[other]) > _JUMP)
+        jump = touched[one] & touched[other] & (angle_between(normals[one], normals[other]) > _JUMP)
         border = jump | (touched[one] != touched[other])
         edges[one] |= border
         edges[other] |= border

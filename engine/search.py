@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.bands import Planes, cut_into_bands
-from mirrorskin.engine.samples import Noise, check_dtype
+from mirrorskin.engine.samples import Noise, check_dtype, check_frames
 from mirrorskin.io import Block, InputError, check_travel
 from mirrorskin.kernels.device import Device
 
@@ -97,10 +97,7 @@ class Search:
     def _accept(self, block: Block, so_far: Sequence[float]) -> NDArray[np.float64]:
         """Look at a block before it is taken in: return its travel, if it can follow the travel so far."""
         frames = block.frames
-        if frames.dtype != self._dtype or frames.shape[1:] != self._shape or len(frames) == 0:
-            raise InputError(
-                f"frames of {frames.dtype} {frames.shape}: expected {self._dtype} (n, *{self._shape})"
-            )
+        check_frames(frames, self._dtype, self._shape)
         travel = check_travel(block.travel, len(frames), "travel", after=so_far[-1:], falls=self._release)
         self._noise.look(frames)
         return travel

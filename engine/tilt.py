@@ -89,8 +89,8 @@ def estimate_tilt(
         inside = ((zeniths > low + 3 * error) & (zeniths < high - 3 * error)).all(axis=0)
     usable = whole(samples).all(axis=0) & inside
     zeniths, error = zeniths[:, usable], error[usable]
-    mean, cosine, sine = matrix @ zeniths
-    left = np.sum(weights[:, np.newaxis] * (zeniths - basis(phase) @ (matrix @ zeniths)) ** 2, axis=0)
+    mean, cosine, sine = wave = matrix @ zeniths
+    left = np.sum(weights[:, np.newaxis] * (zeniths - basis(phase) @ wave) ** 2, axis=0)
     clean = left <= special.chdtri(max(1, len(phase) - 3), 1e-3) * error**2 * 1.5
     covariance = matrix @ (matrix / weights).T
     square = cosine**2 + sine**2 - (covariance[1, 1] + covariance[2, 2]) * error**2

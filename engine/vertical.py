@@ -57,13 +57,10 @@ def reconstruct_press(
         device=device,
         memory_limit=min(memory_limit, 2 * size),
     )
-    if source.rewindable:
-        source.rewind()
     feed(source, search, frames, progress)
     twice = False
     if isinstance(search, ChangePointSearch) and search.passes == 2:
         twice = True
-        source.rewind()
         search.rewind()
         feed(source, search, frames, progress)
     onset = search.result()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.angles import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import MISSING, check_same_size, extent, new_figure, save_figure
@@ -74,11 +75,7 @@ def _maps(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
 def _errors(result: Result, truth: Truth) -> Floats:
     """Return the angles to the true normals, degrees, where there was contact in every frame, else NaN."""
     normals, _, _ = _maps(result)
-    zenith = truth.zenith.astype(np.float64)
-    azimuth = np.where(zenith == 0, 0.0, truth.azimuth)  # a level one has none
-    true = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    across = np.linalg.norm(np.cross(normals, np.stack(true, axis=-1)), axis=-1)
-    angle = np.degrees(np.arctan2(across, np.sum(normals * np.stack(true, axis=-1), axis=-1)))
+    angle = np.degrees(angle_between(normals, true_normals(truth)))
     told = truth.contact.astype(bool)
     if result.contact is not None:
         told = told & result.contact.astype(bool)
