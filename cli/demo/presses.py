@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
+from mirrorskin.cli.demo.lab import lab_camera, record
 from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
@@ -119,10 +120,9 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
 
 
 def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | None) -> io.Truth:
-    """Press with a camera as labs have it: read and shot noise, deviations of the pixels, a lens."""
+    """Press with a camera as labs have it, and references taken with a ball."""
     from mirrorskin import hw, io
-    from mirrorskin.cli.progress import progress
-    from mirrorskin.hw.twin import Camera, Vertical
+    from mirrorskin.hw.twin import Vertical
 
     twin = hw.Twin(
         object=experiment.thing,
@@ -131,16 +131,11 @@ def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | No
         movement=Vertical(io.Steps(experiment.step, experiment.step).positions(experiment.frames)),
         contact=sensor.contact,
         optics=sensor.optics,
-        camera=Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5),
+        camera=lab_camera(),
         references="ball",
         device=device,
     )
-    with (
-        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
-        progress(f"pressing on the {experiment.thing} ({sensor.name})", experiment.frames) as show,
-    ):
-        recorder.drain(show)
-    return twin.truth
+    return record(twin, path, f"pressing on the {experiment.thing} ({sensor.name})")
 
 
 def _reconstruct(base: Path, sensor: Sensor, device: str | None) -> dict[str, io.Result]:

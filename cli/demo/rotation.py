@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from mirrorskin.cli.demo.lab import lab_camera, record
 from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
@@ -84,8 +85,7 @@ def _record(experiment: Experiment, path: Path, device: str | None) -> io.Truth:
     import math
 
     from mirrorskin import hw, io
-    from mirrorskin.cli.progress import progress
-    from mirrorskin.hw.twin import Axial, Camera
+    from mirrorskin.hw.twin import Axial
 
     phase = io.Steps(2 * math.pi / experiment.steps).positions(experiment.steps)
     twin = hw.Twin(
@@ -94,15 +94,10 @@ def _record(experiment: Experiment, path: Path, device: str | None) -> io.Truth:
         pixel_size=experiment.pixel_size,
         movement=Axial(phase, math.radians(experiment.tilt), experiment.press),
         pattern="linear",
-        camera=Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5),
+        camera=lab_camera(),
         device=device,
     )
-    with (
-        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
-        progress(f"turning on the {experiment.thing}", experiment.steps) as show,
-    ):
-        recorder.drain(show)
-    return twin.truth
+    return record(twin, path, f"turning on the {experiment.thing}")
 
 
 def tell(outcomes: Mapping[str, Outcomes]) -> None:
