@@ -1,17 +1,17 @@
 """The estimators: what turns frames into maps."""
 
-from mirrorskin.engine.axial import correlate_source, reconstruct_rotation
-from mirrorskin.engine.changepoint import ChangePointSearch, find_change_point
-from mirrorskin.engine.correlation import Correlation, Correlator, correlate
-from mirrorskin.engine.edges import find_edges
-from mirrorskin.engine.normals import NormalEstimator, NormalMethod, Normals, estimate_normals
-from mirrorskin.engine.onset import OnsetSearch, find_onset
+from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
+from mirrorskin.engine.press.onset import OnsetSearch, find_onset
+from mirrorskin.engine.press.search import EVENTS, Event, Onset
+from mirrorskin.engine.press.vertical import PressMethod, reconstruct_press
 from mirrorskin.engine.reconstruct import reconstruct
-from mirrorskin.engine.registration import Registered
+from mirrorskin.engine.rotation.axial import correlate_source, reconstruct_rotation
+from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
+from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.normals import NormalEstimator, NormalMethod, Normals, estimate_normals
+from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.score import AngleScore, ContactScore, EdgeScore, HeightScore, Score, score
-from mirrorskin.engine.search import EVENTS, Event, Onset
 from mirrorskin.engine.summary import Summary, summarise
-from mirrorskin.engine.vertical import PressMethod, reconstruct_press
 
 __all__ = [
     "EVENTS",

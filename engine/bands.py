@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.kernels.device import Array, Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
+MEMORY_LIMIT = 256_000_000
+"""Bytes of host memory for frames on the move, where nothing else is said."""
+
 _MOST_PIXELS = 2**30  # kernels number those of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mirrorskin.engine.axial import reconstruct_rotation
-from mirrorskin.engine.vertical import reconstruct_press
+from mirrorskin.engine.press.vertical import reconstruct_press
+from mirrorskin.engine.rotation.axial import reconstruct_rotation
 from mirrorskin.io import InputError, Result, Source
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.edges import LIMITS, find_edges
+from mirrorskin.engine.rotation.edges import LIMITS, find_edges
 from mirrorskin.kernels import edges
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, PASSES
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.references import reference_maps
-from mirrorskin.engine.search import Onset
+from mirrorskin.engine.press.references import reference_maps
+from mirrorskin.engine.press.search import Onset
 from mirrorskin.kernels import onset as reference
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}

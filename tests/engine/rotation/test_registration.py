@@ -11,7 +11,7 @@ import pytest
 from stacks import MadeUp, assert_same, read_all
 
 from mirrorskin import hw, io
-from mirrorskin.engine.registration import Registered
+from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.hw.twin import Axial, Body, Camera
 from mirrorskin.kernels.errors import DeviceMemoryError
 
@@ -164,7 +164,7 @@ def test_blocks_make_no_difference(device, dtype, monkeypatch):
         read = read_all(source, length)
         np.testing.assert_array_equal(read.phase, PHASES)
         answers.append((read.frames, source.noise_gain))
-    monkeypatch.setattr("mirrorskin.engine.registration._BLOCK", 2 * frames[0].nbytes)
+    monkeypatch.setattr("mirrorskin.engine.rotation.registration._BLOCK", 2 * frames[0].nbytes)
     small = Registered(made_up(frames), some_heights(), device)
     assert len(small.read(np.empty((6, *SHAPE), np.float32)).frames) == 2
     for found, gain in answers:

@@ -8,11 +8,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.changepoint import ChangePointSearch
+from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.feed import Progress, feed
-from mirrorskin.engine.onset import OnsetSearch
+from mirrorskin.engine.press.changepoint import ChangePointSearch
+from mirrorskin.engine.press.onset import OnsetSearch
+from mirrorskin.engine.press.search import Event
 from mirrorskin.engine.provenance import sign, told
-from mirrorskin.engine.search import MEMORY_LIMIT, Event
 from mirrorskin.io import InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.scale import make_scale
+from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.io import InputError
 
 SHAPE = (3, 4)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mirrorskin.engine.noise import CountNoise, whole
-from mirrorskin.engine.phases import Doubles, basis
+from mirrorskin.engine.rotation.fit_noise import CountNoise, whole
+from mirrorskin.engine.rotation.phases import Doubles, basis
 from mirrorskin.io import InputError
 
 _STEEPEST = math.radians(30.0)  # no sheet follows a body that leans further
@@ -36,7 +36,7 @@ def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
     wave : ndarray, (3, n), float64
         Mean, cosine and sine of the samples, counts.
     scale : ndarray, (4,) or (4, n), float64
-        See `mirrorskin.engine.scale.Scale`.
+        See `mirrorskin.engine.rotation.scale.Scale`.
     """
     offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
     told = (wave[0] - offset) * per_count > _CLEAR * np.hypot(*wave[1:]) * np.abs(per_count)
@@ -67,9 +67,9 @@ def estimate_tilt(
     phase, weights : ndarray, (N,), float64
         Radians, and weights above 0.
     matrix : ndarray, (3, N), float64
-        See `mirrorskin.engine.phases.fit_matrix`.
+        See `mirrorskin.engine.rotation.phases.fit_matrix`.
     scale : ndarray, (4,) or (4, n), float64
-        See `mirrorskin.engine.scale.Scale`.
+        See `mirrorskin.engine.rotation.scale.Scale`.
     noise : CountNoise
 
     Returns

@@ -8,7 +8,7 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.normals import NormalEstimator, estimate_normals
+from mirrorskin.engine.rotation.normals import NormalEstimator, estimate_normals
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.errors import DeviceError
 

@@ -16,7 +16,6 @@ from mirrorskin.kernels.device import Device
 
 Event = Literal["onset", "release"]
 EVENTS: tuple[Event, ...] = get_args(Event)
-MEMORY_LIMIT = 256_000_000
 
 
 @dataclass(frozen=True, slots=True)

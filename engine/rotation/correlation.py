@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.phases import check_phases, check_weights
+from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.rotation.phases import check_phases, check_weights
+from mirrorskin.engine.rotation.sums import TurnSums, WindowSums
 from mirrorskin.engine.samples import check_dtype, check_frames
-from mirrorskin.engine.search import MEMORY_LIMIT
-from mirrorskin.engine.sums import TurnSums, WindowSums
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import Device, open_device
@@ -77,7 +77,7 @@ def correlate(
     Raises
     ------
     mirrorskin.io.InputError
-        Frames, phases or weights that cannot be used; see ``mirrorskin.engine.phases.check_phases``.
+        Frames, phases or weights that cannot be used; see ``mirrorskin.engine.rotation.phases.check_phases``.
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
     """

@@ -7,9 +7,9 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.noise import CountNoise
-from mirrorskin.engine.phases import fit_matrix
-from mirrorskin.engine.tilt import check_tilt, estimate_tilt, one_wave, zenith_seen
+from mirrorskin.engine.rotation.fit_noise import CountNoise
+from mirrorskin.engine.rotation.phases import fit_matrix
+from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave, zenith_seen
 from mirrorskin.io import InputError
 
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")

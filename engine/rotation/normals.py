@@ -10,14 +10,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, Planes, cut_into_bands
-from mirrorskin.engine.noise import CountNoise, noise_of_fit, thin_out, thinning
-from mirrorskin.engine.phases import Doubles, check_phases, check_weights, fit_matrix
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes, cut_into_bands
+from mirrorskin.engine.noise import thin_out, thinning
+from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
+from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights, fit_matrix
+from mirrorskin.engine.rotation.scale import make_scale
+from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave
+from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns, goes_round
 from mirrorskin.engine.samples import check_dtype, check_frames
-from mirrorskin.engine.scale import make_scale
-from mirrorskin.engine.search import MEMORY_LIMIT
-from mirrorskin.engine.tilt import check_tilt, estimate_tilt, one_wave
-from mirrorskin.engine.turns import LONGEST, cut_into_turns, goes_round
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
 from mirrorskin.kernels.normals import MORE, contact_limits

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.correlation import Correlator
-from mirrorskin.engine.edges import find_edges
+from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.feed import Progress, feed
-from mirrorskin.engine.normals import NORMAL_METHODS, NormalEstimator, NormalMethod, Normals
 from mirrorskin.engine.provenance import naming, sign, told
-from mirrorskin.engine.registration import Registered
-from mirrorskin.engine.search import MEMORY_LIMIT
-from mirrorskin.engine.turns import LONGEST, longest_turn
+from mirrorskin.engine.rotation.correlation import Correlator
+from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.normals import NORMAL_METHODS, NormalEstimator, NormalMethod, Normals
+from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.turns import LONGEST, longest_turn
 from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.phases import Doubles
+from mirrorskin.engine.rotation.phases import Doubles
 
 LONGEST = 64
 """Frames of one turn that are taken at most."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.bands import Band, Planes, cut_into_bands
-from mirrorskin.engine.phases import Doubles, basis
+from mirrorskin.engine.rotation.phases import Doubles, basis
 from mirrorskin.io import InputError
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Array, Device

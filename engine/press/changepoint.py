@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band
-from mirrorskin.engine.references import reference_pair
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band
+from mirrorskin.engine.press.references import reference_pair
+from mirrorskin.engine.press.search import Event, Onset, Search, check_stack
 from mirrorskin.engine.samples import travel_pairs
-from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Array, Device, Kernel, open_device

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.phases import Doubles
+from mirrorskin.engine.rotation.phases import Doubles
 from mirrorskin.io import InputError
 
 _OPEN = {"low": -np.inf, "high": np.inf}

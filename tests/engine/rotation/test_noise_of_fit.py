@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rotations import EIGHTHS, UNEVEN
 
-from mirrorskin.engine.noise import CountNoise, noise_of_fit
+from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
 from mirrorskin.io import InputError
 
 PIXELS = 10_000

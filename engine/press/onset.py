@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, Planes
-from mirrorskin.engine.fitting import fit
-from mirrorskin.engine.references import check_threshold, reference_maps
-from mirrorskin.engine.search import MEMORY_LIMIT, Event, Onset, Search, check_stack
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes
+from mirrorskin.engine.press.fitting import fit
+from mirrorskin.engine.press.references import check_threshold, reference_maps
+from mirrorskin.engine.press.search import Event, Onset, Search, check_stack
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mirrorskin.engine import OnsetSearch, fitting
-from mirrorskin.engine.onset import _trial
+from mirrorskin.engine import OnsetSearch
+from mirrorskin.engine.press import fitting
+from mirrorskin.engine.press.onset import _trial
 from mirrorskin.io import Block
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.shape import BESIDE, CORE

@@ -1,0 +1,1 @@
+"""An axial rotation: normals, contact and edges from a pixel's wave."""

@@ -1,0 +1,140 @@
+"""How noisy a rotation is: told from what a fit of its waves leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+
+from mirrorskin.engine.noise import QUANTUM
+from mirrorskin.engine.rotation.phases import Doubles, basis
+from mirrorskin.io import InputError
+
+_FLOAT = 1e-6  # of the greatest count: the least noise that float frames are taken to have
+_FRAMES_OF_TWO, _APART = 7, 100.0  # frames, and condition, with which a second wave is told from the first
+_PARTS, _ENOUGH = 16, 200  # parts by brightness, and pixels of one
+_ROUNDS, _USUAL = 10, 0.2  # of the fit of a line, and by which share a part's variance may miss it
+_BEYOND = 1e-3  # share of the pixels that noise alone puts out
+
+
+@dataclass(frozen=True, slots=True)
+class CountNoise:
+    """The noise of a sample by its brightness: read noise, and shot noise, which grows with the light.
+
+    Attributes
+    ----------
+    base : float
+        Variance at 0 counts, were it to go on like that down to there.
+    slope : float
+        Variance per count.
+    least : float
+        The smallest variance that there is.
+    """
+
+    base: float
+    slope: float
+    least: float
+
+    def at(self, level: ArrayLike) -> Doubles:
+        """Return the standard deviation of samples around a level, counts."""
+        return np.sqrt(np.maximum(self.base + self.slope * np.asarray(level, np.float64), self.least))
+
+
+def noise_of_fit(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> CountNoise:
+    """Estimate the noise of samples from what waves of one and two a turn leave.
+
+    Level surfaces show the second one; of fewer than 7 frames a turn it is taken for noise. Pixels are sorted
+    by their brightness. Of each part, the median of the sums of squares tells the variance at first. Then
+    those beyond chi-square's quantile of 99.9 % are left out, until that settles: pixels that lose contact.
+    Through the parts' variances goes a line that does not fall.
+
+    Parameters
+    ----------
+    samples : ndarray, (N, n), uint8, uint16 or float32
+        Of n pixels. Frames that have less than half as many whole samples as others are left out, and then
+        pixels of which a sample is clipped by its type or no number.
+    phase, weights : ndarray, (N,), float64
+        Radians, and weights above 0.
+
+    Returns
+    -------
+    CountNoise
+        Of a sample of weight 1.
+
+    Raises
+    ------
+    InputError
+        Three frames, of which a fit leaves nothing, or no pixel that is whole.
+    """
+    if len(samples) == 3:
+        raise InputError("3 frames a turn tell no noise: give the standard deviation of a sample in counts")
+    good = whole(samples)
+    quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT
+    if not (good.sum(axis=0) >= 3).any():  # no pixel will have an answer
+        return CountNoise(quantum**2, 0.0, quantum**2)
+    share = good.mean(axis=1)
+    frames = share > share.max() / 2  # one that is missing or clipped tells nothing
+    pixels = good[frames].all(axis=0)
+    if np.count_nonzero(frames) <= 3 or not pixels.any():
+        raise InputError(
+            "too few samples are whole to tell the noise: give the standard deviation of a sample in counts"
+        )
+    counts, phase, weights = samples[frames][:, pixels].astype(np.float64), phase[frames], weights[frames]
+    floor = quantum * (1.0 if samples.dtype.kind == "u" else float(np.max(np.abs(counts))))
+    root = np.sqrt(weights)[:, np.newaxis]
+    waves = root * _waves(phase)
+    left = root * counts - waves @ (np.linalg.pinv(waves) @ (root * counts))
+    squares, level = np.sum(left**2, axis=0), counts.mean(axis=0)
+    freedom = len(counts) - waves.shape[1]
+    order = np.argsort(level, kind="stable")
+    parts = np.array_split(order, max(1, min(_PARTS, len(order) // _ENOUGH)))
+    variances = np.array([_variance(squares[part], freedom) for part in parts])
+    levels = np.array([level[part].mean() for part in parts])
+    return _line(levels, np.maximum(variances, floor**2), floor**2)
+
+
+def _variance(squares: Doubles, freedom: int) -> float:
+    """Return the variance of normal samples from sums of so many squares, some of which are of others."""
+    furthest = float(special.chdtri(freedom, _BEYOND))
+    kept_share = float(special.chdtr(freedom + 2, furthest) / special.chdtr(freedom, furthest))
+    variance = float(np.median(squares)) / float(special.chdtri(freedom, 0.5))
+    for _ in range(10):
+        kept = squares[squares <= furthest * variance]
+        if kept.size == 0 or variance == (variance := float(np.mean(kept)) / (freedom * kept_share)):
+            break
+    return variance
+
+
+def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
+    """Lay a line that does not fall through variances, which parts that are quite wrong do not bend."""
+    weights = 1 / variances
+    base, slope = float(np.median(variances)), 0.0
+    for _ in range(_ROUNDS if np.ptp(levels) > 0 else 0):
+        centre = np.average(levels, weights=weights**2)
+        mean = np.average(variances, weights=weights**2)
+        apart = levels - centre
+        slope = max(
+            0.0, float(np.sum(weights**2 * apart * (variances - mean)) / np.sum(weights**2 * apart**2))
+        )
+        base = float(mean - slope * centre)
+        fitted = np.maximum(base + slope * levels, least)
+        off = np.abs(variances - fitted) / fitted
+        weights = np.sqrt(np.minimum(1.0, _USUAL / np.maximum(off, _USUAL))) / fitted
+    return CountNoise(base, slope, least)
+
+
+def _waves(phase: Doubles) -> Doubles:
+    """Return what to fit, (N, 3 or 5): one wave a turn, and two where the phases tell them apart."""
+    one = basis(phase)
+    both = np.concatenate([one, basis(2 * phase)[:, 1:]], axis=1)
+    return both if len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _APART else one
+
+
+def whole(samples: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which samples, of any shape, are neither clipped by their type nor no number."""
+    if samples.dtype.kind == "f":
+        return np.asarray(np.isfinite(samples))
+    return np.asarray((samples > 0) & (samples < np.iinfo(samples.dtype).max))
