@@ -1,6 +1,12 @@
 """The estimators: what turns frames into maps."""
 
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.fusion import frames_to_read, fuse, fuse_sources
+from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.integration.live import Integrator
+from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
+from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.onset import OnsetSearch, find_onset
 from mirrorskin.engine.press.search import EVENTS, Event, Onset
 from mirrorskin.engine.press.vertical import PressMethod, reconstruct_press
@@ -23,21 +29,29 @@ __all__ = [
     "EdgeScore",
     "Event",
     "HeightScore",
+    "Integrator",
     "NormalEstimator",
     "NormalMethod",
     "Normals",
+    "NotConverged",
     "Onset",
     "OnsetSearch",
     "PressMethod",
     "Registered",
     "Score",
     "Summary",
+    "Surface",
     "correlate",
     "correlate_source",
     "estimate_normals",
+    "fill_holes",
     "find_change_point",
     "find_edges",
     "find_onset",
+    "frames_to_read",
+    "fuse",
+    "fuse_sources",
+    "integrate",
     "reconstruct",
     "reconstruct_press",
     "reconstruct_rotation",

@@ -167,10 +167,10 @@ class Device:
         DeviceError
             It does not compile; the message quotes the line.
         """
-        cut = {"LANES": self.shape.lanes, "WORDS": self.shape.words, "TILE": self.shape.tile}
-        options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
-        made, key = self._kernels.made, (file, name, options, self.shape.group)
+        made, key = self._kernels.made, (file, name, self.shape, *defines.items())
         if key not in made:
+            cut = {"LANES": self.shape.lanes, "WORDS": self.shape.words, "TILE": self.shape.tile}
+            options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
             made[key] = self._make_kernel(file, name, options)
         return made[key]
 
@@ -350,7 +350,7 @@ class _ThreadKernels(threading.local):
     """Each thread's own kernel objects: setting the arguments of one is not thread-safe."""
 
     def __init__(self) -> None:
-        self.made: dict[tuple[str, str, tuple[str, ...], int], Kernel] = {}
+        self.made: dict[tuple[object, ...], Kernel] = {}
 
 
 def _find() -> list[cl.Device]:

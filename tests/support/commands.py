@@ -12,6 +12,9 @@ from unittest import mock
 from mirrorskin.cli.demo import presses, rotation
 from mirrorskin.cli.main import main
 
+# Pixels across and down of what is small; the press and the rotation on the sphere are fused.
+_SIZE, _SPHERE = 24, 48
+
 
 class Ended(NamedTuple):
     """How a command ended: its exit code, and what it wrote to standard output and standard error."""
@@ -35,7 +38,7 @@ def run(*words: object) -> Ended:
 
 def small_experiments() -> tuple[presses.Experiment, ...]:
     """Return the demo's own experiments over the same fields and travels, of few pixels and frames."""
-    size, frames = 24, 8
+    frames = 8
     return tuple(
         dataclasses.replace(
             one,
@@ -45,14 +48,14 @@ def small_experiments() -> tuple[presses.Experiment, ...]:
             step=one.step * one.frames / frames,
         )
         for one in presses.EXPERIMENTS
+        for size in [_SPHERE if one.thing == "sphere" else _SIZE]
     )
 
 
 def small_rotations() -> tuple[rotation.Experiment, ...]:
     """Return the demo's own rotations over the same fields, of few pixels."""
-    size = 48
     return tuple(
-        dataclasses.replace(one, size=size, pixel_size=one.pixel_size * one.size / size)
+        dataclasses.replace(one, size=_SPHERE, pixel_size=one.pixel_size * one.size / _SPHERE)
         for one in rotation.EXPERIMENTS
     )
 

@@ -1,0 +1,7 @@
+"""What can go wrong in the engine besides input that cannot be used."""
+
+
+class NotConverged(Exception):  # noqa: N818  # its name is a promise to users
+    """A solver did not get as near as was asked for; the message is one line: how near, and what to do."""
+
+    exit_code = 1

@@ -1,0 +1,1 @@
+"""Heights from slopes: weighted least squares on the graph of the pixels."""

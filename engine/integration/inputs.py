@@ -1,0 +1,214 @@
+"""What is integrated: slopes, where and how sure they are, and known heights; all of it checked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io import InputError
+
+Floats = NDArray[np.float32]
+Flags = NDArray[np.uint8]
+
+
+_LEAST, _MOST = 1e-4, 1e3  # of the median, between which weights of slopes count: float32 solves no more
+_FIRMEST = 1e4  # of a link's weight, above which a known height does not count more
+_SAMPLES = 65536  # pixels that tell the median
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Maps of one size, (H, W), and numbers, fit to be integrated.
+
+    Attributes
+    ----------
+    dz_dx, dz_dy : ndarray, (H, W), float32
+    pixel_size : (float, float)
+        Width and height, mm.
+    mask, edges : ndarray, (H, W), uint8, or None
+    weight_x, weight_y : ndarray, (H, W), float32, or None
+        ``weight_y`` is None where it is ``weight_x``; both are where all have the same.
+    weight : float
+        That same weight, else 1.
+    typical : float
+        A weight as there are many.
+    absolute : bool
+        Whether the weights of the slopes were given, and are to be taken for inverse variances.
+    heights, height_weights : ndarray, (H, W), float32, or None
+        Heights relative to ``datum``; weights None where all have the same.
+    height_weight : float
+        That same weight, else 1.
+    datum : float
+        What the known heights are relative to, mm.
+    """
+
+    dz_dx: Floats
+    dz_dy: Floats
+    pixel_size: tuple[float, float]
+    mask: Flags | None
+    edges: Flags | None
+    weight_x: Floats | None
+    weight_y: Floats | None
+    weight: float
+    typical: float
+    absolute: bool
+    heights: Floats | None
+    height_weights: Floats | None
+    height_weight: float
+    datum: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, columns = self.dz_dx.shape
+        return rows, columns
+
+
+def check_inputs(
+    dz_dx: ArrayLike,
+    dz_dy: ArrayLike,
+    pixel_size: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    edges: ArrayLike | None = None,
+    heights: ArrayLike | None = None,
+    height_weights: ArrayLike | None = None,
+) -> Inputs:
+    """Return the arguments of ``integrate`` as maps of one size.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        They do not fit each other, or are no weights, or no size.
+    """
+    x, y = np.asarray(dz_dx), np.asarray(dz_dy)
+    if x.ndim != 2 or x.shape != y.shape or 0 in x.shape:
+        raise InputError(
+            f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W) are needed"
+        )
+    shape = x.shape
+    weight, planes = _split_weights("weights", weights, shape)
+    height_weight, height_planes = _split_weights("height_weights", height_weights, shape, 1)
+    known, datum = None, 0.0
+    if heights is not None and height_weight:
+        counted = np.ones(shape, bool) if mask is None else np.asarray(fitting("mask", mask, shape)) != 0
+        for plane in height_planes:
+            counted &= plane > 0
+        known, datum = _relative(fitting("heights", heights, shape), counted)
+    if not weight:
+        planes = [np.zeros(shape, np.float32)]
+    size = check_pixel_size(pixel_size)
+    typical = _typical(planes) if planes else weight
+    planes = [_bounded(plane, typical * _LEAST, typical * _MOST) for plane in planes]
+    firmest = _FIRMEST * typical / min(size) ** 2
+    height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
+    return Inputs(
+        dz_dx=_floats(x),
+        dz_dy=_floats(y),
+        pixel_size=size,
+        mask=_marks("mask", mask, shape),
+        edges=_marks("edges", edges, shape),
+        weight_x=planes[0] if planes else None,
+        weight_y=planes[1] if len(planes) > 1 else None,
+        weight=weight or 1.0,
+        typical=typical,
+        absolute=weights is not None,
+        heights=known,
+        height_weights=height_planes[0] if height_planes and known is not None else None,
+        height_weight=min(height_weight, firmest),
+        datum=datum,
+    )
+
+
+def check_pixel_size(pixel_size: ArrayLike) -> tuple[float, float]:
+    """Return width and height of a pixel, mm, of one number or both."""
+    size = np.asarray(pixel_size, np.float64)
+    if size.shape not in ((), (2,)) or not np.all((size > 0) & (size < np.inf)):
+        raise InputError(f"pixel size {pixel_size!r}: one length in mm above 0, or (x, y), is needed")
+    width, height = np.broadcast_to(size, 2).tolist()
+    return width, height
+
+
+def check_above_zero(**numbers: float | None) -> None:
+    """Check numbers that may be left out, by their names."""
+    for name, number in numbers.items():
+        if number is not None and not 0 < number < math.inf:
+            raise InputError(f"{name} {number}: a number above 0 is needed")
+
+
+def fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """Return a map that has the shape of the slopes."""
+    given = np.asarray(values)
+    if given.shape != shape:
+        raise InputError(f"{name}: shape {given.shape}, but the slopes have {shape}; give maps of one size")
+    return given
+
+
+def _floats(values: NDArray[np.generic]) -> Floats:
+    return np.asarray(values, np.float32)
+
+
+def _marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Flags | None:
+    """Return a map of bytes that are 0 where the values are, or are no number."""
+    if values is None:
+        return None
+    given = fitting(name, values, shape)
+    if given.dtype in (np.bool_, np.uint8):
+        return given.view(np.uint8)
+    return np.asarray((given != 0) & (given == given)).view(np.uint8)  # NaN marks nothing
+
+
+def _split_weights(
+    name: str, values: ArrayLike | None, shape: tuple[int, ...], most: int = 2
+) -> tuple[float, list[Floats]]:
+    """Return a factor, and the maps to be multiplied with it: none where one number says it all."""
+    if values is None:
+        return 1.0, []
+    given = np.asarray(values)
+    if given.ndim == 0:
+        weight = float(given)
+        if not 0 <= weight < math.inf:
+            raise InputError(f"{name} {weight}: an inverse variance of 0 or more is needed")
+        return weight, []
+    if given.shape != shape and (most == 1 or given.shape != (2, *shape)):
+        pairs = " or (2, H, W)" if most == 2 else ""
+        raise InputError(f"{name}: shape {given.shape}; one number, (H, W){pairs} as the slopes is needed")
+    if not (given.min() >= 0 and given.max() < math.inf):
+        raise InputError(
+            f"{name}: some are negative or no number; give inverse variances, 0 where nothing is known"
+        )
+    planes = [given] if given.ndim == 2 else list(given)
+    return 1.0, [_floats(plane) for plane in planes]
+
+
+def _typical(planes: list[Floats]) -> float:
+    """Return the median of weights above 0, of evenly spread pixels, or 1."""
+    step = max(1, math.isqrt(planes[0].size // _SAMPLES))
+    some = np.concatenate([plane[step // 2 :: step, step // 2 :: step].ravel() for plane in planes])
+    some = some[some > 0]
+    return float(np.median(some)) if some.size else 1.0
+
+
+def _bounded(plane: Floats, least: float, most: float) -> Floats:
+    """Return weights of which those above 0 lie within bounds."""
+    positive = plane > 0
+    if np.min(plane, where=positive, initial=np.inf) >= least and plane.max() <= most:
+        return plane
+    return np.where(positive, np.clip(plane, least, most), 0).astype(np.float32)
+
+
+def _relative(heights: NDArray[np.generic], counted: NDArray[np.bool_]) -> tuple[Floats | None, float]:
+    """Return heights less the mean of those that count, which would cost float32 its digits, and that mean.
+
+    Others are NaN; None where none counts.
+    """
+    exact = np.asarray(heights, np.float64)
+    known = np.isfinite(exact) & counted
+    if not known.any():
+        return None, 0.0
+    datum = float(np.mean(exact, where=known))
+    return np.where(known, exact - datum, np.nan).astype(np.float32), datum

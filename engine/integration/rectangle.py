@@ -1,0 +1,195 @@
+"""Heights of a full rectangle by a direct solver: cosine modes along lines, elimination across them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.integration.cosines import HALF, make_plan, work_of
+from mirrorskin.kernels.device import Array, Device
+
+SLOTS = 2 * HALF
+"""Modes of a strip of the spectrum; see ``rectangle.cl``."""
+
+_LANES = 8  # lines side by side in a vector, where an item is a core's loop
+_MOST_ROOM = 4096  # complex numbers in an item's own memory; where a transform has more, none are
+_SETTLED = 2.0**-26  # of itself: what a rate may still change by when it is taken for constant
+_ASTRIDE = 18.0  # work, as `work_of` counts it, of going over the picture against the order in memory
+
+Doubles = NDArray[np.float64]
+
+
+class Rectangle:
+    """Solver of A u = b for heights u, where all pixels of a picture are there and all links alike.
+
+    A is the Laplacian of the pixels' graph: (A u)_i is the sum of w (u_i - u_j) over the neighbours j, with
+    one weight w along x and one along y; a screening may be added on its diagonal. Cosine modes along rows or
+    columns, whichever are the easier, leave a tridiagonal system for each mode across them (Hockney, J. ACM
+    12, 1965), which is solved by elimination. It is exact but for rounding, and takes any shape.
+
+    It may only be used by one thread at a time.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    pixel_size : (float, float)
+        Of a pixel along x and y: links along x have the weight scale / x^2, those along y scale / y^2.
+    device : Device
+    scale : float, optional
+        See ``pixel_size``.
+
+    Raises
+    ------
+    mirrorskin.kernels.errors.DeviceMemoryError
+        The device has no room for its maps, two or four of the picture's size.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], pixel_size: tuple[float, float], device: Device, scale: float = 1.0
+    ) -> None:
+        self._device = device
+        self._lanes = _LANES if device.shape.tile > 1 else 1
+        self._is_along = are_rows_easier(shape, side_by_side=self._lanes == 1)
+        self._lines, length = shape if self._is_along else shape[::-1]
+        weights = scale / pixel_size[0] ** 2, scale / pixel_size[1] ** 2
+        self._along, self._across = weights if self._is_along else weights[::-1]
+        self._plan = plan = make_plan(length)
+        self._items = -(-self._lines // (2 * self._lanes))
+        self._padded = 2 * self._lanes * self._items
+        self._spectrum = self._make("spectrum", (len(plan.place) // HALF, self._padded, SLOTS))
+        self._height = self._make("height", shape)
+        self._owns_room = self._lanes > 1 and plan.size <= _MOST_ROOM
+        room = (2, self._items, plan.size, self._lanes)
+        self._scratch = [] if self._owns_room else [self._make("scratch", room)]
+        self._place = self._put("place", plan.place)
+        self._turns = self._put("turns", plan.turns)
+        self._back = self._put("turns", plan.turns / (2 * length * self._across))
+        self._steps = self._put("steps", plan.steps), self._put("factors", plan.factors)
+        self._chirp = [self._put("chirp", part) for part in (plan.chirp, plan.other) if part.size]
+        self._screening: float | None = None
+
+    def solve(self, source: Array, screening: float = 0.0) -> Array:
+        """Solve for the heights.
+
+        Parameters
+        ----------
+        source : Array, (H, W), float32
+            Right side b, on the device. Without screening it must sum to 0; what it sums to all the same is
+            taken from all pixels alike.
+        screening : float, optional
+            On the diagonal of A, not negative.
+
+        Returns
+        -------
+        Array, (H, W), float32
+            Heights, on the device; the next call writes there again. Without screening their mean is 0.
+        """
+        if screening != self._screening:
+            weights = self._along, self._across, screening
+            reach, fading, ends = find_rates(self._plan.length, self._lines, *weights)
+            self._rates = self._put("reach", reach), self._put("fading", fading), self._put("ends", ends)
+            self._screening = screening
+        moved = source.host.nbytes + self._spectrum.host.nbytes
+        self._transform("rectangle_modes", source, self._turns, self._spectrum, moved)
+        slots = self._spectrum.host.size // self._padded
+        self._device.kernel("rectangle", "rectangle_columns", LANES=self._lanes)(
+            slots if self._lanes == 1 else slots // SLOTS,
+            *map(np.int32, (self._lines, self._padded, slots, screening == 0)),
+            *(*self._rates, self._spectrum),
+            moved=2 * self._spectrum.host.nbytes,
+        )
+        self._transform("rectangle_heights", self._spectrum, self._back, self._height, moved)
+        return self._height
+
+    def _transform(self, name: str, given: Array, turns: Array, found: Array, moved: int) -> None:
+        """Run one of the two kernels that go between points and modes."""
+        macros = {
+            "LANES": self._lanes,
+            "ROOM": _MOST_ROOM if self._owns_room else 0,
+            "CHIRP": int(bool(self._chirp)),
+        }
+        plan = self._plan
+        sizes = [np.int32(n) for n in (self._is_along, self._lines, self._padded, plan.length, plan.size)]
+        steps = np.int32(len(plan.steps)), *self._steps
+        kernel = self._device.kernel("rectangle", name, **macros)
+        kernel(
+            self._items,
+            *sizes,
+            given,
+            self._place,
+            turns,
+            *steps,
+            *self._chirp,
+            found,
+            *self._scratch,
+            moved=moved,
+        )
+
+    def _make(self, name: str, shape: tuple[int, ...]) -> Array:
+        array = self._device.array(name, shape, np.float32)
+        array.upload()
+        return array
+
+    def _put(self, name: str, values: Doubles | NDArray[np.int32]) -> Array:
+        dtype = np.float32 if values.dtype.kind == "f" else np.int32
+        array = self._device.array(name, (max(1, values.size),), dtype)  # no step at all has no table
+        array.host[: values.size] = values.ravel()
+        array.upload()
+        return array
+
+
+def are_rows_easier(shape: tuple[int, int], *, side_by_side: bool) -> bool:
+    """Tell whether cosine modes are to be taken along rows.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    side_by_side : bool
+        Whether work-items are lanes side by side, which read columns together.
+    """
+    rows, columns = (work_of(length) for length in shape)
+    return columns + _ASTRIDE <= rows if side_by_side else columns <= rows + _ASTRIDE
+
+
+def find_rates(
+    length: int, lines: int, along: float, across: float, screening: float
+) -> tuple[NDArray[np.int32], Doubles, Doubles]:
+    """Return the elimination of all modes' tridiagonal systems; see ``rectangle_columns``.
+
+    Parameters
+    ----------
+    length, lines : int
+        Points of a line, and lines.
+    along, across : float
+        Weights of the links along lines and across them.
+    screening : float
+        On the diagonal.
+
+    Returns
+    -------
+    reach : ndarray, (strips, 2), int32
+    fading : ndarray, (N, 16)
+    ends : ndarray, (strips, 16)
+    """
+    low = np.arange(-(-(length // 2 + 1) // HALF) * HALF).reshape(-1, HALF)
+    mode = np.clip(np.concatenate([low, length - low], axis=1), 0, length)
+    weights = 4 * along * np.sin(np.pi * mode / (2 * length)) ** 2 + screening
+    bend = 2 * np.arcsinh(np.sqrt(weights / across) / 2)
+    with np.errstate(divide="ignore"):
+        settled = -np.log(_SETTLED) / (2 * bend.min(axis=1))
+    depth = np.ceil(np.clip(settled, 1, lines)).astype(int)
+    fading = [
+        _fading(strip, np.arange(count)[:, np.newaxis]) for strip, count in zip(bend, depth, strict=True)
+    ]
+    last = _fading(bend, lines - 1)
+    ends = np.divide(1 - last, last, out=np.zeros_like(last), where=last > 0)
+    reach = np.stack([np.cumsum(depth) - depth, depth], axis=1).astype(np.int32)
+    return reach, np.concatenate(fading), ends
+
+
+def _fading(bend: Doubles, line: NDArray[np.int_] | int) -> Doubles:
+    """Return 1 - c_r / c_(r+1) at line r, c_r = cosh((r + 1/2) bend), without its cancellation."""
+    once, often = np.expm1(-bend), np.expm1(-(2 * line + 2) * bend)
+    return np.asarray(once * often / (1 + (1 + once) * (1 + often)))

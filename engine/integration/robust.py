@@ -1,0 +1,356 @@
+"""Heights of a surface that breaks where nobody says: bilateral weights, renewed step by step."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.integration.inputs import Flags, Inputs
+from mirrorskin.engine.integration.links import Graph, Links
+from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.kernels.bilateral import DOWN, RIGHT
+from mirrorskin.kernels.device import Array
+
+BROKEN = 0.02
+"""Part of its full weight below which a link leads across a discontinuity."""
+
+_Weights = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+_LOOSE, _TIGHT = 0.03, 1e-3  # residuals of a step's equations: as a rule, and where the energy rose
+_CURL, _CLEAR = 4.0, 6.0  # standard deviations of the curl's noise: to open links; somewhere at least
+_LEAST_CURL = 0.05  # to open links where there is no noise
+_EAGER = 2.5  # times k: cuts are cheaper then
+_BEYOND = 1.5  # times a step: the bound is lower up to twice of it, and this is sooner there
+_ROUGH, _REST = 1e-3, 1e-6  # parts of the energy; to fall by less is to rest: at first, and in the end
+
+
+@dataclass(frozen=True, slots=True)
+class Robust:
+    """Heights of a surface that may break, and where it does.
+
+    Attributes
+    ----------
+    relief : Array, (H, W), float32
+        Heights above the graph's plane, mm; of no meaning where there is no pixel.
+    links : Links
+        The graph that they solve: its weights are those that the heights ask for.
+    flags : ndarray, (H, W), uint8
+        The given graph's, without links whose weight is 0 now.
+    edges : ndarray, (H, W), uint8
+        1 on either side of a discontinuity.
+    energies : tuple of float
+        Energy of the heights that the best descent began with, and after each of its steps.
+    iterations : int
+        Steps of all descents.
+    residual : float
+        Norm of b - A u, of the links' final weights, over that of b; times the solver's own residual, if it
+        had to come nearer in the end.
+    converged : bool
+        Whether the energy has come to rest, and the residual is as little as was asked for, or as lowers it.
+    """
+
+    relief: Array
+    links: Links
+    flags: Flags
+    edges: Flags
+    energies: tuple[float, ...]
+    iterations: int
+    residual: float
+    converged: bool
+
+
+@dataclass(slots=True)
+class _Descent:
+    """Where a descent has come to."""
+
+    relief: Array
+    energies: list[float]
+    converged: bool = False
+
+
+def solve_robust(
+    inputs: Inputs,
+    graph: Graph,
+    k: float,
+    *,
+    start: NDArray[np.floating[Any]] | None = None,
+    tolerance: float = 1e-5,
+    limit: int = 300,
+    deadline: float | None = None,
+) -> Robust:
+    """Find heights that fit slopes and known heights, and the discontinuities between them.
+
+    The energy of ``mirrorskin.kernels.bilateral`` is lowered step by step: a step solves the least squares
+    that bound it at the heights so far, loosely, for the change of the heights, and so begins where the last
+    one ended; the change is then taken one and a half times. A step that would raise the energy is done again
+    with care, or not at all. There are many minima, so descents from several starts compete: from plain least
+    squares; where the curl of the slopes is far above its noise, from least squares without the links around
+    it, where a surface must break; and from there by way of an energy in which breaks are cheaper.
+
+    What slopes determine: a height is told along paths of links that are not cut, and a break must be worth
+    its price, ln 2 / k for each pixel on either side and along it.
+
+    - A piece that is cut off all round keeps its shape, and has an offset that nothing tells unless a height
+      in it is known: it is a component of its own. As long as no slope contradicts, it is not cut off at all:
+      a ball on a plane stays on it without a step, of whatever height.
+    - Of two ways to cut that explain the slopes, the shorter one is found. A ramp that rises from a plane and
+      ends in a cliff is told from one that begins with the cliff if its foot is the longer side.
+    - Where a break goes is told where its height changes along it; elsewhere it takes the shortest way.
+    - A step lower than about two pixels (at k = 2; the square root of 8 / k) is taken for a bend, and bends
+      the surface for some pixels around: so at the tip of a tear.
+    - A known height that contradicts the slopes around it is worth four cuts at most: if it stands alone, its
+      pixel breaks away. It takes about as many known heights as a break is long to set a piece right.
+    - Creases err towards their flatter side by s^3 / (2 (2 + s^2)) pixels, s the slope on the other: 0.07 at
+      35 degrees. It is how the energy counts, and 2 % of a step of 7 pixels with two creases.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    graph : Graph
+        Their links; only these can be cut.
+    k : float
+        How misfits are told from noise, 1/pixel^2: a link is cut where it misses the slopes by well above the
+        square root of 1 / k, seen across the surface.
+    start : ndarray, (H, W), optional
+        Heights above the graph's plane, mm: the only start then.
+    tolerance : float
+        Residual of the least squares that the last weights make.
+    limit : int
+        Of the steps of a descent.
+    deadline : float, optional
+        Of ``time.perf_counter``: no step is begun after it.
+    """
+    search = _Search(inputs, graph, limit, deadline)
+    starts = [(search.given(start), 1.0)] if start is not None else search.starts()
+    found, steps = [], 0
+    for relief, factor in starts:
+        if factor != 1.0:
+            first = search.descend(relief, factor * k, _ROUGH)
+            relief, steps = first.relief, steps + len(first.energies) - 1
+        found.append(search.descend(relief, k, _REST))
+        steps += len(found[-1].energies) - 1
+    return search.conclude(min(found, key=lambda one: one.energies[-1]), k, tolerance, steps)
+
+
+class _Search:
+    """Descents of the energy of ``mirrorskin.kernels.bilateral`` on a device."""
+
+    def __init__(self, inputs: Inputs, graph: Graph, limit: int, deadline: float | None) -> None:
+        self._bound = _Bound(inputs, graph)
+        self._limit, self._deadline = limit, deadline
+        self._zero = self._bound.put("zero", np.zeros(1))
+        self._bound.share(0.0, self._zero)
+        self._solver = Multigrid(self._bound.link(self._zero))
+
+    def given(self, relief: NDArray[np.floating[Any]]) -> Array:
+        """Return a start that was given."""
+        return self._bound.put("start", np.where(np.isfinite(relief), relief, 0.0))
+
+    def starts(self) -> list[tuple[Array, float]]:
+        """Return reliefs to begin with, and by what k is multiplied at first."""
+        plain = self._solve(self._zero, _TIGHT)
+        curl = self._bound.curl()
+        sizes = np.abs(curl.download())
+        curl.upload()
+        some = sizes[sizes > 0]
+        noise = float(np.median(some)) / 0.6745 if some.size else 0.0  # of a normal distribution
+        if sizes.max() <= max(_CLEAR * noise, _LEAST_CURL):
+            return [(plain, 1.0)]
+        level = max(_CURL * noise, _LEAST_CURL)
+        self._solver.rebuild(self._bound.link(self._zero, curl, level))
+        opened = self._solve(self._zero, _TIGHT)
+        return [(opened, 1.0), (opened, _EAGER), (plain, 1.0)]
+
+    def descend(self, relief: Array, k: float, rest: float) -> _Descent:
+        """Lower the energy of a relief until it rests."""
+        descent = _Descent(relief, [self._bound.share(k, relief)])
+        while len(descent.energies) <= self._limit and not descent.converged:
+            if self._deadline is not None and time.perf_counter() > self._deadline:
+                break
+            before = descent.energies[-1]
+            lower = self._lower(descent, k)
+            descent.converged = lower is None or lower > (1 - rest) * before
+            if lower is not None:
+                descent.energies.append(lower)
+        return descent
+
+    def _lower(self, descent: _Descent, k: float) -> float | None:
+        """Take a step that lowers the energy, and return that; None where rounding leaves none."""
+        for tolerance, part in ((_LOOSE, _BEYOND), (_TIGHT, 1.0)):
+            self._solver.rebuild(self._bound.link(descent.relief))
+            stepped = self._solve(descent.relief, tolerance, part)
+            energy = self._bound.share(k, stepped)
+            if energy < descent.energies[-1]:
+                descent.relief = stepped
+                return energy
+            self._bound.share(k, descent.relief)
+        return None
+
+    def _solve(self, relief: Array, tolerance: float, part: float = 1.0) -> Array:
+        """Return a relief that goes so much of the way to that which solves the last graph, about."""
+        return self._bound.step(relief, self._solver.solve(tolerance=tolerance).height, part)
+
+    def conclude(self, best: _Descent, k: float, tolerance: float, steps: int) -> Robust:
+        """Solve the last graph to the tolerance, and tell what was found."""
+        bound, relief = self._bound, best.relief
+        bound.share(0.0, relief)
+        full = bound.weights(relief)
+        bound.share(k, relief)
+        wanted, left = (self._norm(bound.link(one)) for one in (self._zero, relief))
+        residual, met = left / wanted if wanted else 0.0, best.converged
+        self._solver.rebuild(bound.link(relief))
+        last = self._solver.solve(tolerance=min(1.0, tolerance / residual) if residual else 1.0)
+        solved = bound.step(relief, last.height)
+        weights = bound.weights(solved)
+        energy = bound.share(k, solved)
+        if energy < best.energies[-1]:
+            best.energies.append(energy)
+            # The solver's own residual: that of float32 heights has a floor of their rounding.
+            relief, residual, met = solved, residual * last.residual, met and last.converged
+        flags, edges = _cut(bound.flags, weights, full)
+        return Robust(
+            relief=relief,
+            links=bound.last,
+            flags=flags,
+            edges=edges,
+            energies=tuple(best.energies),
+            iterations=steps + 1,
+            residual=residual,
+            converged=met,
+        )
+
+    def _norm(self, links: Links) -> float:
+        """Return the norm of the right side."""
+        left = links.source.download().astype(np.float64)
+        norm = float(np.sqrt(np.sum(left * left)))
+        links.source.upload()
+        return norm
+
+
+def _cut(flags: Flags, weights: _Weights, full: _Weights) -> tuple[Flags, Flags]:
+    """Return flags without the links that have no weight, and pixels beside those that have nearly none."""
+    flags, edges = flags.copy(), np.zeros_like(flags)
+    for bit, axis, weight, whole in zip((RIGHT, DOWN), (1, 0), weights, full, strict=True):
+        broken = weight < BROKEN * whole
+        edges |= broken | np.roll(broken, 1, axis)
+        flags[weight == 0] &= np.uint8(~bit & 255)
+    return flags, edges
+
+
+class _Bound:
+    """The energy of a relief, and the least squares that bound it, on the graph's device."""
+
+    def __init__(self, inputs: Inputs, graph: Graph) -> None:
+        self.flags = graph.flags
+        self._device, self._shape = graph.links.device, graph.links.shape
+        self._size = tuple(np.float32(size) for size in inputs.pixel_size)
+        self._unit = inputs.typical
+        self._maps = (self.put("flags", graph.flags, np.uint8), *self._slopes(inputs, graph.plane))
+        self._sure = self._confidence(inputs)
+        self._anchor = graph.links.anchor
+        self._held = self._heights(inputs, graph)
+        names = "share x", "share y", "right", "down", "pull x", "pull y", "source"
+        rooms = [self._room(name) for name in names]
+        self._shares, self._links, self._source = rooms[:2], rooms[2:6], rooms[6]
+        rows, columns = self._shape
+        self._pieces = rows * -(-columns // min(self._device.shape.tile, 256))
+        self._sums = self._room("sums", (self._pieces,))
+
+    def share(self, k: float, relief: Array) -> float:
+        """Divide the pixels' weights between their links; return the energy."""
+        known = self._held[:2]
+        terms: list[Array | np.generic] = [*self._maps, *self._sure, *known, relief, np.float32(k)]
+        self._run("shares", self._pieces, *terms, *self._size, *self._shares, self._sums)
+        energy = float(self._sums.download().sum(dtype=np.float64))
+        self._sums.upload()
+        return self._unit * energy
+
+    def link(self, relief: Array, curl: Array | None = None, level: float = 0.0) -> Links:
+        """Return the graph that the shares make, for a step from a relief; it may open at curl."""
+        terms = [*self._maps, *self._sure, *self._shares, relief]
+        self._run("links", self._pieces, *terms, *self._size, *self._links)
+        if curl is not None:
+            self._run("open", self._pieces, curl, np.float32(level), *self._links)
+        known = (self._anchor, self._held[1], relief) if self._anchor is not None else ()
+        self._run("left", self._pieces, *self._links[2:], *known, self._source)
+        return self.last
+
+    @property
+    def last(self) -> Links:
+        """The last graph, for the step from the relief on that it was made for."""
+        right, down = self._links[:2]
+        return Links(self._device, self._shape, right, down, self._anchor, self._source)
+
+    def weights(self, relief: Array) -> _Weights:
+        """Return weights of the links to the right and down, as the shares are."""
+        last = self.link(relief)
+        found = last.right.download().copy(), last.down.download().copy()
+        last.right.upload()
+        last.down.upload()
+        return found
+
+    def curl(self) -> Array:
+        """Return what does not close of the slopes."""
+        found = self._room("curl")
+        width, height = self._size
+        mean = np.sqrt(width * height)
+        self._run("curl", self._pieces, *self._maps[:3], width / mean, height / mean, found)
+        return found
+
+    def step(self, relief: Array, change: Array, part: float = 1.0) -> Array:
+        """Return a relief changed by so much of a change."""
+        found = self._room("relief")
+        items = -(-self.flags.size // self._device.shape.tile)
+        self._run("step", items, relief, change, np.float32(part), found)
+        return found
+
+    def put(self, name: str, values: NDArray[Any], dtype: type[np.generic] = np.float32) -> Array:
+        """Bring a map to the device."""
+        array = self._device.array(name, self._shape, dtype)
+        array.host[...] = values
+        array.upload()
+        return array
+
+    def _room(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
+        array = self._device.array(name, shape or self._shape, np.float32)
+        array.upload()
+        return array
+
+    def _run(self, name: str, items: int, *arguments: Array | np.generic) -> None:
+        sizes = [np.int32(size) for size in self._shape]
+        moved = sum(one.host.nbytes for one in arguments if isinstance(one, Array))
+        kernel = self._device.kernel("bilateral", f"bilateral_{name}", KNOWN=int(bool(self._held)))
+        kernel(items, *sizes, *arguments, moved=moved)
+
+    def _slopes(self, inputs: Inputs, plane: tuple[float, float, float]) -> tuple[Array, Array, Array]:
+        """Return slopes relative to the plane, to the right and down, and the squared z of the normals."""
+        x, y = inputs.dz_dx, inputs.dz_dy
+        good = np.isfinite(x) & np.isfinite(y)
+        x, y = np.where(good, x, np.float32(0)), np.where(good, y, np.float32(0))
+        return (
+            self.put("slope x", x - np.float32(plane[0])),
+            self.put("slope y", np.float32(plane[1]) - y),
+            self.put("steep", 1 / (1 + x * x + y * y)),
+        )
+
+    def _confidence(self, inputs: Inputs) -> tuple[Array, Array]:
+        """Return inverse variances along x and y, relative to what is typical."""
+        factor = inputs.weight / inputs.typical
+        one = np.ones(1, np.float32) if inputs.weight_x is None else inputs.weight_x
+        first = self.put("sure x", factor * one)
+        return first, first if inputs.weight_y is None else self.put("sure y", factor * inputs.weight_y)
+
+    def _heights(self, inputs: Inputs, graph: Graph) -> tuple[Array, ...]:
+        """Return weights of known heights, relative to what is typical, and these; nothing without any."""
+        if inputs.heights is None or self._anchor is None:
+            return ()
+        row, column = np.indices(self._shape, np.float32)
+        rise, fall = graph.plane[0] * inputs.pixel_size[0], graph.plane[1] * inputs.pixel_size[1]
+        relief = inputs.heights - (graph.plane[2] + rise * column - fall * row)
+        weight = self._anchor.download() / np.float32(inputs.pixel_size[0] * inputs.pixel_size[1])
+        self._anchor.upload()
+        return self.put("held", weight), self.put("known", np.where(weight > 0, relief, 0))

@@ -1,0 +1,249 @@
+"""Heights of one picture, or of one after the other: the choice of a solver, and what it found."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.integration.components import Components, Settler, find_components
+from mirrorskin.engine.integration.inputs import Flags, Floats, Inputs
+from mirrorskin.engine.integration.links import LEVEL, Graph, LinkRoom, Links, Plane
+from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.engine.integration.rectangle import Rectangle
+from mirrorskin.engine.integration.robust import solve_robust
+from mirrorskin.engine.integration.spread import find_sigma
+from mirrorskin.engine.integration.surface import IntegrationMethod, Surface
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.links import KNOWN, LOST, SLOPE
+
+_STIFF = 100.0  # times a link's that known heights weigh, above which the direct solver loses too many digits
+_GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is asked of a solver.
+
+    Attributes
+    ----------
+    tolerance : float or None
+        Of the residual; None: as near as two cycles get.
+    deadline : float or None
+        Of ``time.perf_counter``; where there is one, no tolerance must be met.
+    k : float or None
+        Of the bilateral weights that look for discontinuities; None where none are looked for.
+    sigma : bool
+        Whether to tell how sure the heights are.
+    """
+
+    tolerance: float | None = None
+    deadline: float | None = None
+    k: float | None = None
+    sigma: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Relief:
+    """Heights above a plane as a solver leaves them, on the device."""
+
+    height: Array
+    plane: Plane
+    method: IntegrationMethod
+    iterations: int
+    residual: float
+    converged: bool
+    links: Links | None = None
+    flags: Flags | None = None
+    edges: Flags | None = None
+
+
+class SurfaceSolver:
+    """Solvers for pictures of one shape and pixel size; what they allocated and found is used again.
+
+    Parameters
+    ----------
+    device : Device
+    shape : (int, int)
+        Rows and columns.
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        self._device = device
+        self._room = LinkRoom(device, shape)
+        self._settler = Settler(self._room)
+        self._rectangle: Rectangle | None = None
+        self._multigrid: Multigrid | None = None
+        self._flags = np.zeros(shape, np.uint8)
+        self._key: tuple[object, ...] | None = None
+        self._next_key: tuple[object, ...] | None = None
+        self._components: Components | None = None
+        self._plane: Plane | None = None
+        self._last: Array | None = None
+        self._rest = 0.0
+
+    def restart(self) -> None:
+        """Forget the last picture and its heights."""
+        self._last = self._plane = self._components = self._key = None
+
+    def solve(self, inputs: Inputs, wish: Wish, start: NDArray[np.floating] | None = None) -> Surface:
+        """Return the surface of a picture.
+
+        Parameters
+        ----------
+        inputs : Inputs
+        wish : Wish
+        start : ndarray, (H, W), optional
+            Heights to begin with, mm, NaN where there is none; by default those found last.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            No pixel has slopes or a known height.
+        NotConverged
+            The tolerance was not met.
+        """
+        flags = self._room.take(inputs)
+        if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
+            raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
+        same = self._is_same(inputs, flags)
+        relief = self._find(inputs, wish, start, same)
+        if not relief.converged and wish.deadline is None:
+            raise NotConverged(_explain(relief, wish.tolerance))
+        begun = time.perf_counter()
+        surface = self._finish(inputs, wish, relief, same)
+        self._rest = time.perf_counter() - begun
+        return surface
+
+    def _is_same(self, inputs: Inputs, flags: Flags) -> bool:
+        """Tell whether the graph is that of the last multigrid; until there is a new one, it is no one's."""
+        maps = inputs.weight_x, inputs.height_weights
+        key = inputs.weight, inputs.height_weight, inputs.heights is None, inputs.pixel_size
+        plain = all(one is None for one in maps)
+        same = plain and key == self._key and np.array_equal(flags, self._flags)
+        self._key, self._next_key = None, key if plain else None
+        if not same:
+            self._flags = flags.copy()
+        return same
+
+    def _find(self, inputs: Inputs, wish: Wish, start: NDArray[np.floating] | None, same: bool) -> _Relief:
+        """Choose a solver and run it."""
+        if wish.k is None and self._is_plain(inputs):
+            return self._solve_rectangle(inputs)
+        if self._plane is None:
+            self._plane = self._room.lean()
+        first = None if start is None else self._above_plane(start, inputs)
+        if wish.k is not None:
+            return self._solve_robust(inputs, wish, wish.k, first)
+        begin = self._last if first is None else self._room.put("start", first)
+        links = self._room.join(self._plane)
+        if self._multigrid is None:
+            self._multigrid = Multigrid(links)
+        elif not same:
+            self._multigrid.rebuild(links)
+        self._key = self._next_key
+        goal = wish.tolerance if wish.deadline is None else wish.tolerance or _GOAL
+        deadline = None if wish.deadline is None else wish.deadline - self._rest
+        found = self._multigrid.solve(begin, tolerance=goal, deadline=deadline)
+        self._last = found.height
+        return _Relief(
+            found.height, self._plane, "multigrid", found.iterations, found.residual, found.converged
+        )
+
+    def _is_plain(self, inputs: Inputs) -> bool:
+        """Tell whether all pixels, links and known heights are alike."""
+        every = SLOPE if inputs.heights is None else SLOPE | KNOWN
+        uniform = inputs.weight_x is None and inputs.edges is None and inputs.height_weights is None
+        uniform = uniform and self._screening(inputs) <= _STIFF
+        return uniform and bool(np.bitwise_and.reduce(self._flags, axis=None) & every == every)
+
+    def _solve_rectangle(self, inputs: Inputs) -> _Relief:
+        height = self._find_rectangle(inputs).solve(self._room.ask(), self._screening(inputs))
+        return _Relief(height, LEVEL, "direct", 1, 0.0, True)
+
+    def _find_rectangle(self, inputs: Inputs) -> Rectangle:
+        if self._rectangle is None:
+            scale = self._room.scale * inputs.weight
+            self._rectangle = Rectangle(self._room.shape, inputs.pixel_size, self._device, scale)
+        return self._rectangle
+
+    def _screening(self, inputs: Inputs) -> float:
+        return 0.0 if inputs.heights is None else self._room.scale * inputs.height_weight
+
+    def _above_plane(self, start: NDArray[np.floating], inputs: Inputs) -> Floats:
+        """Return heights to begin with above the plane, about 0 where nothing is known of them."""
+        known = np.isfinite(start)
+        rise = self._room.rise(self._plane or LEVEL)
+        row, column = np.ogrid[: start.shape[0], : start.shape[1]]
+        above = start - (rise[2] + rise[0] * column + rise[1] * row)
+        datum = (
+            inputs.datum
+            if inputs.heights is not None
+            else np.mean(above, where=known)
+            if known.any()
+            else 0.0
+        )
+        return np.where(known, above - datum, 0.0).astype(np.float32)
+
+    def _solve_robust(self, inputs: Inputs, wish: Wish, k: float, start: Floats | None) -> _Relief:
+        plane = self._plane or LEVEL
+        graph = Graph(self._room.join(plane), self._flags, self._room.scale, plane)
+        tolerance = wish.tolerance or _GOAL
+        found = solve_robust(inputs, graph, k, start=start, tolerance=tolerance, deadline=wish.deadline)
+        numbers = found.iterations, found.residual, found.converged or wish.tolerance is None
+        return _Relief(found.relief, plane, "robust", *numbers, found.links, found.flags, found.edges)
+
+    def _finish(self, inputs: Inputs, wish: Wish, relief: _Relief, same: bool) -> Surface:
+        """Bring relief to its height, and tell how sure it is."""
+        components = self._find_components(inputs, relief, same)
+        self._settler.take(components)
+        height = self._settler.settle(relief.height, relief.plane, inputs.datum)
+        return Surface(
+            height=height,
+            sigma=self._find_sigma(inputs, relief) if wish.sigma else None,
+            component=components.labels,
+            offset_unknown=components.offset_unknown,
+            filled=np.zeros(height.shape, np.uint8),
+            edges=relief.edges,
+            iterations=relief.iterations,
+            residual=relief.residual,
+            converged=relief.converged,
+            method=relief.method,
+            invalid=int(np.count_nonzero(self._flags & LOST)),
+        )
+
+    def _find_components(self, inputs: Inputs, relief: _Relief, same: bool) -> Components:
+        if relief.method == "direct":
+            labels, unknown = np.zeros(self._room.shape, np.int32), np.array([inputs.heights is None])
+            return Components(labels, unknown)
+        if relief.flags is not None:
+            return find_components(relief.flags, True)
+        if not same or self._components is None:
+            alone = (self._flags & (SLOPE | KNOWN)) == KNOWN
+            cut = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
+            self._components = find_components(self._flags, cut)
+        return self._components
+
+    def _find_sigma(self, inputs: Inputs, relief: _Relief) -> Floats:
+        links, room = relief.links, self._room
+        solver = self._multigrid if links is None else Multigrid(replace(links, source=room.ask(links=links)))
+
+        def solve() -> Array:
+            source = room.ask(links=links)
+            if relief.method == "direct" or solver is None:
+                return self._find_rectangle(inputs).solve(source, self._screening(inputs))
+            return solver.solve(tolerance=None).height
+
+        misfit = None if inputs.absolute else room.misfit(relief.height, relief.plane, links)
+        return find_sigma(inputs, room, self._settler, solve, links, misfit)
+
+
+def _explain(relief: _Relief, tolerance: float | None) -> str:
+    asked = "" if tolerance is None else f", more than {tolerance:.2g}"
+    reached = f"{relief.iterations} iterations left a residual of {relief.residual:.2g}{asked}"
+    remedy = "give engine.integrate a larger tolerance, or None to take it as it is"
+    return f"the surface did not converge: {reached}; {remedy}"

@@ -1,0 +1,117 @@
+// Heights of the connected pieces of a surface. Specification: components.py.
+//
+// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// ONE      1 where all that is answered hangs together: labels are then not read
+// HEIGHTS  0 none known, 1 known with the same weight everywhere, 2 with a map of weights
+//
+// PoCL makes vector code of loops without branches.
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#define SLOPE 4
+#define KNOWN 8
+#define WIDE 8
+
+#if TILE < 256
+#define CHUNK TILE
+#else
+#define CHUNK 256
+#endif
+
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define ANSWERED(p) (flags[p] & (SLOPE | KNOWN))
+#define RISEN(p, column) (relief[p] + (start + plane_x * (column)))
+
+#if ONE
+#define LABEL(p) 0
+#else
+#define LABEL(p) (labels[p] > 0 ? labels[p] : 0)
+#endif
+
+// Both are there before one is chosen: no branch.
+float chosen(const int which, const float one, const float other)
+{
+    return which ? one : other;
+}
+
+// What is averaged: heights, or by how much they are above those that are known.
+#if HEIGHTS == 0
+#define HEIGHT_MAPS
+#define SHARE(p) (ANSWERED(p) ? 1.0f : 0.0f)
+#define VALUE(p, column) RISEN(p, column)
+#else
+#define VALUE(p, column) (RISEN(p, column) - heights[p])
+#if HEIGHTS == 1
+#define HEIGHT_MAPS __global const float *restrict heights,
+#define SHARE(p) ((flags[p] & KNOWN) ? 1.0f : 0.0f)
+#else
+#define HEIGHT_MAPS __global const float *restrict heights, __global const float *restrict height_weights,
+#define SHARE(p) chosen(flags[p] & KNOWN, height_weights[p], 0.0f)
+#endif
+#endif
+
+#define ADD(sum, total, p, column) {                                                                   \
+    const float share = SHARE(p), value = share * VALUE(p, column);                                    \
+    sum += share > 0.0f ? value : 0.0f;                                                                \
+    total += share;                                                                                    \
+}
+
+// Each item sums over its rows, into its own row of the sums.
+__kernel void components_sum(
+    const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
+    __global const float *restrict relief, const float plane_x, const float plane_y, const float plane_z,
+    HEIGHT_MAPS const int strip, const int pieces, __global float *restrict sums, __global float *restrict totals)
+{
+    const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
+    if (top >= rows) return;
+    __global float *sum = sums + item * pieces, *total = totals + item * pieces;
+    for (int piece = 0; piece < pieces; ++piece) sum[piece] = total[piece] = 0.0f;
+    for (int row = top; row < bottom; ++row) {
+        const float start = plane_z + plane_y * row;
+        const int first = row * columns;
+#if ONE
+        float some[WIDE] = {0, 0, 0, 0, 0, 0, 0, 0}, share_of[WIDE] = {0, 0, 0, 0, 0, 0, 0, 0};
+        int column = 0;
+        for (; column + WIDE <= columns; column += WIDE)
+            for (int lane = 0; lane < WIDE; ++lane)
+                ADD(some[lane], share_of[lane], first + column + lane, column + lane)
+        for (; column < columns; ++column) ADD(some[0], share_of[0], first + column, column)
+        for (int lane = 0; lane < WIDE; ++lane) {
+            sum[0] += some[lane];
+            total[0] += share_of[lane];
+        }
+#else
+        // Pixels of one piece side by side are summed first: a sum in memory is slow, and loses digits.
+        int piece = -1;
+        float part = 0.0f, shares = 0.0f;
+        for (int column = 0; column <= columns; ++column) {
+            const int label = column < columns ? labels[first + column] : -1;
+            if (label != piece) {
+                if (piece >= 0) {
+                    sum[piece] += part;
+                    total[piece] += shares;
+                }
+                piece = label;
+                part = shares = 0.0f;
+            }
+            if (label >= 0) ADD(part, shares, first + column, column)
+        }
+#endif
+    }
+}
+
+__kernel void components_settle(
+    const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
+    __global const float *restrict relief, const float plane_x, const float plane_y, const float plane_z,
+    __global const float *restrict offsets, __global float *restrict height)
+{
+    const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
+    const int row = item / pieces, begin = item % pieces * CHUNK, end = LESSER(columns, begin + CHUNK);
+    if (row >= rows) return;
+    const float start = plane_z + plane_y * row;
+    const int first = row * columns;
+    for (int column = begin; column < end; ++column) {
+        const int p = first + column;
+        height[p] = chosen(ANSWERED(p), RISEN(p, column) + offsets[LABEL(p)], NAN);
+    }
+}

@@ -1,0 +1,73 @@
+"""Heights of a surface's connected pieces: what ``components.cl`` computes, in NumPy with float64 inside.
+
+A solver tells the relief: heights above a plane, up to an offset of each piece.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.links import KNOWN, Doubles, Flags, Triple
+
+Labels = NDArray[np.int32]
+
+
+def components_sum(
+    flags: Flags,
+    labels: Labels,
+    relief: NDArray[np.floating],
+    plane: Triple,
+    heights: NDArray[np.floating] | None,
+    height_weights: NDArray[np.floating] | None,
+    pieces: int,
+) -> tuple[Doubles, Doubles]:
+    """Return of each piece a sum of heights, and what to divide it by for their mean; (pieces,) each.
+
+    With known heights it is the mean of what the others are above these, weighted like them.
+
+    Parameters
+    ----------
+    flags : ndarray, (H, W), uint8
+        See `mirrorskin.kernels.links`.
+    labels : ndarray, (H, W), int32
+        To which piece a pixel belongs; -1 without an answer.
+    relief : ndarray, (H, W)
+        Heights above the plane, mm.
+    plane : (float, float, float)
+        How much it rises from column to column and from row to row, and its height in the top left pixel, mm.
+    heights, height_weights : ndarray, (H, W), or None
+        See `mirrorskin.kernels.links`.
+    pieces : int
+        How many there are. The kernel is told before it of how many rows each of its items makes a sum.
+    """
+    risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
+    if heights is not None:
+        known = flags & KNOWN != 0
+        share = known * np.where(known, 1.0 if height_weights is None else height_weights, 0.0)
+        risen = risen - np.where(known, heights, 0.0)
+    inside = share > 0
+    where, some = labels[inside], share[inside]
+    sums, totals = (np.bincount(where, part, pieces) for part in (some * risen[inside], some))
+    return np.asarray(sums, np.float64), np.asarray(totals, np.float64)
+
+
+def components_settle(
+    flags: Flags, labels: Labels, relief: NDArray[np.floating], plane: Triple, offsets: NDArray[np.floating]
+) -> Doubles:
+    """Return heights: relief, plane, and the offset of the piece; NaN without an answer.
+
+    Parameters
+    ----------
+    flags, labels, relief, plane
+        See ``components_sum``.
+    offsets : ndarray, (pieces,)
+        Millimetres.
+    """
+    height = relief + _level(plane, flags.shape) + np.asarray(offsets, np.float64)[labels]
+    return np.where(labels >= 0, height, np.nan)
+
+
+def _level(plane: Triple, shape: tuple[int, ...]) -> Doubles:
+    row, column = np.indices(shape)
+    return np.asarray(plane[2] + plane[0] * column + plane[1] * row)

@@ -1,0 +1,322 @@
+// The pixels' graph from slopes. Specification: links.py.
+//
+// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// MASK     1 where a mask is given
+// WEIGHTS  of the slopes: 0 the same everywhere, 1 a map, 2 a map for x and one for y, 3 maps of the links' own
+// HEIGHTS  0 none known, 1 known with the same weight everywhere, 2 with a map of weights
+// KEEP     1 where the weights are to be written
+//
+// Arguments that are not given are left out. An item has a piece of a row, or of ROWS of them. PoCL makes
+// vector code of loops without branches and calls; what would read outside the maps is done beside them.
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#define RIGHT 1
+#define DOWN 2
+#define SLOPE 4
+#define KNOWN 8
+#define LOST 16
+
+#if TILE < 256
+#define CHUNK TILE
+#define ROWS 1
+#else
+#define CHUNK 256
+#define ROWS 16
+#endif
+
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+#define FINITE(value) ((value) - (value) == 0.0f)
+
+#if MASK
+#define MASK_MAP __global const uchar *restrict mask,
+#define WANTED(p) (mask[p] != 0)
+#else
+#define MASK_MAP
+#define WANTED(p) 1
+#endif
+
+#if WEIGHTS == 0
+#define WEIGHT_MAPS
+#define X_COUNTS(p) 1
+#define Y_COUNTS(p) 1
+#define X_WEIGHT(here, next) weight_x
+#define Y_WEIGHT(here, next) weight_y
+#elif WEIGHTS == 1
+#define WEIGHT_MAPS __global const float *restrict map_x,
+#define map_y map_x
+#else
+#define WEIGHT_MAPS __global const float *restrict map_x, __global const float *restrict map_y,
+#endif
+
+#if WEIGHTS
+#define X_COUNTS(p) (map_x[p] > 0.0f)
+#define Y_COUNTS(p) (map_y[p] > 0.0f)
+#endif
+#if WEIGHTS == 3
+#define X_WEIGHT(here, next) (weight_x * map_x[here])
+#define Y_WEIGHT(here, next) (weight_y * map_y[here])
+#elif WEIGHTS
+#define X_WEIGHT(here, next) harmonic(weight_x * map_x[here], weight_x * map_x[next])
+#define Y_WEIGHT(here, next) harmonic(weight_y * map_y[here], weight_y * map_y[next])
+#endif
+
+#if HEIGHTS == 0
+#define HEIGHT_MAPS
+#elif HEIGHTS == 1
+#define HEIGHT_MAPS __global const float *restrict heights,
+#define ANCHOR(p) weight_z
+#define IS_KNOWN(p) FINITE(heights[p])
+#else
+#define HEIGHT_MAPS __global const float *restrict heights, __global const float *restrict height_weights,
+#define ANCHOR(p) (weight_z * height_weights[p])
+#define IS_KNOWN(p) (FINITE(heights[p]) & (height_weights[p] > 0.0f))
+#endif
+
+// Begins a loop's item: columns begin to end of the rows top to bottom.
+#define PIECE(rows_of_it)                                                                              \
+    const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);                     \
+    const int top = item / across_all * rows_of_it, bottom = LESSER(rows, top + rows_of_it);           \
+    const int begin = item % across_all * CHUNK, end = LESSER(columns, begin + CHUNK);
+
+float harmonic(const float a, const float b)
+{
+    return 2.0f * a * b / (a + b);
+}
+
+#if WEIGHTS < 3
+#if HEIGHTS
+#define KNOWN_FLAG(p) (-(WANTED(p) & IS_KNOWN(p)) & KNOWN)
+#else
+#define KNOWN_FLAG(p) 0
+#endif
+
+// What a pixel is by itself: with RIGHT and DOWN where its slopes count along these links.
+#define TELL(p, state) {                                                                               \
+    const int real = FINITE(dz_dx[p]) & FINITE(dz_dy[p]);                                              \
+    const int x = WANTED(p) & X_COUNTS(p), y = WANTED(p) & Y_COUNTS(p);                                \
+    const int slope = real ? SLOPE : LOST, links = (-x & RIGHT) | (-y & DOWN);                         \
+    state = (-(x | y) & slope) | (-real & links) | KNOWN_FLAG(p);                                      \
+}
+
+__kernel void links_flags(
+    const int rows, const int columns, __global const float *restrict dz_dx, __global const float *restrict dz_dy,
+    MASK_MAP WEIGHT_MAPS HEIGHT_MAPS __global uchar *restrict flags)
+{
+    PIECE(ROWS)
+    if (top >= rows) return;
+    const int width = end - begin, more = end < columns;
+    int here[CHUNK + 1], below[CHUNK + 1];
+    for (int i = 0; i < width + more; ++i) TELL(top * columns + begin + i, here[i])
+    if (!more) here[width] = 0;
+    for (int row = top; row < bottom; ++row) {
+        const int first = row * columns + begin, down = row + 1 < rows ? columns : 0;
+        const int open = down ? RIGHT | DOWN : RIGHT;
+        for (int i = 0; i < width + more; ++i) TELL(first + down + i, below[i])
+        if (!more) below[width] = 0;
+        for (int i = 0; i < width; ++i) {
+            const int links = (here[i + 1] & RIGHT) | (below[i] & DOWN);
+            flags[first + i] = here[i] & (links & open | ~(RIGHT | DOWN));
+        }
+        for (int i = 0; i <= width; ++i) here[i] = below[i];
+    }
+}
+#endif
+
+#define UNLIKE(a, b) ((dz_dx[a] - dz_dx[b]) * (dz_dx[a] - dz_dx[b]) + (dz_dy[a] - dz_dy[b]) * (dz_dy[a] - dz_dy[b]))
+
+// The neighbour to which a pixel on an edge keeps its link: the one off the edge that is most like it; else -1.
+int kept(
+    const int p, const int row, const int column, const int columns, __global const float *dz_dx,
+    __global const float *dz_dy, __global const uchar *edges, __global const uchar *flags)
+{
+    const int there[4] = {p + 1, p - 1, p + columns, p - columns};
+    const int linked[4] = {
+        flags[p] & RIGHT, column > 0 && flags[p - (column > 0)] & RIGHT,
+        flags[p] & DOWN, row > 0 && flags[row > 0 ? p - columns : p] & DOWN,
+    };
+    int best = -1;
+    float least = INFINITY;
+    for (int way = 0; way < 4; ++way) {
+        if (!linked[way] || edges[there[way]]) continue;
+        const float far = UNLIKE(there[way], p);
+        if (far < least) {
+            least = far;
+            best = there[way];
+        }
+    }
+    return best;
+}
+
+#define KEPT(p, row, column) kept(p, row, column, columns, dz_dx, dz_dy, edges, flags)
+
+__kernel void links_cut(
+    const int rows, const int columns, __global const float *restrict dz_dx, __global const float *restrict dz_dy,
+    __global const uchar *restrict edges, __global const uchar *restrict flags, __global uchar *restrict cut)
+{
+    PIECE(1)
+    if (top >= rows) return;
+    const int first = top * columns;
+    for (int p = first + begin; p < first + end; ++p) cut[p] = flags[p];
+    const int down = top + 1 < rows ? columns : 0;
+    for (int column = begin; column < end; ++column) {
+        const int p = first + column, right = p + (column + 1 < columns), below = p + down;
+        if (!(edges[p] | edges[right] | edges[below])) continue;
+        const int joins = (!edges[p] || KEPT(p, top, column) == right)
+            && (!edges[right] || KEPT(right, top, column + 1) == p);
+        const int meets = (!edges[p] || KEPT(p, top, column) == below)
+            && (!edges[below] || KEPT(below, top + 1, column) == p);
+        cut[p] = flags[p] & ~((joins ? 0 : RIGHT) | (meets ? 0 : DOWN));
+    }
+}
+
+// Slope of the link from here to next: of four pixels in line where links lead through all of them (bit is 0 where
+// there are not as many), else the mean of two.
+float link_slope(
+    __global const float *slope, __global const uchar *flags, const int before, const int here, const int next,
+    const int after, const int bit)
+{
+    const float near = slope[here] + slope[next], far = slope[before] + slope[after];
+    const float four = 0.5f * near + (near - far) * (1.0f / 24);
+    return (flags[before] & flags[here] & flags[next] & bit) ? four : 0.5f * near;
+}
+
+// Weight times what is asked of a link. It is reckoned everywhere and chosen afterwards: no branch, no call.
+float asked(const int linked, const float weight, const float size, const float slope, const float plane)
+{
+    const float all = weight * (size * (slope - plane));
+    return linked ? all : 0.0f;
+}
+
+float chosen(const int linked, const float value)
+{
+    return linked ? value : 0.0f;
+}
+
+#define X_SLOPE(p, before, bit) link_slope(dz_dx, flags, before, p, (p) + 1, (p) + 2, bit)
+#define Y_SLOPE(p) link_slope(dz_dy, flags, (p) - before, p, (p) + next, (p) + after, line)
+#define X_ASKS(p, before, bit)                                                                         \
+    asked(flags[p] & RIGHT, X_WEIGHT(p, (p) + 1), size_x, X_SLOPE(p, before, bit), plane_x)
+#define Y_ASKS(p) asked(flags[p] & DOWN, Y_WEIGHT(p, (p) + next), -size_y, Y_SLOPE(p), plane_y)
+
+// Where a row's neighbours are, and whether links downwards have pixels in line with them.
+#define NEIGHBOURS(row)                                                                                \
+    const int before = (row) > 0 ? columns : 0, next = (row) + 1 < rows ? columns : 0;                 \
+    const int after = (row) + 2 < rows ? 2 * columns : next, line = (row) > 0 ? DOWN : 0;
+
+#define LEVEL(row, column) (plane_z + (plane_x * size_x * (column) - plane_y * size_y * (row)))
+
+#define GRAPH                                                                                          \
+    const int rows, const int columns, __global const float *restrict dz_dx,                           \
+        __global const float *restrict dz_dy, __global const uchar *restrict flags, WEIGHT_MAPS        \
+        HEIGHT_MAPS const float weight_x, const float weight_y, const float weight_z,                  \
+        const float size_x, const float size_y, const float plane_x, const float plane_y,              \
+        const float plane_z
+
+#if KEEP && HEIGHTS
+#define KEPT_MAPS __global float *restrict right, __global float *restrict down, __global float *restrict anchor,
+#elif KEEP
+#define KEPT_MAPS __global float *restrict right, __global float *restrict down,
+#else
+#define KEPT_MAPS
+#endif
+
+__kernel void links_join(GRAPH, KEPT_MAPS __global float *restrict source)
+{
+    PIECE(ROWS)
+    if (top >= rows) return;
+    const int width = end - begin;
+    float beside[CHUNK + 1], above[CHUNK];
+    for (int i = 0; i < width; ++i) above[i] = 0.0f;
+    if (top > 0) {
+        NEIGHBOURS(top - 1)
+        const int first = (top - 1) * columns + begin;
+        for (int i = 0; i < width; ++i) above[i] = Y_ASKS(first + i);
+    }
+    for (int row = top; row < bottom; ++row) {
+        const int first = row * columns + begin;
+        NEIGHBOURS(row)
+        beside[0] = begin > 0 ? X_ASKS(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
+        beside[1] = X_ASKS(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);
+        for (int i = 1; i < width; ++i) beside[i + 1] = X_ASKS(first + i, first + i - 1, RIGHT);
+        for (int i = 0; i < width; ++i) {
+            const int p = first + i;
+            const float below = Y_ASKS(p);
+            float sum = beside[i] - beside[i + 1] + above[i] - below;
+            above[i] = below;
+#if HEIGHTS
+            const float weight = ANCHOR(p), rise = heights[p] - LEVEL(row, begin + i);
+            sum += chosen(flags[p] & KNOWN, weight * rise);
+#endif
+            source[p] = sum;
+#if KEEP
+            right[p] = chosen(flags[p] & RIGHT, X_WEIGHT(p, p + 1));
+            down[p] = chosen(flags[p] & DOWN, Y_WEIGHT(p, p + next));
+#if HEIGHTS
+            anchor[p] = chosen(flags[p] & KNOWN, weight);
+#endif
+#endif
+        }
+    }
+}
+
+#if HEIGHTS
+#define HEIGHT_SQUARE(p, row, column)                                                                  \
+    square(flags[p] & KNOWN, ANCHOR(p), relief[p] + LEVEL(row, column) - heights[p])
+#else
+#define HEIGHT_SQUARE(p, row, column) 0.0f
+#endif
+#define ADD_SQUARES(column, left, bit) {                                                               \
+    const int p = first + (column);                                                                    \
+    const float x = relief[p + 1] - relief[p] - size_x * (X_SLOPE(p, left, bit) - plane_x);            \
+    const float y = relief[p + next] - relief[p] + size_y * (Y_SLOPE(p) - plane_y);                    \
+    squares[(column) - begin] += square(flags[p] & RIGHT, X_WEIGHT(p, p + 1), x)                       \
+        + square(flags[p] & DOWN, Y_WEIGHT(p, p + next), y) + HEIGHT_SQUARE(p, row, column);           \
+}
+
+float square(const int linked, const float weight, const float left)
+{
+    const float all = weight * left * left;
+    return linked ? all : 0.0f;
+}
+
+// Sums of an item each: squares of what is left over, times their weights.
+__kernel void links_misfit(GRAPH, __global const float *restrict relief, __global float *restrict sums)
+{
+    PIECE(ROWS)
+    if (top >= rows) return;
+    float squares[CHUNK];
+    for (int i = 0; i < end - begin; ++i) squares[i] = 0.0f;
+    for (int row = top; row < bottom; ++row) {
+        const int first = row * columns;
+        NEIGHBOURS(row)
+        ADD_SQUARES(begin, GREATER(p - 1, 0), begin > 0 ? RIGHT : 0)
+        for (int column = begin + 1; column < end; ++column) ADD_SQUARES(column, p - 1, RIGHT)
+    }
+    float sum = 0.0f;
+    for (int i = 0; i < end - begin; ++i) sum += squares[i];
+    sums[item] = sum;
+}
+
+// What comes along a link, but not from where the height is known to where it is not, or back.
+#define GAIN(linked, p, other)                                                                         \
+    chosen(((linked) != 0) & (((flags[p] ^ flags[other]) & KNOWN) == 0), values[other] - values[p])
+#define SMOOTH(column, left, bit) {                                                                    \
+    const int p = first + (column);                                                                    \
+    const float x = GAIN(flags[p] & RIGHT, p, p + 1) + GAIN(flags[left] & (bit), p, left);             \
+    const float y = GAIN(flags[p] & DOWN, p, p + next) + GAIN(flags[p - before] & line, p, p - before); \
+    smoothed[p] = values[p] + 0.2f * (x + y);                                                          \
+}
+
+__kernel void links_smooth(
+    const int rows, const int columns, __global const uchar *restrict flags,
+    __global const float *restrict values, __global float *restrict smoothed)
+{
+    PIECE(1)
+    if (top >= rows) return;
+    const int first = top * columns;
+    NEIGHBOURS(top)
+    SMOOTH(begin, GREATER(first + begin - 1, 0), begin > 0 ? RIGHT : 0)
+    for (int column = begin + 1; column < end; ++column) SMOOTH(column, p - 1, RIGHT)
+}

@@ -1,0 +1,273 @@
+"""The pixels' graph from slopes: what ``links.cl`` computes, in plain NumPy with float64 inside.
+
+Heights u are sought that minimise, over the links from pixel i to its neighbour j on the right or below, ::
+
+    sum of w (u_j - u_i - d)^2  +  sum of a (u_i - k_i)^2
+
+with d = pixel size x slope of the link, k the known heights. Its normal equations are A u = b; b is summed
+per link, so that it is 0 in all on every connected component without a known height.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Flags = NDArray[np.uint8]
+Triple = tuple[float, float, float]
+
+RIGHT, DOWN = 1, 2
+"""Flags of a pixel: it is linked to the one on the right, to the one below."""
+SLOPE, KNOWN = 4, 8
+"""Its slopes count; its height is known."""
+LOST = 16
+"""It was wanted, but its slopes are no numbers."""
+
+
+def links_flags(
+    dz_dx: NDArray[np.float32],
+    dz_dy: NDArray[np.float32],
+    mask: NDArray[np.uint8] | None,
+    weight_x: NDArray[np.float32] | None,
+    weight_y: NDArray[np.float32] | None,
+    heights: NDArray[np.float32] | None,
+    height_weights: NDArray[np.float32] | None,
+) -> Flags:
+    """Return what the pixels are and which are linked, (H, W), a sum of the flags above.
+
+    Neighbours are linked where the slopes of both count along the link.
+
+    Parameters
+    ----------
+    dz_dx, dz_dy : ndarray, (H, W), float32
+        Slopes; not finite where there is none.
+    mask : ndarray, (H, W), uint8, or None
+        0 where no answer is wanted. None for nowhere.
+    weight_x, weight_y : ndarray, (H, W), float32, or None
+        Confidence of the slopes; 0 where there is none. None for the same everywhere; ``weight_y`` None where
+        it is ``weight_x``.
+    heights : ndarray, (H, W), float32, or None
+        Known heights; not finite where there is none.
+    height_weights : ndarray, (H, W), float32, or None
+        Their confidence; 0 where there is none. None for the same everywhere.
+    """
+    wanted = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
+    along_x = wanted if weight_x is None else wanted & (weight_x > 0)
+    along_y = along_x if weight_y is None else wanted & (weight_y > 0)
+    finite = np.isfinite(dz_dx) & np.isfinite(dz_dy)
+    flags = np.where((along_x | along_y) & finite, SLOPE, 0) | np.where(
+        (along_x | along_y) & ~finite, LOST, 0
+    )
+    if heights is not None:
+        known = wanted & np.isfinite(heights)
+        flags |= np.where(known if height_weights is None else known & (height_weights > 0), KNOWN, 0)
+    right, down = np.zeros_like(finite), np.zeros_like(finite)
+    right[:, :-1] = (along_x & finite)[:, :-1] & (along_x & finite)[:, 1:]
+    down[:-1] = (along_y & finite)[:-1] & (along_y & finite)[1:]
+    return np.asarray(flags + RIGHT * right + DOWN * down, np.uint8)
+
+
+def links_cut(
+    dz_dx: NDArray[np.float32], dz_dy: NDArray[np.float32], edges: NDArray[np.uint8], flags: Flags
+) -> Flags:
+    """Return the flags without the links that lead across edges.
+
+    A pixel on an edge keeps one link, to that neighbour off the edge whose slopes are the most similar; among
+    equals to the one on the right, on the left, below, above, in this order.
+
+    Parameters
+    ----------
+    dz_dx, dz_dy : ndarray, (H, W), float32
+    edges : ndarray, (H, W), uint8
+        Not 0 on an edge.
+    flags : ndarray, (H, W), uint8
+        Of ``links_flags``.
+    """
+    cut, marked = flags.copy(), edges != 0
+    for row, column in np.argwhere(marked):
+        best = _most_alike(dz_dx, dz_dy, marked, flags, row, column)
+        for (there, below), (owner, bit) in _links_of(row, column, flags.shape).items():
+            if (there, below) != best:
+                cut[owner] &= ~np.uint8(bit)
+    return cut
+
+
+def _links_of(
+    row: int, column: int, shape: tuple[int, ...]
+) -> dict[tuple[int, int], tuple[tuple[int, int], int]]:
+    """Return the four neighbours in the picture, with the pixel and flag that say whether there is a link."""
+    links = {
+        (row, column + 1): ((row, column), RIGHT),
+        (row, column - 1): ((row, column - 1), RIGHT),
+        (row + 1, column): ((row, column), DOWN),
+        (row - 1, column): ((row - 1, column), DOWN),
+    }
+    return {
+        there: link for there, link in links.items() if 0 <= there[0] < shape[0] and 0 <= there[1] < shape[1]
+    }
+
+
+def _most_alike(
+    dz_dx: NDArray[np.float32], dz_dy: NDArray[np.float32], marked: Mask, flags: Flags, row: int, column: int
+) -> tuple[int, int] | None:
+    """Return the linked neighbour off the edge whose slopes are nearest to a pixel's."""
+    best, least = None, np.inf
+    for there, (owner, bit) in _links_of(row, column, flags.shape).items():
+        far = math.hypot(*(float(s[there]) - float(s[row, column]) for s in (dz_dx, dz_dy)))
+        if flags[owner] & bit and not marked[there] and far < least:
+            best, least = there, far
+    return best
+
+
+def links_join(
+    dz_dx: NDArray[np.float32],
+    dz_dy: NDArray[np.float32],
+    flags: Flags,
+    weight_x: NDArray[np.float32] | None,
+    weight_y: NDArray[np.float32] | None,
+    heights: NDArray[np.float32] | None,
+    height_weights: NDArray[np.float32] | None,
+    weights: Triple,
+    size: tuple[float, float],
+    plane: Triple,
+    *,
+    owned: bool = False,
+) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    """Return right, down, anchor and source of `mirrorskin.engine.integration.links.Links`, (H, W) each.
+
+    The slope of a link is (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line, where links lead
+    through all of them, else the mean of two; its weight is the harmonic mean of two pixels' weights.
+
+    Parameters
+    ----------
+    dz_dx, dz_dy, flags, heights, height_weights
+        See ``links_flags``.
+    weight_x, weight_y : ndarray, (H, W), float32, or None
+        See there; with ``owned`` the links' own weights, of the link to the right and of the one below.
+    weights : (float, float, float)
+        Factors of the weights of links to the right and down, and of known heights.
+    size : (float, float)
+        Width and height of a pixel, mm.
+    plane : (float, float, float)
+        Slopes along x and y, and height in the picture's top left pixel, of what the heights are relative to.
+    owned : bool
+        Whether the weights are of links, not of pixels.
+    """
+    (right, across), (down, along) = _steps(
+        dz_dx, dz_dy, flags, weight_x, weight_y, weights, size, plane, owned
+    )
+    source = np.zeros(flags.shape)
+    source -= right * across + down * along
+    source[:, 1:] += (right * across)[:, :-1]
+    source[1:] += (down * along)[:-1]
+    anchor, above = _anchors(flags, heights, height_weights, weights, size, plane)
+    return right, down, anchor, source + anchor * above
+
+
+def links_misfit(
+    dz_dx: NDArray[np.float32],
+    dz_dy: NDArray[np.float32],
+    flags: Flags,
+    weight_x: NDArray[np.float32] | None,
+    weight_y: NDArray[np.float32] | None,
+    heights: NDArray[np.float32] | None,
+    height_weights: NDArray[np.float32] | None,
+    weights: Triple,
+    size: tuple[float, float],
+    plane: Triple,
+    relief: NDArray[np.floating],
+    *,
+    owned: bool = False,
+) -> float:
+    """Return the sum that heights are to make least, of ``relief``, (H, W), the heights above the plane.
+
+    The other parameters are those of ``links_join``. The kernel returns a sum of each of its items.
+    """
+    (right, across), (down, along) = _steps(
+        dz_dx, dz_dy, flags, weight_x, weight_y, weights, size, plane, owned
+    )
+    anchor, above = _anchors(flags, heights, height_weights, weights, size, plane)
+    u = relief.astype(np.float64)
+    sums = [
+        np.sum((right * (np.roll(u, -1, axis=1) - u - across) ** 2)[flags & RIGHT != 0]),
+        np.sum((down * (np.roll(u, -1, axis=0) - u - along) ** 2)[flags & DOWN != 0]),
+        np.sum((anchor * (u - above) ** 2)[flags & KNOWN != 0]),
+    ]
+    return float(sum(sums))
+
+
+def links_smooth(flags: Flags, values: NDArray[np.floating]) -> Doubles:
+    """Return values, (H, W), each with a fifth of the way to each linked neighbour's gone.
+
+    Pixels whose heights are known and such whose heights are not give each other nothing.
+    """
+    smoothed, known = values.astype(np.float64), flags & KNOWN
+    for bit, axis in ((RIGHT, 1), (DOWN, 0)):
+        alike = (flags & bit != 0) & (known == np.roll(known, -1, axis))
+        with np.errstate(invalid="ignore"):
+            flow = np.where(alike, np.roll(values, -1, axis) - values.astype(np.float64), 0.0) / 5
+        smoothed += flow - np.roll(flow, 1, axis)
+    return smoothed
+
+
+def _steps(
+    dz_dx: NDArray[np.float32],
+    dz_dy: NDArray[np.float32],
+    flags: Flags,
+    weight_x: NDArray[np.float32] | None,
+    weight_y: NDArray[np.float32] | None,
+    weights: Triple,
+    size: tuple[float, float],
+    plane: Triple,
+    owned: bool,
+) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]]:
+    """Return the weight of each link and the height that it should lead up; to the right, and down."""
+    map_x = np.ones(flags.shape) if weight_x is None else weight_x.astype(np.float64)
+    map_y = map_x if weight_y is None else weight_y.astype(np.float64)
+    right, down = flags & RIGHT != 0, flags & DOWN != 0
+    across, along = _slopes(dz_dx, right), _slopes(dz_dy.T, down.T).T
+    wx, wy = (map_x, map_y) if owned else (_harmonic(map_x), _harmonic(map_y.T).T)
+    return (
+        (np.where(right, weights[0] * wx, 0.0), np.where(right, size[0] * (across - plane[0]), 0.0)),
+        (np.where(down, weights[1] * wy, 0.0), np.where(down, -size[1] * (along - plane[1]), 0.0)),
+    )
+
+
+def _slopes(slope: NDArray[np.float32], linked: Mask) -> Doubles:
+    """Return the slopes of the links to the next column."""
+    ends = linked | np.roll(linked, 1, axis=1)
+    known, found = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
+    found[:, :-1] = (known[:, :-1] + known[:, 1:]) / 2
+    four = linked[:, :-3] & linked[:, 1:-2] & linked[:, 2:-1]
+    wide = (13 * (known[:, 1:-2] + known[:, 2:-1]) - known[:, :-3] - known[:, 3:]) / 24
+    found[:, 1:-2] = np.where(four, wide, found[:, 1:-2])
+    return found
+
+
+def _harmonic(weight: Doubles) -> Doubles:
+    """Return the harmonic mean of the weights of each pixel and the next in its row; 0 where one is 0."""
+    joined, near, far = np.zeros(weight.shape), weight[:, :-1], weight[:, 1:]
+    both = (near > 0) & (far > 0)
+    joined[:, :-1][both] = 2 / (1 / near[both] + 1 / far[both])
+    return joined
+
+
+def _anchors(
+    flags: Flags,
+    heights: NDArray[np.float32] | None,
+    height_weights: NDArray[np.float32] | None,
+    weights: Triple,
+    size: tuple[float, float],
+    plane: Triple,
+) -> tuple[Doubles, Doubles]:
+    """Return the weight of each known height, and how high it is above the plane."""
+    known = flags & KNOWN != 0
+    row, column = np.indices(flags.shape)
+    level = plane[2] + plane[0] * size[0] * column - plane[1] * size[1] * row
+    weight = np.ones(flags.shape) if height_weights is None else height_weights
+    height = np.zeros(flags.shape) if heights is None else heights
+    return np.where(known, weights[2] * weight, 0.0), np.where(known, height - level, 0.0)

@@ -1,0 +1,793 @@
+// Heights on a graph of pixels, by multigrid: the passes over one level. Specification: multigrid.py.
+//
+// TILE      nodes of one work-item, a multiple of WIDTH
+// WIDTH     nodes side by side in a vector: 8, or 1 where an item is a lane
+// PART      nodes of one part of a sum
+// ANCHORED  1 where there are known heights, 0 where there are none
+//
+// All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
+// none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has four
+// neighbours in memory, and where there is no link its weight is 0. Nodes that have no place in the picture,
+// because their block has more than one, lie behind all levels; whatever has to do with them is done by the
+// passes for odd nodes, row by row of a sparse matrix, over what the plain passes left there.
+
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+
+#if WIDTH == 8
+typedef float8 reals;
+typedef float8 __attribute__((aligned(4))) loose;  // somewhere in memory
+#define AT(p) (*(__global const loose *)(p))
+#define PUT(p) *(__global loose *)(p)
+#define EVEN(p) ((float8)(AT(p).even, AT((p) + 8).even))
+#define ODD(p) ((float8)(AT(p).odd, AT((p) + 8).odd))
+#define PUT_BOTH(p, one, two)                                                                              \
+    PUT(p) = (float8)(one.s0, two.s0, one.s1, two.s1, one.s2, two.s2, one.s3, two.s3);                     \
+    PUT((p) + 8) = (float8)(one.s4, two.s4, one.s5, two.s5, one.s6, two.s6, one.s7, two.s7);
+#define WHOLE(v) (((v.s0 + v.s1) + (v.s2 + v.s3)) + ((v.s4 + v.s5) + (v.s6 + v.s7)))
+#else
+typedef float reals;
+#define AT(p) (*(p))
+#define PUT(p) *(p)
+#define EVEN(p) ((p)[0])
+#define ODD(p) ((p)[1])
+#define PUT_BOTH(p, one, two) (p)[0] = one; (p)[1] = two;
+#define WHOLE(v) (v)
+#endif
+
+// Nodes from `begin` to `end`, which an item takes of a level, and blocks of a coarse row.
+#define ITEMS_NODES                                                                                        \
+    const int begin = base + stride + (int)get_global_id(0) * TILE;                                        \
+    const int end = LESSER(begin + TILE, base + stride * (rows + 1));
+#define EACH_NODE for (int i = begin; i < end; i += WIDTH)
+
+// Coarse nodes J of one row, each of the fine nodes I and I + 1 and of K and K + 1 below them.
+#define EACH_BLOCK                                                                                         \
+    for (int J = coarse_base + coarse_stride * (row + 1), I = base + stride * (2 * row + 1), K = I + stride, \
+             last = J + stride / 2; J < last; J += WIDTH, I += 2 * WIDTH, K += 2 * WIDTH)
+
+#if ANCHORED
+#define WITH_ANCHOR(value) + (value)
+#else
+#define WITH_ANCHOR(value)
+#endif
+
+#define CONST __global const float *restrict
+#define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
+
+// The links of nodes i: to the right and left, down and up.
+#define LINKS                                                                                              \
+    const reals to_right = AT(right + i), to_left = AT(right + i - 1);                                     \
+    const reals to_below = AT(down + i), to_above = AT(down + i - stride);
+
+#define DIAGONAL ((to_right + to_left) + (to_below + to_above) WITH_ANCHOR(AT(anchor + i)))
+
+// What flows to nodes along their links, and to their anchors: -A x. X tells heights, of which those of the nodes,
+// above and below them lie at c, a and b.
+#define FLOW(X, a, c, b)                                                                                   \
+    ((to_right * (X(c + 1) - X(c)) + to_left * (X(c - 1) - X(c))) + (to_below * (X(b) - X(c))              \
+     + to_above * (X(a) - X(c))) WITH_ANCHOR(-AT(anchor + i) * X(c)))
+#define FLOWING(X) FLOW(X, i - stride, i, i + stride)
+
+#define HEIGHT(i) AT(x + (i))
+#define LEFT(i) AT(left + (i))
+
+// One over the diagonal.
+__kernel void multigrid_invert(
+    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor,
+    __global float *restrict inverse)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        LINKS
+        const reals diagonal = DIAGONAL;
+        PUT(inverse + i) = INVERSE(diagonal);
+    }
+}
+
+// Two steps of Jacobi's method from heights of zero.
+#define FIRST(i) (omega * AT(b + (i)) * AT(inverse + (i)))
+void begin_nodes(
+    const int begin, const int end, const int stride, const float omega, const float then, CONST right, CONST down,
+    CONST anchor, CONST inverse, CONST b, __global float *restrict x)
+{
+    EACH_NODE {
+        LINKS
+        PUT(x + i) = FIRST(i) + then * AT(inverse + i) * (AT(b + i) + FLOWING(FIRST));
+    }
+}
+
+__kernel void multigrid_begin(
+    const int base, const int rows, const int stride, const float omega, const float then, CONST right, CONST down,
+    CONST anchor, CONST inverse, CONST b, __global float *restrict x)
+{
+    ITEMS_NODES
+    begin_nodes(begin, end, stride, omega, then, right, down, anchor, inverse, b, x);
+}
+
+// One step of Jacobi's method.
+void smooth_nodes(
+    const int begin, const int end, const int stride, const float omega, CONST right, CONST down, CONST anchor, CONST b,
+    CONST x, __global float *restrict smoother)
+{
+    EACH_NODE {
+        LINKS
+        const reals diagonal = DIAGONAL;
+        PUT(smoother + i) = HEIGHT(i) + omega * (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
+    }
+}
+
+__kernel void multigrid_smooth(
+    const int base, const int rows, const int stride, const float omega, CONST right, CONST down, CONST anchor, CONST b,
+    CONST x, __global float *restrict smoother)
+{
+    ITEMS_NODES
+    smooth_nodes(begin, end, stride, omega, right, down, anchor, b, x, smoother);
+}
+
+// What is left over.
+void residual_nodes(
+    const int begin, const int end, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
+    __global float *restrict left)
+{
+    EACH_NODE {
+        LINKS
+        PUT(left + i) = AT(b + i) + FLOWING(HEIGHT);
+    }
+}
+
+__kernel void multigrid_residual(
+    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
+    __global float *restrict left)
+{
+    ITEMS_NODES
+    residual_nodes(begin, end, stride, right, down, anchor, b, x, left);
+}
+
+// Ask for what is left over, and keep the heights so far.
+void keep_nodes(
+    const int begin, const int end, CONST left, CONST x, __global float *restrict b, __global float *restrict kept)
+{
+    EACH_NODE {
+        PUT(b + i) = AT(left + i);
+        PUT(kept + i) = HEIGHT(i);
+    }
+}
+
+__kernel void multigrid_keep(
+    const int base, const int rows, const int stride, CONST left, CONST x, __global float *restrict b,
+    __global float *restrict kept)
+{
+    ITEMS_NODES
+    keep_nodes(begin, end, left, x, b, kept);
+}
+
+// What is left over, over the diagonal.
+void leave_nodes(
+    const int begin, const int end, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
+    __global float *restrict left)
+{
+    EACH_NODE {
+        LINKS
+        const reals diagonal = DIAGONAL;
+        PUT(left + i) = (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
+    }
+}
+
+__kernel void multigrid_leave(
+    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
+    __global float *restrict left)
+{
+    ITEMS_NODES
+    leave_nodes(begin, end, stride, right, down, anchor, b, x, left);
+}
+
+// What is left over of heights of zero, over the diagonal.
+void scale_nodes(const int begin, const int end, CONST inverse, CONST b, __global float *restrict left)
+{
+    EACH_NODE {
+        PUT(left + i) = AT(inverse + i) * AT(b + i);
+    }
+}
+
+__kernel void multigrid_scale(
+    const int base, const int rows, const int stride, CONST inverse, CONST b, __global float *restrict left)
+{
+    ITEMS_NODES
+    scale_nodes(begin, end, inverse, b, left);
+}
+
+// Nothing, where no pass writes what others read.
+__kernel void multigrid_clear(const int base, const int rows, const int stride, __global float *restrict x)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        PUT(x + i) = 0;
+    }
+}
+
+// Heights and others.
+void add_nodes(const int begin, const int end, CONST other, __global float *restrict x)
+{
+    EACH_NODE {
+        PUT(x + i) += AT(other + i);
+    }
+}
+
+__kernel void multigrid_add(
+    const int base, const int rows, const int stride, CONST other, __global float *restrict x)
+{
+    ITEMS_NODES
+    add_nodes(begin, end, other, x);
+}
+
+// The coarse right side: what is left over of a block's nodes, once a step of Jacobi's method has spread it.
+// Of each link that enters the block the far end counts, and of those inside both. What is left over lies, of the
+// row above the block, its own two and the one below, at `above` to `below`.
+void restrict_row(
+    const int I, const int K, const int J, const int count, const int stride, CONST right, CONST down, CONST above,
+    CONST upper, CONST lower, CONST below, __global float *restrict b)
+{
+    for (int c = 0; c < count; c += WIDTH) {
+        const int f = 2 * c, i = I + f, k = K + f;
+        const reals one = EVEN(upper + f), two = ODD(upper + f), three = EVEN(lower + f), four = ODD(lower + f);
+        const reals top = EVEN(right + i) * (one + two) + EVEN(right + i - 1) * EVEN(upper + f - 1)
+            + ODD(right + i) * ODD(upper + f + 1);
+        const reals bottom = EVEN(right + k) * (three + four) + EVEN(right + k - 1) * EVEN(lower + f - 1)
+            + ODD(right + k) * ODD(lower + f + 1);
+        const reals before = EVEN(down + i) * (one + three) + EVEN(down + i - stride) * EVEN(above + f)
+            + EVEN(down + k) * EVEN(below + f);
+        const reals after = ODD(down + i) * (two + four) + ODD(down + i - stride) * ODD(above + f)
+            + ODD(down + k) * ODD(below + f);
+        PUT(b + J + c) = (top + bottom) + (before + after);
+    }
+}
+
+#define RESTRICT_ROW                                                                                       \
+    const int I = base + stride * (2 * row + 1), K = I + stride, J = coarse_base + coarse_stride * (row + 1); \
+    restrict_row(I, K, J, stride / 2, stride, right, down, left + I - stride, left + I, left + K,       \
+                 left + K + stride, b);
+
+__kernel void multigrid_restrict(
+    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
+    CONST right, CONST down, CONST left, __global float *restrict b)
+{
+    const int row = get_global_id(0);
+    if (row < coarse_rows) {
+        RESTRICT_ROW
+    }
+}
+
+// The coarse right side of full multigrid, where no block is odd: all that a block's nodes are asked for.
+void gather_row(
+    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, CONST fine,
+    __global float *restrict b)
+{
+    EACH_BLOCK {
+        PUT(b + J) = (EVEN(fine + I) + ODD(fine + I)) + (EVEN(fine + K) + ODD(fine + K));
+    }
+}
+
+__kernel void multigrid_gather(
+    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride, CONST fine,
+    __global float *restrict b)
+{
+    const int row = get_global_id(0);
+    if (row < coarse_rows) gather_row(row, base, stride, coarse_base, coarse_stride, fine, b);
+}
+
+// Heights and the coarse correction, spread by a step of Jacobi's method.
+void prolong_row(
+    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, const float keep,
+    CONST right, CONST down, CONST inverse, CONST e, CONST x, __global float *restrict upper,
+    __global float *restrict lower)
+{
+    EACH_BLOCK {
+        const reals here = AT(e + J), above = AT(e + J - coarse_stride), below = AT(e + J + coarse_stride);
+        const reals before = AT(e + J - 1), after = AT(e + J + 1);
+        const reals a = keep * EVEN(x + I) + EVEN(inverse + I) * (EVEN(right + I) * here
+            + EVEN(right + I - 1) * before + EVEN(down + I) * here + EVEN(down + I - stride) * above);
+        const reals b = keep * ODD(x + I) + ODD(inverse + I) * (ODD(right + I) * after
+            + EVEN(right + I) * here + ODD(down + I) * here + ODD(down + I - stride) * above);
+        const reals c = keep * EVEN(x + K) + EVEN(inverse + K) * (EVEN(right + K) * here
+            + EVEN(right + K - 1) * before + EVEN(down + K) * below + EVEN(down + I) * here);
+        const reals d = keep * ODD(x + K) + ODD(inverse + K) * (ODD(right + K) * after
+            + EVEN(right + K) * here + ODD(down + K) * below + ODD(down + I) * here);
+        PUT_BOTH(upper, a, b)
+        PUT_BOTH(lower, c, d)
+        upper += 2 * WIDTH;
+        lower += 2 * WIDTH;
+    }
+}
+
+#define PROLONG_ROW                                                                                        \
+    __global float *upper = corrected + base + stride * (2 * row + 1), *lower = upper + stride;            \
+    prolong_row(row, base, stride, coarse_base, coarse_stride, keep, right, down, inverse, e, x, upper, lower);
+
+__kernel void multigrid_prolong(
+    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
+    const float keep, CONST right, CONST down, CONST inverse, CONST e, CONST x, __global float *restrict corrected)
+{
+    const int row = get_global_id(0);
+    if (row < coarse_rows) {
+        PROLONG_ROW
+    }
+}
+
+// The coarse links and anchors, and 1 where a block's nodes do not hang together by strong links.
+#define STRENGTH 0.25f
+#define GREATEST(PICK, i)                                                                                  \
+    GREATER(GREATER(PICK(right + (i)), PICK(right + (i) - 1)), GREATER(PICK(down + (i)), PICK(down + (i) - stride)))
+#define JOIN(w, g, h) ((w) > 0 ? 1 / (1 / (w) + 0.5f / (g) + 0.5f / (h)) : 0)
+#define COUNT(condition) ((condition) ? (reals)1 : (reals)0)
+#define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= STRENGTH * STRENGTH * (g) * (h)))
+__kernel void multigrid_coarsen(
+    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
+    CONST right, CONST down, CONST anchor,
+    __global float *restrict coarse_right, __global float *restrict coarse_down, __global float *restrict coarse_anchor,
+    __global float *restrict split)
+{
+    const int row = get_global_id(0);
+    if (row >= coarse_rows) return;
+    EACH_BLOCK {
+        const reals a = GREATEST(EVEN, I), b = GREATEST(ODD, I), c = GREATEST(EVEN, K), d = GREATEST(ODD, K);
+        const reals after_b = GREATEST(EVEN, I + 2), after_d = GREATEST(EVEN, K + 2);
+        const reals below_c = GREATEST(EVEN, K + stride), below_d = GREATEST(ODD, K + stride);
+        const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
+        const reals from_b = ODD(right + I), from_d = ODD(right + K), under_c = EVEN(down + K), under_d = ODD(down + K);
+        const reals live = COUNT(a > 0) + COUNT(b > 0) + COUNT(c > 0) + COUNT(d > 0);
+        const reals joined = STRONG(ab, a, b) + STRONG(cd, c, d) + STRONG(ac, a, c) + STRONG(bd, b, d);
+        PUT(coarse_right + J) = JOIN(from_b, b, after_b) + JOIN(from_d, d, after_d);
+        PUT(coarse_down + J) = JOIN(under_c, c, below_c) + JOIN(under_d, d, below_d);
+#if ANCHORED
+        PUT(coarse_anchor + J) = (COUNT(a > 0) * EVEN(anchor + I) + COUNT(b > 0) * ODD(anchor + I))
+            + (COUNT(c > 0) * EVEN(anchor + K) + COUNT(d > 0) * ODD(anchor + K));
+#endif
+        PUT(split + J) = COUNT(joined < live - 1);
+    }
+}
+
+// The same passes for odd nodes: row k is of node[k], and SUM over its other nodes j of weight w.
+#define ODD_TILE GREATER(TILE / 16, 1)
+#define ODD_ROWS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, CONST weight
+#define ITEMS_ODD                                                                                          \
+    const int begin = at + (int)get_global_id(0) * ODD_TILE, end = LESSER(begin + ODD_TILE, at + count);
+#define EACH_ODD for (int k = begin; k < end; ++k)
+#define SUM(sum, term)                                                                                     \
+    float sum = 0;                                                                                         \
+    for (int m = start[k]; m < start[k + 1]; ++m) {                                                        \
+        const int j = column[m];                                                                           \
+        const float w = weight[m];                                                                         \
+        sum += term;                                                                                       \
+    }
+
+__kernel void multigrid_invert_odd(
+    const int at, const int count, ODD_ROWS, CONST anchor, __global float *restrict inverse)
+{
+    ITEMS_ODD
+    EACH_ODD {
+        SUM(diagonal, w)
+        const float whole = diagonal WITH_ANCHOR(anchor[node[k]]);
+        inverse[node[k]] = INVERSE(whole);
+    }
+}
+
+#define SEED(i) (omega * b[i] * inverse[i])
+void begin_odd(
+    const int begin, const int end, ODD_ROWS, const float omega, const float then, CONST anchor, CONST inverse, CONST b,
+    __global float *restrict x)
+{
+    EACH_ODD {
+        const int i = node[k];
+        SUM(flow, w * (SEED(j) - SEED(i)))
+        x[i] = SEED(i) + then * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * SEED(i)));
+    }
+}
+
+__kernel void multigrid_begin_odd(
+    const int at, const int count, ODD_ROWS, const float omega, const float then, CONST anchor, CONST inverse, CONST b,
+    __global float *restrict x)
+{
+    ITEMS_ODD
+    begin_odd(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
+}
+
+void smooth_odd(
+    const int begin, const int end, ODD_ROWS, const float omega, CONST anchor, CONST inverse, CONST b, CONST x,
+    __global float *restrict smoother)
+{
+    EACH_ODD {
+        const int i = node[k];
+        SUM(flow, w * (x[j] - x[i]))
+        smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
+    }
+}
+
+__kernel void multigrid_smooth_odd(
+    const int at, const int count, ODD_ROWS, const float omega, CONST anchor, CONST inverse, CONST b, CONST x,
+    __global float *restrict smoother)
+{
+    ITEMS_ODD
+    smooth_odd(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
+}
+
+// Over the diagonal, if there is one to divide by.
+void leave_odd(
+    const int begin, const int end, ODD_ROWS, const int divide, CONST anchor, CONST inverse, CONST b, CONST x,
+    __global float *restrict left)
+{
+    EACH_ODD {
+        const int i = node[k];
+        SUM(flow, w * (x[j] - x[i]))
+        left[i] = (divide ? inverse[i] : 1) * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
+    }
+}
+
+__kernel void multigrid_leave_odd(
+    const int at, const int count, ODD_ROWS, const int divide, CONST anchor, CONST inverse, CONST b, CONST x,
+    __global float *restrict left)
+{
+    ITEMS_ODD
+    leave_odd(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, left);
+}
+
+void restrict_odd(const int begin, const int end, ODD_ROWS, CONST left, __global float *restrict b)
+{
+    EACH_ODD {
+        SUM(whole, w * left[j])
+        b[node[k]] = whole;
+    }
+}
+
+__kernel void multigrid_restrict_odd(
+    const int at, const int count, ODD_ROWS, CONST left, __global float *restrict b)
+{
+    ITEMS_ODD
+    restrict_odd(begin, end, node, start, column, weight, left, b);
+}
+
+void prolong_odd(
+    const int begin, const int end, ODD_ROWS, const float keep, CONST inverse, CONST e, CONST x,
+    __global float *restrict corrected)
+{
+    EACH_ODD {
+        const int i = node[k];
+        SUM(whole, w * e[j])
+        corrected[i] = keep * x[i] + inverse[i] * whole;
+    }
+}
+
+__kernel void multigrid_prolong_odd(
+    const int at, const int count, ODD_ROWS, const float keep, CONST inverse, CONST e, CONST x,
+    __global float *restrict corrected)
+{
+    ITEMS_ODD
+    prolong_odd(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
+}
+
+// The coarsest level: the pseudo-inverse of its matrix, times what is asked of its nodes.
+void solve_node(
+    const int k, const int count, __global const int *restrict bottom, CONST matrix, CONST b, __global float *restrict x)
+{
+    float sum = 0;
+    for (int m = 0; m < count; ++m) {
+        sum += matrix[k * count + m] * b[bottom[m]];
+    }
+    x[bottom[k]] = sum;
+}
+
+__kernel void multigrid_solve(
+    const int count, __global const int *restrict bottom, CONST matrix, CONST b, __global float *restrict x)
+{
+    const int k = get_global_id(0);
+    if (k < count) solve_node(k, count, bottom, matrix, b, x);
+}
+
+#if WIDTH > 1
+// Half a V-cycle over a large level without odd links, in one go: what passes hand on stays in the cache, in lines of
+// an item's own. An item does a band of coarse rows, and at its borders what its neighbours do as well.
+#define LINES 8
+#define MARGIN 8
+#define LINE(row) (mine + ((row) & 3) * width)
+#define OTHER_LINE(row) (mine + (4 + ((row) & 3)) * width)
+#define BAND                                                                                               \
+    const int first = get_global_id(0) * band, last = LESSER(first + band, coarse_rows);                   \
+    const int top = 2 * first, bottom = 2 * last, width = stride + 2 * MARGIN;                             \
+    __global float *mine = lines + (int)get_global_id(0) * LINES * width + MARGIN;
+#define EACH_OF_ROW(r) for (int c = 0, i = base + stride * ((r) + 1); c < stride; c += WIDTH, i += WIDTH)
+#define IN_PICTURE(r) ((r) >= 0 && (r) < rows)
+#define LINED(p) AT(p)
+
+void clear_line(__global float *line, const int stride)
+{
+    for (int c = 0; c < stride; c += WIDTH) PUT(line + c) = 0;
+}
+
+// Two steps of Jacobi's method from heights of zero, what is left over then, and the coarse right side. What is left
+// over is kept if `keep` is 1.
+__kernel void multigrid_descend(
+    const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
+    const int coarse_stride, const int band, const int keep, const float omega, const float then, CONST right, CONST down,
+    CONST anchor, CONST inverse, CONST b, __global float *restrict x, __global float *restrict left,
+    __global float *restrict lines, __global float *restrict coarse_b)
+{
+    BAND
+    if (first >= last) return;
+    for (int r = top - 2; r <= bottom + 1; ++r) {
+        __global float *line = LINE(r);
+        if (!IN_PICTURE(r)) clear_line(line, stride);
+        else EACH_OF_ROW(r) {
+            LINKS
+            const reals height = FIRST(i) + then * AT(inverse + i) * (AT(b + i) + FLOWING(FIRST));
+            PUT(line + c) = height;
+            if (r >= top && r < bottom) PUT(x + i) = height;
+        }
+        const int q = r - 1;
+        if (q < top - 1) continue;
+        __global float *over = OTHER_LINE(q), *middle = LINE(q), *above = LINE(q - 1), *below = LINE(q + 1);
+        if (!IN_PICTURE(q)) clear_line(over, stride);
+        else EACH_OF_ROW(q) {
+            LINKS
+            const reals rest = (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
+            PUT(over + c) = rest;
+            if (keep && q >= top && q < bottom) PUT(left + i) = rest;
+        }
+        if (q > top && q % 2 == 0) {
+            const int I = base + stride * (q - 1), J = coarse_base + coarse_stride * (q / 2);
+            restrict_row(I, I + stride, J, stride / 2, stride, right, down, OTHER_LINE(q - 3), OTHER_LINE(q - 2),
+                         OTHER_LINE(q - 1), over, coarse_b);
+        }
+    }
+}
+
+// The coarse correction and two steps of Jacobi's method, and parts of the product of heights and right side. The
+// rows of the table for odd prolongation that belong to a row of the picture begin at odd[row].
+__kernel void multigrid_ascend(
+    const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
+    const int coarse_stride, const int band, const float omega, const float then, CONST right, CONST down, CONST anchor,
+    CONST inverse, CONST b, CONST e, CONST x, __global float *restrict lines, __global float *restrict smoother,
+    __global float *restrict parts, const int odds, __global const int *restrict odd, ODD_ROWS)
+{
+    BAND
+    if (first >= last) return;
+    reals sum = 0;
+    for (int row = first - 1; row <= last; ++row) {
+        __global float *upper = LINE(2 * row), *lower = LINE(2 * row + 1);
+        if (row < 0 || row >= coarse_rows) {
+            clear_line(upper, stride);
+            clear_line(lower, stride);
+        } else {
+            prolong_row(row, base, stride, coarse_base, coarse_stride, 1, right, down, inverse, e, x, upper, lower);
+            for (int k = odds ? odd[2 * row] : 0; k < (odds ? odd[LESSER(2 * row + 2, rows)] : 0); ++k) {
+                SUM(whole, w * e[j])
+                const int i = node[k], r = (i - base) / stride - 1;
+                LINE(r)[i - base - stride * (r + 1)] = x[i] + inverse[i] * whole;
+            }
+        }
+        for (int q = GREATER(2 * row - 1, top - 1); q <= LESSER(2 * row, bottom); ++q) {
+            __global float *line = OTHER_LINE(q), *middle = LINE(q), *above = LINE(q - 1), *below = LINE(q + 1);
+            if (!IN_PICTURE(q)) clear_line(line, stride);
+            else EACH_OF_ROW(q) {
+                LINKS
+                PUT(line + c) = LINED(middle + c)
+                    + then * (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
+            }
+        }
+        for (int q = GREATER(2 * row - 2, top); q < LESSER(2 * row, LESSER(bottom, rows)); ++q) {
+            __global float *middle = OTHER_LINE(q), *above = OTHER_LINE(q - 1), *below = OTHER_LINE(q + 1);
+            EACH_OF_ROW(q) {
+                LINKS
+                const reals height = LINED(middle + c)
+                    + omega * (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
+                PUT(smoother + i) = height;
+                sum += height * AT(b + i);
+            }
+        }
+    }
+    parts[get_global_id(0)] = WHOLE(sum);
+}
+
+// All passes over the small levels by one item, for each launch would take longer than its pass.
+
+typedef struct {
+    int base, rows, stride, odd, odds, graph, graphs, restricting, restricts, prolonging, prolongs;
+} Level;
+
+#define LEVEL(l) levels[l]
+#define ODDS node, start, column, weight
+#define ODD_OF(name, l) LEVEL(l).name##ing, LEVEL(l).name##ing + LEVEL(l).name##s
+#define GRAPH_OF(l) LEVEL(l).graph, LEVEL(l).graph + LEVEL(l).graphs
+#define PICTURE_OF(l) LEVEL(l).base + LEVEL(l).stride, LEVEL(l).base + LEVEL(l).stride * (LEVEL(l).rows + 1)
+#define BEHIND(l) LEVEL(l).odd, LEVEL(l).odd + LEVEL(l).odds
+#define GRAPH right, down, anchor
+#define ALL_NODES(l) PICTURE_OF(l), LEVEL(l).stride
+#define TAIL                                                                                               \
+    const int first, const int last, __global const Level *restrict levels, CONST right, CONST down, CONST anchor, \
+    CONST inverse, ODD_ROWS, const int count, __global const int *restrict bottom, CONST matrix, const float omega, \
+    const float then
+
+void tail_restrict(
+    const int l, __global const Level *restrict levels, CONST right, CONST down, ODD_ROWS, CONST left,
+    __global float *restrict b)
+{
+    const int base = LEVEL(l).base, stride = LEVEL(l).stride;
+    const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
+    for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
+        RESTRICT_ROW
+    }
+    restrict_odd(ODD_OF(restrict, l), ODDS, left, b);
+}
+
+void tail_prolong(
+    const int l, __global const Level *restrict levels, const float keep, CONST right, CONST down, CONST inverse, ODD_ROWS,
+    CONST e, CONST x, __global float *restrict corrected)
+{
+    const int base = LEVEL(l).base, stride = LEVEL(l).stride;
+    const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
+    for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
+        PROLONG_ROW
+    }
+    prolong_odd(ODD_OF(prolong, l), ODDS, keep, inverse, e, x, corrected);
+}
+
+void tail_smooth(
+    const int l, __global const Level *restrict levels, const float omega, CONST right, CONST down, CONST anchor,
+    CONST inverse, ODD_ROWS, CONST b, CONST x, __global float *restrict smoother)
+{
+    smooth_nodes(ALL_NODES(l), omega, GRAPH, b, x, smoother);
+    smooth_odd(GRAPH_OF(l), ODDS, omega, anchor, inverse, b, x, smoother);
+}
+
+// A cycle from level `first` on: what b asks for goes to x. Levels from `twice` to `once` are gone through a second time
+// for what the first left over.
+#define CYCLE                                                                                              \
+    const int twice, const int once, __global float *b, __global float *x, __global float *t, __global float *kept
+void tail_cycle(TAIL, CYCLE)
+{
+    int l = first, second = 0;  // a bit for each level
+    do {
+        for (; l < last; ++l) {
+            begin_nodes(ALL_NODES(l), omega, then, GRAPH, inverse, b, t);
+            begin_odd(GRAPH_OF(l), ODDS, omega, then, anchor, inverse, b, t);
+            leave_nodes(ALL_NODES(l), GRAPH, b, t, x);
+            leave_odd(GRAPH_OF(l), ODDS, 1, anchor, inverse, b, t, x);
+            tail_restrict(l, levels, right, down, ODDS, x, b);
+        }
+        for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, b, x);
+        int again = 0;
+        while (l > first && !again) {
+            --l;
+            tail_prolong(l, levels, 1, right, down, inverse, ODDS, x, t, x);
+            tail_smooth(l, levels, then, GRAPH, inverse, ODDS, b, x, t);
+            tail_smooth(l, levels, omega, GRAPH, inverse, ODDS, b, t, x);
+            if (second >> l & 1) {
+                add_nodes(PICTURE_OF(l), kept, x);
+                add_nodes(BEHIND(l), kept, x);
+            }
+            again = l >= twice && l < once && !(second >> l & 1);
+            second &= ~(1 << l);
+        }
+        if (again) {
+            residual_nodes(ALL_NODES(l), GRAPH, b, x, t);
+            leave_odd(GRAPH_OF(l), ODDS, 0, anchor, inverse, b, x, t);
+            keep_nodes(PICTURE_OF(l), t, x, b, kept);
+            keep_nodes(BEHIND(l), t, x, b, kept);
+            second |= 1 << l;
+        }
+    } while (l > first || second >> l & 1);
+}
+
+__kernel void multigrid_tail_cycle(TAIL, CYCLE)
+{
+    tail_cycle(first, last, levels, GRAPH, inverse, ODDS, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
+}
+
+// Full multigrid from level `first` on.
+__kernel void multigrid_tail_full(TAIL, CYCLE, __global float *full_b, __global float *full_x)
+{
+    for (int l = first; l < last; ++l) {
+        const int base = LEVEL(l).base, stride = LEVEL(l).stride;
+        const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
+        for (int row = 0; row < LEVEL(l + 1).rows; ++row)
+            gather_row(row, base, stride, coarse_base, coarse_stride, full_b, full_b);
+        if (LEVEL(l).restricts == 0) continue;
+        scale_nodes(PICTURE_OF(l), inverse, full_b, t);
+        scale_nodes(BEHIND(l), inverse, full_b, t);
+        tail_restrict(l, levels, right, down, ODDS, t, full_b);
+    }
+    for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, full_b, x);
+    for (int l = last - 1; l >= first; --l) {
+        tail_prolong(l, levels, 0, right, down, inverse, ODDS, x, full_b, full_x);
+        residual_nodes(ALL_NODES(l), GRAPH, full_b, full_x, b);
+        leave_odd(GRAPH_OF(l), ODDS, 0, anchor, inverse, full_b, full_x, b);
+        tail_cycle(l, last, levels, GRAPH, inverse, ODDS, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
+        add_nodes(PICTURE_OF(l), full_x, x);
+        add_nodes(BEHIND(l), full_x, x);
+    }
+}
+#endif
+
+// Conjugate gradients. Sums are told in parts, for the host to add up.
+#define EACH_PART                                                                                          \
+    const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
+    const int end = LESSER(begin + PART, base + stride * (rows + 1));                                      \
+    reals sum = 0;                                                                                         \
+    EACH_NODE
+#define TELL_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
+
+// The next direction, the matrix times it, and the product of both.
+#define DIRECTION(i) (AT(z + (i)) + beta * AT(before + (i)))
+__kernel void multigrid_direct(
+    const int base, const int rows, const int stride, const float beta, CONST right,
+    CONST down, CONST anchor, CONST z,
+    CONST before, __global float *restrict direction, __global float *restrict image,
+    __global float *restrict parts)
+{
+    EACH_PART {
+        LINKS
+        const reals p = DIRECTION(i), q = -FLOWING(DIRECTION);
+        PUT(direction + i) = p;
+        PUT(image + i) = q;
+        sum += p * q;
+    }
+    TELL_PART
+}
+
+// A step along it, what is left over then, and the square of that.
+__kernel void multigrid_advance(
+    const int base, const int rows, const int stride, const float alpha, CONST direction,
+    CONST image, __global float *restrict b, __global float *restrict x,
+    __global float *restrict parts)
+{
+    EACH_PART {
+        const reals r = AT(b + i) - alpha * AT(image + i);
+        PUT(x + i) = AT(x + i) + alpha * AT(direction + i);
+        PUT(b + i) = r;
+        sum += r * r;
+    }
+    TELL_PART
+}
+
+// The product of two.
+__kernel void multigrid_dot(
+    const int base, const int rows, const int stride, CONST one,
+    CONST other, __global float *restrict parts)
+{
+    EACH_PART {
+        sum += AT(one + i) * AT(other + i);
+    }
+    TELL_PART
+}
+
+// What the anchors weigh of heights.
+__kernel void multigrid_weigh(
+    const int base, const int rows, const int stride, CONST anchor, CONST x, __global float *restrict parts)
+{
+    EACH_PART {
+        sum += AT(anchor + i) * HEIGHT(i) * HEIGHT(i);
+    }
+    TELL_PART
+}
+
+// Maps of pixels without margins, to and from the finest level, row by row.
+__kernel void multigrid_admit(
+    const int rows, const int columns, const int stride, CONST map,
+    __global float *restrict level)
+{
+    const int row = get_global_id(0);
+    if (row >= rows) return;
+    for (int c = 0; c < columns; ++c) {
+        level[(row + 1) * stride + c] = map[row * columns + c];
+    }
+}
+
+__kernel void multigrid_release(
+    const int rows, const int columns, const int stride, CONST level,
+    __global float *restrict map)
+{
+    const int row = get_global_id(0);
+    if (row >= rows) return;
+    for (int c = 0; c < columns; ++c) {
+        map[row * columns + c] = level[(row + 1) * stride + c];
+    }
+}

@@ -1,0 +1,485 @@
+"""Heights on a graph of pixels: what ``multigrid.cl`` computes, in plain NumPy with float64 inside.
+
+The heights x of a graph minimise sum w (x_j - x_i - d)^2 over its links and sum a (x_i - k)^2 over known
+heights k: A x = b with A = D - W, where W holds the links' weights and D, the diagonal, their sums and the
+anchors a. A V-cycle solves it nearly:
+
+- *begin*, *smooth*: x += omega D^-1 (b - A x), Jacobi's method; with two steps after Chebyshev it takes out
+  what changes from node to node. It works in differences of neighbours, so that float32 heights are enough.
+- *restrict*: the coarse level, of a node for each block of two by two, is asked for P^T (b - A x).
+- *prolong*: x += P e, the coarse answer e brought to each block's nodes and spread by a step of Jacobi's
+  method, so P = D^-1 W I, where I gives a node what its block has.
+- *coarsen*: a coarse link's weight is the sum over those that it stands for of 1 / (1/w + 0.5/g + 0.5/h),
+  where g and h are the greatest weights of its two nodes: of links that are all alike, the mean of two.
+
+All arrays are flat. A level's picture of `rows` by `stride` nodes lies at `base`, with a row of none before
+and behind it. Arguments are those of the kernels; of functions for odd nodes, rows `at` to `at` + `count` of
+a sparse matrix: row k is of ``node[k]``, its entries are those from ``start[k]`` to ``start[k + 1]`` of
+``column`` and ``weight``. ``anchor`` is an array of zeros where there is none. The passes that do several of
+these in one go (*descend*, *ascend*, *tail_cycle*, *tail_full*) have no functions of their own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Doubles = NDArray[np.float64]
+Array = NDArray[Any]
+Table = tuple[Array, Array, Array, Array]
+
+STRENGTH = 0.25  # a link is strong from this share of the geometric mean of its nodes' greatest ones on
+
+
+def _picture(base: int, rows: int, stride: int) -> slice:
+    return slice(base + stride, base + stride * (rows + 1))
+
+
+def _moved(part: slice, by: int) -> slice:
+    return slice(part.start + by, part.stop + by)
+
+
+def _double(values: Array, part: slice) -> Doubles:
+    return values[part].astype(np.float64)
+
+
+def _inverse(diagonal: Doubles) -> Doubles:
+    return np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1), 0)
+
+
+def _sides(part: slice, stride: int, right: Array, down: Array) -> list[tuple[Doubles, slice]]:
+    """Return the weights of a picture's links, and the nodes that they lead to."""
+    return [
+        (_double(right, part), _moved(part, 1)),
+        (_double(right, _moved(part, -1)), _moved(part, -1)),
+        (_double(down, part), _moved(part, stride)),
+        (_double(down, _moved(part, -stride)), _moved(part, -stride)),
+    ]
+
+
+def _diagonal(part: slice, stride: int, right: Array, down: Array, anchor: Array) -> Doubles:
+    whole: Doubles = sum((w for w, _ in _sides(part, stride, right, down)), np.zeros(1))
+    return whole + anchor[part]
+
+
+def _flow(part: slice, stride: int, right: Array, down: Array, anchor: Array, x: Array) -> Doubles:
+    """Return -A x."""
+    here = _double(x, part)
+    flow = -anchor[part] * here
+    for w, other in _sides(part, stride, right, down):
+        flow = flow + w * (x[other] - here)
+    return flow
+
+
+def multigrid_invert(
+    base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array, inverse: Array
+) -> None:
+    """Write one over the diagonal."""
+    part = _picture(base, rows, stride)
+    inverse[part] = _inverse(_diagonal(part, stride, right, down, anchor))
+
+
+def multigrid_begin(
+    base: int,
+    rows: int,
+    stride: int,
+    omega: float,
+    then: float,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    inverse: Array,
+    b: Array,
+    x: Array,
+) -> None:
+    """Do two steps of Jacobi's method from heights of zero."""
+    part = _picture(base, rows, stride)
+    first = np.zeros(part.stop + stride)
+    first[part] = omega * _double(b, part) * inverse[part]
+    left = b[part] + _flow(part, stride, right, down, anchor, first)
+    x[part] = first[part] + then * inverse[part] * left
+
+
+def multigrid_smooth(
+    base: int,
+    rows: int,
+    stride: int,
+    omega: float,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    b: Array,
+    x: Array,
+    smoother: Array,
+) -> None:
+    """Do a step of Jacobi's method."""
+    part = _picture(base, rows, stride)
+    left = b[part] + _flow(part, stride, right, down, anchor, x)
+    smoother[part] = x[part] + omega * left * _inverse(_diagonal(part, stride, right, down, anchor))
+
+
+def multigrid_residual(
+    base: int,
+    rows: int,
+    stride: int,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    b: Array,
+    x: Array,
+    left: Array,
+) -> None:
+    """Write what is left over."""
+    part = _picture(base, rows, stride)
+    left[part] = b[part] + _flow(part, stride, right, down, anchor, x)
+
+
+def multigrid_leave(
+    base: int,
+    rows: int,
+    stride: int,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    b: Array,
+    x: Array,
+    left: Array,
+) -> None:
+    """Write what is left over, over the diagonal."""
+    part = _picture(base, rows, stride)
+    rest = b[part] + _flow(part, stride, right, down, anchor, x)
+    left[part] = rest * _inverse(_diagonal(part, stride, right, down, anchor))
+
+
+def multigrid_keep(base: int, rows: int, stride: int, left: Array, x: Array, b: Array, kept: Array) -> None:
+    """Ask for what is left over, and keep the heights so far."""
+    part = _picture(base, rows, stride)
+    b[part], kept[part] = left[part], x[part]
+
+
+def multigrid_scale(base: int, rows: int, stride: int, inverse: Array, b: Array, left: Array) -> None:
+    """Write what is left over of heights of zero, over the diagonal."""
+    part = _picture(base, rows, stride)
+    left[part] = inverse[part] * _double(b, part)
+
+
+def multigrid_clear(base: int, rows: int, stride: int, x: Array) -> None:
+    """Write 0."""
+    x[_picture(base, rows, stride)] = 0
+
+
+def multigrid_add(base: int, rows: int, stride: int, other: Array, x: Array) -> None:
+    """Add heights to others."""
+    part = _picture(base, rows, stride)
+    x[part] = _double(x, part) + other[part]
+
+
+def _blocks(base: int, stride: int, coarse_rows: int) -> tuple[Array, Array]:
+    """Return the top left nodes of blocks, (rows, blocks), and of each picture row the step to the next."""
+    row, column = np.arange(coarse_rows)[:, np.newaxis], np.arange(0, stride, 2)
+    return base + stride * (2 * row + 1) + column, np.array([0, 1, stride, stride + 1])
+
+
+def _coarse(coarse_base: int, coarse_rows: int, coarse_stride: int, count: int) -> Array:
+    row = np.arange(coarse_rows)[:, np.newaxis]
+    nodes: Array = coarse_base + coarse_stride * (row + 1) + np.arange(count)
+    return nodes
+
+
+def _neighbours(node: Array, stride: int, right: Array, down: Array) -> list[tuple[Doubles, Array]]:
+    """Return weights and nodes at the other ends of nodes' links."""
+    links = (right, node, 1), (right, node - 1, -1), (down, node, stride), (down, node - stride, -stride)
+    return [(weights[at].astype(np.float64), node + step) for weights, at, step in links]
+
+
+def multigrid_restrict(
+    base: int,
+    stride: int,
+    coarse_base: int,
+    coarse_rows: int,
+    coarse_stride: int,
+    right: Array,
+    down: Array,
+    left: Array,
+    b: Array,
+) -> None:
+    """Write the coarse right side: what is left over, spread by a step of Jacobi's method, of each block."""
+    corner, steps = _blocks(base, stride, coarse_rows)
+    whole = np.zeros(corner.shape)
+    for step in steps:
+        for w, other in _neighbours(corner + step, stride, right, down):
+            whole += w * left[other]
+    b[_coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)] = whole
+
+
+def multigrid_gather(
+    base: int,
+    stride: int,
+    coarse_base: int,
+    coarse_rows: int,
+    coarse_stride: int,
+    fine: Array,
+    b: Array,
+) -> None:
+    """Write the coarse right side of full multigrid where no block is odd: the sum of each block."""
+    corner, steps = _blocks(base, stride, coarse_rows)
+    whole = sum(fine[corner + step].astype(np.float64) for step in steps)
+    b[_coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)] = whole
+
+
+def multigrid_prolong(
+    base: int,
+    stride: int,
+    coarse_base: int,
+    coarse_rows: int,
+    coarse_stride: int,
+    keep: float,
+    right: Array,
+    down: Array,
+    inverse: Array,
+    e: Array,
+    x: Array,
+    corrected: Array,
+) -> None:
+    """Add the coarse answer, spread by a step of Jacobi's method, to so much of heights."""
+    corner, steps = _blocks(base, stride, coarse_rows)
+    for step in steps:
+        node = corner + step
+        told = np.zeros(node.shape)
+        for w, other in _neighbours(node, stride, right, down):
+            row, column = np.divmod(other - base - stride, stride)
+            told += w * e[coarse_base + coarse_stride * (row // 2 + 1) + column // 2]
+        corrected[node] = keep * x[node].astype(np.float64) + inverse[node] * told
+
+
+def multigrid_coarsen(
+    base: int,
+    stride: int,
+    coarse_base: int,
+    coarse_rows: int,
+    coarse_stride: int,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    coarse_right: Array,
+    coarse_down: Array,
+    coarse_anchor: Array,
+    split: Array,
+) -> None:
+    """Write the coarse links and anchors, and 1 where a block does not hang together by strong links."""
+    corner, _ = _blocks(base, stride, coarse_rows)
+    a, b, c, d = corner, corner + 1, corner + stride, corner + stride + 1
+
+    def greatest(node: Array) -> Doubles:
+        most: Doubles = np.max([w for w, _ in _neighbours(node, stride, right, down)], axis=0)
+        return most
+
+    def joint(weights: Array, node: Array, other: Array) -> Doubles:
+        w = weights[node].astype(np.float64)
+        real = w > 0
+        w, g, h = (np.where(real, value, 1) for value in (w, greatest(node), greatest(other)))
+        return np.where(real, 1 / (1 / w + 0.5 / g + 0.5 / h), 0)
+
+    def strong(weights: Array, node: Array, other: Array) -> Array:
+        w = weights[node].astype(np.float64)
+        bound: Array = w >= STRENGTH * np.sqrt(greatest(node) * greatest(other))
+        return (w > 0) & bound
+
+    to = _coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)
+    coarse_right[to] = joint(right, b, b + 1) + joint(right, d, d + 1)
+    coarse_down[to] = joint(down, c, c + stride) + joint(down, d, d + stride)
+    coarse_anchor[to] = sum(np.where(greatest(node) > 0, anchor[node], 0) for node in (a, b, c, d))
+    live = sum((greatest(node) > 0).astype(int) for node in (a, b, c, d))
+    links = (right, a, b), (right, c, d), (down, a, c), (down, b, d)
+    split[to] = sum(strong(*link).astype(int) for link in links) < live - 1
+
+
+def _rows(
+    at: int, count: int, table: Table, values: Array | None = None, own: Array | None = None
+) -> Doubles:
+    """Return each row's sum of its weights, times values there, less its own node's."""
+    node, start, column, weight = table
+    sums = np.zeros(count)
+    for k in range(at, at + count):
+        entries = slice(start[k], start[k + 1])
+        term = np.ones(entries.stop - entries.start) if values is None else values[column[entries]]
+        less = 0.0 if own is None else own[node[k]]
+        sums[k - at] = np.sum(weight[entries].astype(np.float64) * (term.astype(np.float64) - less))
+    return sums
+
+
+def multigrid_invert_odd(
+    at: int,
+    count: int,
+    node: Array,
+    start: Array,
+    column: Array,
+    weight: Array,
+    anchor: Array,
+    inverse: Array,
+) -> None:
+    """Write one over the diagonal of odd nodes."""
+    i = node[at : at + count]
+    inverse[i] = _inverse(_rows(at, count, (node, start, column, weight)) + anchor[i])
+
+
+def multigrid_begin_odd(
+    at: int,
+    count: int,
+    node: Array,
+    start: Array,
+    column: Array,
+    weight: Array,
+    omega: float,
+    then: float,
+    anchor: Array,
+    inverse: Array,
+    b: Array,
+    x: Array,
+) -> None:
+    """Do two steps of Jacobi's method from heights of zero, at odd nodes."""
+    i, first = node[at : at + count], omega * b.astype(np.float64) * inverse
+    flow = _rows(at, count, (node, start, column, weight), first, first) - anchor[i] * first[i]
+    x[i] = first[i] + then * inverse[i] * (b[i] + flow)
+
+
+def multigrid_smooth_odd(
+    at: int,
+    count: int,
+    node: Array,
+    start: Array,
+    column: Array,
+    weight: Array,
+    omega: float,
+    anchor: Array,
+    inverse: Array,
+    b: Array,
+    x: Array,
+    smoother: Array,
+) -> None:
+    """Do a step of Jacobi's method at odd nodes."""
+    i = node[at : at + count]
+    flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
+    smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow)
+
+
+def multigrid_leave_odd(
+    at: int,
+    count: int,
+    node: Array,
+    start: Array,
+    column: Array,
+    weight: Array,
+    divide: int,
+    anchor: Array,
+    inverse: Array,
+    b: Array,
+    x: Array,
+    left: Array,
+) -> None:
+    """Write what is left over at odd nodes, over the diagonal or not."""
+    i = node[at : at + count]
+    flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
+    left[i] = (b[i] + flow) * (inverse[i] if divide else 1)
+
+
+def multigrid_restrict_odd(
+    at: int, count: int, node: Array, start: Array, column: Array, weight: Array, left: Array, b: Array
+) -> None:
+    """Write the right side of nodes that stand for parts of odd blocks."""
+    b[node[at : at + count]] = _rows(at, count, (node, start, column, weight), left)
+
+
+def multigrid_prolong_odd(
+    at: int,
+    count: int,
+    node: Array,
+    start: Array,
+    column: Array,
+    weight: Array,
+    keep: float,
+    inverse: Array,
+    e: Array,
+    x: Array,
+    corrected: Array,
+) -> None:
+    """Add the coarse answer to heights of nodes that odd parts tell."""
+    i = node[at : at + count]
+    told = _rows(at, count, (node, start, column, weight), e)
+    corrected[i] = keep * x[i].astype(np.float64) + inverse[i] * told
+
+
+def multigrid_solve(count: int, bottom: Array, matrix: Array, b: Array, x: Array) -> None:
+    """Solve the coarsest level by its pseudo-inverse, (count, count)."""
+    nodes = bottom[:count]
+    x[nodes] = matrix.reshape(-1)[: count**2].reshape(count, count).astype(np.float64) @ b[nodes]
+
+
+def multigrid_direct(
+    base: int,
+    rows: int,
+    stride: int,
+    beta: float,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    z: Array,
+    before: Array,
+    direction: Array,
+    image: Array,
+    parts: Array,
+) -> None:
+    """Write the next direction of conjugate gradients, the matrix times it, and their product."""
+    part = _picture(base, rows, stride)
+    whole = slice(part.start - stride, part.stop + stride)
+    p = np.zeros(len(direction))
+    p[whole] = _double(z, whole) + beta * before[whole]
+    direction[part] = p[part]
+    image[part] = -_flow(part, stride, right, down, anchor, p)
+    parts[...] = 0
+    parts[0] = np.sum(p[part] * image[part])
+
+
+def multigrid_advance(
+    base: int,
+    rows: int,
+    stride: int,
+    alpha: float,
+    direction: Array,
+    image: Array,
+    b: Array,
+    x: Array,
+    parts: Array,
+) -> None:
+    """Take a step along it; write the square of what is left over in the first part."""
+    part = _picture(base, rows, stride)
+    x[part] = _double(x, part) + alpha * direction[part]
+    b[part] = _double(b, part) - alpha * image[part]
+    parts[...] = 0
+    parts[0] = np.sum(_double(b, part) ** 2)
+
+
+def multigrid_dot(base: int, rows: int, stride: int, one: Array, other: Array, parts: Array) -> None:
+    """Write the product of two, in the first part."""
+    part = _picture(base, rows, stride)
+    parts[...] = 0
+    parts[0] = np.sum(_double(one, part) * other[part])
+
+
+def multigrid_weigh(base: int, rows: int, stride: int, anchor: Array, x: Array, parts: Array) -> None:
+    """Write what the anchors weigh of heights, in the first part."""
+    part = _picture(base, rows, stride)
+    parts[...] = 0
+    parts[0] = np.sum(_double(anchor, part) * _double(x, part) ** 2)
+
+
+def multigrid_admit(rows: int, columns: int, stride: int, map_: Array, level: Array) -> None:
+    """Copy a picture to the finest level."""
+    level[stride : stride * (rows + 1)].reshape(rows, stride)[:, :columns] = map_.reshape(rows, columns)
+
+
+def multigrid_release(rows: int, columns: int, stride: int, level: Array, map_: Array) -> None:
+    """Copy the finest level to a picture."""
+    map_.reshape(rows, columns)[...] = level[stride : stride * (rows + 1)].reshape(rows, stride)[:, :columns]

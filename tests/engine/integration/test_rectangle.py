@@ -1,0 +1,88 @@
+"""The direct solver finds the heights of full rectangles of any shape, as exactly as float32 holds them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse
+from rectangles import put, scene, source_of
+from scipy.sparse.linalg import spsolve
+
+from mirrorskin.engine.integration.rectangle import Rectangle, are_rows_easier
+
+
+def solve_sparse(source, wx, wy, screening):
+    """A direct solution in float64, by a sparse matrix whose first pixel is held where nothing else is."""
+    rows, columns = source.shape
+    chains = []
+    for count in (rows, columns):
+        step = scipy.sparse.diags([np.ones(count), -np.ones(count)], [1, 0], (count - 1, count))
+        chains.append((step.T @ step).tocsc())
+    matrix = wy * scipy.sparse.kron(chains[0], scipy.sparse.eye(columns))
+    matrix += wx * scipy.sparse.kron(scipy.sparse.eye(rows), chains[1])
+    held = np.full(source.size, screening)
+    held[0] += screening == 0
+    right = source.astype(np.float64).ravel()
+    height = spsolve((matrix + scipy.sparse.diags(held)).tocsc(), right - right.mean() * (screening == 0))
+    return (height - height.mean() * (screening == 0)).reshape(source.shape)
+
+
+@pytest.mark.parametrize("screening", [0.0, 0.02])
+@pytest.mark.parametrize("shape", [(1, 7), (7, 1), (2, 2), (48, 64), (31, 47), (53, 41), (24, 22), (16, 200)])
+def test_heights_solve_the_links_of_any_shape(device, shape, screening):
+    wx, wy = 2.5 / 0.03**2, 2.5 / 0.04**2
+    source = np.random.default_rng(0).normal(size=shape)
+    source = (source - source.mean()).astype(np.float32)
+    solver = Rectangle(shape, (0.03, 0.04), device, scale=2.5)
+    height = solver.solve(put(device, source), screening * wx).download()
+    told = solve_sparse(source, wx, wy, screening * wx)
+    np.testing.assert_allclose(height, told, atol=1e-6 * np.ptp(told))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 3), (40, 30)])
+def test_a_picture_without_slopes_is_flat(device, shape):
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, np.zeros(shape))).download()
+    np.testing.assert_array_equal(height, 0)
+
+
+def test_a_single_pixel_is_as_high_as_its_screening_says(device):
+    height = Rectangle((1, 1), (1.0, 1.0), device).solve(put(device, np.array([[3.0]])), 1.5).download()
+    assert height == pytest.approx(2.0)
+
+
+def test_what_a_source_sums_to_changes_nothing(device):
+    source = source_of(scene((60, 45), 0.3))
+    solver = Rectangle((60, 45), (1.0, 1.0), device)
+    height = solver.solve(put(device, source)).download().copy()
+    lifted = solver.solve(put(device, source + 0.25)).download()
+    np.testing.assert_allclose(lifted, height, atol=2e-5 * np.ptp(height))
+
+
+def test_a_solver_serves_one_picture_and_screening_after_the_other(device):
+    shape = (35, 20)
+    solver = Rectangle(shape, (1.0, 1.0), device)
+    for seed, screening in enumerate([0.0, 0.1, 0.1, 0.0]):
+        surface = np.random.default_rng(seed).normal(size=shape).cumsum(0).cumsum(1)
+        surface -= surface.mean()
+        source = put(device, source_of(surface, screening=screening))
+        height = solver.solve(source, screening).download()
+        np.testing.assert_allclose(height, surface, atol=1e-5 * np.ptp(surface))
+
+
+@pytest.mark.parametrize("size", [(1.0, 4.0), (4.0, 1.0), (1e-3, 1e-3), (1e3, 1e3)])
+def test_cosines_are_as_high_as_their_wave_numbers_say(device, size):
+    shape, waves = (40, 35), (3, 2)
+    y, x = (
+        np.cos(np.pi * n * (np.arange(count) + 0.5) / count) for n, count in zip(waves, shape, strict=True)
+    )
+    wy, wx = (4 * np.sin(np.pi * n / (2 * count)) ** 2 for n, count in zip(waves, shape, strict=True))
+    source = put(device, (wx / size[0] ** 2 + wy / size[1] ** 2) * np.outer(y, x))
+    height = Rectangle(shape, size, device).solve(source).download()
+    np.testing.assert_allclose(height, np.outer(y, x), atol=5e-6)
+
+
+def test_modes_are_taken_along_the_side_of_small_factors():
+    assert are_rows_easier((1021, 1024), side_by_side=False)
+    assert not are_rows_easier((1024, 1021), side_by_side=False)
+    assert are_rows_easier((1024, 1024), side_by_side=False)
+    assert not are_rows_easier((1024, 1024), side_by_side=True)

@@ -1,0 +1,86 @@
+"""Sigma is the standard deviation of the heights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from slope_oracle import Problem, build, centred
+
+from mirrorskin import engine
+
+SHAPE = 32, 36
+FLAT = np.zeros(SHAPE)
+ROW, COLUMN = np.indices(SHAPE)
+DISTANCE = np.hypot(ROW - 15.5, COLUMN - 17.5)
+LEFT = np.where(COLUMN < 9, 0.0, np.nan)
+
+
+def exact_variance(problem):
+    """The heights' variance by dense algebra, where the weights are inverse variances."""
+    graph = build(problem)
+    difference, reading = graph.difference.toarray(), graph.reading.toarray()
+    matrix = difference.T @ (graph.weight[:, None] * difference) + np.diag(graph.pull)
+    for label in np.flatnonzero(graph.free):
+        member = (graph.label == label).astype(float)
+        matrix += np.outer(member, member)
+    weights = np.broadcast_to(1.0 if problem.weights is None else problem.weights, (2, *SHAPE)).reshape(-1)
+    moves = difference.T @ (graph.weight[:, None] * reading) / np.sqrt(np.where(weights > 0, weights, 1))
+    moves = np.hstack([moves, np.diag(np.sqrt(graph.pull))])
+    found = np.sum(centred(graph, np.linalg.solve(matrix, moves)) ** 2, axis=1)
+    picture = np.full(SHAPE, np.nan)
+    picture[graph.pixel >= 0] = found
+    return picture
+
+
+SCENES = {
+    "rectangle": ({}, 0.06),
+    "annulus": ({"mask": (DISTANCE < 15) & (DISTANCE > 7)}, 0.15),
+    "heights known on the left": ({"heights": LEFT, "height_weights": 4.0}, 0.15),
+    "uneven": ({"weights": np.exp(np.random.default_rng(1).normal(0, 0.5, SHAPE) + COLUMN / 18)}, 0.12),
+}
+
+
+@pytest.mark.parametrize(("options", "doubtful"), SCENES.values(), ids=SCENES)
+def test_sigma_is_that_of_the_noise(options, doubtful):
+    problem = Problem(FLAT, FLAT, (1.0, 1.0), **options)
+    sigma = engine.integrate(FLAT, FLAT, 1.0, **{"weights": 1.0, **options}).sigma
+    ratio = exact_variance(problem) / sigma**2
+    ratio = ratio[np.isfinite(ratio)]
+    assert len(ratio) > 500
+    assert np.mean(ratio) == pytest.approx(1, abs=0.04)
+    assert np.mean(np.abs(ratio - 1) > 0.1) < doubtful
+    assert np.quantile(ratio, 0.99) < 1.3
+    assert np.quantile(ratio, 0.01) > 0.75
+
+
+def test_noise_that_nobody_told_is_found():
+    slopes = np.random.default_rng(2).normal(0, 0.07, (2, *SHAPE))
+    told = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, weights=1 / 0.07**2)
+    found = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15)
+    np.testing.assert_array_equal(np.isnan(told.sigma), DISTANCE >= 15)
+    np.testing.assert_array_equal(np.isnan(found.sigma), DISTANCE >= 15)
+    ratio = found.sigma / told.sigma
+    assert np.nanmedian(ratio) == pytest.approx(1, abs=0.05)
+    assert np.nanstd(ratio) < 1e-4
+
+
+def test_sigma_is_the_same_each_time():
+    slopes = np.random.default_rng(2).normal(0, 0.07, (2, 9, 11))
+    slopes[:, 3, 4] = np.nan
+    first, second = (engine.integrate(*slopes, 1.0).sigma for _ in range(2))
+    assert np.nanmin(first) > 0
+    np.testing.assert_array_equal(first, second)
+
+
+def test_where_nothing_contradicts_nothing_tells_the_noise():
+    found = engine.integrate(np.ones((1, 9)), np.ones((1, 9)), 1.0)
+    assert np.isnan(found.sigma).all()
+    assert np.isfinite(engine.integrate(np.ones((1, 9)), np.ones((1, 9)), 1.0, weights=4.0).sigma).all()
+
+
+def test_sigma_goes_with_pixel_size_and_noise():
+    flat = np.zeros((9, 11))
+    first = engine.integrate(flat, flat, 0.5, weights=1.0).sigma
+    second = engine.integrate(flat, flat, 0.05, weights=4e6).sigma
+    np.testing.assert_allclose(second, first / 10 / 2000, rtol=1e-4)
+    assert engine.integrate(flat, flat, 0.5, sigma=False).sigma is None

@@ -1,0 +1,73 @@
+"""The components' kernels do what their reference does, and that is what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.integration.components import Settler, find_components
+from mirrorskin.engine.integration.inputs import check_inputs
+from mirrorskin.engine.integration.links import LinkRoom
+from mirrorskin.kernels import components
+from mirrorskin.kernels.links import SLOPE
+
+SHAPES = [(1, 1), (1, 9), (9, 1), (23, 37), (130, 11), (5, 300)]
+PLANE = 0.3, -0.2, 0.7
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("heights", [0, 1, 2])
+@pytest.mark.parametrize("pieces", ["one", "many"])
+def test_kernels_and_reference_settle_alike(device, shape, heights, pieces):
+    random = np.random.default_rng(shape[0])
+    known = np.where(random.random(shape) < 0.2, random.normal(2, 1, shape), np.nan)
+    known[0, 0] = 1.0
+    share, wanted = random.random(shape) + 0.1, random.random(shape) < 0.6
+    wanted[0, 0] = True
+    inputs = check_inputs(
+        np.zeros(shape),
+        np.zeros(shape),
+        (0.5, 0.25),
+        mask=wanted if pieces == "many" else None,
+        heights=known if heights else None,
+        height_weights=share if heights == 2 else None,
+    )
+    room = LinkRoom(device, shape)
+    flags = room.take(inputs).copy()
+    found = find_components(flags, cut=False)
+    assert min(shape) < 9 or (found.count > 20) == (pieces == "many")
+    relief = random.normal(0, 1, shape).astype(np.float32)
+    array = device.array("relief", shape, np.float32)
+    array.host[...] = relief
+    array.upload()
+    settler = Settler(room)
+    settler.take(found)
+
+    rise = PLANE[0] * 0.5, -PLANE[1] * 0.25, PLANE[2]
+    given = flags, found.labels, relief, rise
+    offsets = np.zeros(found.count)
+    for some, maps in (
+        (found.offset_unknown, (None, None)),
+        (~found.offset_unknown, (inputs.heights, inputs.height_weights)),
+    ):
+        if some.any():
+            total, share = components.components_sum(*given, *maps, found.count)
+            offsets[some] = -(total[some] / share[some])
+    offsets[~found.offset_unknown] += 5.0
+    exact = components.components_settle(*given, offsets)
+    np.testing.assert_allclose(settler.settle(array, PLANE, 5.0), exact, atol=1e-5)
+    assert np.isnan(exact).sum() == np.sum(found.labels < 0)
+
+
+def test_a_piece_without_known_height_has_the_mean_nothing_and_others_meet_what_is_known():
+    flags = np.full((2, 3), SLOPE, np.uint8)
+    flags[1, 2] |= 8
+    labels = np.array([[0, -1, 1], [0, -1, 1]], np.int32)
+    relief, plane = np.array([[1.0, 9, 2], [3, 9, 4]]), (10.0, 100.0, 1000.0)
+    total, share = components.components_sum(flags, labels, relief, plane, None, None, 2)
+    assert (total / share).tolist() == [1052, 1073]
+    heights = np.array([[0, 0, 0], [0, 0, 1130.0]])
+    total, share = components.components_sum(flags, labels, relief, plane, heights, None, 2)
+    assert (total[1], share.tolist()) == (4 + 1120 - 1130, [0, 1])
+    settled = components.components_settle(flags, labels, relief, plane, np.array([-1052.0, 6]))
+    np.testing.assert_array_equal(settled, [[-51, np.nan, 1028], [51, np.nan, 1130]])

@@ -1,0 +1,210 @@
+"""The links' kernels do what their reference does, and that is what it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.integration.inputs import Inputs, check_inputs
+from mirrorskin.engine.integration.links import LinkRoom
+from mirrorskin.kernels import links
+from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
+
+SHAPES = [(1, 1), (1, 2), (1, 9), (9, 1), (3, 2), (23, 37), (18, 300)]
+SIZE = 0.03, 0.04
+PLANE = 0.1, -0.2, 0.05
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Which of the maps are given."""
+
+    mask: bool = False
+    weights: int = 0
+    edges: bool = False
+    heights: int = 0
+
+    def inputs(self, shape: tuple[int, int]) -> Inputs:
+        """Random maps, some of them with holes."""
+        random = np.random.default_rng(shape[1])
+        dz_dx, dz_dy = random.normal(0, 1, (2, *shape)).astype(np.float32)
+        dz_dx[random.random(shape) < 0.05] = np.nan
+        dz_dy[random.random(shape) < 0.03] = np.inf
+        known = np.where(random.random(shape) < 0.5, random.normal(-300, 1, shape), np.nan)
+        some = random.random((3, *shape)) * (random.random((3, *shape)) > 0.1)
+        return check_inputs(
+            dz_dx,
+            dz_dy,
+            SIZE,
+            mask=random.random(shape) > 0.1 if self.mask else None,
+            weights=[None, some[0], some[:2]][self.weights],
+            edges=random.random(shape) < 0.1 if self.edges else None,
+            heights=known if self.heights else None,
+            height_weights=some[2] if self.heights == 2 else None,
+        )
+
+
+SCENES = {
+    "plain": Scene(),
+    "mask": Scene(mask=True),
+    "weights": Scene(weights=1),
+    "two weights, edges": Scene(mask=True, weights=2, edges=True),
+    "heights": Scene(edges=True, heights=1),
+    "all": Scene(mask=True, weights=2, edges=True, heights=2),
+}
+scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+
+
+def told(inputs):
+    """The flags, by the reference."""
+    maps = inputs.dz_dx, inputs.dz_dy
+    rest = inputs.weight_x, inputs.weight_y, inputs.heights, inputs.height_weights
+    flags = links.links_flags(*maps, inputs.mask, *rest)
+    return flags if inputs.edges is None else links.links_cut(*maps, inputs.edges, flags)
+
+
+def arguments(inputs, flags, scale):
+    """What goes over links is given, by the reference."""
+    weights = scale / SIZE[0] ** 2, scale / SIZE[1] ** 2, scale
+    rest = inputs.weight_x, inputs.weight_y, inputs.heights, inputs.height_weights
+    return inputs.dz_dx, inputs.dz_dy, flags, *rest, weights, SIZE, PLANE
+
+
+def put(room, values):
+    """An array on the room's device."""
+    array = room.device.array("test", values.shape, np.float32)
+    array.host[...] = values
+    array.upload()
+    return array
+
+
+def near(device_map, exact):
+    np.testing.assert_allclose(device_map, exact, rtol=2e-5, atol=2e-6 * max(np.abs(exact).max(), 1e-3))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@scenes
+def test_kernels_and_reference_build_the_same_graph(device, shape, scene):
+    inputs, room = scene.inputs(shape), LinkRoom(device, shape)
+    flags = told(inputs)
+    np.testing.assert_array_equal(room.take(inputs), flags)
+    right, down, anchor, source = links.links_join(*arguments(inputs, flags, room.scale))
+    found = room.join(PLANE)
+    near(found.right.download(), right)
+    near(found.down.download(), down)
+    near(found.source.download(), source)
+    assert (found.anchor is None) == (inputs.heights is None)
+    if found.anchor is not None:
+        near(found.anchor.download(), anchor)
+    near(room.ask(PLANE).download(), source)
+
+
+@scenes
+def test_kernels_and_reference_find_the_same_misfit(device, scene):
+    inputs, room = scene.inputs((23, 37)), LinkRoom(device, (23, 37))
+    flags = room.take(inputs).copy()
+    relief = np.random.default_rng(1).normal(0, 1, room.shape).astype(np.float32)
+    exact = links.links_misfit(*arguments(inputs, flags, room.scale), relief)
+    assert exact > 1
+    assert room.misfit(put(room, relief), PLANE) * room.scale == pytest.approx(exact, rel=1e-5)
+
+
+def test_links_may_have_weights_of_their_own(device):
+    inputs, room = SCENES["heights"].inputs((23, 37)), LinkRoom(device, (23, 37))
+    flags = room.take(inputs).copy()
+    joined = room.join(PLANE)
+    own = [np.random.default_rng(n).random(room.shape).astype(np.float32) for n in (1, 2)]
+    for array, values in zip((joined.right, joined.down), own, strict=True):
+        array.claim()
+        array.host[...] = values
+        array.upload()
+    maps = (*own, inputs.heights, inputs.height_weights)
+    numbers = (1.0, 1.0, room.scale), SIZE, PLANE
+    given = inputs.dz_dx, inputs.dz_dy, flags, *maps, *numbers
+    near(room.ask(PLANE, joined).download(), links.links_join(*given, owned=True)[3])
+    relief = np.random.default_rng(3).normal(0, 1, room.shape).astype(np.float32)
+    exact = links.links_misfit(*given, relief, owned=True)
+    assert room.misfit(put(room, relief), PLANE, joined) * room.scale == pytest.approx(exact, rel=1e-5)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_kernel_and_reference_smooth_alike(device, shape):
+    inputs, room = SCENES["heights"].inputs(shape), LinkRoom(device, shape)
+    flags = room.take(inputs).copy()
+    values = np.random.default_rng(1).random(shape).astype(np.float32)
+    exact = values
+    for _ in range(3):
+        exact = links.links_smooth(flags, exact)
+    near(room.smooth(values, 3), exact)
+    assert np.sum(exact) == pytest.approx(np.sum(values, dtype=float), rel=1e-12)
+
+
+def grid(shape):
+    row, column = np.indices(shape)
+    return column * SIZE[0], -row * SIZE[1]
+
+
+def flat(shape, **maps):
+    zeros = np.zeros(shape, np.float32)
+    return check_inputs(zeros, zeros, SIZE, **maps)
+
+
+def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
+    x, y = grid((9, 9))
+    dz_dx, dz_dy = (1 + x - 6 * x**2, 2 - y + 3 * y**2)
+    inputs = check_inputs(dz_dx.astype(np.float32), dz_dy.astype(np.float32), SIZE)
+    height = x + x**2 / 2 - 2 * x**3 + 2 * y - y**2 / 2 + y**3
+    flags = told(inputs)
+    inner = flags.copy()
+    inner[:, [0, -2]] &= ~np.uint8(RIGHT)
+    inner[[0, -2]] &= ~np.uint8(DOWN)
+    given = arguments(inputs, flags, 1.0)
+    steps = links._steps(*given[:5], *given[7:], owned=False)
+    for (_, step), bit, axis in zip(steps, (RIGHT, DOWN), (1, 0), strict=True):
+        real = np.roll(height, -1, axis) - height
+        level = (PLANE[0] * SIZE[0], -PLANE[1] * SIZE[1])[1 - axis]
+        where = inner & bit != 0
+        assert where.sum() > 40
+        np.testing.assert_allclose((step + level)[where], real[where], atol=1e-8)
+        assert np.abs((step + level - real)[flags & ~inner & bit != 0]).min() > 1e-7  # of two pixels only
+
+
+def test_the_source_of_each_piece_sums_to_nothing():
+    inputs = SCENES["two weights, edges"].inputs((23, 37))
+    flags = told(inputs)
+    source = links.links_join(*arguments(inputs, flags, 1.0))[3]
+    assert source.sum() == pytest.approx(0, abs=1e-12 * np.abs(source).sum())
+    assert np.abs(source).sum() > 1
+
+
+def test_a_pixel_is_told_by_its_maps():
+    nan, one = np.nan, 1.0
+    dz = np.array([[one, nan, one, one, nan]], np.float32)
+    inputs = check_inputs(
+        dz, np.ones_like(dz), SIZE, weights=[[1, 1, 0, 1, 0]], heights=[[nan, 2, nan, 3, nan]]
+    )
+    assert told(inputs).tolist() == [[SLOPE, LOST | KNOWN, 0, SLOPE | KNOWN, 0]]
+
+
+def test_a_pixel_on_an_edge_keeps_its_link_to_the_neighbour_most_like_it():
+    dz_dx = np.zeros((3, 4), np.float32)
+    dz_dx[:, 2:], dz_dx[1, 1] = 1.0, 0.9
+    marked = np.zeros((3, 4), bool)
+    marked[:, 1] = True
+    flags = told(check_inputs(dz_dx, np.zeros_like(dz_dx), SIZE, edges=marked))
+    assert (flags & RIGHT).tolist() == [[1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 1, 0]]
+    assert (flags[:-1] & DOWN > 0).tolist() == [[1, 0, 1, 1], [1, 0, 1, 1]]
+
+
+def test_a_pixel_among_others_on_edges_is_alone():
+    inputs = flat((3, 3), edges=np.ones((3, 3)))
+    assert told(inputs).tolist() == [[SLOPE] * 3] * 3
+
+
+def test_known_and_unknown_pixels_are_not_smoothed_together():
+    heights = np.array([[1.0, 1.0, np.nan, np.nan]])
+    flags = told(flat((1, 4), heights=heights))
+    smoothed = links.links_smooth(flags, np.array([[1.0, 0.0, 4.0, 0.0]]))
+    np.testing.assert_allclose(smoothed, [[0.8, 0.2, 3.2, 0.8]])

@@ -1,0 +1,129 @@
+"""Each pass against its reference, on levels of odd sizes with nodes that are odd as well."""
+
+import numpy as np
+import pytest
+
+from mirrorskin.kernels import multigrid
+
+FINE = (0, 13, 32)  # base, rows, stride; 21 columns
+COARSE = (15 * 32, 7, 16)
+ODD = COARSE[0] + 9 * 16  # the first node without a place in the picture
+NODES = ODD + 16
+ROWS = 9
+STEPS = 1.3896, 0.5617
+PAIR = (FINE[0], FINE[2], *COARSE)
+
+
+class Arrays:
+    """All that passes work on, at random."""
+
+    def __init__(self, anchored, seed=0):
+        rng = np.random.default_rng(seed)
+        self.right, self.down, self.anchor = (np.zeros(NODES) for _ in range(3))
+        for (base, rows, stride), columns in ((FINE, 21), (COARSE, 11)):
+            node = base + stride * (np.arange(rows)[:, np.newaxis] + 1) + np.arange(columns)
+            for name, inside in (("right", node[:, :-1]), ("down", node[:-1])):
+                weights = rng.uniform(0.1, 3.0, inside.shape) * (rng.random(inside.shape) < 0.8)
+                getattr(self, name)[inside] = weights * rng.choice([1, 1e-3], inside.shape, p=[0.9, 0.1])
+            if anchored:
+                self.anchor[node] = rng.uniform(0, 1, node.shape) * (rng.random(node.shape) < 0.3)
+        for name in ("b", "x", "e", "z", "before", "left", "inverse"):
+            setattr(self, name, rng.normal(size=NODES))
+        self.inverse = np.abs(self.inverse)
+        self.smoother, self.direction, self.image, self.split = (np.zeros(NODES) for _ in range(4))
+        self.weight_at = np.abs(rng.normal(size=NODES))
+        self.parts = np.zeros(-(-FINE[1] * FINE[2] // 64))
+        inside = FINE[2] + rng.choice(FINE[1] * FINE[2], ROWS - 3, replace=False)
+        self.node = np.sort(np.concatenate([inside, ODD + np.arange(3)]))
+        counts = rng.integers(1, 9, ROWS)
+        self.start = np.concatenate([[0], np.cumsum(counts)])
+        self.column = rng.integers(FINE[2], ODD + 3, self.start[-1])
+        self.weight = rng.uniform(0, 2, self.start[-1])
+        self.bottom = COARSE[0] + COARSE[2] + np.arange(30)
+        self.matrix = rng.normal(size=900)
+        self.map_ = rng.normal(size=13 * 21)
+        self.level = np.zeros(NODES)
+
+    def all(self):
+        return vars(self)
+
+
+TABLE = "node", "start", "column", "weight"
+GRAPH = "right", "down", "anchor"
+PASSES = {
+    "invert": (FINE, *GRAPH, "inverse"),
+    "begin": (FINE, *STEPS, *GRAPH, "inverse", "b", "x"),
+    "smooth": (FINE, 0.5617, *GRAPH, "b", "x", "smoother"),
+    "residual": (FINE, *GRAPH, "b", "x", "left"),
+    "leave": (FINE, *GRAPH, "b", "x", "left"),
+    "keep": (FINE, "left", "x", "b", "smoother"),
+    "scale": (FINE, "inverse", "b", "left"),
+    "clear": (FINE, "x"),
+    "add": (FINE, "e", "x"),
+    "restrict": (PAIR, "right", "down", "left", "b"),
+    "gather": (PAIR, "e", "b"),
+    "prolong": (PAIR, 1.0, "right", "down", "inverse", "e", "x", "smoother"),
+    "coarsen": (PAIR, *GRAPH, *GRAPH, "split"),
+    "invert_odd": ((1, 7), *TABLE, "anchor", "inverse"),
+    "begin_odd": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
+    "smooth_odd": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
+    "leave_odd": ((2, 7), *TABLE, np.int32(1), "anchor", "inverse", "b", "x", "left"),
+    "restrict_odd": ((0, ROWS), *TABLE, "left", "b"),
+    "prolong_odd": ((3, 6), *TABLE, 0.0, "inverse", "e", "x", "smoother"),
+    "solve": ((30,), "bottom", "matrix", "b", "x"),
+    "direct": (FINE, 0.7, *GRAPH, "z", "before", "direction", "image", "parts"),
+    "advance": (FINE, 0.3, "e", "before", "b", "x", "parts"),
+    "dot": (FINE, "e", "x", "parts"),
+    "weigh": (FINE, "weight_at", "x", "parts"),
+    "admit": ((13, 21, 32), "map_", "level"),
+    "release": ((13, 21, 32), "x", "map_"),
+}
+INTEGERS = {"node", "start", "column", "bottom"}
+
+
+def items_of(name, device):
+    if name in ("restrict", "gather", "prolong", "coarsen"):
+        return COARSE[1]
+    if name in ("admit", "release"):
+        return FINE[1]
+    if name == "solve":
+        return 30
+    if name.endswith("odd"):
+        return ROWS
+    nodes = FINE[1] * FINE[2]
+    sums = "direct", "advance", "dot", "weigh"
+    return -(-nodes // (64 if name in sums else device.shape.tile))
+
+
+@pytest.mark.parametrize("anchored", [True, False], ids=["anchored", "free"])
+@pytest.mark.parametrize("name", PASSES)
+def test_a_pass_does_what_its_reference_says(device, name, anchored):
+    sizes, *arguments = PASSES[name]
+    arrays = Arrays(anchored).all()
+    arrays = {key: value.astype(np.int32 if key in INTEGERS else np.float32) for key, value in arrays.items()}
+    on_device = {}
+    for key, value in arrays.items():
+        on_device[key] = device.array(key, value.shape, value.dtype)
+        on_device[key].host[...] = value
+        on_device[key].upload()
+    before = {key: value.copy() for key, value in arrays.items()}
+    getattr(multigrid, f"multigrid_{name}")(
+        *sizes, *(arrays[a] if isinstance(a, str) else a for a in arguments)
+    )
+    width = 8 if device.shape.tile > 1 else 1
+    kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=int(anchored), PART=64, WIDTH=width)
+    scalars = [np.int32(size) for size in sizes]
+    given = [
+        on_device[a] if isinstance(a, str) else a if isinstance(a, np.int32) else np.float32(a)
+        for a in arguments
+    ]
+    kernel(items_of(name, device), *scalars, *given, moved=0)
+    changed = [key for key in arrays if not np.array_equal(arrays[key], before[key])]
+    assert changed
+    for key in arrays:
+        found = on_device[key].download()
+        if key == "parts":
+            found, expected = found.astype(np.float64).sum(), arrays[key].astype(np.float64).sum()
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
+        else:
+            np.testing.assert_allclose(found, arrays[key], rtol=2e-5, atol=2e-5)

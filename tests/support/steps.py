@@ -1,0 +1,130 @@
+"""Surfaces whose depth jumps, or only seems to, and where on them normals determine the height.
+
+Nowhere do normals tell how deep a step is that no slope leads up or down. So heights are compared within
+each part of the picture that hangs together, each about its own median. Within it, pixels count whose height
+the direct solve of the same noisy slopes gets within 1 % of the step when it is told where the steps are:
+elsewhere it is the noise, or the pixels' coarseness, that errs. Nor do pixels count within 3 of a step that
+is less than 5 pixels deep, such as the end of a tear: there the energy's least may be a bend.
+
+The energy of `bilateral_oracle` itself pulls a crease, which is no step, towards its flatter side: by
+s^3 / (2 (2 + s^2)) pixels for a slope s on one side, 0.07 at 35 degrees and 0.11 at 40. So the steps here are
+of 12 pixels and more: of smaller ones 2 % is less than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import slope_oracle
+import surfaces
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Map = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+RELIEF = 0.25  # mm, of the coin
+
+
+class Case(NamedTuple):
+    """What is looked at, with pixels of what size in mm, and how deep the step is in mm."""
+
+    seen: surfaces.Sample
+    pixel_size: tuple[float, float]
+    step: float
+    mask: Mask
+
+
+def on_grid(
+    surface: surfaces.Shape,
+    shape: tuple[int, int],
+    step: float,
+    pixel_size: tuple[float, float] = (0.05, 0.05),
+    mask: Mask | None = None,
+) -> Case:
+    """Look at a surface; the step is told in pixels."""
+    mask = np.ones(shape, bool) if mask is None else mask
+    return Case(surfaces.sample(surface, shape, pixel_size), pixel_size, step * pixel_size[0], mask)
+
+
+def on_coin(x: float, y: float, shape: tuple[int, int], pixel: float = 0.016) -> Case:
+    """Look at the twin's coin, round a place in mm."""
+    from mirrorskin.hw.twin.objects import Coin
+
+    columns, rows = surfaces.places(shape)
+    place = x + pixel * columns, y + pixel * rows
+    seen = surfaces.Sample(Coin().height(*place), *Coin().slope(*place), np.zeros(shape, np.intp))
+    return Case(seen, (pixel, pixel), RELIEF, np.ones(shape, bool))
+
+
+def cap(size: float) -> surfaces.Shape:
+    """Return a ball's cap, as far as a zenith of 55 degrees, whose rim is one radius above a plane."""
+    return surfaces.ball_on_plane(size, size, float(np.sin(np.radians(55))))
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "ball on a plane": lambda: on_grid(cap(32), (66, 71), 32),
+    "ball on a plane, through a disc": lambda: on_grid(cap(32), (66, 71), 32, mask=surfaces.disc((66, 71))),
+    "ball on a plane, long pixels": lambda: on_grid(cap(32), (50, 71), 32, (0.02, 0.028)),
+    "stairs": lambda: on_grid(surfaces.stairs(2, 20, 30, 36), (24, 130), 30),
+    "a single ramp": lambda: on_grid(surfaces.stairs(1, 20, 30, 43), (23, 91), 30),
+    "coin: writing": lambda: on_coin(-4.5, -5.3, (120, 120)),
+    "coin: rim": lambda: on_coin(9.8, 1.0, (80, 110)),
+    # One lip rises along the tear; below, where the sheet is whole, normals tell how far above the other.
+    "torn sheet": lambda: on_grid(surfaces.tear(24, 30), (96, 96), 24),
+}
+
+
+def tilted(seen: surfaces.Sample, angle: float, seed: int = 0) -> Map:
+    """Return the slopes (2, H, W) of normals with noise of so many radians on each of their three numbers."""
+    normals = np.stack([-seen.dz_dx, -seen.dz_dy, np.ones_like(seen.dz_dx)])
+    normals /= np.linalg.norm(normals, axis=0)
+    normals += np.random.default_rng([seed, 21]).normal(0, angle, normals.shape)
+    return np.asarray(-normals[:2] / normals[2])
+
+
+def determined(case: Case, slopes: Map) -> NDArray[np.intp]:
+    """Return the part to which a pixel belongs whose height normals determine, else -1, (H, W)."""
+    problem = slope_oracle.Problem(slopes[0], slopes[1], case.pixel_size, case.mask)
+    told = slope_oracle.solve(problem, surfaces.joined(case.seen.side))
+    off = told.height - case.seen.height
+    part = np.full(case.mask.shape, -1)
+    for label in range(len(told.offset_unknown)):
+        within = told.component == label
+        part[within & (np.abs(off - np.median(off[within])) <= 0.01 * case.step)] = label
+    part[ndimage.binary_dilation(beside_steps(case, below=5.0), iterations=3)] = -1
+    return part
+
+
+def errors(height: NDArray[np.floating], case: Case, part: NDArray[np.intp]) -> Map:
+    """Return the error as a share of the step, about each part's median; NaN where none is determined."""
+    error = np.full(height.shape, np.nan)
+    for label in np.unique(part[part >= 0]):
+        within = part == label
+        off = height[within] - case.seen.height[within]
+        error[within] = (off - np.median(off)) / case.step
+    return error
+
+
+def smooth_links(case: Case, height: NDArray[np.floating]) -> tuple[Map, Map]:
+    """Return the errors of the links where the surface is smooth, along x and y, as a share of the step."""
+    found = []
+    for axis, joined in zip((1, 0), surfaces.joined(case.seen.side), strict=True):
+        ahead = np.diff(height, axis=axis) - np.diff(case.seen.height, axis=axis)
+        creased = np.abs(np.diff([case.seen.dz_dx, case.seen.dz_dy], axis=axis + 1)).max(axis=0) > 0.2
+        found.append(ahead[joined & ~creased & np.isfinite(ahead)] / case.step)
+    return found[0], found[1]
+
+
+def beside_steps(case: Case, below: float = np.inf) -> Mask:
+    """Return the pixels on either side of a step that is less than so many pixels deep."""
+    beside = np.zeros(case.mask.shape, bool)
+    for axis, joined in zip((1, 0), surfaces.joined(case.seen.side), strict=True):
+        jump = np.abs(np.diff(case.seen.height, axis=axis)) / case.pixel_size[1 - axis]
+        line = ~joined & (jump < below)
+        first, second = ((slice(None), part) if axis == 1 else part for part in (np.s_[:-1], np.s_[1:]))
+        beside[first] |= line
+        beside[second] |= line
+    return np.asarray(beside & case.mask)
