@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.press.changepoint import ChangePointSearch
+from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.engine.press.search import Event
 from mirrorskin.engine.provenance import sign, told
@@ -21,6 +23,8 @@ PressMethod = Literal["threshold", "change-point"]
 METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
 
 _RANGE = "range of the type"
+_LIGHT_AT_START = 3  # of an onset's status
+_NO_PIXEL_SIZE = "none: the recording has no pixel size"
 
 
 def reconstruct_press(
@@ -34,11 +38,47 @@ def reconstruct_press(
     dark: ArrayLike | None = None,
     bright: ArrayLike | None = None,
     noise: float | None = None,
+    fill: bool = True,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> Result:
-    """Reconstruct heights from a press or a release; see ``mirrorskin.engine.reconstruct``."""
+    """Reconstruct heights from a press or a release.
+
+    Parameters
+    ----------
+    source : Source
+        Of vertical motion. It is rewound first, if it can be.
+    event : {"onset", "release"}
+        Whether to look for the light state's begin or its end.
+    method : {"threshold", "change-point"}
+        The first crossing of the threshold, or the most likely change.
+    threshold, hold, subframe
+        As for ``find_onset``.
+    dark, bright : array_like, scalar or (H, W), optional
+        Counts without and with full light, instead of the source's own.
+    noise : float, optional
+        Standard deviation of a sample, counts; by default told from the first two frames.
+    fill : bool
+        Whether to fill holes, such as flat tops, which never turn light: their heights are guesses, marked in
+        ``filled``; see `mirrorskin.engine.fill_holes`. It takes a known pixel size.
+    memory_limit : int
+        Bytes of host memory for frames on the move.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+    progress : callable, optional
+        Told the number of frames so far.
+
+    Returns
+    -------
+    Result
+        ``height_sigma`` is NaN where the height was filled.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The input cannot be used.
+    """
     if method not in METHODS:
         known = ", ".join(METHODS)
         raise InputError(f"{source.name} is a press, which method {method!r} cannot do: take {known}")
@@ -78,7 +118,28 @@ def reconstruct_press(
         "bright": "each pixel's own" if twice else told(bright, header.bright, _RANGE),
     }
     result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
+    process["fill"] = "none: not asked"
+    if fill:
+        result, process["fill"] = _fill(result, source, frames, event)
     return sign(result, source, search.device, process)
+
+
+def _fill(result: Result, source: Source, frames: range, event: Event) -> tuple[Result, str]:
+    """Fill the holes of a height map, where it is known how wide they are, and say what was done."""
+    assert result.height is not None
+    assert result.height_sigma is not None
+    pixel_size = source.header.pixel_size
+    if pixel_size is None:
+        return result, _NO_PIXEL_SIZE
+    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+    above = deepest = None
+    if travel is not None:
+        used = travel[frames.start : frames.stop]
+        deepest = -float(np.max(used))
+        if event == "onset":  # what is light at start was touched before
+            above = np.where(result.status == _LIGHT_AT_START, -used[0], np.nan)
+    height, filled = fill_holes(result.height, result.height_sigma, pixel_size, above=above, deepest=deepest)
+    return replace(result, height=height, filled=filled), "holes"
 
 
 def _frames_of(source: Source, event: Event) -> range:

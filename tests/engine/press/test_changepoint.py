@@ -440,7 +440,7 @@ def frames_of(source):
 
 
 def test_a_source_is_reconstructed_by_its_change_points():
-    result = engine.reconstruct(twin(), method="change-point", memory_limit=2 * 7 * 120 * 120)
+    result = engine.reconstruct(twin(), method="change-point", fill=False, memory_limit=2 * 7 * 120 * 120)
     source = twin()
     given = find_change_point(frames_of(source), TRAVEL, source.header.dark, source.header.bright)
     np.testing.assert_array_equal(result.height, given.height)
@@ -458,7 +458,8 @@ def test_a_source_without_references_is_read_twice(missing):
     done = []
     source = twin(**missing)
     limit = 2 * 16 * 120 * 120
-    result = engine.reconstruct(source, method="change-point", memory_limit=limit, progress=done.append)
+    options = {"method": "change-point", "fill": False}
+    result = engine.reconstruct(source, **options, memory_limit=limit, progress=done.append)
     np.testing.assert_array_equal(result.height, find_change_point(frames_of(twin()), TRAVEL).height)
     assert done == [16, 30, 16, 30]
     assert result.process["dark"] == result.process["bright"] == "each pixel's own"

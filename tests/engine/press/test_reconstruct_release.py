@@ -32,7 +32,8 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
     find = engine.find_onset if method == "threshold" else engine.find_change_point
     with io.open_recording(record(twin(), tmp_path / "both.h5", block=13)) as recording:
         for event, part in (("onset", slice(0, 31)), ("release", slice(29, 60))):
-            result = engine.reconstruct(recording, event=event, method=method, memory_limit=7 * 160 * 160)
+            options = {"method": method, "fill": False, "memory_limit": 7 * 160 * 160}
+            result = engine.reconstruct(recording, event=event, **options)
             given = find(frames[part], STROKE[part], header.dark, header.bright, event=event)
             np.testing.assert_array_equal(result.height, given.height)
             np.testing.assert_array_equal(result.height_sigma, given.sigma)
@@ -60,7 +61,7 @@ def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method, nois
 
 def test_a_recording_may_hold_a_release_alone():
     source = twin(DOWN[::-1], seed=3)
-    result = engine.reconstruct(source, event="release")
+    result = engine.reconstruct(source, event="release", fill=False)
     assert used(result) == ("release", 0, 30)
     given = engine.find_onset(
         frames_of(twin(DOWN[::-1], seed=3)),
@@ -128,7 +129,7 @@ def test_without_references_a_release_is_read_twice_from_its_own_first_frame():
     source = twin()
     frames = frames_of(source)
     source.header = dataclasses.replace(source.header, dark=None, bright=None)
-    result = engine.reconstruct(source, event="release", method="change-point")
+    result = engine.reconstruct(source, event="release", method="change-point", fill=False)
     given = engine.find_change_point(frames[29:], STROKE[29:], event="release")
     np.testing.assert_array_equal(result.height, given.height)
     assert result.process["dark"] == "each pixel's own"

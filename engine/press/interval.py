@@ -1,0 +1,132 @@
+"""What the interval that holds an onset says of the height, once it is known about where that is.
+
+All heights between two frames have one onset. Taken one by one their errors are spread evenly over the
+interval, but on a surface they belong together: over each terrace they run from one end to the other. So
+their mean is not better for there being more pixels, as that of independent errors would be. But where the
+shape of a surface is known, the lines at which one terrace meets the next tell its height, and are sharp.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.special import ndtr
+
+Doubles = NDArray[np.float64]
+
+_LEAST = 0.02  # of half an interval: what its ends are blurred by at least
+_FAR = 6.0  # blurs beyond an end, from which on an onset is a mistake
+_FEWEST, _MOST = 1e-4, 0.5  # share of mistakes
+_SAMPLES = 8192  # of errors that tell how they are spread
+_ROUNDS = 12  # until the share of mistakes settles
+_FAINT = 1e-4  # of an end's own weight, below which a weight is not taken to be more sure
+
+
+class Evidence(NamedTuple):
+    """A known height and its weight, (H, W), float64, 1/mm^2; the weight is 0 where nothing is known."""
+
+    height: Doubles
+    weight: Doubles
+
+
+class Spread(NamedTuple):
+    """How errors of known heights are spread.
+
+    Attributes
+    ----------
+    blur : float
+        Standard deviation that the ends of intervals are blurred by, mm.
+    mistaken : float
+        Mistakes for each height that is none, over twice the logarithm of how far they reach.
+    """
+
+    blur: float
+    mistaken: float
+
+
+def find_spread(error: Doubles, half: Doubles) -> Spread:
+    """Tell how sharp the intervals' ends are, and how many heights are mistakes, by the greatest likelihood.
+
+    An error e is from a blurred interval with the chance 1 - m, and a mistake of any size with the chance m:
+    its density is (1 - m) P(e) / (2 half) + m / (2 ln(1 + reach / half)) / (half + |e|). Mistakes are on one
+    side, as late onsets are, and what is within intervals does not hold against them: they must not count as
+    blurred ends.
+
+    Parameters
+    ----------
+    error : ndarray, (n,), float64
+        Middles of intervals less the heights, mm.
+    half : ndarray, (n,), float64
+        Half the intervals' widths, mm.
+
+    Returns
+    -------
+    Spread
+        Its blur is at least a fiftieth of half an interval.
+    """
+    thin = slice(None, None, -(-error.size // _SAMPLES))
+    error, half = error[thin], half[thin]
+    middle, farthest = float(np.median(half)), float(np.max(np.abs(error)))
+    reach = 2 * np.log1p(max(farthest / middle, 1.0))
+    anything = 1 / (half + np.abs(error)) / reach
+
+    def share(density: Doubles) -> float:
+        found = _MOST / 2
+        for _ in range(_ROUNDS):
+            found = float(np.mean(found * anything / (found * anything + (1 - found) * density)))
+        return float(np.clip(found, _FEWEST, _MOST))
+
+    def unlikely(size: float) -> float:
+        density = _chance(error, half, float(np.exp(size))) / (2 * half)
+        mistakes = share(density)
+        return -float(np.sum(np.log(mistakes * anything + (1 - mistakes) * density)))
+
+    least, most = np.log(_LEAST * middle), np.log(max(farthest, middle)) + 1.0
+    sizes = np.linspace(least, most, 12)
+    best = int(np.argmin([unlikely(size) for size in sizes]))
+    bounds = sizes[max(best - 1, 0)], sizes[min(best + 1, sizes.size - 1)]
+    size = float(minimize_scalar(unlikely, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
+    size = min((least, size), key=unlikely)
+    mistakes = share(_chance(error, half, float(np.exp(size))) / (2 * half))
+    return Spread(float(np.exp(size)), mistakes / (1 - mistakes) / reach)
+
+
+def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread) -> Evidence:
+    """Tell what intervals say of heights, by one Newton step on their likelihood.
+
+    That of a height u is the chance that u and an error of standard deviation ``spread.blur`` lie between the
+    interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). Its logarithm has the derivative g
+    and the curvature -h at u; the same have a known height u + g / h of the weight h. It counts by the chance
+    that it is no mistake.
+
+    Parameters
+    ----------
+    height : ndarray, (n,), float64
+        Where it is about, mm.
+    middle, half : ndarray, (n,), float64
+        Of the intervals, mm.
+    spread : Spread
+
+    Returns
+    -------
+    Evidence
+        Of the weight 0 where the height is far outside.
+    """
+    blur, mistaken = spread
+    below, above = (middle - half - height) / blur, (middle + half - height) / blur
+    near = (below < _FAR) & (above > -_FAR)
+    below, above = np.where(near, below, -1.0), np.where(near, above, 1.0)
+    chance = ndtr(above) - ndtr(below)
+    left, right = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above))
+    pull = left - right
+    weight = np.clip(pull**2 - (below * left - above * right), _FAINT, 1.0)
+    sound = chance / (chance + 2 * half * mistaken / (half + np.abs(middle - height)))
+    return Evidence(height + blur * pull / weight, np.where(near, sound * weight / blur**2, 0.0))
+
+
+def _chance(error: Doubles, half: Doubles, blur: float) -> Doubles:
+    """Return the chance that a blurred height lies in an interval."""
+    return np.asarray(ndtr((half - error) / blur) - ndtr((-half - error) / blur))
