@@ -11,6 +11,7 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.engine.errors import NotConverged
 from mirrorskin.io import InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
 
@@ -50,3 +51,5 @@ def naming(source: Source) -> Iterator[None]:
     except InputError as error:
         message = str(error)
         raise (error if source.name in message else InputError(f"{source.name}: {message}")) from error
+    except NotConverged as error:
+        raise NotConverged(f"{source.name}: {error}") from error

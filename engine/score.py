@@ -22,6 +22,8 @@ _JUMP = np.radians(10.0)  # between neighbours, from which on a change of the no
 class HeightScore:
     """Errors of a height map.
 
+    Of pieces whose heights are relative, the mean difference from the truth is taken off first.
+
     Attributes
     ----------
     answered : int
@@ -34,6 +36,8 @@ class HeightScore:
         Of the height error (mean) and its magnitude (the others), mm; NaN without answers.
     chi_square : float
         Mean of (error / sigma)^2: 1 where the standard deviations are honest; NaN without them.
+    relative : int
+        Pieces whose mean difference was taken off.
     """
 
     answered: int
@@ -45,10 +49,14 @@ class HeightScore:
     p99: float
     largest: float
     chi_square: float
+    relative: int = 0
 
     def table(self) -> dict[str, str]:
         """Return names and values to print."""
-        return _table_of_errors(self, "mm", "|error|", {"mean error": f"{self.mean:+.4f} mm"})
+        mean = {"mean error": f"{self.mean:+.4f} mm"}
+        if self.relative:
+            mean["offset"] = f"mean difference taken off; pieces without a known height: {self.relative}"
+        return _table_of_errors(self, "mm", "|error|", mean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +159,9 @@ class Score:
     Attributes
     ----------
     height : HeightScore or None
+        Of the measured heights.
+    filled : HeightScore or None
+        Of heights that were filled, where a result has any.
     normal : AngleScore or None
     azimuth : AngleScore or None
         Of a result that has azimuths but no normals.
@@ -161,6 +172,7 @@ class Score:
     """
 
     height: HeightScore | None = None
+    filled: HeightScore | None = None
     normal: AngleScore | None = None
     azimuth: AngleScore | None = None
     contact: ContactScore | None = None
@@ -216,8 +228,10 @@ def score(result: Result, truth: Truth) -> Score:
     # Registered frames tell of the object's points, the truth of the picture's pixels.
     follows = result.process.get("heights", "none") != "none"
     contact, edges = (None, None) if follows else (result.contact, result.edges)
+    height, filled = _score_heights(result, truth.height, touched)
     return Score(
-        height=None if result.height is None else _score_heights(result, truth.height, touched),
+        height=height,
+        filled=filled,
         normal=None if result.normals is None else _score_normals(result, truth, touched),
         azimuth=None if azimuth is None else _score_angles(_turned(azimuth, truth.azimuth), None, touched),
         contact=None if contact is None else _score_contact(result, touched),
@@ -241,9 +255,36 @@ def _table_of_errors(
     }
 
 
-def _score_heights(result: Result, truth: NDArray[np.float32], touched: Mask) -> HeightScore:
-    assert result.height is not None
+def _score_heights(
+    result: Result, truth: NDArray[np.float32], touched: Mask
+) -> tuple[HeightScore | None, HeightScore | None]:
+    """Score what was measured, and what was filled, if anything was."""
+    if result.height is None:
+        return None, None
     error = result.height.astype(np.float64) - truth
+    shift, relative = _mean_differences(result, error)
+    error = error - shift
+    filled = np.zeros(error.shape, bool) if result.filled is None else result.filled.astype(bool)
+    measured = _score_errors(np.where(filled, np.nan, error), result.height_sigma, touched, relative)
+    return measured, _score_errors(np.where(filled, error, np.nan), None, touched) if filled.any() else None
+
+
+def _mean_differences(result: Result, error: Doubles) -> tuple[Doubles | float, int]:
+    """Return the mean error of the piece that each pixel belongs to, if it is relative, and how many are."""
+    unknown, component = result.offset_unknown, result.component
+    if unknown is None or component is None or not unknown.any():
+        return 0.0, 0
+    told = np.isfinite(error) & (component >= 0)
+    count = np.bincount(component[told], minlength=unknown.size)
+    total = np.bincount(component[told], error[told], unknown.size)
+    mean = np.where(unknown, total / np.maximum(count, 1), 0.0)
+    # The last one is for pixels that are in no piece.
+    return np.append(mean, 0.0)[component], int(np.count_nonzero(count[unknown.astype(bool)]))
+
+
+def _score_errors(
+    error: Doubles, sigma: NDArray[np.float32] | None, touched: Mask, relative: int = 0
+) -> HeightScore:
     touched = np.broadcast_to(touched, error.shape)
     answered = np.isfinite(error)
     return HeightScore(
@@ -251,7 +292,8 @@ def _score_heights(result: Result, truth: NDArray[np.float32], touched: Mask) ->
         touched=int(np.count_nonzero(touched)),
         coverage=_share(answered, touched),
         mean=float(np.mean(error[answered])) if answered.any() else np.nan,
-        chi_square=_chi_square(error, result.height_sigma, answered),
+        chi_square=_chi_square(error, sigma, answered),
+        relative=relative,
         **_spread(np.abs(error[answered])),
     )
 

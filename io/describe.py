@@ -94,4 +94,10 @@ def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str
 
 def _result(result: Result) -> dict[str, str]:
     maps = {f"map {name}": f"{' x '.join(map(str, m.shape))} {m.dtype}" for name, m in result.maps().items()}
-    return {"kind": "result", **maps, **{name: str(value) for name, value in result.process.items()}}
+    facts = {"kind": "result", **maps}
+    if result.filled is not None:
+        facts["filled"] = f"{np.count_nonzero(result.filled)} pixels"
+    if result.offset_unknown is not None:
+        count, unknown = result.offset_unknown.size, np.count_nonzero(result.offset_unknown)
+        facts["components"] = f"{count}, of which {unknown} have an unknown offset"
+    return {**facts, **{name: str(value) for name, value in result.process.items()}}

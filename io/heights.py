@@ -11,7 +11,7 @@ from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK
 from mirrorskin.io.recording import open_recording
 from mirrorskin.io.result import open_result
-from mirrorskin.io.types import InputError
+from mirrorskin.io.types import InputError, Result
 
 
 def open_heights(path: str | Path) -> NDArray[np.float32]:
@@ -38,7 +38,19 @@ def open_heights(path: str | Path) -> NDArray[np.float32]:
         with open_recording(path) as recording:
             height = None if recording.truth is None else recording.truth.height
     else:
-        height = open_result(path).height
+        height = _absolute(open_result(path))
     if height is None:
         raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
+    if not np.isfinite(height).any():
+        raise InputError(
+            f"{path} holds no heights whose offset is known: give a result of a press, or of 'fuse'"
+        )
     return height
+
+
+def _absolute(result: Result) -> NDArray[np.float32] | None:
+    """Return the heights of a result without the pieces whose offset nobody knows."""
+    height, piece, unknown = result.height, result.component, result.offset_unknown
+    if height is None or piece is None or unknown is None or not unknown.any():
+        return height
+    return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))

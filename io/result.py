@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.plain import legible
-from mirrorskin.io.types import InputError, Result
+from mirrorskin.io.types import NO_MAPS, InputError, Result
 
 MARK = "mirrorskin_result"
 _UNITS = (
@@ -22,9 +22,13 @@ _UNITS = (
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
 )
-_DTYPES = dict.fromkeys(("status", "edges", "contact"), np.uint8) | dict.fromkeys(("x", "y"), np.float64)
-_MAPS = [field.name for field in fields(Result) if field.name not in ("x", "y", "process")]
-_VECTORS = "normals"
+_DTYPES = (
+    dict.fromkeys(("status", "edges", "filled", "contact", "offset_unknown"), np.uint8)
+    | {"component": np.int32}
+    | dict.fromkeys(("x", "y"), np.float64)
+)
+_MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
+_VECTORS, _OFFSETS = "normals", "offset_unknown"
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 
 
@@ -65,6 +69,8 @@ def _write_maps(data: h5py.Group, result: Result) -> None:
             data[name].attrs["interpretation"] = "image"
         if name in _UNITS:
             data[name].attrs["units"] = _UNITS[name]
+    if result.offset_unknown is not None:
+        data[_OFFSETS] = result.offset_unknown
     _write_axes(data, result, maps[plotted[0]].shape if plotted else ())
 
 
@@ -96,6 +102,7 @@ def open_result(path: str | Path) -> Result:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
         maps = _read_maps(file)
+        maps |= _read_offsets(file, maps.get("component"))
         process = {
             name: file.value(file.follow(f"{_PROCESS}/{name}", "reconstruct it again"))
             for name in file.names(_PROCESS)
@@ -117,6 +124,17 @@ def _read_maps(file: Hdf5File) -> dict[str, NDArray[Any]]:
         )
         for name, node in found.items()
     }
+
+
+def _read_offsets(file: Hdf5File, component: NDArray[np.int32] | None) -> dict[str, NDArray[Any]]:
+    """Read which components have an unknown offset, if that is told: a list, one number a component."""
+    node = file.find(f"{_RESULT}/{_OFFSETS}")
+    if component is not None and component.min(initial=-1) < -1:
+        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: reconstruct it again")
+    if node is None or component is None:
+        return {}
+    count = int(component.max(initial=-1)) + 1
+    return {_OFFSETS: file.read(node, (count,), remedy="reconstruct it again").astype(_DTYPES[_OFFSETS])}
 
 
 def _size_of(found: Mapping[str, Node]) -> Shape | None:

@@ -182,12 +182,13 @@ class Truth:
 class Result:
     """The maps of a reconstruction; one that was not computed is None.
 
-    Of a result for each turn of a rotation all maps have a leading axis, (turns, H, W) and (turns, H, W, 3).
+    Of a result for each turn of a rotation all maps have a leading axis, (turns, H, W) and (turns, H, W, 3);
+    components are numbered through all turns.
 
     Attributes
     ----------
     height, height_sigma : ndarray, (H, W), float32
-        Millimetres; NaN where there is no answer.
+        Millimetres, and the standard deviation that is expected of the height; NaN where there is no answer.
     status : ndarray, (H, W), uint8
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
         2 dark at start, 3 light to the end.
@@ -202,8 +203,14 @@ class Result:
         modulation is its amplitude, the residual the standard deviation that is left.
     edges : ndarray, (H, W), uint8
         1 on thin lines where the normal jumps or contact ends.
+    filled : ndarray, (H, W), uint8
+        1 where the height was not measured but filled from those around.
     contact : ndarray, (H, W), uint8
         1 where the sheet was in contact in every frame.
+    component : ndarray, (H, W), int32
+        Number of the connected piece that a height belongs to, from 0; -1 where there is no height.
+    offset_unknown : ndarray, (components,), uint8
+        1 of a component whose heights are relative: no absolute one is known in it, and their mean is 0.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
     process : mapping
@@ -223,15 +230,22 @@ class Result:
     modulation: NDArray[np.float32] | None = None
     residual: NDArray[np.float32] | None = None
     edges: NDArray[np.uint8] | None = None
+    filled: NDArray[np.uint8] | None = None
     contact: NDArray[np.uint8] | None = None
+    component: NDArray[np.int32] | None = None
+    offset_unknown: NDArray[np.uint8] | None = None
     x: Floats | None = None
     y: Floats | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps that were computed, by name."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("x", "y", "process")}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in NO_MAPS}
         return {name: value for name, value in values.items() if value is not None}
+
+
+NO_MAPS = ("offset_unknown", "x", "y", "process")
+"""What a result has besides maps."""
 
 
 def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:

@@ -1,9 +1,9 @@
-"""Normals, contact and edges from an axial rotation; or its wave alone."""
+"""Normals, contact, edges and heights from an axial rotation; or its wave alone."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,13 +17,38 @@ from mirrorskin.engine.rotation.correlation import Correlator
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.normals import NORMAL_METHODS, NormalEstimator, NormalMethod, Normals
 from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.relief import find_relief
 from mirrorskin.engine.rotation.turns import LONGEST, longest_turn
 from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
+_NO_PIXEL_SIZE = "none: the recording has no pixel size"
 
 _REACH = 5  # pixels across, of which a registered sample may be made
+
+
+@dataclass(frozen=True, slots=True)
+class Rotation:
+    """What a rotation tells of each pixel.
+
+    Attributes
+    ----------
+    normals : Normals
+    white : ndarray, (H, W), float32
+        The predicted errors, radians, that normals would have without registration. That makes errors smaller
+        but neighbours' alike, and means over many pixels no better.
+    edges : ndarray, (H, W), uint8
+    device : Device
+    process : dict
+        What it was made with.
+    """
+
+    normals: Normals
+    white: NDArray[np.float32]
+    edges: NDArray[np.uint8]
+    device: Device
+    process: dict[str, ProcessValue]
 
 
 def reconstruct_rotation(
@@ -36,14 +61,16 @@ def reconstruct_rotation(
     noise: float | None = None,
     per_turn: bool = False,
     heights: ArrayLike | None = None,
+    robust: bool = False,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> Result:
-    """Reconstruct normals from an axial rotation of one turn or more.
+    """Reconstruct normals from an axial rotation of one turn or more, and the heights that fit them.
 
     Brightness is taken to be linear in the zenith between the source's dark and bright references, where it
-    has them. Without a zenith gain, there are azimuth, mean, modulation and residual only.
+    has them. Without a zenith gain, there are azimuth, mean, modulation and residual only; without a pixel
+    size, no heights. Heights are relative: the mean of each connected piece is 0.
 
     Parameters
     ----------
@@ -64,6 +91,9 @@ def reconstruct_rotation(
     heights : array_like, (H, W), optional
         Millimetres of the surface: frames are registered for the pivot's shift with them first; see
         ``Registered``.
+    robust : bool
+        Whether the surface may break, at discontinuities that are found in it; see
+        `mirrorskin.engine.integrate`. Edges are drawn there, too.
     memory_limit : int
         Bytes of host memory for frames on the move.
     device : str or Device, optional
@@ -79,13 +109,60 @@ def reconstruct_rotation(
     ------
     mirrorskin.io.InputError
         Phases, tilt, scale or heights that are missing or cannot be used.
+    mirrorskin.engine.NotConverged
+        The heights that fit the normals were not found.
     """
-    if method not in NORMAL_METHODS:
-        known = ", ".join(NORMAL_METHODS)
-        raise InputError(f"{source.name} is a rotation, which method {method!r} cannot do: take {known}")
     if gain is None and source.header.zenith_gain is None:
+        check_method(source, method)
         _need_no_gain(source, per_turn, heights)
         return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
+    found = estimate_rotation(
+        source,
+        method=method,
+        tilt=tilt,
+        gain=gain,
+        offset=offset,
+        noise=noise,
+        per_turn=per_turn,
+        heights=heights,
+        memory_limit=memory_limit,
+        device=device,
+        progress=progress,
+    )
+    result = maps_of(found)
+    if source.header.pixel_size is None:
+        return sign(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
+    with naming(source):
+        relief = find_relief(
+            found.normals, found.white, source.header.pixel_size, robust=robust, device=found.device
+        )
+    result = replace(
+        result,
+        height=relief.height,
+        height_sigma=relief.sigma,
+        component=relief.component,
+        offset_unknown=relief.offset_unknown,
+        edges=found.edges if relief.edges is None else found.edges | relief.edges,
+    )
+    return sign(result, source, found.device, found.process | relief.process)
+
+
+def estimate_rotation(
+    source: Source,
+    *,
+    method: NormalMethod = "exact",
+    tilt: float | Literal["estimate"] | None = None,
+    gain: ArrayLike | None = None,
+    offset: ArrayLike | None = None,
+    noise: float | None = None,
+    per_turn: bool = False,
+    heights: ArrayLike | None = None,
+    memory_limit: int = MEMORY_LIMIT,
+    device: str | Device | None = None,
+    progress: Progress | None = None,
+) -> Rotation:
+    """Find the normals of a rotation whose zenith gain is known; see ``reconstruct_rotation``."""
+    check_method(source, method)
     header = _believe(source, tilt, gain, offset)
     opened = open_device(device)
     frames: Source = source
@@ -114,7 +191,9 @@ def reconstruct_rotation(
         feed(frames, estimator, range(frames.shape[0]), progress)
         normals = estimator.result()
     edges = _edges(normals, opened)  # where contact ends, before that is moved inwards
+    white = normals.sigma
     if isinstance(frames, Registered):
+        white = white if noise is not None else white / frames.noise_gain
         normals = _mend(normals, frames.noise_gain, given=noise is not None)
     process: dict[str, ProcessValue] = {
         "method": method,
@@ -131,7 +210,7 @@ def reconstruct_rotation(
         "per_turn": per_turn,
         "heights": "none" if heights is None else "given",
     }
-    return sign(_result(normals, edges), source, opened, process)
+    return Rotation(normals, white, edges, opened, process)
 
 
 def correlate_source(
@@ -179,16 +258,9 @@ def correlate_source(
     return sign(result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN})
 
 
-def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
-    """Find the edges of each turn, or of their mean."""
-    maps = normals.vectors, normals.sigma, normals.contact
-    if normals.contact.ndim == 2:
-        return find_edges(*maps, device=device)
-    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
-
-
-def _result(normals: Normals, edges: NDArray[np.uint8]) -> Result:
-    """Put together what is told."""
+def maps_of(rotation: Rotation) -> Result:
+    """Put together what a rotation tells, but heights."""
+    normals = rotation.normals
     return Result(
         normals=normals.vectors,
         zenith=normals.zenith,
@@ -197,9 +269,24 @@ def _result(normals: Normals, edges: NDArray[np.uint8]) -> Result:
         mean=normals.mean,
         modulation=normals.modulation,
         residual=normals.residual,
-        edges=edges,
+        edges=rotation.edges,
         contact=normals.contact,
     )
+
+
+def check_method(source: Source, method: str) -> None:
+    """Refuse a method that is none of a rotation."""
+    if method not in NORMAL_METHODS:
+        known = ", ".join(NORMAL_METHODS)
+        raise InputError(f"{source.name} is a rotation, which method {method!r} cannot do: take {known}")
+
+
+def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
+    """Find the edges of each turn, or of their mean."""
+    maps = normals.vectors, normals.sigma, normals.contact
+    if normals.contact.ndim == 2:
+        return find_edges(*maps, device=device)
+    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
 
 
 def _believe(

@@ -15,7 +15,7 @@ def twin(**options):
 
 def test_the_recordings_own_references_are_used():
     source = twin()
-    result = engine.reconstruct(source)
+    result = engine.reconstruct(source, fill=False)
     given = engine.find_onset(source_frames(twin()), TRAVEL, source.header.dark, source.header.bright)
     np.testing.assert_array_equal(result.height, given.height)
     assert result.process["dark"] == result.process["bright"] == "map of the recording"
@@ -27,7 +27,7 @@ def source_frames(source):
 
 def test_what_is_given_goes_before_what_the_recording_says():
     options = {"dark": 40, "bright": np.full((40, 50), 180.0), "noise": 3.0, "threshold": 0.3, "hold": 3}
-    result = engine.reconstruct(twin(), **options)
+    result = engine.reconstruct(twin(), fill=False, **options)
     given = engine.find_onset(source_frames(twin()), TRAVEL, **options)
     np.testing.assert_array_equal(result.height, given.height)
     np.testing.assert_array_equal(result.height_sigma, given.sigma)

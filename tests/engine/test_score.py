@@ -1,5 +1,7 @@
 """Scores against errors that were put in by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from rotations import direction
@@ -199,6 +201,52 @@ def test_a_score_prints_what_there_is():
     assert {name.split()[0] for name in table} == {"height", "normal"}
 
 
+def in_pieces():
+    """Return heights of two pieces, one of them relative, with a filled pixel each, and the truth."""
+    truth = truth_of(np.array([[0, 1, 2, 3, 4, 5]], np.float32))
+    height = np.array([[0.1, 1.1, 2.3, 7, 8.2, NAN]], np.float32)
+    maps = {
+        "component": np.array([[0, 0, 0, 1, 1, -1]], np.int32),
+        "offset_unknown": np.array([0, 1], np.uint8),
+        "filled": np.array([[0, 0, 1, 0, 0, 0]], np.uint8),
+    }
+    return io.Result(height=height, height_sigma=np.full((1, 6), 0.1, np.float32), **maps), truth
+
+
+def test_relative_heights_are_compared_without_their_mean_difference():
+    result, truth = in_pieces()
+    score = engine.score(result, truth)
+    # Errors of 0.1 twice in the absolute piece, and of -0.1 and 0.1 about the mean of 4.1 in the other.
+    assert score.height.answered == 4
+    assert score.height.relative == 1
+    assert score.height.rms == pytest.approx(0.1, rel=1e-5)
+    assert score.height.mean == pytest.approx(0.05, rel=1e-5)
+    assert score.height.chi_square == pytest.approx(1, rel=1e-5)
+    assert score.table()["height offset"] == ("mean difference taken off; pieces without a known height: 1")
+
+
+def test_filled_heights_are_scored_apart():
+    result, truth = in_pieces()
+    score = engine.score(result, truth)
+    assert list(score.parts()) == ["height", "filled"]
+    assert (score.filled.answered, score.filled.relative) == (1, 0)
+    assert score.filled.rms == pytest.approx(0.3, rel=1e-5)
+    assert np.isnan(score.filled.chi_square)  # of what is filled nothing tells how sure it is
+    assert score.table()["filled RMS error"] == "0.3000 mm"
+    assert "filled offset" not in score.table()
+    assert engine.score(dataclasses.replace(result, filled=result.filled * 0), truth).filled is None
+
+
+def test_each_piece_of_each_turn_has_its_own_difference():
+    truth = truth_of(np.array([[0, 1, 2]], np.float32))
+    height = np.array([[[5, 6, NAN]], [[-3, -2, -1.3]]], np.float32)
+    component = np.array([[[0, 0, -1]], [[1, 1, 2]]], np.int32)
+    result = io.Result(height=height, component=component, offset_unknown=np.ones(3, np.uint8))
+    score = engine.score(result, truth).height
+    assert (score.answered, score.relative) == (5, 3)
+    assert score.rms == pytest.approx(0, abs=1e-6)
+
+
 ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
 
 
@@ -220,6 +268,23 @@ ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
             "azimuth at 4 of 6 pixels, modulation from 7.250 to 7.250 counts",
         ),
         ({"height": ZENITH * 0 - 1, "zenith": ZENITH}, "height at 4 of 6 pixels, from -1.000 to -1.000 mm"),
+        (
+            {"height": ZENITH * 0 - 1, "filled": (ZENITH == 0).astype(np.uint8)},
+            "height at 4 of 6 pixels (1 filled), from -1.000 to -1.000 mm",
+        ),
+        (
+            {"height": ZENITH, "zenith": ZENITH, "offset_unknown": np.array([1, 0], np.uint8)},
+            "height at 4 of 6 pixels, from 0.000 to 0.794 mm",
+        ),
+        (
+            {"height": ZENITH, "zenith": ZENITH, "offset_unknown": np.array([1, 1], np.uint8)},
+            "normals at 4 of 6 pixels, zenith from 0.000 to 45.500 deg,"
+            " relative height from 0.000 to 0.794 mm",
+        ),
+        (
+            {"height": ZENITH * NAN, "zenith": ZENITH, "offset_unknown": np.array([], np.uint8)},
+            "normals at 4 of 6 pixels, zenith from 0.000 to 45.500 deg",
+        ),
     ],
 )
 def test_a_result_in_one_line(maps, line):

@@ -60,3 +60,21 @@ def test_a_file_without_heights_is_one_line(tmp_path, make, line):
         io.open_heights(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_heights_whose_offset_nobody_knows_are_left_out(tmp_path):
+    piece = np.zeros((5, 7), np.int32)
+    piece[:, 4:] = 1
+    result = io.Result(height=heights(), component=piece, offset_unknown=np.array([1, 0], np.uint8))
+    io.save_result(result, tmp_path / "r.h5")
+    found = io.open_heights(tmp_path / "r.h5")
+    assert np.isnan(found[:, :4]).all()
+    np.testing.assert_array_equal(found[:, 4:], heights()[:, 4:])
+
+
+def test_heights_that_are_all_relative_are_refused(tmp_path):
+    piece = np.zeros((5, 7), np.int32)
+    result = io.Result(height=heights(), component=piece, offset_unknown=np.ones(1, np.uint8))
+    io.save_result(result, tmp_path / "r.h5")
+    with pytest.raises(io.InputError, match="offset"):
+        io.open_heights(tmp_path / "r.h5")

@@ -148,6 +148,78 @@ def test_a_rotation_s_maps_say_their_units(path):
         assert (maps["normals"].shape, maps["normals"].dtype.str[1:]) == ((2, 5, 7, 3), "f4")
 
 
+def pieces(*size):
+    """Return what tells of two pieces, of which one is relative, and of filled pixels."""
+    component = np.full(size, -1, np.int32)
+    component[..., :2, :], component[..., 3:, :] = 0, 1
+    filled = np.zeros(size, np.uint8)
+    filled[..., 3, 3] = 1
+    return {"component": component, "offset_unknown": np.array([0, 1], np.uint8), "filled": filled}
+
+
+@pytest.mark.parametrize("turns", [(), (3,)])
+def test_pieces_of_a_surface_come_back(path, turns):
+    result = a_turn(*turns, 5, 7, height=np.zeros((*turns, 5, 7), np.float32), **pieces(*turns, 5, 7))
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    with h5py.File(path) as file:
+        maps = file["entry/result"]
+        assert (maps["component"].dtype.str[1:], maps["component"].shape) == ("i4", (*turns, 5, 7))
+        assert (maps["filled"].dtype.str[1:], maps["filled"].attrs["interpretation"]) == ("u1", "image")
+        assert (maps["offset_unknown"].dtype.str[1:], maps["offset_unknown"].shape) == ("u1", (2,))
+        assert "interpretation" not in maps["offset_unknown"].attrs
+        assert not {"units"} & {
+            *maps["component"].attrs,
+            *maps["filled"].attrs,
+            *maps["offset_unknown"].attrs,
+        }
+        assert {"component", "filled"} < set(maps.attrs["auxiliary_signals"])
+        assert "offset_unknown" not in maps.attrs["auxiliary_signals"]
+    assert plot_of(path)[1].name == "/entry/result/height"
+
+
+def test_a_surface_without_an_answer_comes_back(path):
+    nothing = {"component": np.full((5, 7), -1, np.int32), "offset_unknown": np.empty(0, np.uint8)}
+    result = a_turn(5, 7, **nothing)
+    io.save_result(result, path)
+    assert_same(io.open_result(path), result)
+    assert io.describe(path)["components"] == "0, of which 0 have an unknown offset"
+
+
+def test_pieces_of_a_surface_are_described(path):
+    io.save_result(a_turn(5, 7, **pieces(5, 7)), path)
+    facts = io.describe(path)
+    assert facts["map component"] == "5 x 7 int32"
+    assert facts["filled"] == "1 pixels"
+    assert facts["components"] == "2, of which 1 have an unknown offset"
+    assert "map offset_unknown" not in facts
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "line"),
+    [
+        (
+            "offset_unknown",
+            np.zeros(3),
+            r"offset_unknown has shape \(3,\) where \(2,\) is needed: reconstruct",
+        ),
+        ("offset_unknown", np.zeros((5, 7)), r"offset_unknown has shape \(5, 7\) where \(2,\) is needed"),
+        ("offset_unknown", np.zeros(2, "S2"), "offset_unknown holds no numbers: reconstruct"),
+        ("component", np.zeros(2), r"component has shape \(2,\) where \(5, 7\) is needed"),
+        ("filled", np.zeros((7, 5)), r"filled has shape \(7, 5\) where \(5, 7\) is needed"),
+    ],
+)
+def test_damaged_pieces_are_one_line(path, name, value, line):
+    io.save_result(a_turn(5, 7, **pieces(5, 7)), path)
+    with h5py.File(path, "r+") as file:
+        del file[f"entry/result/{name}"]
+        file[f"entry/result/{name}"] = value
+    for read in (io.open_result, io.describe):
+        with pytest.raises(io.InputError, match=line) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("names", "signal"),
     [

@@ -31,6 +31,13 @@ DOME = rotations.direction(np.radians(8 + 35 * np.hypot(X, Y)), np.arctan2(Y, X)
 FLAT = np.full(SHAPE, -1.0, np.float32)  # as deep as the press: about a pivot in the sheet, nothing moves
 
 
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    """Tell the heights' sigma from a few draws of noise: enough to hold it against errors, and faster."""
+    monkeypatch.setattr("mirrorskin.engine.integration.spread.DRAWS", 6)
+    monkeypatch.setattr("mirrorskin.engine.integration.spread.WAVES", 4)
+
+
 @cache
 def frames():
     return rotations.expose(DOME, replace(SETUP, phase=tuple(PHASE)), seed=3)
@@ -62,6 +69,7 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them():
         **dict.fromkeys(
             ("zenith", "azimuth", "normal_sigma", "mean", "modulation", "residual", "edges", "contact"), SHAPE
         ),
+        **dict.fromkeys(("height", "height_sigma", "component"), SHAPE),
         "normals": (*SHAPE, 3),
     }
     assert np.mean((errors(result) / result.normal_sigma) ** 2) == pytest.approx(1, abs=0.25)
@@ -110,6 +118,8 @@ def test_each_turn_may_be_told_alone():
     result, mean = reconstruct(per_turn=True), reconstruct()
     for name, values in result.maps().items():
         assert values.shape == (TURNS, *mean.maps()[name].shape)
+    assert [np.unique(turn).tolist() for turn in result.component] == [[0], [1], [2]]
+    assert result.offset_unknown.tolist() == [1, 1, 1]
     assert result.process["per_turn"]
     noise = mean.process["noise"]
     for turn in range(TURNS):
@@ -205,6 +215,84 @@ def test_heights_register_the_frames():
     np.testing.assert_array_equal(np.isfinite(each.zenith[0]), inside)
 
 
+# Pixels on which the dome is a surface: its normals are those of a height.
+OF_A_SURFACE = replace(HEADER, pixel_size=(2 / (SHAPE[1] - 1), 2 / (SHAPE[0] - 1)))
+RATE = np.radians(35)
+DOME_HEIGHT = np.log(np.cos(np.radians(8) + RATE * np.hypot(X, Y))) / RATE
+
+
+def test_the_heights_are_those_that_fit_the_normals():
+    result = reconstruct(OF_A_SURFACE)
+    assert (result.height.dtype, result.component.dtype) == (np.float32, np.int32)
+    error = result.height - (DOME_HEIGHT - DOME_HEIGHT.mean())
+    assert np.ptp(DOME_HEIGHT) > 0.8
+    assert np.sqrt(np.mean(error**2)) < 0.005
+    assert 0.1 < np.mean((error / result.height_sigma) ** 2) < 4  # one draw of errors that go together
+    assert result.height.mean() == pytest.approx(0, abs=1e-6)
+    assert result.offset_unknown.tolist() == [1]
+    assert (result.component == 0).all()
+    assert result.process["integration"] == "multigrid"
+    assert result.process["integration_residual"] < 1e-3
+    assert result.process["integration_iterations"] > 0
+
+
+def test_the_heights_of_registered_frames_are_told_too():
+    result = reconstruct(OF_A_SURFACE, heights=FLAT)
+    inside = result.component == 0
+    np.testing.assert_array_equal(np.isfinite(result.height), result.contact > 0)
+    error = (result.height - DOME_HEIGHT)[inside]
+    assert inside.sum() > 150
+    assert np.std(error) < 0.01
+
+
+def test_contacts_apart_have_heights_apart():
+    made = frames().copy()
+    made[:, :, 10:13] = 150  # level, which no normal that turns is: no contact
+    result = engine.reconstruct(source(OF_A_SURFACE, frames=made))
+    assert (result.contact[:, 10:13] == 0).all()
+    np.testing.assert_array_equal(np.isnan(result.height), result.contact == 0)
+    assert result.offset_unknown.tolist() == [1, 1]
+    for number, part in enumerate((np.s_[:, :10], np.s_[:, 13:])):
+        assert (result.component[part] == number).all()
+        assert result.height[part].mean() == pytest.approx(0, abs=1e-6)
+        error = result.height[part] - DOME_HEIGHT[part]
+        assert np.std(error) < 0.01
+
+
+def test_without_a_pixel_size_there_are_no_heights():
+    result = reconstruct(replace(HEADER, pixel_size=None))
+    assert result.height is result.height_sigma is result.component is result.offset_unknown is None
+    assert result.process["height"] == "none: the recording has no pixel size"
+    assert result.x is None
+    assert "integration" not in result.process
+
+
+def test_the_surface_may_break_on_request(monkeypatch):
+    asked = []
+
+    def listen(*slopes, **options):
+        asked.append(options.pop("robust"))
+        broken = np.zeros(SHAPE, np.uint8)
+        broken[3, 4] = 1
+        return replace(engine.integrate(*slopes, **options), edges=broken if asked[-1] else None)
+
+    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", listen)
+    whole, robust = reconstruct(), reconstruct(robust=True)
+    assert asked == [False, True]
+    assert whole.edges[3, 4] == 0
+    assert robust.edges[3, 4] == 1
+    assert robust.edges.sum() == whole.edges.sum() + 1
+
+
+def test_heights_that_were_not_found_are_no_answer(monkeypatch):
+    def fail(*slopes, **options):
+        raise engine.NotConverged("100 iterations left a residual of 0.1")
+
+    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", fail)
+    with pytest.raises(engine.NotConverged, match="100 iterations"):
+        reconstruct()
+
+
 @pytest.mark.parametrize("shape", [(3, 3), SHAPE])
 def test_heights_at_which_nothing_is_seen_leave_no_answer(shape):
     far = replace(HEADER, pivot=(0.0, 0.0, 400.0))
@@ -212,6 +300,9 @@ def test_heights_at_which_nothing_is_seen_leave_no_answer(shape):
     result = engine.reconstruct(made, heights=np.full(shape, -1.0))
     assert np.isnan(result.zenith).all()
     assert not result.contact.any()
+    assert np.isnan(result.height).all()
+    assert (result.component == -1).all()
+    assert result.offset_unknown.size == 0
 
 
 @cache

@@ -1,0 +1,526 @@
+"""Heights of a press and normals of a rotation make one surface: by eq. 10, on the twin, and in part."""
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rotations
+from rotations import EIGHTHS, TILT, Setup
+from scipy.optimize import least_squares
+from stacks import MadeUp, record
+
+from mirrorskin import engine, hw, io
+from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
+
+NAN = np.float32(np.nan)
+RADIUS = 5.0
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    """Tell sigma from a few draws of noise, which is enough to hold it against errors, and much faster."""
+    monkeypatch.setattr("mirrorskin.engine.integration.spread.DRAWS", 6)
+    monkeypatch.setattr("mirrorskin.engine.integration.spread.WAVES", 4)
+
+
+def press(shape, pixel, step=0.1, depth=3.0, **changes):
+    """As in Figure 5 of the paper: on a ball of 10 mm, in steps of 0.1 mm."""
+    travel = step * np.arange(1, round(depth / step) + 1)
+    camera = changes.pop("camera", Camera(seed=1))
+    return hw.Twin(
+        object="sphere", shape=shape, pixel_size=pixel, movement=Vertical(travel), camera=camera, **changes
+    )
+
+
+def rotation(shape, pixel, pivot=(0.0, 0.0, 0.0), body=None, **camera):
+    """As in Figure 10 (a), on the same ball; the wall is linear from zenith 0 on unless a body is given."""
+    return hw.Twin(
+        object="sphere",
+        shape=shape,
+        pixel_size=pixel,
+        movement=Axial(EIGHTHS, TILT, press=1.45, pivot=pivot),
+        pattern="linear",
+        body=body or Body(height=1e5, scatter=0.0),
+        camera=Camera(**{"seed": 2} | camera),
+    )
+
+
+@cache
+def ball(size, pixel):
+    """Return x, y, true heights and zeniths of a ball, (H, W), float64; NaN beside it."""
+    x, y = np.meshgrid(*io.pixel_axes((size, size), (pixel, pixel)))
+    away = np.hypot(x, y)
+    with np.errstate(invalid="ignore"):
+        return x, y, np.sqrt(RADIUS**2 - away**2) - RADIUS, np.degrees(np.arcsin(away / RADIUS))
+
+
+@cache
+def by_equation_10(size, pixel, seed=1, setup=Setup(), steepest=55.0):  # noqa: B008 - frozen
+    """Return normals of a ball whose frames follow eq. 10: the pivot shifts nothing."""
+    x, y, _, zenith = ball(size, pixel)
+    seen = zenith <= steepest
+    true = rotations.direction(np.radians(np.where(seen, zenith, 0)), np.arctan2(y, x))
+    known = setup.phase, setup.tilt, setup.slope, setup.offset
+    normals = engine.estimate_normals(rotations.expose(true, setup, seed), *known)
+    return replace(normals, contact=(seen & (normals.contact > 0)).astype(np.uint8))
+
+
+@cache
+def onset(size, pixel, step=0.1):
+    """Return the heights of a press on the same ball."""
+    result = engine.reconstruct(press((size, size), pixel, step), fill=False)
+    return SimpleNamespace(height=result.height, sigma=result.height_sigma)
+
+
+def rms(errors):
+    return np.sqrt(np.mean(np.square(errors, dtype=float)))
+
+
+def fitted_radius(x, y, z):
+    """Fit a ball by least squares of the distances from it."""
+
+    def misfit(ball):
+        return np.sqrt((x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2) - ball[3]
+
+    return least_squares(misfit, [0, 0, -4, 4]).x[3]
+
+
+# What the project asks for.
+
+
+@pytest.mark.parametrize("setup", [Setup(), Setup(gain=3.0, noise=1.5)])
+def test_a_ball_by_equation_10_is_right_within_3_micrometres(setup):
+    size, pixel = 170, 0.05
+    normals = by_equation_10(size, pixel, setup=setup)
+    *_, true, zenith = ball(size, pixel)
+    surface = engine.fuse(onset(size, pixel), normals, pixel)
+    inside = zenith <= 55
+    error = (surface.height - true)[inside]
+    assert rms(error) <= 0.003
+    assert np.abs(error[zenith[inside] < 11]).max() <= 0.003  # the crater, of which a press tells nothing
+    assert np.isnan(onset(size, pixel).height[zenith < 10]).all()
+    assert surface.offset_unknown.tolist() == [False]
+    assert not surface.filled.any()
+    assert 0.5 < np.mean((error / surface.sigma[inside]) ** 2) < 3
+
+
+@pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 40.0)])
+def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot):
+    shape, pixel = (150, 150), 0.05
+    turned = rotation(shape, pixel, pivot)
+    result = engine.fuse_sources(press(shape, pixel), turned)
+    sure = result.contact > 0
+    assert sure.sum() > 12_000
+    error = (result.height - turned.truth.height)[sure]
+    assert rms(error) <= 0.010
+    assert rms(error) <= 0.002  # as it is today
+    x, y = (values[sure] for values in np.meshgrid(result.x, result.y))
+    assert abs(fitted_radius(x, y, result.height[sure].astype(float)) - RADIUS) <= 0.01
+    assert 0.3 < np.mean((error / result.height_sigma[sure]) ** 2) < 3
+
+
+def test_the_crater_that_both_leave_is_filled_and_marked():
+    shape, pixel = (110, 110), 0.05
+    turned = rotation(shape, pixel, body=Body())
+    result = engine.fuse_sources(press(shape, pixel, depth=2.0), turned)
+    zenith, filled = np.degrees(turned.truth.zenith), result.filled > 0
+    assert filled[zenith < 10].all()
+    assert not filled[zenith > 12].any()
+    assert rms((result.height - turned.truth.height)[filled]) < 0.005
+    assert np.isnan(result.height_sigma[filled]).all()
+    assert result.offset_unknown.tolist() == [0]
+    assert (result.component[np.isfinite(result.height)] == 0).all()
+    score = engine.score(result, turned.truth)
+    assert score.filled.answered == filled.sum()
+    assert score.height.answered + filled.sum() == np.isfinite(result.height).sum()
+
+
+# What is made of what is there.
+
+SHAPE = (12, 15)
+
+
+def plane(dz_dx=0.3, dz_dy=-0.2, shape=SHAPE, pixel=0.1):
+    """Return the heights of a plane, and its normals."""
+    x, y = np.meshgrid(*io.pixel_axes(shape, (pixel, pixel)))
+    normal = np.array([-dz_dx, -dz_dy, 1.0]) / np.sqrt(1 + dz_dx**2 + dz_dy**2)
+    return (dz_dx * x + dz_dy * y - 1).astype(np.float32), np.tile(normal.astype(np.float32), (*shape, 1))
+
+
+def heights(values, sigma=0.01):
+    values = np.asarray(values, np.float32)
+    return SimpleNamespace(height=values, sigma=np.where(np.isnan(values), NAN, np.float32(sigma)))
+
+
+def directions(vectors, contact=None, sigma=0.01):
+    contact = np.ones(vectors.shape[:2], np.uint8) if contact is None else contact.astype(np.uint8)
+    return SimpleNamespace(vectors=vectors, contact=contact, sigma=np.full(contact.shape, sigma, np.float32))
+
+
+def nothing(shape=SHAPE):
+    return heights(np.full(shape, NAN))
+
+
+def only(values, *places):
+    """Return the values at some places, NaN elsewhere."""
+    kept = np.full_like(values, NAN)
+    for place in places:
+        kept[place] = values[place]
+    return kept
+
+
+def test_one_height_tells_where_a_surface_is():
+    true, normals = plane()
+    surface = engine.fuse(heights(only(true, (4, 5))), directions(normals), 0.1)
+    assert surface.height == pytest.approx(true, abs=1e-5)
+    assert surface.offset_unknown.tolist() == [False]
+    assert (surface.component == 0).all()
+
+
+def test_pixels_need_not_be_square():
+    true, normals = plane()
+    x, y = np.meshgrid(*io.pixel_axes(SHAPE, (0.1, 0.25)))
+    true = 0.3 * x - 0.2 * y - 1
+    surface = engine.fuse(heights(only(true.astype(np.float32), (4, 5))), directions(normals), (0.1, 0.25))
+    assert surface.height == pytest.approx(true, abs=1e-5)
+
+
+def test_without_heights_a_surface_is_relative():
+    true, normals = plane()
+    surface = engine.fuse(nothing(), directions(normals), 0.1)
+    assert surface.height == pytest.approx(true - true.mean(), abs=1e-5)
+    assert surface.offset_unknown.tolist() == [True]
+
+
+def test_without_normals_heights_are_those_of_the_press():
+    true, normals = plane()
+    surface = engine.fuse(heights(true, 0.03), directions(normals, np.zeros(SHAPE)), 0.1)
+    np.testing.assert_allclose(surface.height, true, rtol=1e-6)
+    np.testing.assert_allclose(surface.sigma, 0.03, rtol=1e-5)
+    assert surface.offset_unknown.tolist() == [False]
+    assert (surface.component == 0).all()
+
+
+def test_pieces_without_a_height_are_told():
+    true, normals = plane()
+    contact = np.ones(SHAPE)
+    contact[:, 7] = 0
+    surface = engine.fuse(heights(only(true, (0, 0))), directions(normals, contact), 0.1)
+    assert surface.offset_unknown.tolist() == [False, True]
+    assert surface.component[0].tolist() == [0] * 7 + [-1] + [1] * 7
+    assert surface.height[:, :7] == pytest.approx(true[:, :7], abs=1e-5)
+    relative = true[:, 8:] - true[:, 8:].mean()
+    assert surface.height[:, 8:] == pytest.approx(relative, abs=1e-5)
+    assert np.isnan(surface.height[:, 7]).all()
+
+
+def test_heights_beside_normals_are_one_piece_with_them():
+    true, normals = plane()
+    contact = np.ones(SHAPE)
+    contact[:, 7:] = 0
+    surface = engine.fuse(heights(true), directions(normals, contact), 0.1)
+    assert surface.offset_unknown.tolist() == [False]
+    assert (surface.component == 0).all()
+    assert surface.height == pytest.approx(true, abs=1e-4)
+
+
+def test_a_single_pixel_without_a_normal_follows_those_around():
+    true, normals = plane()
+    contact, known = np.ones(SHAPE), true.copy()
+    contact[5, 6] = 0
+    known[5, 6] += 0.03
+    surface = engine.fuse(heights(known, 0.02), directions(normals, contact), 0.1)
+    assert surface.height[5, 6] == pytest.approx(true[5, 6], abs=0.004)
+
+
+def test_heights_near_normals_go_on_smoothly():
+    true, normals = plane(shape=(30, 40))
+    contact = np.ones((30, 40))
+    contact[:, 32:] = 0
+    step = 0.1
+    terraces = (np.floor(true / step) + 0.5) * step
+    terraces[10, 36] -= 2.0  # a mistake
+    surface = engine.fuse(heights(terraces, step / np.sqrt(12)), directions(normals, contact, 2e-3), 0.1)
+    error = (surface.height - true)[:, 32:]
+    assert rms((terraces - true)[10:12, 32:]) > 0.3
+    assert rms(error) < 0.006
+    assert rms(error / surface.sigma[:, 32:]) < 2
+    assert (surface.component == 0).all()
+
+
+def test_heights_beyond_a_cliff_stay_where_they_are():
+    true, normals = plane(shape=(30, 40))
+    true[:, 32:] -= 0.8
+    contact = np.ones((30, 40))
+    contact[:, 32:] = 0
+    surface = engine.fuse(heights(true, 0.02), directions(normals, contact, 2e-3), 0.1)
+    assert surface.height == pytest.approx(true, abs=0.005)
+
+
+def test_heights_far_from_normals_stay_what_they_are():
+    true, normals = plane(shape=(10, 100))
+    contact = np.zeros((10, 100))
+    contact[:, :10] = 1
+    terraces = np.floor(true / 0.1) * 0.1
+    surface = engine.fuse(heights(terraces, 0.03), directions(normals, contact), 0.1)
+    np.testing.assert_allclose(surface.height[:, 70:], terraces[:, 70:], atol=1e-5)
+    np.testing.assert_allclose(surface.sigma[:, 70:], surface.sigma[0, 99])
+    assert 0.03 <= surface.sigma[0, 99] < 0.06
+
+
+def test_terraces_tell_more_than_their_standard_deviations_say():
+    true, normals = plane(0.11, 0.07, (40, 40))
+    step = 0.1
+    terraces = (np.floor(true / step) + 0.5) * step
+    sigma = step / np.sqrt(12)
+    some = (true > -1.02) & (true < -0.96)  # of two of them
+    known = heights(np.where(some, terraces, NAN), sigma)
+    surface = engine.fuse(known, directions(normals, sigma=1e-3), 0.1)
+    error = surface.height - true
+    bias = np.mean((terraces - true)[some])
+    assert abs(bias) > 0.004
+    assert rms(error) < 0.25 * abs(bias)
+    assert rms(error / surface.sigma) < 3
+
+
+def test_gross_mistakes_of_the_press_are_left_out():
+    true, normals = plane(shape=(40, 40))
+    rng = np.random.default_rng(1)
+    known = true + rng.uniform(-0.05, 0.05, true.shape)
+    mistaken = rng.choice(true.size, 20, replace=False)
+    known.flat[mistaken] -= 2.5
+    surface = engine.fuse(heights(known, 0.05 / np.sqrt(3)), directions(normals, sigma=1e-3), 0.1)
+    assert rms(surface.height - true) < 0.002
+
+
+def test_heights_that_fit_no_surface_count_as_little_as_they_deserve():
+    true, normals = plane(shape=(40, 40))
+    rng = np.random.default_rng(2)
+    known = true + rng.normal(0, 0.2, true.shape)
+    surface = engine.fuse(heights(known, 0.01), directions(normals, sigma=1e-3), 0.1)
+    error = surface.height - true
+    assert rms(error) < 0.02
+    assert 0.2 < rms(error / surface.sigma) < 3
+
+
+def test_only_what_is_wanted_is_told():
+    true, normals = plane()
+    mask = np.zeros(SHAPE)
+    mask[2:6, 3:9] = 7
+    surface = engine.fuse(heights(true), directions(normals), 0.1, mask=mask)
+    np.testing.assert_array_equal(np.isfinite(surface.height), mask > 0)
+    np.testing.assert_array_equal(surface.component >= 0, mask > 0)
+
+
+def test_a_picture_of_one_pixel():
+    true, normals = plane(shape=(1, 1))
+    surface = engine.fuse(heights(true, 0.02), directions(normals), 0.1)
+    assert surface.height == pytest.approx(true)
+    assert surface.sigma == pytest.approx(0.02)
+
+
+def test_holes_are_filled_from_absolute_heights_alone():
+    true, normals = plane(shape=(30, 30))
+    inside = np.zeros((30, 30), bool)
+    inside[12:18, 12:18] = True
+    around = np.where(inside, NAN, true)
+    relative = engine.fuse(nothing((30, 30)), directions(normals, ~inside), 0.1)
+    assert not relative.filled.any()
+    surface = engine.fuse(heights(around), directions(normals, ~inside), 0.1)
+    np.testing.assert_array_equal(surface.filled, inside)
+    assert surface.height == pytest.approx(true, abs=1e-3)
+    assert (surface.component == 0).all()
+    assert np.isnan(surface.sigma[inside]).all()
+
+
+def test_the_surface_may_break_on_request(monkeypatch):
+    true, normals = plane()
+    asked = []
+
+    def listen(*slopes, **options):
+        asked.append(options["robust"])
+        return engine.integrate(*slopes, **options)
+
+    monkeypatch.setattr("mirrorskin.engine.joint.integrate", listen)
+    for robust in (False, True):
+        engine.fuse(heights(true), directions(normals), 0.1, robust=robust)
+    assert asked == [False, False, True, True]
+
+
+def test_a_surface_that_was_not_found_is_no_answer(monkeypatch):
+    def fail(*slopes, **options):
+        raise engine.NotConverged("100 iterations left a residual of 0.1")
+
+    monkeypatch.setattr("mirrorskin.engine.joint.integrate", fail)
+    with pytest.raises(engine.NotConverged, match="100 iterations"):
+        engine.fuse(heights(plane()[0]), directions(plane()[1]), 0.1)
+
+
+BAD = {
+    "other heights": ({"onset": heights(np.zeros((3, 4)))}, "maps of one size .* heights \\(3, 4\\)"),
+    "other normals": ({"normals": directions(plane(shape=(3, 4))[1])}, "normals \\(3, 4\\)"),
+    "one row": ({"onset": heights(np.zeros(4))}, "maps of one size \\(H, W\\) are needed"),
+    "another mask": ({"mask": np.ones((3, 4))}, "the mask \\(3, 4\\)"),
+    "nothing": ({"onset": nothing(), "normals": directions(plane()[1], np.zeros(SHAPE))}, "nothing to fuse"),
+    "no size": ({"pixel_size": 0.0}, "pixel size 0.0"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_fused_is_refused_in_one_line(case):
+    changes, line = BAD[case]
+    given = {"onset": heights(plane()[0]), "normals": directions(plane()[1]), "pixel_size": 0.1} | changes
+    with pytest.raises(io.InputError, match=line) as caught:
+        engine.fuse(**given)
+    assert "\n" not in str(caught.value)
+
+
+# From sources.
+
+SMALL, PIXEL = (50, 50), 0.1
+
+
+@cache
+def fused(**options):
+    return engine.fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
+
+
+def test_a_result_of_both_has_the_maps_of_both():
+    result = fused()
+    assert set(result.maps()) == {
+        *("height", "height_sigma", "status", "normals", "zenith", "azimuth", "normal_sigma", "mean"),
+        *("modulation", "residual", "edges", "filled", "contact", "component"),
+    }
+    assert {values.shape[:2] for values in result.maps().values()} == {SMALL}
+    assert result.offset_unknown.dtype == np.uint8
+    np.testing.assert_array_equal(result.x, io.pixel_axes(SMALL, (PIXEL, PIXEL))[0])
+    rotated = engine.reconstruct(rotation(SMALL, PIXEL), heights=result.height)
+    steep = (result.contact > 0) & (result.zenith > np.radians(3))
+    away = rotations.between(result.normals[steep].astype(float), rotated.normals[steep].astype(float))
+    assert np.degrees(np.median(away)) < 0.05
+
+
+def test_a_result_of_both_says_how_it_came_about():
+    told = fused().process
+    assert told["method"] == "fusion"
+    assert told["source"] == "twin: sphere, twin: sphere"
+    assert (told["vertical_source"], told["axial_source"]) == ("twin: sphere", "twin: sphere")
+    assert (told["vertical_threshold"], told["axial_tilt"]) == (0.5, TILT)
+    assert told["heights"] == "fused"
+    assert 1 <= told["registrations"] <= 3
+    assert told["last_move_in_pixels"] < 0.02
+    assert told["integration_residual"] < 1e-3
+    assert {"program", "version", "date", "device", "driver"} <= set(told)
+
+
+def test_recordings_are_told_by_their_hashes(tmp_path):
+    paths = [
+        record(source, tmp_path / name)
+        for name, source in (("down.h5", press(SMALL, PIXEL)), ("round.h5", rotation(SMALL, PIXEL)))
+    ]
+    with io.open_recording(paths[0]) as down, io.open_recording(paths[1]) as turn:
+        result = engine.fuse_sources(down, turn)
+        hashes = down.sha256(), turn.sha256()
+    assert (result.process["vertical_source_sha256"], result.process["axial_source_sha256"]) == hashes
+    np.testing.assert_array_equal(result.height, fused().height)
+    io.save_result(result, tmp_path / "both.h5")
+    found = io.open_result(tmp_path / "both.h5")
+    np.testing.assert_array_equal(found.offset_unknown, result.offset_unknown)
+    assert found.process == result.process
+
+
+def test_options_reach_the_press_and_the_rotation():
+    result = fused_with(
+        press={"threshold": 0.6, "subframe": False}, rotation={"method": "paper", "noise": 1.5}
+    )
+    told = result.process
+    assert (told["vertical_threshold"], told["vertical_subframe"]) == (0.6, False)
+    assert (told["axial_method"], told["axial_noise"]) == ("paper", 1.5)
+
+
+def fused_with(**options):
+    return engine.fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
+
+
+def test_frames_may_stay_as_they_were_seen():
+    header = replace(rotation(SMALL, PIXEL).header, pivot=None, press=None)
+    turned = rotation(SMALL, PIXEL)
+    turned.header = header
+    with pytest.raises(io.InputError, match="does not say its press"):
+        engine.fuse_sources(press(SMALL, PIXEL), turned)
+    result = engine.fuse_sources(press(SMALL, PIXEL), turned, register=False)
+    assert result.process["heights"] == "none"
+    assert "registrations" not in result.process
+    assert not np.array_equal(result.normals, fused().normals, equal_nan=True)
+
+
+def test_progress_is_told_to_the_last_frame():
+    for register, most in ((True, 30 + 3 * 8), (False, 30 + 8)):
+        done = []
+        down, turn = press(SMALL, PIXEL), rotation(SMALL, PIXEL)
+        engine.fuse_sources(down, turn, register=register, progress=done.append)
+        assert done == sorted(done)
+        assert done[-1] == engine.frames_to_read(down, turn, register) == most
+
+
+def test_what_cannot_be_read_twice_is_registered_once():
+    turned = rotation(SMALL, PIXEL)
+    frames = np.empty(turned.shape, turned.dtype)
+    turned.read(frames)
+    live = MadeUp(frames, turned.header, phase=np.array(EIGHTHS))
+    result = engine.fuse_sources(press(SMALL, PIXEL), live)
+    assert result.process["registrations"] == 1
+    sure = result.contact > 0
+    assert rms((result.height - turned.truth.height)[sure]) < 0.01
+
+
+class Other:
+    """A source that is asked what it is, and never read."""
+
+    rewindable = True
+
+    def __init__(self, name, motion="vertical", shape=(9, *SMALL), pixel_size=(PIXEL, PIXEL)):
+        self.name, self.motion, self.shape = name, motion, shape
+        self.header = io.Header(motion, pixel_size=pixel_size)
+
+
+DOWN, ROUND = Other("down.h5"), Other("round.h5", "axial")
+UNFIT = {
+    "swapped": (ROUND, DOWN, "round.h5 is the rotation and down.h5 the press: give the press first"),
+    "two presses": (DOWN, Other("b.h5"), "b.h5 is of vertical motion: a vertical one and an axial one"),
+    "two rotations": (Other("a.h5", "axial"), ROUND, "a.h5 is of axial motion"),
+    "a twist": (DOWN, Other("b.h5", "twist"), "b.h5 is of twist motion"),
+    "no pixel size": (Other("a.h5", pixel_size=None), ROUND, "a.h5 does not say its pixel size"),
+    "other size": (
+        DOWN,
+        Other("b.h5", "axial", (8, 60, 40)),
+        "down.h5 and b.h5 differ: 50 x 50 pixels and 40 x 60 pixels: record both",
+    ),
+    "other pixels": (
+        DOWN,
+        Other("b.h5", "axial", pixel_size=(PIXEL, 0.12)),
+        "down.h5 and b.h5 differ: pixels of 0.1 x 0.1 mm and pixels of 0.1 x 0.12 mm: record both",
+    ),
+    "no gain": (press(SMALL, PIXEL), ROUND, "round.h5 has no zenith gain"),
+}
+
+
+@pytest.mark.parametrize("case", UNFIT)
+def test_sources_that_do_not_fit_are_refused_in_one_line(case):
+    vertical, axial, line = UNFIT[case]
+    with pytest.raises(io.InputError, match=line) as caught:
+        engine.fuse_sources(vertical, axial)
+    assert "\n" not in str(caught.value)
+
+
+def test_turns_are_not_fused_one_by_one():
+    with pytest.raises(io.InputError, match="all turns make one surface"):
+        fused_with(rotation={"per_turn": True})
+
+
+def test_a_press_that_touched_nothing_has_no_height_to_fuse():
+    dark = MadeUp(np.full((4, *SMALL), 20, np.uint8), DOWN.header, travel=np.arange(4.0))
+    with pytest.raises(io.InputError, match="made up: no pixel turned light"):
+        engine.fuse_sources(dark, rotation(SMALL, PIXEL))
