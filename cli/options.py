@@ -43,6 +43,17 @@ Phases = Annotated[
     typer.Option(metavar="FILE", help="Phases of all frames, a text of angles: 178.1deg 220.8deg ..."),
 ]
 Tilt = Annotated[str | None, typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
+ZenithGain = Annotated[
+    str | None,
+    typer.Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
+]
+ZenithOffset = Annotated[
+    float | None, typer.Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")
+]
+Robust = Annotated[
+    bool,
+    typer.Option("--robust", help="Rotation: find where the surface breaks, and do not smooth that over."),
+]
 PixelSize = Annotated[
     str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
 ]

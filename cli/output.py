@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +21,31 @@ def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool)
     from mirrorskin.kernels.device import open_device
 
     io.save_result(result, path)
-    summary = engine.summarise(result)
+    summary, pieces = engine.summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records()
-        print_json({"output": str(path), "summary": summary, "process": result.process, "profile": profile})
+        told = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
+        print_json({"output": str(path), **told, "profile": profile})
     else:
-        typer.echo(f"{path}: {summary}")
+        typer.echo(", ".join([f"{path}: {summary}", *_words(**pieces)]))
+
+
+def _pieces(result: Result) -> dict[str, int]:
+    """Count the pieces that heights are in, and those of which nobody knows how high they lie."""
+    import numpy as np
+
+    unknown = result.offset_unknown
+    if unknown is None:
+        return {}
+    return {"components": unknown.size, "offset_unknown": int(np.count_nonzero(unknown))}
+
+
+def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
+    """Tell of pieces what is worth a word."""
+    if components > 1:
+        yield f"in {components} components"
+    if offset_unknown:
+        yield "offset unknown" if offset_unknown == components else f"offset unknown of {offset_unknown}"
 
 
 def print_json(value: Any) -> None:

@@ -31,14 +31,16 @@ class MethodName(StrEnum):
 # The options that only one motion has.
 _OWN = {
     MotionName.vertical: {
-        *("travel_step", "travel_start", "dark", "bright", "event", "threshold", "hold", "subframe")
+        *("travel_step", "travel_start", "dark", "bright", "event", "threshold", "hold", "subframe", "fill")
     },
     MotionName.axial: {
-        *("phase_step", "phases", "tilt", "zenith_gain", "zenith_offset", "per_turn", "heights")
+        *("phase_step", "phases", "tilt", "zenith_gain", "zenith_offset", "robust", "per_turn", "heights")
     },
 }
 _ESTIMATE = "estimate"
-_UNTOLD = "none: "  # how a result's process says that a map is missing, and why
+# How a result's process says that a map is missing, and why; and the options that would bring it.
+_UNTOLD = "none: "
+_REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}
 
 
 def command(
@@ -87,13 +89,10 @@ def command(
     subframe: Annotated[
         bool, typer.Option(help="Press: look between frames; without it, eq. 4 as printed.")
     ] = True,
-    zenith_gain: Annotated[
-        str | None,
-        typer.Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
-    ] = None,
-    zenith_offset: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")
-    ] = None,
+    fill: Annotated[bool, typer.Option(help="Press: fill holes, such as flat tops, smoothly.")] = True,
+    zenith_gain: options.ZenithGain = None,
+    zenith_offset: options.ZenithOffset = None,
+    robust: options.Robust = False,
     per_turn: Annotated[
         bool, typer.Option("--per-turn", help="Rotation: maps of each turn, not of all together.")
     ] = False,
@@ -108,7 +107,7 @@ def command(
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct heights from a press, or normals from a rotation."""
+    """Reconstruct heights from a press, or normals and heights from a rotation."""
     from mirrorskin import engine, io
     from mirrorskin.cli.output import save_and_tell
     from mirrorskin.cli.positions import given
@@ -126,12 +125,12 @@ def command(
         io.check_output(target, recording, phases, heights)
         asked: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if source.motion == MotionName.axial:
-            asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn}
+            asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
             asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else None
             asked["heights"] = None if heights is None else io.open_heights(heights)
         else:
             asked |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
-            asked |= {"dark": dark, "bright": bright}
+            asked |= {"dark": dark, "bright": bright, "fill": fill}
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 source,
@@ -140,9 +139,10 @@ def command(
                 device=device,
                 progress=show,
             )
-    zenith = str(result.process.get("zenith"))
-    if zenith.startswith(_UNTOLD):
-        typer.echo(f"{recording}: no zenith: {zenith.removeprefix(_UNTOLD)}; give --zenith-gain", err=True)
+    for name, remedy in _REMEDIES.items():
+        said = str(result.process.get(name))
+        if said.startswith(_UNTOLD):
+            typer.echo(f"{recording}: no {name}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
     save_and_tell(result, target, device, as_json)
 
 

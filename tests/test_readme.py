@@ -10,9 +10,12 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from commands import run
+from rotations import Setup, direction, expose
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+PYTHON = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("mirrorskin ")]
 SUPPORT = Path(__file__).parent / "support"
 RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); import commands; commands.main_with_a_small_demo()"
@@ -46,3 +49,42 @@ def test_a_command_of_the_readme_runs(desk, line):
         [sys.executable, "-c", RUN, str(SUPPORT), *words], cwd=desk, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
+
+
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["--size", "48x40", "--pixel-size", "0.25mm", "--frames", "12"]
+    assert run("simulate", "vertical", *words, "-o", "sphere.h5").code == 0
+    assert len(PYTHON) == 2
+    known = arrays()
+    for block in PYTHON:
+        exec(block, known)
+    assert np.isfinite(known["onset"].height).any()
+    assert np.isfinite(known["surface"].height).all()
+    assert known["twin"].shape == (4, 480, 640)
+
+
+def arrays():
+    """Return what the README takes for granted in Python: a slope of 20 degrees that falls to the right."""
+    shape, setup = (30, 40), Setup()
+    x = np.broadcast_to(0.1 * np.arange(40), shape)
+    travel = 0.1 * np.arange(1, 21)
+    slope = np.full(shape, -np.tan(np.radians(20)))
+    return {
+        "frames": np.where(travel[:, None, None] >= np.tan(np.radians(20)) * x, 200, 20).astype(np.uint8),
+        "travel": travel,
+        "dark": 20,
+        "bright": 200,
+        "turn": expose(direction(np.full(shape, np.radians(20)), np.zeros(shape)), setup, seed=1),
+        "phase": setup.phase,
+        "tilt": setup.tilt,
+        "gain": setup.slope,
+        "offset": setup.offset,
+        "pixel_size": 0.1,
+        "dz_dx": slope,
+        "dz_dy": 0 * slope,
+        "mask": np.ones(shape, np.uint8),
+        "weights": 1 + x,
+        "edges": np.zeros(shape, np.uint8),
+        "heights": np.where(x == 0, 0.0, np.nan),
+    }

@@ -3,5 +3,6 @@
 from mirrorskin.view.canvas import check_drawing
 from mirrorskin.view.heights import height_figure
 from mirrorskin.view.normals import normal_figure
+from mirrorskin.view.surfaces import surface_figure
 
-__all__ = ["check_drawing", "height_figure", "normal_figure"]
+__all__ = ["check_drawing", "height_figure", "normal_figure", "surface_figure"]

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 MISSING = "lightsteelblue"
 """Colour of what has no answer."""
+FILLED = "tab:orange"
+"""Colour of what was not measured but filled."""
+FILLED_SHADES = "#331a00", "#ffb266"
+"""Its shades, from the lowest to the highest."""
 
 
 def check_drawing() -> None:

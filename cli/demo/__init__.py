@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.demo import presses, rotation
+from mirrorskin.cli.demo import presses, rotation, shapes
 from mirrorskin.cli.output import print_json
 
 
@@ -31,11 +31,14 @@ def command(
         ) from error
     pressed = {one.name: presses.run(one, output, device) for one in presses.EXPERIMENTS}
     turned = {one.name: rotation.run(one, output, device) for one in rotation.EXPERIMENTS}
+    shaped = shapes.run(output, device)
     if as_json:
-        print_json(pressed | turned)
+        print_json({**pressed, **turned, **shaped})
         return
     presses.tell(pressed)
     typer.echo()
     rotation.tell(turned)
+    typer.echo()
+    shapes.tell(shaped)
     first = presses.EXPERIMENTS[0].name
     typer.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -161,8 +161,8 @@ def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Out
     from mirrorskin import engine
 
     height = _height(result)
-    common = replace(result, height=np.where(shared, height, np.float32(np.nan)))
-    whole, shared_part = engine.score(result, truth).height, engine.score(common, truth).height
+    parts = height, np.where(shared, height, np.float32(np.nan))
+    whole, shared_part = (engine.score(replace(result, height=part), truth).height for part in parts)
     assert whole is not None
     assert shared_part is not None
     return {
@@ -173,8 +173,13 @@ def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Out
 
 
 def _height(result: io.Result) -> NDArray[np.float32]:
+    """Return what was measured: what was filled is told with the surfaces."""
+    import numpy as np
+
     assert result.height is not None
-    return result.height
+    if result.filled is None:
+        return result.height
+    return np.where(result.filled, np.float32(np.nan), result.height)
 
 
 def _rows(name: str, by_sensor: Outcomes) -> list[list[str]]:

@@ -83,7 +83,18 @@ def test_a_result_tells_how_it_came_about(folder):
 
 
 def test_options_reach_the_engine(folder):
-    words = ["--threshold", "0.3", "--hold", "1", "--no-subframe", "--memory", "100kB", "--device", "0"]
+    words = [
+        "--threshold",
+        "0.3",
+        "--hold",
+        "1",
+        "--no-subframe",
+        "--memory",
+        "100kB",
+        "--device",
+        "0",
+        "--no-fill",
+    ]
     told = json.loads(mirrorskin("reconstruct", "sphere.h5", "-o", "o.h5", *words, "--json", cwd=folder))
     process = told["process"]
     assert (process["threshold"], process["hold"], process["subframe"]) == (0.3, 1, False)

@@ -18,6 +18,8 @@ WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
+DRAWN = *MADE, "fig10a", "fig10b", "fused"
+
 # The table's rows.
 EXPECTED = [
     [name, sensor.replace("-", ", "), method]
@@ -31,7 +33,7 @@ EXPECTED = [
 def shown(tmp_path_factory):
     """What a small demo printed, the folder that it made, and what its figures were drawn of."""
     folder = tmp_path_factory.mktemp("demo") / "made"
-    figures, draw, turned = {}, view.height_figure, view.normal_figure
+    figures, draw, turned, shaped = {}, view.height_figure, view.normal_figure, view.surface_figure
 
     def watch(results, truth, title, path, *, surface):
         figures[path.name] = (list(results), title, surface)
@@ -41,11 +43,16 @@ def shown(tmp_path_factory):
         figures[path.name] = (list(results), title)
         turned(results, truth, title, path)
 
+    def watch_surfaces(results, truth, title, path):
+        figures[path.name] = (list(results), title)
+        shaped(results, truth, title, path)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presses, "EXPERIMENTS", small_experiments())
         patch.setattr(rotation, "EXPERIMENTS", small_rotations())
         patch.setattr(view, "height_figure", watch)
         patch.setattr(view, "normal_figure", watch_normals)
+        patch.setattr(view, "surface_figure", watch_surfaces)
         ended = run("demo", "-o", folder)
     assert (ended.code, ended.said) == (0, "")
     return ended.out.splitlines(), folder, figures
@@ -74,8 +81,9 @@ def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
     files = {f"{name}-{sensor}{end}" for name, each in MADE.items() for sensor in each for end in
              (".h5", "-result.h5")}  # fmt: skip
     files |= {"fig10a.h5"} | {f"fig10a-{way.replace(', ', '-')}-result.h5" for way in WAYS}
-    assert {path.name for path in folder.iterdir()} == files | {f"{name}.png" for name in (*MADE, "fig10a")}
-    for name in (*MADE, "fig10a"):
+    files |= {"fused-result.h5"} | {f"{name}.png" for name in DRAWN}
+    assert {path.name for path in folder.iterdir()} == files
+    for name in DRAWN:
         assert cv2.imread(str(folder / f"{name}.png")).shape[0] > 300
 
 
@@ -109,7 +117,7 @@ def test_the_table_of_normals_tells_of_both_methods_before_and_after_registratio
         assert 0 < told["median"] <= told["RMS"] <= told["99 %"] < 120
     for method in ("paper", "exact"):
         assert found[f"{method}, registered"]["median"] < found[method]["median"]
-    legend = " ".join(shown[0][start + 5 : -1])
+    legend = " ".join(shown[0][start + 5 : shown[0].index("", start)])
     for word in ("answered", "chi2", "registered"):
         assert f"{word}: " in legend
 
@@ -137,6 +145,37 @@ def test_the_table_tells_of_each_sensor_and_what_it_costs(shown):
     for word in names[:2] + names[5:]:
         assert f"{word}: " in " ".join(legend)
     assert last.endswith("fig5.png")
+
+
+def test_the_sphere_is_drawn_from_its_normals_and_fused(shown):
+    assert shown[2]["fig10b.png"][0] == ["rotation, registered", "rotation"]
+    assert shown[2]["fig10b.png"][1].startswith("Fig. 10 (b)")
+    assert shown[2]["fused.png"][0] == ["press", "rotation", "press and rotation"]
+
+
+def test_the_table_of_surfaces_tells_what_was_measured_apart_from_what_was_filled(shown):
+    _, folder, _ = shown
+    start = next(number for number, line in enumerate(shown[0]) if "heights from" in line)
+    names = ["answered", "median", "RMS", "99 %", "filled", "RMS there", "apex"]
+    assert cells(shown[0][start]) == ["experiment", "heights from", *names]
+    rows = [cells(line) for line in shown[0][start + 1 : start + 5]]
+    ways = [["fig10b", "rotation"], ["fig10b", "rotation, registered"], ["fused", "press"]]
+    assert [row[:2] for row in rows] == [*ways, ["fused", "press and rotation"]]
+    found = {tuple(row[:2]): dict(zip(names, row[2:], strict=True)) for row in rows}
+    for way in ways[:2]:
+        # The whole lies at the truth's level, and the dark top has no answer.
+        assert (found[*way]["apex"], found[*way]["RMS there"]) == ("-", "-")
+        assert 0 < float(found[*way]["median"]) <= float(found[*way]["RMS"]) < 100
+    fused = {name: float(told.split()[0]) for name, told in found["fused", "press and rotation"].items()}
+    result = io.open_result(folder / "fused-result.h5")
+    assert fused["answered"] + fused["filled"] <= np.count_nonzero(np.isfinite(result.height))
+    assert fused["filled"] == np.count_nonzero(result.filled) > 0
+    assert fused["median"] < float(found["fused", "press"]["median"])
+    assert fused["RMS"] < float(found["fused", "press"]["RMS"])
+    assert abs(fused["apex"]) < 100
+    legend = " ".join(shown[0][start + 5 : -1])
+    for word in ("answered", "filled", "apex", "registered"):
+        assert f"{word}: " in legend
 
 
 def cells(row):
@@ -167,9 +206,11 @@ def test_the_recordings_are_of_those_sensors_and_presses(shown):
 
 
 def test_json_tells_the_scores(tmp_path, monkeypatch):
-    only = dataclasses.replace(small_experiments()[1], sensors=presses.SENSORS[:1])
-    monkeypatch.setattr(presses, "EXPERIMENTS", (only,))
+    sphere, only = (dataclasses.replace(one, sensors=presses.SENSORS[:1]) for one in small_experiments()[:2])
+    monkeypatch.setattr(presses, "EXPERIMENTS", (sphere, only))
     monkeypatch.setattr(rotation, "EXPERIMENTS", small_rotations())
+    for figure in ("height_figure", "normal_figure", "surface_figure"):
+        monkeypatch.setattr(view, figure, lambda *given, **style: None)
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
     assert {name: list(scores) for name, scores in told["fig6"].items()} == {
@@ -182,6 +223,8 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     assert papers["mean"] < -0.3 * only.step
     assert list(told["fig10a"]) == list(WAYS)
     assert told["fig10a"]["exact"]["normal"]["rms"] > 0
+    rms = {way: shape["measured"]["rms"] for way, shape in told["fused"].items()}
+    assert 0 < rms["press and rotation"] < rms["press"]
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):

@@ -13,7 +13,7 @@ from commands import run
 from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, read_all, record, sphere
 
-from mirrorskin import io
+from mirrorskin import engine, io
 
 SHAPE = (9, 11)
 X, Y = np.meshgrid(np.linspace(-1, 1, 11), np.linspace(1, -1, 9))
@@ -64,9 +64,12 @@ def test_a_rotation_becomes_normals_that_are_scored():
     turn()
     ended = run("reconstruct", "turn.h5")
     assert (ended.code, ended.said) == (0, "")
-    assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
-    assert ended.out.count("\n") == 1
     result = io.open_result("turn-result.h5")
+    assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
+    lowest, highest = result.height.min(), result.height.max()
+    told = f"in contact at 99, relative height from {lowest:.3f} to {highest:.3f} mm, offset unknown"
+    assert ended.out.endswith(f", {told}\n")
+    assert ended.out.count("\n") == 1
     assert np.max(errors(result)) < 2
     assert result.x is not None
     score = json.loads(run("score", "turn-result.h5", "--truth", "turn.h5", "--json").out)
@@ -75,6 +78,72 @@ def test_a_rotation_becomes_normals_that_are_scored():
     assert score["normal"]["rms"] < 0.5
     assert "normal RMS error" in run("score", "turn-result.h5", "--truth", "turn.h5").out
     assert "map normals" in run("info", "turn-result.h5").out
+
+
+def rise(radius):
+    """Return how far the dome falls from the middle to so many millimetres off it, by fine steps."""
+    steps = np.linspace(0, radius, 2001)
+    # The picture's 0.1 mm a pixel are 0.2 in X, and 0.25 in Y.
+    slope = np.tan(np.radians(10 + 40 * (2 * steps) / np.sqrt(2)))
+    return float(np.sum((slope[1:] + slope[:-1]) / 2 * np.diff(steps)))
+
+
+def test_the_normals_become_heights_in_millimetres():
+    turn()
+    result, _ = reconstruct()
+    assert result.height.dtype == np.float32
+    assert np.mean(result.height) == pytest.approx(0, abs=1e-5)
+    assert result.height[4, 5] - result.height[4, 10] == pytest.approx(rise(0.5), rel=0.05)
+    assert np.all(result.component == 0)
+    np.testing.assert_array_equal(result.offset_unknown, [1])
+    assert np.all(result.height_sigma > 0)
+    assert "map component" in run("info", "out.h5").out
+    assert "height" in json.loads(run("score", "out.h5", "--truth", "turn.h5", "--json").out)
+
+
+def test_without_a_pixel_size_there_are_no_heights_and_a_line_says_why():
+    turn(pixel_size=None)
+    result, ended = reconstruct()
+    assert ended.said == "turn.h5: no height: the recording has no pixel size; give --pixel-size\n"
+    assert ended.out.startswith("out.h5: normals at 99 of 99 pixels, zenith from ")
+    assert not {"height", "height_sigma", "component"} & set(result.maps())
+    given, ended = reconstruct("--pixel-size", "0.1mm")
+    assert ended.said == ""
+    assert np.isfinite(given.height).all()
+
+
+def test_robust_heights_of_a_smooth_surface_are_the_same_but_for_noise():
+    turn()
+    plain, _ = reconstruct()
+    robust, ended = reconstruct("--robust", "--json")
+    told = json.loads(ended.out)
+    assert told["summary"]["components"] == 1
+    assert told["process"]["integration"] == "robust"
+    assert not np.array_equal(robust.height, plain.height)
+    assert np.max(np.abs(robust.height - plain.height)) < 0.05 * np.ptp(plain.height)
+
+
+def test_pieces_are_told():
+    turn()
+    with h5py.File("turn.h5", "a") as file:
+        stack = file["entry/instrument/detector/data"]
+        stack[:, :, 5] = 0  # no answer there, which cuts the picture in two
+    result, ended = reconstruct()
+    assert ended.out.endswith(", in 2 components, offset unknown\n")
+    assert set(np.unique(result.component)) == {-1, 0, 1}
+
+
+def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
+    def fails(*maps, **options):
+        raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
+
+    turn()
+    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", fails)
+    before = set(Path().iterdir())
+    ended = run("reconstruct", "turn.h5")
+    line = "mirrorskin: the residual is 0.3 after 100 iterations: allow more\n"
+    assert (ended.code, ended.out, ended.said) == (1, "", line)
+    assert set(Path().iterdir()) == before
 
 
 def test_the_paper_s_method_is_another():
@@ -160,6 +229,8 @@ PRESS = {
     "--hold": ["2"],
     "--subframe": [],
     "--no-subframe": [],
+    "--fill": [],
+    "--no-fill": [],
 }
 ROTATION = {
     "--phase-step": ["45deg"],
@@ -167,6 +238,7 @@ ROTATION = {
     "--tilt": ["estimate"],
     "--zenith-gain": ["4/deg"],
     "--zenith-offset": ["10"],
+    "--robust": [],
     "--per-turn": [],
     "--heights": ["turn.h5"],
 }

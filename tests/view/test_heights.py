@@ -16,9 +16,16 @@ def slope(shape=(20, 30)):
     return np.fromfunction(lambda row, column: -0.01 * column - 0.0001 * row, shape).astype(np.float32)
 
 
-def result_of(height):
+def result_of(height, **maps):
     x, y = io.pixel_axes(height.shape, (0.1, 0.2))
-    return io.Result(height=height, x=x, y=y)
+    return io.Result(height=height, x=x, y=y, **maps)
+
+
+def filled_in(shape=(20, 30)):
+    """Marks of a block that was filled, across the middle row."""
+    filled = np.zeros(shape, np.uint8)
+    filled[8:13, 10:15] = 1
+    return filled
 
 
 def truth_of(height):
@@ -32,13 +39,20 @@ def draw(results, truth, surface=False):
 
 
 @pytest.fixture
-def surfaces(monkeypatch):
+def styles():
+    """How these surfaces are drawn."""
+    return []
+
+
+@pytest.fixture
+def surfaces(monkeypatch, styles):
     """The x, y and z of all surfaces that are drawn."""
     drawn = []
     plot = Axes3D.plot_surface
 
     def plot_surface(axes, *given, **style):
         drawn.append(given)
+        styles.append(style)
         return plot(axes, *given, **style)
 
     monkeypatch.setattr(Axes3D, "plot_surface", plot_surface)
@@ -107,7 +121,7 @@ def test_the_first_and_the_last_are_drawn_as_a_whole(surfaces, surface, count):
     results = {f"sensor {k}": result_of(slope() - np.float32(0.1 * k)) for k in range(count)}
     figure = view.heights._draw(results, truth_of(slope()), surface)
     wholes = [axes for axes in figure.axes if axes.get_title().startswith("sensor")]
-    names = [axes.get_title().split(";")[0].removesuffix(" (mm)") for axes in wholes]
+    names = [axes.get_title().split("\n")[0].removesuffix(" (mm)") for axes in wholes]
     expected = ["sensor 0"] if count == 1 else ["sensor 0", f"sensor {count - 1}"]
     assert names == expected
     drawn = surfaces if surface else [axes.get_images()[0].get_array() for axes in wholes]
@@ -158,7 +172,7 @@ def test_a_surface_stands_in_space_over_the_field(surfaces):
 
 def test_a_millimetre_is_as_long_along_x_as_along_y(monkeypatch):
     aspects = []
-    monkeypatch.setattr(Axes3D, "set_box_aspect", lambda axes, aspect: aspects.append(aspect))
+    monkeypatch.setattr(Axes3D, "set_box_aspect", lambda axes, aspect, zoom=1: aspects.append(aspect))
     draw({"a": result_of(slope())}, truth_of(slope()), surface=True)
     across, up, _ = aspects[-1]
     assert up / across == pytest.approx((19 * 0.2) / (29 * 0.1))
@@ -205,3 +219,89 @@ def test_a_result_without_any_answer_is_shown_as_such(empty, surface):
     np.testing.assert_array_equal(lines["truth"], truth[10])
     assert np.all(np.isfinite([*left.get_xlim(), *left.get_ylim(), *right.get_ylim()]))
     assert right.get_ylim()[0] < truth[10].min()
+
+
+def test_what_was_filled_is_orange_on_a_map_and_as_bright_as_it_is_high():
+    height = slope()
+    plain, _ = draw({"a": result_of(height, filled=np.zeros(height.shape, np.uint8))}, truth_of(height))
+    assert len(plain.get_images()) == 1
+    assert "filled" not in plain.get_title()
+    axes, _ = draw({"a": result_of(height, filled=filled_in())}, truth_of(height))
+    assert "orange: filled" in axes.get_title()
+    grey, orange = axes.get_images()
+    for picture, part in ((grey, filled_in() == 0), (orange, filled_in() == 1)):
+        shown = np.ma.filled(picture.get_array(), np.nan)
+        np.testing.assert_array_equal(shown, np.where(part, height, np.nan))
+        assert picture.get_extent() == grey.get_extent()
+        assert picture.norm.vmin == grey.norm.vmin
+        assert picture.norm.vmax == grey.norm.vmax
+    colours = orange.cmap(orange.norm(np.linspace(height.min(), height.max(), 9)))[:, :3]
+    assert np.all(colours[:, 0] - colours[:, 2] > 0.15)  # red above blue at any height
+    assert np.all(np.diff(colours.sum(axis=1)) > 0)
+
+
+def test_what_was_filled_has_a_colour_of_its_own_in_space(surfaces, styles):
+    height = slope()
+    axes, _ = draw({"a": result_of(height, filled=filled_in())}, truth_of(height), surface=True)
+    colours = styles[0]["facecolors"]
+    orange = np.all(colours[..., :3] == to_rgb("tab:orange"), axis=-1)
+    np.testing.assert_array_equal(orange, filled_in() == 1)
+    assert len(surfaces) == 1
+    assert "orange: filled" in axes.get_title()
+
+
+def test_a_surface_that_was_filled_where_nothing_was_measured_is_drawn(tmp_path):
+    height = np.where(filled_in() == 1, slope(), np.float32(np.nan))
+    result = result_of(height, filled=filled_in())
+    view.height_figure({"a": result}, truth_of(slope()), "", tmp_path / "a.png", surface=True)
+    assert (tmp_path / "a.png").exists()
+
+
+@KINDS
+def test_what_was_filled_is_open_on_the_cut(surface):
+    height = slope()
+    _, right = draw({"a": result_of(height, filled=filled_in())}, truth_of(height), surface)
+    _, measured, filled = right.get_lines()
+    inside = filled_in()[10] == 1
+    np.testing.assert_array_equal(np.isnan(measured.get_ydata()), inside)
+    np.testing.assert_array_equal(np.isnan(filled.get_ydata()), ~inside)
+    np.testing.assert_array_equal(filled.get_ydata()[inside], height[10][inside])
+    assert filled.get_markerfacecolor() == "none"
+    assert filled.get_color() == measured.get_color()
+    assert "filled" in right.get_title()
+    assert [text.get_text() for text in right.get_legend().get_texts()] == ["truth", "a"]
+
+
+def test_components_that_know_no_height_are_moved_to_the_truth_and_the_others_are_not():
+    truth = slope()
+    component = np.zeros(truth.shape, np.int32)
+    component[:, 10:] = 1
+    component[:, 20:] = 2
+    component[5] = -1
+    height = np.where(component < 0, np.nan, truth + np.select([component == 1, component == 2], [3, -4], 1))
+    result = result_of(
+        height.astype(np.float32), component=component, offset_unknown=np.array([0, 1, 1], np.uint8)
+    )
+    kept = result.height.copy()
+    axes, _ = draw({"a": result}, truth_of(truth))
+    shown = np.ma.filled(axes.get_images()[0].get_array(), np.nan)
+    expected = np.where(component < 0, np.nan, truth + (component == 0))
+    np.testing.assert_allclose(shown, expected, atol=1e-6)
+    np.testing.assert_array_equal(result.height, kept)
+    assert "truth's level" in axes.get_title()
+    known = result_of(kept, component=component, offset_unknown=np.zeros(3, np.uint8))
+    axes, _ = draw({"a": known}, truth_of(truth))
+    np.testing.assert_array_equal(np.ma.filled(axes.get_images()[0].get_array(), np.nan), kept)
+    assert "level" not in axes.get_title()
+
+
+def test_a_component_off_the_truth_keeps_its_level():
+    truth = slope()
+    truth[:, 20:] = np.nan
+    component = np.zeros(truth.shape, np.int32)
+    component[:, 20:] = 1
+    result = result_of(np.ones_like(truth), component=component, offset_unknown=np.ones(2, np.uint8))
+    axes, _ = draw({"a": result}, truth_of(truth))
+    shown = np.ma.filled(axes.get_images()[0].get_array(), np.nan)
+    np.testing.assert_array_equal(shown[:, 20:], 1)
+    assert shown[:, :20].mean() == pytest.approx(truth[:, :20].mean(), abs=1e-6)

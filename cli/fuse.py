@@ -1,0 +1,89 @@
+"""``mirrorskin fuse``: a press and a rotation become one surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+if TYPE_CHECKING:
+    from mirrorskin.cli.positions import Given
+    from mirrorskin.io import Motion, Recording
+
+
+def command(
+    vertical: Annotated[Path, typer.Argument(metavar="VERTICAL", help="Recording of a press, in HDF5.")],
+    axial: Annotated[Path, typer.Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="VERTICAL-fused.h5"
+        ),
+    ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(metavar="PATH", help="The stack in others' files, of one name in both.")
+    ] = None,
+    travel_step: options.TravelStep = None,
+    travel_start: options.TravelStart = None,
+    phase_step: options.PhaseStep = None,
+    phases: options.Phases = None,
+    tilt: options.Tilt = None,
+    pixel_size: options.PixelSize = None,
+    zenith_gain: options.ZenithGain = None,
+    zenith_offset: options.ZenithOffset = None,
+    robust: options.Robust = False,
+    register: Annotated[
+        bool,
+        typer.Option(
+            help="Let the rotation's frames follow the object; without it, they need no press and pivot."
+        ),
+    ] = True,
+    memory: options.Memory = "256MB",
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Make one surface of a press and a rotation."""
+    from mirrorskin import engine, io
+    from mirrorskin.cli.output import save_and_tell
+    from mirrorskin.cli.positions import given
+    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.quantity import memory as bytes_of
+    from mirrorskin.cli.quantity import per_angle
+
+    known = given(None, travel_step, travel_start, phase_step, phases, tilt, pixel_size)
+    gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
+    rotation = {"gain": gain, "offset": zenith_offset}
+    limit = bytes_of(memory, "--memory")
+    target = output or vertical.with_name(f"{vertical.stem}-fused.h5")
+    with (
+        _open(vertical, "vertical", dataset, known, limit) as pressed,
+        _open(axial, "axial", dataset, known, limit) as turned,
+    ):
+        io.check_output(target, vertical, axial, phases)
+        with progress("fusing", engine.frames_to_read(pressed, turned, register)) as show:
+            result = engine.fuse_sources(
+                pressed,
+                turned,
+                rotation={name: value for name, value in rotation.items() if value is not None},
+                register=register,
+                robust=robust,
+                memory_limit=limit,
+                device=device,
+                progress=show,
+            )
+    save_and_tell(result, target, device, as_json)
+
+
+def _open(path: Path, place: Motion, dataset: str | None, known: Given, limit: int) -> Recording:
+    """Open a recording; of another's file, its place on the command line tells the motion."""
+    from mirrorskin import io
+    from mirrorskin.io.hdf5 import Hdf5File
+    from mirrorskin.io.layout import MARK
+
+    with Hdf5File(path) as file:
+        ours = file.marked(MARK)
+    mine = known if ours else {**known, "motion": place}
+    return io.open_recording(path, dataset=None if ours else dataset, memory_limit=limit, **mine)
