@@ -22,6 +22,8 @@ _PACKAGES = (
     "opencv-contrib-python-headless",
     "torch",
     "numba",
+    "scipy",
+    "pyamg",
 )
 
 

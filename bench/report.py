@@ -17,7 +17,8 @@ HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of 
 LEGEND = (
     "ms: median by the host's clock, from the call to its return; kernels and copies: the device's own "
     "account of that time. of limit: bandwidth as a share of the first row's, by the clock; then the same "
-    "of kernels alone. Bytes are those of the frames, each once, and of axial rotation those of the maps too."
+    "of kernels alone. Bytes are those of the frames, each once, of axial rotation those of the maps too, "
+    "and of integration those of what is given and of the heights, each once."
 )
 
 

@@ -77,6 +77,13 @@ def check_correlation(name: str, ours: engine.Correlation, theirs: correlation.W
         _require(name, word, mine, other, same)
 
 
+def check_surface(name: str, exact: NDArray[Any], found: NDArray[Any], share: float) -> None:
+    """Raise DisagreementError unless heights are those of a direct solution, within a share of its range."""
+    tolerance = share * (np.nanmax(exact) - np.nanmin(exact))
+    same = (np.abs(found - exact) <= tolerance) | (np.isnan(found) & np.isnan(exact))
+    _require(name, "height", exact, found, same, whom="a direct solution")
+
+
 def _require(
     name: str,
     word: str,
@@ -84,12 +91,13 @@ def _require(
     theirs: NDArray[Any],
     same: NDArray[np.bool_],
     spared: int = 0,
+    whom: str = "mirrorskin",
 ) -> None:
     if np.count_nonzero(~same) <= spared:
         return
     row, column = np.argwhere(~same)[0]
     raise DisagreementError(
-        f"{name} differs from mirrorskin in the {word} of {np.count_nonzero(~same)} of {same.size} pixels, "
+        f"{name} differs from {whom} in the {word} of {np.count_nonzero(~same)} of {same.size} pixels, "
         f"first in row {row}, column {column}: {theirs[row, column]}, not {ours[row, column]}; "
         "nothing was timed"
     )

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mirrorskin.bench.correlation import CorrelationCase, run_correlation, run_sliding
+from mirrorskin.bench.integration import IntegrationCase, run_frames, run_mask, run_rectangle
 from mirrorskin.bench.live import run_live
 from mirrorskin.bench.normals import NormalsCase, run_normals
 from mirrorskin.bench.onset import OnsetCase, run_onset
@@ -19,6 +20,7 @@ from mirrorskin.kernels.device import Device
 
 _HD, _MEMORY, _LIVE = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640)
 _RENDERED, _WINDOW = (128, 480, 640), (64, 480, 640)
+_MPIXEL = (1024, 1024)
 _QUICK = (12, 48, 64)
 _TURNS = 16  # frames of a quick correlation, whole turns
 _ROUNDS = 15
@@ -66,6 +68,13 @@ _NORMALS = [
     NormalsCase("normals-float32", _HD[1:], np.dtype(np.float32)),
 ]
 _CORRELATE = CorrelationCase("correlate-uint8", _HD)
+_INTEGRATION = {
+    IntegrationCase("integrate-rectangle", _MPIXEL): run_rectangle,
+    IntegrationCase("integrate-rectangle-4mp", (2048, 2048)): run_rectangle,
+    IntegrationCase("integrate-mask", _MPIXEL): run_mask,
+    IntegrationCase("integrate-cuts", _MPIXEL, cuts=50): run_mask,
+    IntegrationCase("integrate-live", _LIVE[1:]): run_frames,
+}
 _SLIDING = CorrelationCase("sliding", _WINDOW)
 
 
@@ -99,6 +108,12 @@ def _correlation(case: CorrelationCase, run: Callable[[CorrelationCase, Device, 
     )
 
 
+def _integration(case: IntegrationCase, run: Callable[[IntegrationCase, Device, int], Case]) -> _Run:
+    return lambda device, quick: run(
+        replace(case, shape=_QUICK[1:]) if quick else case, device, _rounds(quick)
+    )
+
+
 def _rounds(quick: bool) -> int:
     return 1 if quick else _ROUNDS
 
@@ -110,6 +125,7 @@ _RUNS: dict[str, _Run] = {
     **{case.name: _normals(case) for case in _NORMALS},
     _CORRELATE.name: _correlation(_CORRELATE, run_correlation),
     _SLIDING.name: _correlation(_SLIDING, run_sliding),
+    **{case.name: _integration(case, run) for case, run in _INTEGRATION.items()},
 }
 NAMES = tuple(_RUNS)
 
