@@ -136,6 +136,11 @@ class Settler:
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
     @property
+    def labels(self) -> Labels:
+        """The pieces' numbers, (H, W)."""
+        return self._pieces.labels
+
+    @property
     def _pieces(self) -> Components:
         if self._components is None:
             raise RuntimeError("take pieces first")
