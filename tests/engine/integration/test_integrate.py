@@ -32,7 +32,7 @@ def known(level=1.0):
 
 def uneven(count=1):
     random = np.random.default_rng(5)
-    return np.squeeze(random.random((count, *SHAPE)) * (random.random((count, *SHAPE)) > 0.1))
+    return np.squeeze(random.uniform(0.01, 1, (count, *SHAPE)) * (random.random((count, *SHAPE)) > 0.1))
 
 
 PROBLEMS = {

@@ -31,7 +31,7 @@ def press(step, count, spikes=0.0):
     """Press the twin on the sphere; return the result and the height error, (H, W), mm."""
     travel = step * np.arange(1, count + 1)
     twin = ball(SHAPE, PIXEL, travel, noise=NOISE, seed=7)
-    result = engine.reconstruct(Spiked(twin, spikes) if spikes else twin)
+    result = engine.reconstruct(Spiked(twin, spikes) if spikes else twin, fill=False)
     return result, result.height - geometry.sphere(SHAPE, PIXEL).height
 
 
