@@ -114,7 +114,7 @@ class Hierarchy:
         self._coarsen(range(1, len(self.levels)))
         self.odd, self.table = [OddRows() for _ in self.levels], self._nothing
         split = self._split.download()[finest.end :]
-        odd = self._put_right(split) if split.any() else nothing_odd()
+        odd = self._put_right() if split.any() else nothing_odd()
         self._split.upload()
         self._invert()
         self.bottom = self._solve_bottom(odd)
@@ -175,18 +175,18 @@ class Hierarchy:
             arguments = np.int32(rows.at), np.int32(rows.count), *self.table, *args
             self.kernel(f"{name}_odd")(rows.count, *arguments, moved=64 * rows.count)
 
-    def _put_right(self, split: NDArray[np.float32]) -> Odd:
+    def _put_right(self) -> Odd:
         """Go through the levels again, and care for what is odd; return what is at the coarsest."""
         right, down = self.right.download(), self.down.download()
         odd, following, lookup = nothing_odd(), self.plain, Lookup(self.plain)
         tables: list[dict[str, Pairs]] = [{} for _ in self.levels]
         places = [Rows() for _ in self.levels]
+        marks, changed = self._split.download(), odd.node
         for number in range(1, len(self.levels)):
-            if len(odd.node):
-                right, down = self._coarsen_again(number)
             fine, coarse = (Picture(level, right, down) for level in self.levels[number - 1 : number + 1])
-            marks = self._split.download()[coarse.level.base : coarse.level.end]
-            step = step_over(fine, odd, coarse, np.flatnonzero(marks) + coarse.level.base, following, lookup)
+            split = np.flatnonzero(marks[coarse.level.base : coarse.level.end]) + coarse.level.base
+            step = step_over(fine, odd, changed, coarse, split, following, lookup)
+            changed = step.blocks
             tables[number - 1] |= {"restrict": step.restrict, "prolong": step.prolong}
             odd = step.odd
             room = -(-len(odd.node) // WIDTH) * WIDTH
@@ -200,12 +200,6 @@ class Hierarchy:
         self.down.upload()
         self._keep(tables, places)
         return odd
-
-    def _coarsen_again(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        for array in (self.right, self.down, self._split):
-            array.upload()
-        self._coarsen([number])
-        return self.right.download(), self.down.download()
 
     def _make_room(self, nodes: int) -> None:
         if nodes > self.nodes:

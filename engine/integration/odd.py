@@ -327,7 +327,9 @@ def _first_of_each(count: int, a: Ints, b: Ints) -> Ints:
         label = found
 
 
-def step_over(fine: Picture, odd: Odd, coarse: Picture, split: Ints, following: int, lookup: Lookup) -> Step:
+def step_over(
+    fine: Picture, odd: Odd, changed: Ints, coarse: Picture, split: Ints, following: int, lookup: Lookup
+) -> Step:
     """Put the coarse level right where blocks are odd, and tell what cannot be said in its picture.
 
     Parameters
@@ -335,6 +337,8 @@ def step_over(fine: Picture, odd: Odd, coarse: Picture, split: Ints, following: 
     fine : Picture
     odd : Odd
         Of the fine level.
+    changed : ndarray, (n,), int64
+        Nodes of the fine picture whose links are others than the plain pass knew.
     coarse : Picture
         As the plain pass left it; its links round odd blocks are put right.
     split : ndarray, (n,), int64
@@ -344,10 +348,15 @@ def step_over(fine: Picture, odd: Odd, coarse: Picture, split: Ints, following: 
     lookup : Lookup
     """
     blocks = split
-    if len(odd.node):
+    if len(odd.node) or len(changed):
         ends = np.concatenate([odd.links.a, odd.links.b])
-        row, column = np.concatenate([fine.place(ends[fine.holds(ends)]), odd.block.T], axis=1) // 2
-        blocks = lookup.distinct(np.concatenate([split, coarse.node(row, column)]))
+        stride = fine.level.stride
+        beside = [changed - 1, changed + 1, changed - stride, changed + stride]
+        nodes = np.concatenate([ends[fine.holds(ends)], changed, *beside])
+        row, column = np.concatenate([fine.place(nodes), odd.block.T], axis=1) // 2
+        inside = (row >= 0) & (row < coarse.level.rows) & (column < coarse.level.columns)
+        near = coarse.node(row[inside], column[inside])
+        blocks = lookup.distinct(np.concatenate([split, near]))
     if not len(blocks):
         none = nothing_odd()
         return Step(none, none.node, (none.node, none.node), none.links, none.links, none.links)

@@ -8,8 +8,8 @@ heights of a piece have in common. What the rest does is local.
 It is told from draws, whose squares are averaged and then smoothed a little along the links, but not between
 pixels with and without a known height.
 
-It costs some 80 loose solves. Exact variances over these, of pictures of 36 x 40 pixels, were 1.00 +- 0.02 in the
-mean, and within 1.0 +- 0.1 for all but 2 % of the pixels of a rectangle, 5 % of a disc, 8 % of an annulus
+It costs some 80 loose solves. Exact variances over these, of pictures of 36 x 40 pixels, were 1.00 +- 0.02 in
+the mean, and within 1.0 +- 0.1 for all but 2 % of the pixels of a rectangle, 5 % of a disc, 8 % of an annulus
 and 9 % of a rectangle with known heights on one side; the others lie along the ends of the surface and of
 known heights, where variances change from pixel to pixel. Where a fifth of the pixels are missing at random,
 40 % are off by more than a tenth and 11 % by more than a fifth.

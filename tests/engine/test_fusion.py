@@ -295,6 +295,41 @@ def test_gross_mistakes_of_the_press_are_left_out():
     assert rms(surface.height - true) < 0.002
 
 
+def terraced(step=0.1):
+    """Return a plane of (60, 60), its normals, and what a press with such steps tells of it."""
+    true, normals = plane(0.23, 0.17, (60, 60))
+    terraces = (np.floor(true / step) + 0.5) * step
+    return true, normals, terraces, np.full(true.shape, step / np.sqrt(12), np.float32)
+
+
+def test_few_heights_that_wrongly_claim_to_be_sure_lead_nowhere():
+    true, normals, terraces, sigma = terraced()
+    odd = np.random.default_rng(3).choice(true.size, true.size // 60, replace=False)
+    terraces.flat[odd], sigma.flat[odd] = true.flat[odd] - 0.03, 4e-4
+    known = SimpleNamespace(height=terraces, sigma=sigma)
+    surface = engine.fuse(known, directions(normals, sigma=1e-3), 0.1)
+    assert abs(np.mean(surface.height - true)) < 0.001
+
+
+def test_late_heights_do_not_pull_a_surface_down():
+    true, normals, terraces, sigma = terraced()
+    random = np.random.default_rng(4)
+    late = random.choice(true.size, true.size // 25, replace=False)
+    terraces.flat[late] -= random.uniform(0.03, 1.0, late.size)
+    surface = engine.fuse(SimpleNamespace(height=terraces, sigma=sigma), directions(normals, sigma=1e-3), 0.1)
+    assert abs(np.mean(surface.height - true)) < 0.002
+
+
+def test_heights_beside_the_normals_do_not_say_where_the_surface_is():
+    true, normals, terraces, sigma = terraced()
+    contact = np.ones(true.shape)
+    contact[:, 54:] = 0
+    terraces[:, 54:] -= 0.03  # what is seen at a rim is seen late
+    known = SimpleNamespace(height=terraces, sigma=sigma)
+    surface = engine.fuse(known, directions(normals, contact, 1e-3), 0.1)
+    assert abs(np.mean((surface.height - true)[:, :54])) < 0.001
+
+
 def test_heights_that_fit_no_surface_count_as_little_as_they_deserve():
     true, normals = plane(shape=(40, 40))
     rng = np.random.default_rng(2)

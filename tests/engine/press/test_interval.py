@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mirrorskin.engine.press.interval import blur_of, look_inside
+from mirrorskin.engine.press.interval import Spread, find_spread, look_inside
 
 
 def log_likelihood(height, middle, half, blur):
@@ -16,7 +16,7 @@ def log_likelihood(height, middle, half, blur):
 def test_an_interval_pulls_as_its_likelihood_does(blur):
     middle, half = np.full(41, -0.3), np.full(41, 0.05)
     height = np.linspace(-0.3 - 0.05 - 2 * blur, -0.3 + 0.05 + 2 * blur, 41)
-    found = look_inside(height, middle, half, blur)
+    found = look_inside(height, middle, half, Spread(blur, 0.0))
     step = 1e-4 * blur
     below, here, above = (log_likelihood(height + way * step, middle, half, blur) for way in (-1, 0, 1))
     slope, curvature = (above - below) / (2 * step), -(above - 2 * here + below) / step**2
@@ -28,21 +28,29 @@ def test_an_interval_pulls_as_its_likelihood_does(blur):
 
 def test_sharp_ends_leave_what_is_inside_alone():
     height = np.array([-0.34, -0.3, -0.26])
-    found = look_inside(height, np.full(3, -0.3), np.full(3, 0.05), 1e-3)
+    found = look_inside(height, np.full(3, -0.3), np.full(3, 0.05), Spread(1e-3, 0.0))
     assert found.height == pytest.approx(height, abs=1e-9)
     assert (found.weight < 1e-3 * 1e6).all()
 
 
 def test_wide_blurs_make_a_plain_known_height():
-    found = look_inside(np.array([0.7]), np.array([0.2]), np.array([0.3]), 10.0)
+    found = look_inside(np.array([0.7]), np.array([0.2]), np.array([0.3]), Spread(10.0, 0.0))
     assert found.height == pytest.approx(0.2, abs=1e-3)
     assert found.weight == pytest.approx(1 / (10.0**2 + 0.3**2 / 3), rel=1e-3)
 
 
 def test_what_is_far_outside_is_a_mistake():
-    far = look_inside(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), 0.01)
+    far = look_inside(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), Spread(0.01, 0.0))
     assert (far.weight == 0).all()
     assert np.isfinite(far.height).all()
+
+
+def test_heights_count_by_the_chance_that_they_are_no_mistakes():
+    height, middle, half = np.linspace(-0.07, 0.07, 15), np.zeros(15), np.full(15, 0.05)
+    sure, unsure = (look_inside(height, middle, half, Spread(0.01, share)) for share in (0.0, 0.3))
+    good = (norm.cdf((0.05 - height) / 0.01) - norm.cdf((-0.05 - height) / 0.01)) / 0.1
+    assert unsure.weight == pytest.approx(sure.weight * good / (good + 0.3))
+    assert (np.diff(unsure.weight / sure.weight)[8:] < 0).all()
 
 
 @pytest.mark.parametrize("blur", [0.002, 0.01, 0.05, 0.2])
@@ -50,19 +58,21 @@ def test_the_blur_is_found(blur):
     random = np.random.default_rng(3)
     half = np.full(200_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, blur, half.size)
-    assert blur_of(error, half) == pytest.approx(blur, rel=0.05)
+    assert find_spread(error, half).blur == pytest.approx(blur, rel=0.1)
 
 
-def test_a_few_gross_mistakes_do_not_blur():
+def test_mistakes_on_one_side_do_not_blur():
     random = np.random.default_rng(4)
     half = np.full(20_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, 0.005, half.size)
-    error[::500] = 2.9
-    assert blur_of(error, half) < 0.007
+    error[::25] = random.uniform(-1.5, 0, 800)
+    found = find_spread(error, half)
+    assert found.blur == pytest.approx(0.005, rel=0.25)
+    assert found.mistaken == pytest.approx(0.04 / 0.96 / np.ptp(error), rel=0.15)
 
 
 def test_the_least_blur_is_a_fiftieth_of_half_an_interval():
     half = np.full(100, 0.05)
-    assert blur_of(np.linspace(-0.049, 0.049, 100), half) == pytest.approx(0.001)
-    assert blur_of(np.zeros(1), half[:1]) == pytest.approx(0.001)
-    assert np.isfinite(blur_of(np.full(100, 9.0), half))
+    assert find_spread(np.linspace(-0.049, 0.049, 100), half).blur == pytest.approx(0.001)
+    assert find_spread(np.zeros(1), half[:1]).blur == pytest.approx(0.001)
+    assert np.isfinite(find_spread(np.full(100, 9.0), half)).all()
