@@ -27,9 +27,13 @@ _SHARPEST = 1e-5  # mm: no height is known better than this
 _NARROWEST, _WIDEST = 2.0, 8.0  # standard deviation of a window that slopes are taken from, pixels
 _NEAR = 3.0  # such windows, beyond which pixels are too far from any normal
 _LEVEL = 0.05  # slope below which a surface has no terraces to speak of
-_FIRM = 3.0  # how many times a height with normals around is as sure as one of the press
+_FIRM = 30.0  # how many times a height with normals around is as sure as one of the press
 _OFF = 4.0  # standard deviations from those around, beyond which a height is a mistake
 _ROUGH = 3.0  # mean squared error in standard deviations of what is no smooth surface
+_CLAIM = 2.0  # how many times less sure than they claim heights may be, and still be believed
+_SEVERAL = 6.0  # half intervals that heights go over, for their errors to be spread evenly
+_NEARLY_ALL = 0.9  # of all heights, by which it is told how much of their intervals errors use
+_LEAST_USED = 0.5
 _LOOKS = 5  # at where the intervals lift a surface
 
 
@@ -92,12 +96,14 @@ class Joint:
         self._robust, self._device = robust, device
         plain = known.height, np.nan_to_num(1 / known.sigma**2)
         first = self._solve(*plain, sigma=False)
+        known = _doubt(known, first, slopes)
+        plain = known.height, np.nan_to_num(1 / known.sigma**2)
         longer = _extend(slopes, first, known, self._pixel_size)
         if longer is not slopes:
             self._slopes = longer
             first = self._solve(*plain, start=first.height, sigma=False)
         self._start = first.height
-        self._height, self._weight = _sharpen(first, known)
+        self._height, self._weight = _sharpen(first, known, slopes)
 
     def heights(self) -> NDArray[np.float32]:
         """Return the heights alone, which is faster."""
@@ -123,6 +129,18 @@ class Joint:
             **options,
         )
         return _level(surface, height, weight)
+
+
+def _doubt(known: Known, surface: Surface, slopes: Slopes) -> Known:
+    """Return heights as unsure as they are, where slopes tell that most claim to be much more sure."""
+    both = known.there & slopes.known
+    if not both.any():
+        return known
+    off = known.height[both] - surface.height[both]
+    usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _EVEN  # half are beyond half of an interval
+    if usual < _CLAIM * float(np.median(known.sigma[both])):
+        return known
+    return Known(known.height, np.maximum(known.sigma, usual))
 
 
 def _extend(slopes: Slopes, surface: Surface, known: Known, pixel_size: tuple[float, float]) -> Slopes:
@@ -174,14 +192,18 @@ def _level(surface: Surface, height: Doubles, weight: Doubles) -> Surface:
     return replace(surface, height=(surface.height + lift).astype(np.float32))
 
 
-def _sharpen(surface: Surface, known: Known) -> tuple[Doubles, Doubles]:
+def _sharpen(surface: Surface, known: Known, slopes: Slopes) -> tuple[Doubles, Doubles]:
     """Return known heights and their weights, by what their intervals say where the surface is about known.
 
-    Heights far from it are mistakes, and get no weight. A piece of which no height is near an end of its
+    Heights far from it are mistakes, and get no weight. Nor do those without a normal of their own, which are
+    at rims and often late, in a piece that has others. A piece of which no height is near an end of its
     interval lies on one terrace: then all of its heights together say no more than one.
     """
     size = np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
     joined = known.there & (size[surface.component] > 1)
+    both = joined & slopes.known
+    told = np.bincount(surface.component[both], minlength=size.size) > 0
+    joined &= slopes.known | ~told[surface.component]
     height, weight = known.height.copy(), np.nan_to_num(1 / known.sigma**2)
     if not joined.any():
         return height, weight
@@ -189,6 +211,7 @@ def _sharpen(surface: Surface, known: Known) -> tuple[Doubles, Doubles]:
     middle, shape = known.height[joined], surface.height[joined].astype(np.float64)
     # The mean that a solver finds is moved by mistakes, the median is not.
     lift = np.asarray(ndimage.median(middle - shape, piece, np.arange(size.size)))
+    half *= _share_used(middle - shape - lift[piece], half, shape)
     for _ in range(_LOOKS):
         at = shape + lift[piece]
         spread = find_spread(middle - at, half)
@@ -196,6 +219,7 @@ def _sharpen(surface: Surface, known: Known) -> tuple[Doubles, Doubles]:
         firm = np.bincount(piece, inside.weight, size.size)
         lift += np.bincount(piece, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
     weight = np.nan_to_num(1 / (known.sigma**2 + spread.blur**2))
+    weight[told[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
     near = inside.weight > 0
     count = np.maximum(np.bincount(piece, near, size.size), 1)
     plain = np.where(near, weight[joined] / count[piece], 0.0)
@@ -203,6 +227,18 @@ def _sharpen(surface: Surface, known: Known) -> tuple[Doubles, Doubles]:
     height[joined] = np.where(ends, inside.height, middle)
     weight[joined] = np.where(ends, inside.weight, plain)
     return height, weight
+
+
+def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
+    """Return which share of their intervals errors make use of, if heights go over several of them.
+
+    Samples that tell more than an interval alone lie nearer to the truth. Ends that no error reaches leave
+    a surface free to follow the few that are beyond.
+    """
+    if np.ptp(height) < _SEVERAL * float(np.median(half)):
+        return 1.0
+    used = np.quantile(np.abs(error) / half, _NEARLY_ALL) / _NEARLY_ALL
+    return float(np.clip(used, _LEAST_USED, 1.0))
 
 
 def _tell_lone(surface: Surface, weight: Doubles) -> Surface:

@@ -19,6 +19,7 @@ Doubles = NDArray[np.float64]
 
 _LEAST = 0.02  # of half an interval: what its ends are blurred by at least
 _FAR = 6.0  # blurs beyond an end, from which on an onset is a mistake
+_SPAN = 20.0  # half intervals that mistakes are spread over at least
 _FEWEST, _MOST = 1e-4, 0.5  # share of mistakes
 _SAMPLES = 8192  # of errors that tell how they are spread
 _ROUNDS = 12  # until the share of mistakes settles
@@ -40,7 +41,7 @@ class Spread(NamedTuple):
     blur : float
         Standard deviation that the ends of intervals are blurred by, mm.
     mistaken : float
-        Mistakes for each height that is none, over twice the logarithm of how far they reach.
+        Density of the heights that are mistakes, 1/mm, over the share of those that are none.
     """
 
     blur: float
@@ -50,10 +51,9 @@ class Spread(NamedTuple):
 def find_spread(error: Doubles, half: Doubles) -> Spread:
     """Tell how sharp the intervals' ends are, and how many heights are mistakes, by the greatest likelihood.
 
-    An error e is from a blurred interval with the chance 1 - m, and a mistake of any size with the chance m:
-    its density is (1 - m) P(e) / (2 half) + m / (2 ln(1 + reach / half)) / (half + |e|). Mistakes are on one
-    side, as late onsets are, and what is within intervals does not hold against them: they must not count as
-    blurred ends.
+    An error e is from a blurred interval with the chance 1 - m, and a mistake, which may be anything, with
+    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Mistakes are on one side, as late onsets
+    are, and what is within intervals does not hold against them: they must not count as blurred ends.
 
     Parameters
     ----------
@@ -69,29 +69,29 @@ def find_spread(error: Doubles, half: Doubles) -> Spread:
     """
     thin = slice(None, None, -(-error.size // _SAMPLES))
     error, half = error[thin], half[thin]
-    middle, farthest = float(np.median(half)), float(np.max(np.abs(error)))
-    reach = 2 * np.log1p(max(farthest / middle, 1.0))
-    anything = 1 / (half + np.abs(error)) / reach
+    middle = float(np.median(half))
+    span = max(float(np.ptp(error)), _SPAN * middle)
 
     def share(density: Doubles) -> float:
         found = _MOST / 2
         for _ in range(_ROUNDS):
-            found = float(np.mean(found * anything / (found * anything + (1 - found) * density)))
+            found = float(np.mean(found / (found + (1 - found) * span * density)))
         return float(np.clip(found, _FEWEST, _MOST))
 
     def unlikely(size: float) -> float:
         density = _chance(error, half, float(np.exp(size))) / (2 * half)
         mistakes = share(density)
-        return -float(np.sum(np.log(mistakes * anything + (1 - mistakes) * density)))
+        return -float(np.sum(np.log(mistakes / span + (1 - mistakes) * density)))
 
-    least, most = np.log(_LEAST * middle), np.log(max(farthest, middle)) + 1.0
+    least = np.log(_LEAST * middle)
+    most = np.log(max(float(np.max(np.abs(error))), middle)) + 1.0
     sizes = np.linspace(least, most, 12)
     best = int(np.argmin([unlikely(size) for size in sizes]))
     bounds = sizes[max(best - 1, 0)], sizes[min(best + 1, sizes.size - 1)]
     size = float(minimize_scalar(unlikely, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
     size = min((least, size), key=unlikely)
     mistakes = share(_chance(error, half, float(np.exp(size))) / (2 * half))
-    return Spread(float(np.exp(size)), mistakes / (1 - mistakes) / reach)
+    return Spread(float(np.exp(size)), mistakes / (1 - mistakes) / span)
 
 
 def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread) -> Evidence:
@@ -123,7 +123,7 @@ def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread)
     left, right = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above))
     pull = left - right
     weight = np.clip(pull**2 - (below * left - above * right), _FAINT, 1.0)
-    sound = chance / (chance + 2 * half * mistaken / (half + np.abs(middle - height)))
+    sound = chance / (chance + 2 * half * mistaken)
     return Evidence(height + blur * pull / weight, np.where(near, sound * weight / blur**2, 0.0))
 
 
