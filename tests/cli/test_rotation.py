@@ -141,7 +141,7 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", fails)
     before = set(Path().iterdir())
     ended = run("reconstruct", "turn.h5")
-    line = "mirrorskin: the residual is 0.3 after 100 iterations: allow more\n"
+    line = "mirrorskin: turn.h5: the residual is 0.3 after 100 iterations: allow more\n"
     assert (ended.code, ended.out, ended.said) == (1, "", line)
     assert set(Path().iterdir()) == before
 
