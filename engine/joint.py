@@ -116,7 +116,7 @@ class Joint:
         return _join(_fill(_tell_lone(surface, self._weight), self._pixel_size))
 
     def _solve(self, height: Doubles, weight: Doubles, **options: Any) -> Surface:
-        surface = integrate(
+        return integrate(
             self._slopes.dz_dx,
             self._slopes.dz_dy,
             self._pixel_size,
@@ -128,7 +128,6 @@ class Joint:
             device=self._device,
             **options,
         )
-        return _level(surface, height, weight)
 
 
 def _doubt(known: Known, surface: Surface, slopes: Slopes) -> Known:
@@ -180,16 +179,6 @@ def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     steepness = np.hypot(slopes.dz_dx[slopes.known], slopes.dz_dy[slopes.known])
     terrace = 2 * _EVEN * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
-
-
-def _level(surface: Surface, height: Doubles, weight: Doubles) -> Surface:
-    """Lift pieces to where their known heights want them, which a solver sees last if slopes weigh more."""
-    inside = (surface.component >= 0) & (weight > 0)
-    piece, count = surface.component[inside], len(surface.offset_unknown)
-    apart = np.bincount(piece, weight[inside] * (height - surface.height)[inside], count)
-    total = np.bincount(piece, weight[inside], count)
-    lift = np.append(apart / np.where(total > 0, total, 1.0), 0.0)[surface.component]
-    return replace(surface, height=(surface.height + lift).astype(np.float32))
 
 
 def _sharpen(surface: Surface, known: Known, slopes: Slopes) -> tuple[Doubles, Doubles]:
