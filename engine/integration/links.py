@@ -68,14 +68,6 @@ class Graph:
     plane: Plane
 
 
-def build_links(inputs: Inputs, device: Device) -> Graph:
-    """Return the links between a picture's pixels, for heights above a plane that goes with the slopes."""
-    room = LinkRoom(device, inputs.shape)
-    flags = room.take(inputs)
-    plane = room.lean()
-    return Graph(room.join(plane), flags, room.scale, plane)
-
-
 class LinkRoom:
     """Room on a device for a picture's maps and their links; what was allocated is used again.
 

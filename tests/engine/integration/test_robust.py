@@ -10,7 +10,7 @@ from bilateral import Weighed
 
 from mirrorskin import engine
 from mirrorskin.engine.integration.inputs import check_inputs
-from mirrorskin.engine.integration.links import build_links
+from mirrorskin.engine.integration.links import Graph, LinkRoom
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.kernels.device import open_device
 
@@ -49,7 +49,9 @@ def bump(size=48, sigma=8.0, peak=6.0):
 def search(slopes, device, k=2.0, pixel_size=1.0, start=None, limit=100, deadline=None, **known):
     """Return what the search itself tells, and its heights."""
     inputs = check_inputs(*slopes, pixel_size, **known)
-    graph = build_links(inputs, device)
+    room = LinkRoom(device, inputs.shape)
+    flags, plane = room.take(inputs), room.lean()
+    graph = Graph(room.join(plane), flags, room.scale, plane)
     width, height = inputs.pixel_size
     row, column = np.indices(slopes[0].shape)
     plane = graph.plane[2] + graph.plane[0] * width * column - graph.plane[1] * height * row
