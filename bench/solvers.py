@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +17,7 @@ from mirrorskin.bench.truth import Truth
 from mirrorskin.engine.integration.links import Links
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.rectangle import Rectangle
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.device import Device
 
 SLOPES, SETUP, SOLVE = "from slopes", "set-up and solve", "solve only"
 PYAMG = "pyamg"
@@ -42,7 +40,7 @@ def rectangle_works(slopes: Floats, source: Floats, device: Device) -> dict[str,
         What links of weight 1 make of them.
     device : Device
     """
-    given = _put(device, "source", source)
+    given = device.given("source", source)
     rows, columns = source.shape
     ready = Rectangle((rows, columns), _SQUARE, device)
     return {
@@ -73,9 +71,9 @@ def mask_works(slopes: Floats, mask: Flags, edges: Flags | None, device: Device)
     graph = link(slopes, PIXEL, mask, edges)
     right, down = np.zeros((2, *mask.shape), np.float32)
     right[:, :-1], down[:-1] = graph.right, graph.down
-    maps = _put(device, "right", right), _put(device, "down", down)
+    maps = device.given("right", right), device.given("down", down)
     rows, columns = mask.shape
-    links = Links(device, (rows, columns), *maps, None, _put(device, "source", graph.source))
+    links = Links(device, (rows, columns), *maps, None, device.given("source", graph.source))
     ready = Multigrid(links)
 
     return {
@@ -118,10 +116,3 @@ def _integrate(
     dz_dx, dz_dy = slopes
     found = engine.integrate(dz_dx, dz_dy, PIXEL, mask=mask, edges=edges, sigma=False, device=device)
     return found.height
-
-
-def _put(device: Device, name: str, values: NDArray[Any]) -> Array:
-    array = device.array(name, values.shape, np.float32)
-    array.host[...] = values
-    array.upload()
-    return array

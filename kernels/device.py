@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import pocl
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
@@ -151,6 +151,29 @@ class Device:
             It does not fit; a smaller one may.
         """
         return Array(self, name, shape, np.dtype(dtype))
+
+    def given(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
+        """Make an array that holds values; where there are none, one element that means nothing.
+
+        Parameters
+        ----------
+        name : str
+            What the profile calls it.
+        values : array_like
+        dtype : dtype
+
+        Raises
+        ------
+        DeviceMemoryError
+            It does not fit.
+        """
+        shape = np.shape(values)
+        if 0 in shape:
+            return self.given(name, np.zeros(1), dtype)
+        array = self.array(name, shape, dtype)
+        array.host[...] = values
+        array.upload()
+        return array
 
     def kernel(self, file: str, name: str, **defines: str | int) -> Kernel:
         """Return a kernel of ``file.cl``, compiled once for each set of defines.

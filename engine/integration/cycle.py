@@ -73,7 +73,7 @@ class Cycle:
             spans = odd.nodes, odd.graph, odd.restrict, odd.prolong
             numbers = [number for rows in spans for number in (rows.at, rows.count)]
             table.append([level.base, level.rows, level.stride, *numbers])
-        self._table = h.given("levels", np.array(table), np.int32)
+        self._table = h.device.given("levels", np.array(table), np.int32)
         self._tail = self._first_of_tail()
         self._odd_rows = [self._rows_of(number) for number in range(len(h.levels))]
 
@@ -90,12 +90,12 @@ class Cycle:
         """Return where the table's rows for odd prolongation begin of each row of a level's picture."""
         level, rows = self._h.levels[number], self._h.odd[number].prolong
         if not rows.count or self._h.odd[number].graph.count:
-            return self._h.given("rows", np.zeros(1), np.int32)
+            return self._h.device.given("rows", np.zeros(1), np.int32)
         nodes = self._h.table[0].download()[rows.at : rows.at + rows.count]
         first = level.first + level.stride * np.arange(level.rows + 1)
         starts = np.searchsorted(nodes, first) + rows.at
         self._h.table[0].upload()
-        return self._h.given("rows", starts, np.int32)
+        return self._h.device.given("rows", starts, np.int32)
 
     def start(self, to: Array) -> None:
         """Make heights of the finest level by full multigrid, but for its own cycle.
@@ -233,7 +233,7 @@ class Cycle:
         """Do all of the small levels, or the coarsest alone where items are lanes."""
         h = self._h
         nodes, matrix = h.bottom
-        count = np.int32(h.bottom_count)
+        count = np.int32(len(nodes.host))
         if not self._one_pass:
             b = self.full_b if name == "tail_full" else self.b
             h.kernel("solve")(int(count), count, nodes, matrix, b, self.x, moved=4 * int(count) ** 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -101,6 +100,7 @@ class Hierarchy:
         for array in (self.right, self.down, self._split):
             array.upload()
         self._allocate()
+        self._lookup = Lookup(self.plain)
         self._nothing = self._table([])
         self.odd: list[OddRows] = []
 
@@ -113,8 +113,8 @@ class Hierarchy:
             self.admit(links.anchor, self.anchor)
         self._coarsen(range(1, len(self.levels)))
         self.odd, self.table = [OddRows() for _ in self.levels], self._nothing
-        split = self._split.download()[finest.end :]
-        odd = self._put_right() if split.any() else nothing_odd()
+        split = self._split.download()
+        odd = self._put_right(split) if split[finest.end :].any() else nothing_odd()
         self._split.upload()
         self._invert()
         self.bottom = self._solve_bottom(odd)
@@ -175,17 +175,17 @@ class Hierarchy:
             arguments = np.int32(rows.at), np.int32(rows.count), *self.table, *args
             self.kernel(f"{name}_odd")(rows.count, *arguments, moved=64 * rows.count)
 
-    def _put_right(self) -> Odd:
+    def _put_right(self, split: NDArray[np.float32]) -> Odd:
         """Go through the levels again, and care for what is odd; return what is at the coarsest."""
         right, down = self.right.download(), self.down.download()
-        odd, following, lookup = nothing_odd(), self.plain, Lookup(self.plain)
+        odd, following = nothing_odd(), self.plain
         tables: list[dict[str, Pairs]] = [{} for _ in self.levels]
         places = [Rows() for _ in self.levels]
-        marks, changed = self._split.download(), odd.node
+        changed = odd.node
         for number in range(1, len(self.levels)):
             fine, coarse = (Picture(level, right, down) for level in self.levels[number - 1 : number + 1])
-            split = np.flatnonzero(marks[coarse.level.base : coarse.level.end]) + coarse.level.base
-            step = step_over(fine, odd, changed, coarse, split, following, lookup)
+            marked = np.flatnonzero(split[coarse.level.base : coarse.level.end]) + coarse.level.base
+            step = step_over(fine, odd, changed, coarse, marked, following, self._lookup)
             changed = step.blocks
             tables[number - 1] |= {"restrict": step.restrict, "prolong": step.prolong}
             odd = step.odd
@@ -239,18 +239,11 @@ class Hierarchy:
         nodes = [pairs.a[first] for pairs, first in parts]
         starts = [first + at for (_, first), at in zip(parts, ends, strict=False)]
         return (
-            self.given("nodes", np.concatenate([np.zeros(0), *nodes]), np.int32),
-            self.given("starts", np.concatenate([*starts, ends[-1:]]), np.int32),
-            self.given("columns", whole.b, np.int32),
-            self.given("weights", whole.weight, np.float32),
+            self.device.given("nodes", np.concatenate([np.zeros(0), *nodes]), np.int32),
+            self.device.given("starts", np.concatenate([*starts, ends[-1:]]), np.int32),
+            self.device.given("columns", whole.b, np.int32),
+            self.device.given("weights", whole.weight, np.float32),
         )
-
-    def given(self, name: str, values: NDArray[np.generic], dtype: type[np.generic]) -> Array:
-        """Bring values to the device."""
-        array = self.device.array(name, (max(values.size, 1),), dtype)
-        array.host[: values.size] = values.ravel()
-        array.upload()
-        return array
 
     def _solve_bottom(self, odd: Odd) -> tuple[Array, Array]:
         """Return the coarsest level's nodes, and the pseudo-inverse of its matrix."""
@@ -271,12 +264,9 @@ class Hierarchy:
         for array in (self.right, self.down, self.anchor):
             array.upload()
         inverse = _pseudo_inverse(matrix, anchor[node] if self.anchored else np.zeros(len(node)))
-        return self.given("bottom", node, np.int32), self.given("pseudo-inverse", inverse, np.float32)
-
-    @property
-    def bottom_count(self) -> int:
-        """How many nodes the coarsest level has that are linked."""
-        return math.isqrt(len(self.bottom[1].host))
+        return self.device.given("bottom", node, np.int32), self.device.given(
+            "pseudo-inverse", inverse, np.float32
+        )
 
 
 def part_of(device: Device) -> int:

@@ -112,24 +112,22 @@ class Multigrid:
         done, residual = self._try(start, goal, count, deadline)
         late = deadline is not None and time.perf_counter() > deadline
         if residual > enough and done < count + (tolerance is None) and self._cycle.twice and not late:
-            self._cycle.twice = (
-                False  # the preconditioner was not positive definite: plain V-cycles always are
-            )
+            self._cycle.twice = False  # it was not positive definite; plain V-cycles always are
             more, residual = self._try(start, goal, count, deadline)
             done += more
         h.kernel("release")(*h.picture, self._x, self._height, moved=8 * h.levels[0].nodes)
-        return Solution(self._height, done, residual, residual <= (_LOST if tolerance is None else tolerance))
+        return Solution(self._height, done, residual, residual <= enough)
 
     def _try(self, start: Array | None, goal: float, limit: int, deadline: float | None) -> tuple[int, float]:
         """Solve from a start; return how many steps were done, and the residual."""
         if start is not None:
             self._hierarchy.admit(start, self._x)
             asked = self._dot(self._cycle.full_b, self._cycle.full_b)
-            if self._leave() <= asked:  # a start that is worse than none, or not finite, is none
-                return self._iterate(goal, limit, deadline)
+            left = self._leave()
+            if left <= asked:  # a start that is worse than none, or not finite, is none
+                return self._iterate(left, goal, limit, deadline)
         self._cycle.start(self._x)
-        self._leave()
-        return self._iterate(goal, limit, deadline)
+        return self._iterate(self._leave(), goal, limit, deadline)
 
     def _leave(self) -> float:
         """Find what the heights leave over; return its square."""
@@ -140,9 +138,8 @@ class Multigrid:
         h.kernel("residual")(items, *place(level), *h.graph, *rest, moved=20 * level.nodes)
         return self._dot(cycle.b, cycle.b)
 
-    def _iterate(self, goal: float, limit: int, deadline: float | None) -> tuple[int, float]:
+    def _iterate(self, left: float, goal: float, limit: int, deadline: float | None) -> tuple[int, float]:
         """Do conjugate gradients; return how many steps were done, and the residual."""
-        left = self._dot(self._cycle.b, self._cycle.b)
         before, done, energy, residual = 0.0, 0, 0.0, 0.0 if left == 0 else math.inf
         best, progress = math.inf, 0
         while done < limit and residual > goal and done - progress < _PATIENCE:

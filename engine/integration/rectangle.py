@@ -62,11 +62,11 @@ class Rectangle:
         self._owns_room = self._lanes > 1 and plan.size <= _MOST_ROOM
         room = (2, self._items, plan.size, self._lanes)
         self._scratch = [] if self._owns_room else [self._make("scratch", room)]
-        self._place = self._put("place", plan.place)
-        self._turns = self._put("turns", plan.turns)
-        self._back = self._put("turns", plan.turns / (2 * length * self._across))
-        self._steps = self._put("steps", plan.steps), self._put("factors", plan.factors)
-        self._chirp = [self._put("chirp", part) for part in (plan.chirp, plan.other) if part.size]
+        self._place = device.given("place", plan.place, np.int32)
+        self._turns = device.given("turns", plan.turns)
+        self._back = device.given("turns", plan.turns / (2 * length * self._across))
+        self._steps = device.given("steps", plan.steps, np.int32), device.given("factors", plan.factors)
+        self._chirp = [device.given("chirp", part) for part in (plan.chirp, plan.other) if part.size]
         self._screening: float | None = None
 
     def solve(self, source: Array, screening: float = 0.0) -> Array:
@@ -88,7 +88,8 @@ class Rectangle:
         if screening != self._screening:
             weights = self._along, self._across, screening
             reach, fading, ends = find_rates(self._plan.length, self._lines, *weights)
-            self._rates = self._put("reach", reach), self._put("fading", fading), self._put("ends", ends)
+            given = self._device.given
+            self._rates = given("reach", reach, np.int32), given("fading", fading), given("ends", ends)
             self._screening = screening
         moved = source.host.nbytes + self._spectrum.host.nbytes
         self._transform("rectangle_modes", source, self._turns, self._spectrum, moved)
@@ -128,13 +129,6 @@ class Rectangle:
 
     def _make(self, name: str, shape: tuple[int, ...]) -> Array:
         array = self._device.array(name, shape, np.float32)
-        array.upload()
-        return array
-
-    def _put(self, name: str, values: Doubles | NDArray[np.int32]) -> Array:
-        dtype = np.float32 if values.dtype.kind == "f" else np.int32
-        array = self._device.array(name, (max(1, values.size),), dtype)  # no step at all has no table
-        array.host[: values.size] = values.ravel()
         array.upload()
         return array
 

@@ -141,14 +141,15 @@ class _Search:
 
     def __init__(self, inputs: Inputs, graph: Graph, limit: int, deadline: float | None) -> None:
         self._bound = _Bound(inputs, graph)
+        self._device = graph.links.device
         self._limit, self._deadline = limit, deadline
-        self._zero = self._bound.put("zero", np.zeros(1))
+        self._zero = self._device.given("zero", np.zeros(graph.links.shape))
         self._bound.share(0.0, self._zero)
         self._solver = Multigrid(self._bound.link(self._zero))
 
     def given(self, relief: NDArray[np.floating[Any]]) -> Array:
         """Return a start that was given."""
-        return self._bound.put("start", np.where(np.isfinite(relief), relief, 0.0))
+        return self._device.given("start", np.where(np.isfinite(relief), relief, 0.0))
 
     def starts(self) -> list[tuple[Array, float]]:
         """Return reliefs to begin with, and by what k is multiplied at first."""
@@ -249,7 +250,7 @@ class _Bound:
         self._device, self._shape = graph.links.device, graph.links.shape
         self._size = tuple(np.float32(size) for size in inputs.pixel_size)
         self._unit = inputs.typical
-        self._maps = (self.put("flags", graph.flags, np.uint8), *self._slopes(inputs, graph.plane))
+        self._maps = (self._device.given("flags", graph.flags, np.uint8), *self._slopes(inputs, graph.plane))
         self._sure = self._confidence(inputs)
         self._anchor = graph.links.anchor
         self._held = self._heights(inputs, graph)
@@ -308,13 +309,6 @@ class _Bound:
         self._run("step", items, relief, change, np.float32(part), found)
         return found
 
-    def put(self, name: str, values: NDArray[Any], dtype: type[np.generic] = np.float32) -> Array:
-        """Bring a map to the device."""
-        array = self._device.array(name, self._shape, dtype)
-        array.host[...] = values
-        array.upload()
-        return array
-
     def _room(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
         array = self._device.array(name, shape or self._shape, np.float32)
         array.upload()
@@ -332,17 +326,19 @@ class _Bound:
         good = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(good, x, np.float32(0)), np.where(good, y, np.float32(0))
         return (
-            self.put("slope x", x - np.float32(plane[0])),
-            self.put("slope y", np.float32(plane[1]) - y),
-            self.put("steep", 1 / (1 + x * x + y * y)),
+            self._device.given("slope x", x - np.float32(plane[0])),
+            self._device.given("slope y", np.float32(plane[1]) - y),
+            self._device.given("steep", 1 / (1 + x * x + y * y)),
         )
 
     def _confidence(self, inputs: Inputs) -> tuple[Array, Array]:
         """Return inverse variances along x and y, relative to what is typical."""
         factor = inputs.weight / inputs.typical
-        one = np.ones(1, np.float32) if inputs.weight_x is None else inputs.weight_x
-        first = self.put("sure x", factor * one)
-        return first, first if inputs.weight_y is None else self.put("sure y", factor * inputs.weight_y)
+        one = np.ones(self._shape, np.float32) if inputs.weight_x is None else inputs.weight_x
+        first = self._device.given("sure x", factor * one)
+        if inputs.weight_y is None:
+            return first, first
+        return first, self._device.given("sure y", factor * inputs.weight_y)
 
     def _heights(self, inputs: Inputs, graph: Graph) -> tuple[Array, ...]:
         """Return weights of known heights, relative to what is typical, and these; nothing without any."""
@@ -353,4 +349,5 @@ class _Bound:
         relief = inputs.heights - (graph.plane[2] + rise * column - fall * row)
         weight = self._anchor.download() / np.float32(inputs.pixel_size[0] * inputs.pixel_size[1])
         self._anchor.upload()
-        return self.put("held", weight), self.put("known", np.where(weight > 0, relief, 0))
+        known = np.where(weight > 0, relief, 0)
+        return self._device.given("held", weight), self._device.given("known", known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Array, Device, open_device
@@ -81,10 +81,10 @@ class _Drawing:
         self._device, self._shape = device, (rows, columns)
         cells = (6, rows + 2 * MARGIN, columns + 2 * MARGIN)
         self._maps = {
-            "vectors": self._put("vectors", vectors, np.float32),
-            "sigma": self._put("sigma", sigma, np.float32),
-            "contact": self._put("contact", contact != 0, np.uint8),
-            "doubt": self._put("doubt", np.ones(contact.shape), np.uint8),
+            "vectors": self._device.given("vectors", vectors, np.float32),
+            "sigma": self._device.given("sigma", sigma, np.float32),
+            "contact": self._device.given("contact", contact != 0, np.uint8),
+            "doubt": self._device.given("doubt", np.ones(contact.shape), np.uint8),
             **{name: self._room(name, contact.shape, np.uint8) for name in _FLAGS},
             "strength": self._room("strength", contact.shape, np.float32),
             **{name: self._room(name, cells, np.float32) for name in ("cells", "joined")},
@@ -114,7 +114,10 @@ class _Drawing:
             "LAST": int(chosen is COARSE),
         }
         places, distances = pairs(chosen)
-        table = self._put("places", places, np.int32), self._put("distances", distances, np.float32)
+        table = (
+            self._device.given("places", places, np.int32),
+            self._device.given("distances", distances, np.float32),
+        )
         limits = LIMITS.jump, LIMITS.bend, LIMITS.sure, LIMITS.quiet, LIMITS.floor, LIMITS.lowest
         rows, columns = self._shape
         run = min(self._device.shape.tile, 64)
@@ -126,13 +129,6 @@ class _Drawing:
     def _tiles(self) -> int:
         rows, columns = self._shape
         return int(-(-rows * columns // self._device.shape.tile))
-
-    def _put(self, name: str, values: ArrayLike, dtype: type[np.generic]) -> Array:
-        array = self._room(name, np.shape(values), dtype)
-        array.claim()
-        array.host[:] = values
-        array.upload()
-        return array
 
     def _room(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
         array = self._device.array(name, shape, dtype)

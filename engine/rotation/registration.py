@@ -223,10 +223,10 @@ class _Maps:
         self._sizes = np.int32(rows), np.int32(columns)
         self._items = rows * -(-columns // device.shape.tile)
         padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
-        self._padded = self._put("padded", padding)
-        self._height, self._offset = self._put("height", height), self._put("offset", offset)
-        self._gain = self._put("gain", gain)
-        self._noise = self._put("noise", np.zeros((2, rows, columns), np.float32))
+        self._padded = device.given("padded", padding)
+        self._height, self._offset = device.given("height", height), device.given("offset", offset)
+        self._gain = device.given("gain", gain)
+        self._noise = device.given("noise", np.zeros((2, rows, columns), np.float32))
         self._shift = device.array("shift", (2, 4), np.float32)
         self._frame = device.array("frame", (rows, columns), dtype)
         self._registered = device.array("registered", (rows, columns), np.float32)
@@ -254,11 +254,6 @@ class _Maps:
     def forget(self) -> None:
         """Begin the noise anew."""
         self._fill(self._noise, np.zeros_like(self._noise.host))
-
-    def _put(self, name: str, values: NDArray[np.float32]) -> Array:
-        array = self._device.array(name, values.shape, np.float32)
-        self._fill(array, values)
-        return array
 
     def _fill(self, array: Array, values: NDArray[Any]) -> None:
         array.claim()

@@ -12,7 +12,7 @@ from mirrorskin.hw.twin.optics.pattern import Pattern
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.device import Device
 
 _RAYS = 128  # of each pixel
 _FADES = 24  # the light at the wall's edges fades over this part of the scatter
@@ -58,9 +58,9 @@ class Wall:
         places = [view.x, view.y]
         if not view.orthographic:
             places += [view.slope_x, view.slope_y]
-        self._places = self._put("places", np.stack([place.ravel() for place in places]))
-        self._rays = self._put("rays", scatter_rays(body.scatter))
-        self._table = self._put("table", table)
+        self._places = device.given("places", np.stack([place.ravel() for place in places]))
+        self._rays = device.given("rays", scatter_rays(body.scatter))
+        self._table = device.given("table", table)
         self._sheet = device.array("sheet", (3, *view.shape), np.float32)
         self._light = device.array("light", view.shape, np.float32)
         self._macros = {
@@ -91,12 +91,6 @@ class Wall:
         self._sheet.upload()
         self._launch()
         return self._light.download().copy()
-
-    def _put(self, name: str, values: NDArray[np.floating]) -> Array:
-        array = self._device.array(name, values.shape, np.float32)
-        array.host[:] = values
-        array.upload()
-        return array
 
     def _launch(self) -> None:
         body, pixels = self._body, self._light.host.size
