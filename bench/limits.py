@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.harness import Measured, Work
 from mirrorskin.bench.results import Row
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 
 _SCALE = 3
 _RUNS = {"read": 1, "copy": 2, "triad": 3}  # runs of words that a kernel touches

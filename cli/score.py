@@ -20,7 +20,11 @@ def command(
     from mirrorskin import engine, io
 
     found = io.open_result(result)
-    with io.open_recording(truth) as recording:
+    part = io.part_of(found.process)
+    with io.open_recording(truth) as whole:
+        if part is not None and not io.Region.whole(whole.shape[1:]).holds(part):
+            part = None  # of another stack
+    with io.open_recording(truth, region=part) as recording:
         if recording.truth is None:
             raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
         score = engine.score(found, recording.truth)

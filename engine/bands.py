@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array, Lent, Operand
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 MEMORY_LIMIT = 256_000_000
@@ -26,6 +27,29 @@ class Planes:
 
     count: int
     dtype: DTypeLike
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """Frames that are on a device, or on their way there, for the next kernels.
+
+    Attributes
+    ----------
+    array : Array or Lent, (n, rows, W)
+    frames : slice
+        Which of the frames these are.
+    aligned : bool
+        Whether each begins at a multiple of a word.
+    """
+
+    array: Operand
+    frames: slice
+    aligned: bool
+
+    @property
+    def count(self) -> int:
+        """Number of these frames."""
+        return int(self.frames.stop - self.frames.start)
 
 
 class Band:
@@ -65,6 +89,8 @@ class Band:
         self._device, self._kinds = device, maps
         self.maps = {name: self._make(name) for name in maps}
         self.frames = _longest(device, length, least, shape, dtype)
+        self._other = _second(device, self.frames)
+        self._lent: Lent | None = None
         self._alone = True
         self._resident = False
 
@@ -106,30 +132,67 @@ class Band:
         if not self._alone:
             self._park()
 
-    def stage(self, frames: NDArray[Any]) -> Iterator[tuple[int, int]]:
-        """Bring frames to the device piece by piece, without a copy where they lie in its room already.
+    def stage(self, frames: NDArray[Any], lent: bool = False) -> Iterator[Staged]:
+        """Bring frames to the device, piece by piece; kernels are to be given each before the next.
+
+        Nothing is copied where the device shares the host's memory and the frames are lent, or lie in the
+        room already. A device of its own memory takes them beside the kernels on those before. When all are
+        through, the frames' memory may be written anew, unless it is lent.
 
         Parameters
         ----------
         frames : ndarray, (n, H, W)
-
-        Yields
-        ------
-        start, count : int
-            Which of the frames are there now.
+        lent : bool
+            Whether nobody writes to them as long as they are referred to; see `mirrorskin.io.Block`.
         """
+        if len(frames) == 0:
+            return
+        frames = frames[:, self.rows]
+        whole, shared = frames.flags.c_contiguous, self._device.info.shares_memory
+        borrowed = self._device.lend("frames", frames) if lent and whole and shared else None
+        if borrowed is not None:
+            yield from self._borrow(borrowed)
+        elif whole and not shared:
+            yield from self._bring(frames)
+        else:
+            yield from self._copy(frames)
+
+    def _borrow(self, lent: Lent) -> Iterator[Staged]:
+        """Work on frames where they lie."""
+        before, self._lent = self._lent, lent
+        aligned = self._whole_words and lent.host.ctypes.data % (4 * self._device.shape.lanes) == 0
+        yield Staged(lent, slice(0, len(lent.host)), aligned)
+        # It waits for its kernels: when more frames are read, only these here can still be under way.
+        del before
+
+    def _bring(self, frames: NDArray[Any]) -> Iterator[Staged]:
+        """Copy frames in turns to two places on the device, one while kernels work on the other."""
+        step = len(self.frames.host)
+        for start in range(0, len(frames), step):
+            if self._other is not None:
+                self.frames, self._other = self._other, self.frames
+            part = frames[start : start + step]
+            self.frames.bring(part)
+            yield Staged(self.frames, slice(start, start + len(part)), self._whole_words)
+            self.frames.settle()
+
+    def _copy(self, frames: NDArray[Any]) -> Iterator[Staged]:
+        """Copy frames to the room, unless they are there."""
         room = self.frames.host
-        in_place = (
-            frames.ctypes.data == room.ctypes.data and frames.flags.c_contiguous and len(frames) <= len(room)
-        )
-        step = max(1, len(frames) if in_place else len(room))
+        there = frames.ctypes.data == room.ctypes.data and frames.flags.c_contiguous
+        step = max(1, len(frames) if there and len(frames) <= len(room) else len(room))
         for start in range(0, len(frames), step):
             part = frames[start : start + step]
-            if not in_place:
-                room[: len(part)] = part[:, self.rows]
+            if not there:
+                room[: len(part)] = part
             self.frames.upload(len(part))
-            yield start, len(part)
+            yield Staged(self.frames, slice(start, start + len(part)), self._whole_words)
             self.frames.claim()
+
+    @property
+    def _whole_words(self) -> bool:
+        """Whether each frame is as long as some words."""
+        return bool(self.pixels * self.frames.host.itemsize % (4 * self._device.shape.lanes) == 0)
 
     def _make(self, name: str) -> Array:
         kind = self._kinds[name]
@@ -140,7 +203,9 @@ class Band:
     def _park(self) -> None:
         for array in self.maps.values():
             array.park()
-        self.frames.drop()
+        for room in (self.frames, self._other):
+            if room is not None:
+                room.drop()
         self._resident = False
 
 
@@ -190,6 +255,21 @@ def cut_into_bands(
         return bands
 
     return cut(slice(0, shape[0]))
+
+
+def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Put a map together from those of the bands; that of a single one is taken as it is."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _second(device: Device, first: Array) -> Array | None:
+    """Make as much room again on a device of its own memory, if it has that."""
+    if device.info.shares_memory:
+        return None
+    try:
+        return device.array(first.name, first.host.shape, first.host.dtype)
+    except DeviceMemoryError:
+        return None
 
 
 def _longest(device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:

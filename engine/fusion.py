@@ -19,7 +19,7 @@ from mirrorskin.engine.provenance import sign
 from mirrorskin.engine.rotation.axial import Rotation, estimate_rotation, maps_of
 from mirrorskin.engine.rotation.relief import tell_integration
 from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
-from mirrorskin.io import InputError, Motion, ProcessValue, Result, Source
+from mirrorskin.io import InputError, Motion, ProcessValue, Recording, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
 Mask = NDArray[np.bool_]
@@ -248,6 +248,9 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
     ways = []
     if sizes[0] != sizes[1]:
         ways.append(" and ".join(f"{width} x {height} pixels" for width, height in sizes))
+    origins = [source.origin if isinstance(source, Recording) else (0, 0) for source in (vertical, axial)]
+    if origins[0] != origins[1]:
+        ways.append(" and ".join(f"regions from column {column}, row {row}" for row, column in origins))
     if not np.allclose(pixels[0], pixels[1], rtol=_SAME, atol=0):
         ways.append(" and ".join(f"pixels of {width:g} x {height:g} mm" for width, height in pixels))
     if ways:

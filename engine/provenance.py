@@ -6,32 +6,51 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.version import program_version
 from mirrorskin.io import InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
+
+Floats = NDArray[np.float64]
 
 
 def sign(result: Result, source: Source, device: Device, process: dict[str, ProcessValue]) -> Result:
     """Add where the pixels are, and how the maps came about."""
     x = y = None
     if source.header.pixel_size is not None:
-        x, y = pixel_axes(source.shape[1:], source.header.pixel_size)
+        x, y = _places(source, source.header.pixel_size)
     origin: dict[str, ProcessValue] = {"source": source.name}
     if isinstance(source, Recording):
-        origin |= {"dataset": source.dataset, "source_sha256": source.sha256()}
+        count, rows, columns = source.shape
+        (row, column), first = source.origin, source.first_frame
+        origin |= {
+            "dataset": source.dataset,
+            "source_fingerprint": source.fingerprint(),
+            "source_modified": source.modified,
+            "source_region": f"{column},{row},{columns}x{rows}",
+            "source_frames": f"{first}:{first + count}",
+        }
     made: dict[str, ProcessValue] = {
         "program": "mirrorskin",
-        "version": version("mirrorskin"),
+        "version": program_version(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "device": device.info.title,
         "driver": device.info.driver,
     }
     return replace(result, x=x, y=y, process=made | origin | process)
+
+
+def _places(source: Source, pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Place the pixels from the centre of the whole picture, of which a recording may give a part."""
+    if not isinstance(source, Recording):
+        return pixel_axes(source.shape[1:], pixel_size)
+    (row, column), (_, rows, columns) = source.origin, source.shape
+    x, y = pixel_axes(source.full_shape[1:], pixel_size)
+    return x[column : column + columns], y[row : row + rows]
 
 
 def told(given: ArrayLike | None, own: ArrayLike | None, otherwise: str) -> ProcessValue:

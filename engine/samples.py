@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.noise import estimate_noise, thin_out
 from mirrorskin.io import FRAME_DTYPES, InputError
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 
 
 class Noise:

@@ -7,6 +7,7 @@ from mirrorskin.io.heights import open_heights
 from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
 from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
 from mirrorskin.io.recording import Recording, Steps, open_recording
+from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result, save_result
 from mirrorskin.io.types import (
     FRAME_DTYPES,
@@ -35,6 +36,7 @@ __all__ = [
     "ProcessValue",
     "Recorder",
     "Recording",
+    "Region",
     "Result",
     "Source",
     "Steps",
@@ -48,6 +50,7 @@ __all__ = [
     "open_heights",
     "open_recording",
     "open_result",
+    "part_of",
     "pixel_axes",
     "save_result",
 ]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,14 @@ import h5py
 
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import InputError
+
+MAKE_ROOM = "make room, or choose another place with -o"
+"""What to do where a disk did not take all."""
+
+_PREFIX, _SUFFIX = ".mirrorskin-", ".part"
+
+# Frames begin with a page, so that they can be worked on where they lie.
+_ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
 
 def check_output(path: Path, *keep: Path | None) -> None:
@@ -52,17 +61,20 @@ class NewHdf5:
     Attributes
     ----------
     root : h5py.File
+    descriptor : int
+        Of the file on disk.
     """
 
-    def __init__(self, path: Path, part: str) -> None:
+    def __init__(self, path: Path, descriptor: int) -> None:
+        self.descriptor = descriptor
         self._path = path
-        self._disk = _Disk(part, "w+b")
-        self.root = h5py.File(self._disk, "w")
+        self._disk = _Disk(descriptor, "w+b", closefd=False)
+        self.root = h5py.File(self._disk, "w", **_ALIGNED)
 
     def check(self) -> None:
         """Raise InputError if the disk did not take all that was written so far."""
         if self._disk.error is not None:
-            with plainly(f"{self._path} could not be written", "make room, or choose another place with -o"):
+            with plainly(f"{self._path} could not be written", MAKE_ROOM):
                 raise self._disk.error
 
     def close(self) -> None:
@@ -72,31 +84,79 @@ class NewHdf5:
 
 
 @contextmanager
+def new_file(path: Path) -> Iterator[int]:
+    """Make a file under a temporary name beside ``path``, and rename it when all went well.
+
+    Yields
+    ------
+    int
+        The empty file's descriptor, to write to.
+
+    Raises
+    ------
+    InputError
+        It cannot be made; an older file of that name is left as it was.
+    """
+    check_output(path)
+    with plainly(f"{path} could not be written"):
+        descriptor, part = _new_part(path.parent)
+    try:
+        yield descriptor
+        with plainly(f"{path} could not be written", MAKE_ROOM):
+            os.close(os.dup(descriptor))  # some disks tell only then that they did not take all
+            part.chmod(0o666 & ~_umask())
+            part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+        os.close(descriptor)  # it was locked until it had its name
+
+
+@contextmanager
 def new_hdf5(path: Path) -> Iterator[NewHdf5]:
-    """Write an HDF5 file under a temporary name beside ``path``, and rename it when all went well.
+    """Write an HDF5 file as ``new_file`` does.
 
     Raises
     ------
     InputError
         It cannot be written; an older file of that name is left as it was.
     """
-    check_output(path)
-    with plainly(f"{path} could not be written"):
-        handle, name = tempfile.mkstemp(prefix=".mirrorskin-", suffix=".part", dir=path.parent)
-    os.close(handle)
-    part = Path(name)
-    try:
-        new = NewHdf5(path, name)
+    with new_file(path) as descriptor:
+        new = NewHdf5(path, descriptor)
         try:
             yield new
         finally:
             new.close()
             new.check()
-        with plainly(f"{path} could not be written"):
-            part.chmod(0o666 & ~_umask())
-            part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> list[Path]:
+    """Remove the half-written files of a folder whose writers are gone, as those that were killed.
+
+    A file that is being written is locked, and stays. Where a file system has no locks, all stay.
+
+    Returns
+    -------
+    list of Path
+        The files that were removed.
+    """
+    removed = []
+    for part in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
+        with suppress(OSError), part.open("r+b") as file:  # locked, no one's to open, or gone by now
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            part.unlink()
+            removed.append(part)
+    return removed
+
+
+def _new_part(folder: Path) -> tuple[int, Path]:
+    """Make a file under a temporary name; it is locked as long as it is open."""
+    while True:
+        handle, name = tempfile.mkstemp(prefix=_PREFIX, suffix=_SUFFIX, dir=folder)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if os.fstat(handle).st_nlink:  # else someone took it for a leftover before it was locked
+            return handle, Path(name)
+        os.close(handle)
 
 
 class _Disk(FileIO):

@@ -34,6 +34,7 @@ class Hdf5File(Closing):
     ----------
     path : Path
     memory_limit : int or None
+    root : h5py.File
 
     Raises
     ------
@@ -46,7 +47,8 @@ class Hdf5File(Closing):
         self.memory_limit = memory_limit
         self._home = Path(os.path.realpath(path)).parent
         self._files: dict[str, h5py.File] = {}
-        self._root = self.open_beside(None, path, "")
+        self.root = self.open_beside(None, path, "")
+        self._groups: dict[str, Node | None] = {"": self.root}
 
     def close(self) -> None:
         """Close the file and those it refers to."""
@@ -56,7 +58,7 @@ class Hdf5File(Closing):
     def where(self, node: Node) -> str:
         """Return the file and the name of an object, for messages."""
         filename = node.file.filename
-        return f"{self.path if filename == self._root.filename else filename}: {node.name}"
+        return f"{self.path if filename == self.root.filename else filename}: {node.name}"
 
     def find(self, name: str) -> Node | None:
         """Return an object, or None where it is simply not there.
@@ -66,7 +68,13 @@ class Hdf5File(Closing):
         InputError
             A link on the way leads nowhere, in a circle, or out of the file's folder.
         """
-        return self.walk(self._root, name)
+        if name in self._groups:
+            return self._groups[name]
+        group, _, last = name.rpartition("/")
+        if group not in self._groups:
+            self._groups[group] = self.find(group)
+        parent = self._groups[group]
+        return None if parent is None else self.walk(parent, last)
 
     def follow(self, name: str, remedy: str) -> Node:
         """Return an object; one that is not there raises InputError with the remedy."""
@@ -96,7 +104,7 @@ class Hdf5File(Closing):
                 found[f"/{name}"] = f"{' x '.join(map(str, node.shape))} {node.dtype}"
 
         with plainly(str(self.path)):
-            self._root.visititems(visit)
+            self.root.visititems(visit)
         return dict(sorted(found.items()))
 
     def read(self, node: Node, *shapes: Shape, unit: str | None = None, remedy: str = "") -> NDArray[Any]:
@@ -117,26 +125,31 @@ class Hdf5File(Closing):
         InputError
             No numbers, another shape, an unknown unit, or a file that does not hold what it claims.
         """
-        where, remedy = self.where(node), remedy and f": {remedy}"
-        with plainly(where):
-            if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb":
-                raise InputError(f"{where} holds no numbers{remedy}")
-        if node.shape not in shapes:
+        remedy = remedy and f": {remedy}"
+        with plainly(lambda: self.where(node)):
+            if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
+                raise InputError(f"{self.where(node)} holds no numbers{remedy}")
+            shape = node.id.shape
+        if shape not in shapes:
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
-            raise InputError(f"{where} has shape {node.shape} where {needed} is needed{remedy}")
+            raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
         check_storage(self, node)
-        with plainly(where):
-            values: NDArray[Any] = np.asarray(node[()])
-            given = str(_first(node.attrs.get("units", unit)) or unit)
-        return values if unit is None else values * factor(given, unit, where)
+        with plainly(lambda: self.where(node)):
+            values = _values(node.id)
+            stated = unit is not None and h5py.h5a.exists(node.id, b"units")
+            given = str(_first(_attribute(node.id, b"units")) or unit) if stated else unit
+        if given is None or unit is None or given == unit:
+            return values
+        return values * factor(given, unit, self.where(node))
 
     def value(self, node: Node) -> Any:
         """Read one text or number, alone or in an array of one."""
-        where = self.where(node)
-        with plainly(where):
-            if getattr(node, "shape", None) not in ((), (1,)):
-                raise InputError(f"{where} does not hold one value: write one text or number there")
-            return _first(node[()])
+        with plainly(lambda: self.where(node)):
+            if not isinstance(node, h5py.Dataset) or node.id.shape not in ((), (1,)):
+                raise InputError(
+                    f"{self.where(node)} does not hold one value: write one text or number there"
+                )
+            return _first(_values(node.id))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
         """Do what ``find`` does, from any object on and after so many links."""
@@ -155,9 +168,8 @@ class Hdf5File(Closing):
         path = self.path if node is None else self.beside(node, str(filename), what)
         real = os.path.realpath(path)
         if real not in self._files:
-            _check_file(path)
             with plainly(str(path)):
-                self._files[real] = h5py.File(real, "r")
+                self._files[real] = _open_file(path)
         return self._files[real]
 
     def beside(self, node: Node, filename: str, what: str) -> Path:
@@ -172,12 +184,13 @@ class Hdf5File(Closing):
         return target
 
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
-        with plainly(f"{self.where(node)}: {part}"):
-            link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
-            if isinstance(link, h5py.HardLink):
-                return _open(node, part)
-        if link is None:
-            return None
+        with plainly(lambda: f"{self.where(node)}: {part}"):
+            name = part.encode(errors="surrogateescape")
+            if not isinstance(node, h5py.Group) or not node.id.links.exists(name):
+                return None
+            if node.id.links.get_info(name).type == h5py.h5l.TYPE_HARD:
+                return _open(node, name)
+            link = node.get(part, getlink=True)
         start = node
         if isinstance(link, h5py.ExternalLink):
             start = self.open_beside(node, link.filename, f"the external link {part} in {node.name}")
@@ -189,15 +202,34 @@ class Hdf5File(Closing):
         return target
 
 
-def _open(group: h5py.Group, name: str) -> Node:
-    node = group[name]
-    if isinstance(node, h5py.Dataset) and node.external:
+def _open(group: h5py.Group, name: bytes) -> Node:
+    """Open what a hard link leads to, in a third of the time of h5py's own way."""
+    node = h5py.h5o.open(group.id, name)
+    if isinstance(node, h5py.h5g.GroupID):
+        return h5py.Group(node)
+    if not isinstance(node, h5py.h5d.DatasetID):
+        return h5py.Datatype(node)
+    if node.get_offset() is None and node.get_create_plist().get_external_count():
         # HDF5 looks for raw files in the working directory, unless the first opening says otherwise.
         del node
         access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
         access.set_efile_prefix(b"${ORIGIN}")
-        node = h5py.Dataset(h5py.h5d.open(group.id, name.encode(errors="surrogateescape"), access))
-    return node
+        node = h5py.h5d.open(group.id, name, access)
+    return h5py.Dataset(node)
+
+
+def _values(node: h5py.h5d.DatasetID) -> NDArray[Any]:
+    """Read all of a dataset, in a third of the time of h5py's own way where that is little."""
+    values: NDArray[Any] = np.empty(node.shape, node.dtype)
+    node.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    return values
+
+
+def _attribute(node: h5py.h5d.DatasetID, name: bytes) -> NDArray[Any]:
+    attribute = h5py.h5a.open(node, name)
+    values: NDArray[Any] = np.empty(attribute.shape, attribute.dtype)
+    attribute.read(values)
+    return values
 
 
 def _first(value: Any) -> Any:
@@ -209,19 +241,22 @@ def _first(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _check_file(path: Path) -> None:
-    with plainly(str(path)):
-        if not path.exists():
-            raise InputError(f"{path}: no such file")
-        if path.is_dir():
-            raise InputError(
-                f"{path} is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders"
-            )
-        if not path.is_file():
-            raise InputError(f"{path} is no regular file: save what it gives in one first")
+def _open_file(path: Path) -> h5py.File:
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if path.is_dir():
+        raise InputError(
+            f"{path} is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders"
+        )
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file: save what it gives in one first")
+    try:
+        return h5py.File(os.path.realpath(path), "r")
+    except OSError:
         with path.open("rb"):
             pass
-        if not h5py.is_hdf5(path):
-            raise InputError(
-                f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
-            )
+        if h5py.is_hdf5(path):
+            raise
+        raise InputError(
+            f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
+        ) from None

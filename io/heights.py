@@ -9,17 +9,20 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK
-from mirrorskin.io.recording import open_recording
+from mirrorskin.io.recording import Recording, open_recording
+from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result
 from mirrorskin.io.types import InputError, Result
 
 
-def open_heights(path: str | Path) -> NDArray[np.float32]:
+def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[np.float32]:
     """Read the heights of a result, or the true ones of a simulated recording.
 
     Parameters
     ----------
     path : str or Path
+    source : Recording, optional
+        What they are wanted for: of a larger part of the picture, its part is cut out.
 
     Returns
     -------
@@ -29,23 +32,38 @@ def open_heights(path: str | Path) -> NDArray[np.float32]:
     Raises
     ------
     InputError
-        There is no such file, it holds no heights, or it is damaged.
+        There is no such file, it holds no heights or those of other pixels, or it is damaged.
     """
     path = Path(path)
     with Hdf5File(path) as file:
         ours = file.marked(MARK)
     if ours:
         with open_recording(path) as recording:
-            height = None if recording.truth is None else recording.truth.height
+            height, part = None if recording.truth is None else recording.truth.height, None
     else:
-        height = _absolute(open_result(path))
+        result = open_result(path)
+        height = _absolute(result)
+        part = part_of(result.process)
     if height is None:
         raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
+    if source is not None:
+        height = _cut(height, part or Region.whole(height.shape), source, str(path))
     if not np.isfinite(height).any():
         raise InputError(
             f"{path} holds no heights whose offset is known: give a result of a press, or of 'fuse'"
         )
     return height
+
+
+def _cut(height: NDArray[np.float32], own: Region, source: Recording, name: str) -> NDArray[np.float32]:
+    """Cut out what belongs to the pixels of a recording."""
+    wanted = source.region
+    if not (own.holds(wanted) and Region.whole(source.full_shape[1:]).holds(own)):
+        raise InputError(
+            f"{name} holds the heights of {own}, where {source.name} needs those of {wanted}: "
+            "give some of all these pixels"
+        )
+    return np.ascontiguousarray(height[wanted.within(own)])
 
 
 def _absolute(result: Result) -> NDArray[np.float32] | None:

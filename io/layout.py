@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.positions import check_phase, check_stroke
+from mirrorskin.io.stacks import Cut
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
 MARK = "mirrorskin_recording"
@@ -36,12 +37,15 @@ class Layout:
         Whether the file has our layout.
     shape : (int, int, int)
         Frames, rows and columns of the stack.
+    cut : Cut
+        What is wanted of it; all series and maps are cut as well.
     """
 
-    def __init__(self, file: Hdf5File, ours: bool, shape: Shape) -> None:
+    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], cut: Cut) -> None:
         self._file = file
         self._ours = ours
         self._count, self._frame = shape[0], shape[1:]
+        self._cut = cut
 
     def header(
         self, motion: Motion | None, tilt: float | None, pixel_size: tuple[float, float] | None
@@ -54,45 +58,48 @@ class Layout:
             raise InputError(f"{self._file.path} {said}: give --motion, one of {', '.join(MOTIONS)}")
         # Of a vertical press the travel is no press but the positions.
         pressed = "vertical" not in (own, motion)
+        pixel_size = self._pixel_size() if pixel_size is None else self._above_zero(pixel_size)
         return Header(
             motion,
             title=self._text("/entry/title"),
             start_time=self._text("/entry/start_time"),
-            pixel_size=self._pixel_size() if pixel_size is None else self._above_zero(pixel_size),
+            pixel_size=pixel_size,
             dark=self._reference("dark"),
             bright=self._reference("bright"),
             press=self._scalar(f"{STAGE}/travel", "mm", "correct it") if pressed else None,
             tilt=self._scalar(f"{STAGE}/tilt", "rad", "give --tilt") if tilt is None else tilt,
-            pivot=self._pivot(),
-            zenith_gain=self._read(f"{DETECTOR}/zenith_gain", (), self._frame, unit="1/rad"),
-            zenith_offset=self._read(f"{DETECTOR}/zenith_offset", (), self._frame),
+            pivot=self._pivot(pixel_size),
+            zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
+            zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
         )
 
     def time(self) -> Floats | None:
         """Read the seconds of each frame, if they are known."""
-        return self._series("time", (self._count,))
+        return self._cut_series("time", (self._count,))
 
     def travel(self, given: ArrayLike | None) -> Floats:
         """Read the travel of each frame of a vertical motion, mm, if it is not given; check it."""
         if given is not None:
-            return check_stroke(given, self._count, f"{self._file.path}: the travel given")
+            return check_stroke(given, self._count, f"{self._file.path}: the travel given", self._cut.frames)
         values = self._positions("travel", "give --travel-step")
-        return check_stroke(values, self._count, f"{self._file.path}: {SERIES['travel'][0]}")
+        return check_stroke(
+            values, self._count, f"{self._file.path}: {SERIES['travel'][0]}", self._cut.frames
+        )
 
     def phase(self, given: ArrayLike | None) -> Floats:
         """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""
         if given is not None:
-            return check_phase(given, self._count, f"{self._file.path}: the phase given")
+            return check_phase(given, self._count, f"{self._file.path}: the phase given", self._cut.frames)
         values = self._positions("phase", "give --phase-step or --phases")
-        return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}")
+        return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}", self._cut.frames)
 
     def displacement(self) -> Floats | None:
         """Read where the body was along x and y in each frame of a horizontal motion, mm, if it is known."""
-        return self._series("displacement", (self._count, 2))
+        return self._cut_series("displacement", (self._count, 2))
 
     def twist(self) -> Floats | None:
         """Read how far the body was turned in each frame of a twist, radians, if it is known."""
-        return self._series("twist", (self._count,))
+        return self._cut_series("twist", (self._count,))
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
@@ -104,11 +111,20 @@ class Layout:
         if missing:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
         maps = {
-            name: self._file.read(node, self._frame, unit=TRUTH_UNITS[name]) for name, node in present.items()
+            name: np.ascontiguousarray(
+                self._file.read(node, self._frame, unit=TRUTH_UNITS[name])[self._cut.region.slices]
+            )
+            for name, node in present.items()
         }
-        height, zenith, azimuth = (maps[name].astype(np.float32) for name in ("height", "zenith", "azimuth"))
-        slip = maps["slip"].astype(np.uint8) if "slip" in maps else None
-        return Truth(height, zenith, azimuth, maps["contact"].astype(np.uint8), slip)
+        height, zenith, azimuth = (
+            maps[name].astype(np.float32, copy=False) for name in ("height", "zenith", "azimuth")
+        )
+        slip = maps["slip"].astype(np.uint8, copy=False) if "slip" in maps else None
+        return Truth(height, zenith, azimuth, maps["contact"].astype(np.uint8, copy=False), slip)
+
+    def _cut_series(self, name: str, shape: Shape) -> Floats | None:
+        values = self._series(name, shape)
+        return None if values is None else values[slice(*self._cut.frames)]
 
     def _series(self, name: str, shape: Shape, remedy: str = "") -> Floats | None:
         where, unit = SERIES[name]
@@ -137,12 +153,24 @@ class Layout:
 
     def _reference(self, name: str) -> NDArray[np.float32] | None:
         remedy = f"give --{name}, or take the reference again"
-        values = self._read(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
-        return None if values is None else values.astype(np.float32)
+        values = self._numbers(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
+        return None if values is None else np.ascontiguousarray(values[self._cut.region.slices], np.float32)
 
-    def _pivot(self) -> tuple[float, float, float] | None:
+    def _map(self, name: str, unit: str | None = None) -> Floats | None:
+        """Read a map of the picture, or one number for all of it."""
+        values = self._read(name, (), self._frame, unit=unit)
+        if values is None or not values.ndim:
+            return values
+        return np.ascontiguousarray(values[self._cut.region.slices])
+
+    def _pivot(self, pixel_size: tuple[float, float] | None) -> tuple[float, float, float] | None:
+        """Read the pivot, and place it from the centre of the region."""
         values = self._finite(f"{STAGE}/pivot", (3,), unit="mm")
-        return None if values is None else cast(tuple[float, float, float], tuple(values.tolist()))
+        if values is None:
+            return None
+        x, y, z = values.tolist()
+        right, up = self._cut.region.centre(self._frame, pixel_size) if pixel_size else (0.0, 0.0)
+        return x - right, y - up, z
 
     def _scalar(self, name: str, unit: str, remedy: str) -> float | None:
         values = self._finite(name, (), (1,), unit=unit, remedy=remedy)
@@ -155,10 +183,15 @@ class Layout:
         return values
 
     def _read(self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "") -> Floats | None:
+        values = self._numbers(name, *shapes, unit=unit, remedy=remedy)
+        return None if values is None else values.astype(np.float64, copy=False)
+
+    def _numbers(
+        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = ""
+    ) -> NDArray[Any] | None:
+        """Read numbers of whatever type, if they are there."""
         node = self._find(name)
-        if node is None:
-            return None
-        return self._file.read(node, *shapes, unit=unit, remedy=remedy).astype(np.float64)
+        return None if node is None else self._file.read(node, *shapes, unit=unit, remedy=remedy)
 
     def _text(self, name: str) -> str:
         node = self._find(name)

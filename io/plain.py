@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
 
 from mirrorskin.io.types import InputError
 
@@ -14,21 +15,30 @@ _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeE
 _LONGEST = 100
 
 
-@contextmanager
-def plainly(what: str, remedy: str = "") -> Iterator[None]:
+def plainly(what: str | Callable[[], str], remedy: str = "") -> AbstractContextManager[None]:
     """Turn what goes wrong with a file into an InputError of one line.
 
     Parameters
     ----------
-    what : str
-        The line's beginning: the file, and what was to be done with it.
+    what : str or callable
+        The line's beginning: the file, and what was to be done with it; or what tells, if it comes to that.
     remedy : str, optional
         The line's end: what to do about it.
     """
-    try:
-        yield
-    except _ERRORS as error:
-        raise InputError(f"{what}: {reason(error)}{remedy and f'; {remedy}'}") from error
+    return _Plainly(what, remedy)
+
+
+class _Plainly(AbstractContextManager[None]):
+    """A class, because files are opened with many of these and a generator takes several times as long."""
+
+    def __init__(self, what: str | Callable[[], str], remedy: str) -> None:
+        self._what, self._remedy = what, remedy
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any, /) -> None:
+        if isinstance(error, _ERRORS):
+            what = self._what if isinstance(self._what, str) else self._what()
+            remedy = self._remedy and f"; {self._remedy}"
+            raise InputError(f"{what}: {reason(error)}{remedy}") from error
 
 
 def reason(error: Exception) -> str:

@@ -52,27 +52,34 @@ def check_travel(
     return values
 
 
-def check_stroke(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+def check_stroke(
+    travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
+) -> NDArray[np.float64]:
     """Return the travel of a press, of a release, or of one after the other, as float64 if it can be used.
 
     It rises to its greatest value, where it may rest, and falls from there on; either way may be missing.
-    Parameters and errors are those of ``check_travel``.
+    Parameters and errors are those of ``check_travel``; ``within`` are the first and the end of the frames
+    that are meant, of which alone the travel is checked and returned.
     """
-    values = _known(travel, count, name)
+    values = _known(travel, count, name, within)
     deepest = np.flatnonzero(values == np.max(values, initial=-np.inf))
-    frame = np.arange(1, count)
+    frame = np.arange(1, len(values))
     up, down = values[1:] < values[:-1], values[1:] > values[:-1]
     back = (up & (frame <= deepest[-1:])) | (down & (frame > deepest[:1]))
     if np.any(back):
+        at = (within or (0,))[0] + int(np.argmax(back)) + 1
         raise InputError(
-            f"{name} runs back at frame {int(np.argmax(back)) + 1}: a press goes down and its release up, "
-            "once; cut it"
+            f"{name} runs back at frame {at}: a press goes down and its release up, once; cut it"
         )
     return values
 
 
-def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+def check_phase(
+    phase: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
+) -> NDArray[np.float64]:
     """Return the phases of an axial rotation, radians, as float64 if they can be used.
+
+    Of the frames from the first to the end of ``within`` alone, if it is given.
 
     Raises
     ------
@@ -81,22 +88,26 @@ def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.fl
     """
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
-    return _finite(phase, count, name)
+    return _finite(phase, count, name, within)
 
 
-def _known(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+def _known(
+    travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
+) -> NDArray[np.float64]:
     if travel is None:
         raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
-    return _finite(travel, count, name)
+    return _finite(travel, count, name, within)
 
 
-def _finite(values: ArrayLike, count: int, name: str) -> NDArray[np.float64]:
+def _finite(values: ArrayLike, count: int, name: str, within: tuple[int, int] | None) -> NDArray[np.float64]:
     array: NDArray[Any] = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise InputError(f"{name} is of type {array.dtype}: numbers are needed")
     if array.shape != (count,):
         raise InputError(f"{name} has shape {array.shape} for {count} frames: one number a frame is needed")
-    if not np.all(np.isfinite(array)):
-        frame = int(np.argmin(np.isfinite(array)))
+    start, stop = within or (0, count)
+    known = np.isfinite(array[start:stop])
+    if not np.all(known):
+        frame = start + int(np.argmin(known))
         raise InputError(f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number")
-    return array.astype(np.float64)
+    return array[start:stop].astype(np.float64)

@@ -25,7 +25,8 @@ COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
 # What the frames are plotted along, if it is known; else along the time.
 _AXES: dict[Motion, str] = {"vertical": "travel", "axial": "phase", "twist": "twist"}
 
-_BLOCK = 16_000_000  # bytes of frames that are drained at a time
+# Bytes of frames that are drained at a time: much at once, and the system keeps it in large pages.
+_BLOCK = 64_000_000
 
 
 class Recorder:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, STACK, Layout
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.positions import Positions
+from mirrorskin.io.region import Region
 from mirrorskin.io.result import MARK as RESULT_MARK
+from mirrorskin.io.stacks import Cut, Stack, open_stack
 from mirrorskin.io.storage import check_storage, describe_storage
 from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
 
@@ -51,6 +53,14 @@ class Recording(Closing):
         Millimetres.
     truth : Truth or None
         What a simulation knew.
+    region : Region
+        Which part of the picture it is.
+    origin : (int, int)
+        Row and column of the first pixel in the full picture.
+    first_frame : int
+        Number of the first frame in the whole stack.
+    full_shape : (int, int, int)
+        Frames, rows and columns of the whole stack.
     storage : str
         How the frames are stored, for people.
     """
@@ -60,23 +70,28 @@ class Recording(Closing):
     def __init__(
         self,
         file: Hdf5File,
-        stack: h5py.Dataset,
+        dataset: h5py.Dataset,
+        stack: Stack,
+        cut: Cut,
         header: Header,
         positions: Mapping[str, Floats | None],
         truth: Truth | None,
     ) -> None:
         self.path = file.path
         self.name = str(file.path)
-        self.dataset = str(stack.name)
+        self.dataset = str(dataset.name)
         self.header = header
         self.motion = header.motion
-        self.shape = cast(tuple[int, int, int], tuple(map(int, stack.shape)))
-        self.dtype: np.dtype[Any] = stack.dtype.newbyteorder("=")
+        self.shape, self.dtype = stack.shape, stack.dtype
+        self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
+        self.full_shape = _shape(dataset)
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.truth = truth
-        self.storage = describe_storage(stack)
+        self.storage = describe_storage(dataset)
         self._file = file
+        self._dataset = dataset
+        self._origins = origins(file, dataset)
         self._stack = stack
         self._next = 0
 
@@ -97,10 +112,8 @@ class Recording(Closing):
         start = self._next
         if start >= self.shape[0]:
             return None
-        stop = self._whole_chunks(start, min(start + len(out), self.shape[0]))
-        frames = out[: stop - start]
-        with plainly(f"{self.path}: frames {start} to {stop - 1} of {self.dataset} cannot be read"):
-            self._stack.read_direct(frames, np.s_[start:stop])
+        stop = self._stack.end(start, min(start + len(out), self.shape[0]))
+        frames = self._stack.read(start, stop, out)
         self._next = stop
 
         def here(values: Floats | None) -> Floats | None:
@@ -114,26 +127,38 @@ class Recording(Closing):
             phase=here(self.phase),
             displacement=here(self.displacement),
             twist=here(self.twist),
+            origin=self.origin,
+            lent=not np.may_share_memory(frames, out),
         )
 
     def rewind(self) -> None:
         """Go back to the first frame."""
         self._next = 0
 
-    def sha256(self) -> str:
-        """Return the SHA-256 of the file, in hexadecimal."""
-        with plainly(self.name), self.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+    def fingerprint(self) -> str:
+        """Return what tells the file from others; see ``mirrorskin.io.fingerprint``.
+
+        Raises
+        ------
+        InputError
+            The file was changed, or another took its name, after it was opened.
+        """
+        return fingerprint(self._file, self._dataset, self._origins)
+
+    @property
+    def how(self) -> str:
+        """How the frames are fetched."""
+        return self._stack.how
+
+    @property
+    def modified(self) -> str:
+        """When the file, or one that frames lie in, was written last: ISO 8601, UTC, to the nanosecond."""
+        return modified(self._origins)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; frames that were lent live on."""
+        self._stack.close()
         self._file.close()
-
-    def _whole_chunks(self, start: int, stop: int) -> int:
-        """End a read where a chunk ends, so that none is unpacked twice."""
-        length = self._stack.chunks[0] if self._stack.chunks else 1
-        aligned = stop // length * length
-        return aligned if start < aligned and stop < self.shape[0] else stop
 
 
 def open_recording(
@@ -145,6 +170,9 @@ def open_recording(
     phase: ArrayLike | Positions | None = None,
     tilt: float | None = None,
     pixel_size: tuple[float, float] | None = None,
+    region: Region | None = None,
+    frames: tuple[int, int | None] | None = None,
+    threads: int | None = None,
     memory_limit: int | None = None,
 ) -> Recording:
     """Open a stack of frames in HDF5.
@@ -157,8 +185,16 @@ def open_recording(
     motion, travel, phase, tilt, pixel_size
         What the file does not say, or what to believe instead: positions in mm or radians, one a frame or as
         ``Steps``; half-angle in radians; mm.
+    region : Region, optional
+        The part of the picture that is wanted; only that is read. Maps are cut with it, and the pivot is
+        placed from its centre.
+    frames : (int, int or None), optional
+        The first frame that is wanted, and the end; None for the stack's. Positions are those of the whole
+        stack, and are cut.
+    threads : int, optional
+        How many unpack chunks; by default as many as there are cores.
     memory_limit : int, optional
-        Bytes that a packed chunk of frames may take when it is unpacked.
+        Bytes that chunks of frames may take when they are unpacked.
 
     Returns
     -------
@@ -174,19 +210,43 @@ def open_recording(
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
         stack = _find_stack(file, dataset, ours)
-        layout = Layout(file, ours, stack.shape)
+        shape = _shape(stack)
+        cut = _cut(str(path), shape, frames, region)
+        layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size)
-        count = stack.shape[0]
         positions = {
             "time": layout.time(),
-            "travel": layout.travel(_along(travel, count)) if header.motion == "vertical" else None,
-            "phase": layout.phase(_along(phase, count)) if header.motion == "axial" else None,
+            "travel": layout.travel(_along(travel, shape[0])) if header.motion == "vertical" else None,
+            "phase": layout.phase(_along(phase, shape[0])) if header.motion == "axial" else None,
             "displacement": layout.displacement() if header.motion == "horizontal" else None,
             "twist": layout.twist() if header.motion == "twist" else None,
         }
-        recording = Recording(file, stack, header, positions, layout.truth())
+        truth = layout.truth()
+        fetched = open_stack(stack, str(path), cut, memory_limit, threads)
+        recording = Recording(file, stack, fetched, cut, header, positions, truth)
         opening.pop_all()  # from here on the recording closes its file
     return recording
+
+
+def _shape(stack: h5py.Dataset) -> tuple[int, int, int]:
+    frames, rows, columns = map(int, stack.shape)
+    return frames, rows, columns
+
+
+def _cut(
+    name: str, shape: tuple[int, int, int], frames: tuple[int, int | None] | None, region: Region | None
+) -> Cut:
+    """Return what is wanted of a stack, if it has that."""
+    start, end = frames or (0, None)
+    stop = shape[0] if end is None else end
+    if not 0 <= start <= stop - 2 <= shape[0] - 2:
+        raise InputError(
+            f"{name}: frames {start} to {stop} of {shape[0]}: give a start from 0, and an end up to "
+            f"{shape[0]} with at least 2 frames between"
+        )
+    region = region or Region.whole(shape[1:])
+    region.check(shape[1:], name)
+    return Cut((start, stop), region)
 
 
 def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import new_hdf5
+from mirrorskin.io.atomic import MAKE_ROOM, new_file, new_hdf5
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
-from mirrorskin.io.plain import legible
-from mirrorskin.io.types import NO_MAPS, InputError, Result
+from mirrorskin.io.mould import Mould
+from mirrorskin.io.plain import legible, plainly
+from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"
 _UNITS = (
@@ -30,6 +32,20 @@ _DTYPES = (
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
 _VECTORS, _OFFSETS = "normals", "offset_unknown"
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
+_AGAIN = "reconstruct it again"
+
+
+class _Part(NamedTuple):
+    """A dataset of a result: its name, what it holds, and how that is to be read."""
+
+    name: str
+    values: NDArray[Any]
+    attributes: Mapping[str, str]
+
+
+# Of the forms of results that were written last.
+_moulds: dict[Hashable, Mould] = {}
+_MOST_MOULDS = 8
 
 
 def save_result(result: Result, path: str | Path) -> None:
@@ -40,53 +56,84 @@ def save_result(result: Result, path: str | Path) -> None:
     InputError
         It cannot be written there.
     """
-    with new_hdf5(Path(path)) as new:
-        file = new.root
-        file.attrs.update(NX_class="NXroot", default="entry")
-        entry = file.create_group("entry")
-        entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
-        _write_maps(entry.create_group("result"), result)
-        process = entry.create_group("process")
-        process.attrs["NX_class"] = "NXprocess"
-        for name, value in result.process.items():
-            process[name] = legible(value) if isinstance(value, str) else value
+    path, maps = Path(path), result.maps()
+    parts = [*_parts_of_maps(result, maps), *_parts_of_process(result)]
+    values = [part.values for part in parts]
+    form = tuple((part.name, part.values.dtype.str, part.values.shape) for part in parts)
+    mould = _moulds.get(form)
+    if mould is not None:
+        with new_file(path) as descriptor, plainly(f"{path} could not be written", MAKE_ROOM):
+            mould.pour(descriptor, values)
+        return
+    with new_hdf5(path) as new:
+        _write(new.root, parts, _plot_of(result, maps))
+        places = [(new.root[part.name].id.get_offset() or 0, part.values.nbytes) for part in parts]
+        new.close()
+        new.check()
+        if len(_moulds) == _MOST_MOULDS:
+            _moulds.clear()
+        _moulds[form] = Mould.of(new.descriptor, places)
 
 
-def _write_maps(data: h5py.Group, result: Result) -> None:
-    """Write the maps, and what a viewer should plot of them unasked.
+def _write(file: h5py.File, parts: Iterable[_Part], plot: Mapping[str, Any]) -> None:
+    """Write a result's parts, and what a viewer should plot of them unasked."""
+    file.attrs.update(NX_class="NXroot", default="entry")
+    entry = file.create_group("entry")
+    entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
+    entry.create_group("result").attrs.update(NX_class="NXdata", **plot)
+    entry.create_group("process").attrs["NX_class"] = "NXprocess"
+    for part in parts:
+        # In a piece, so that it lies there as it is in memory.
+        file.create_dataset(part.name, data=part.values).attrs.update(part.attributes)
 
-    What is plotted together must be of one shape, so vectors are not. How to show them is left open: NeXus
-    has no word for a picture of vectors, and of one of colours viewers expect numbers from 0 to 1.
-    """
-    maps = result.maps()
-    plotted = [name for name in maps if name != _VECTORS]
-    data.attrs["NX_class"] = "NXdata"
-    if plotted:
-        data.attrs.update(signal=plotted[0], auxiliary_signals=plotted[1:])
+
+def _parts_of_maps(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[_Part]:
+    """Yield the maps, and what is known of a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
-        data[name] = values
-        if name in plotted:
-            data[name].attrs["interpretation"] = "image"
-        if name in _UNITS:
-            data[name].attrs["units"] = _UNITS[name]
+        said = {} if name == _VECTORS else {"interpretation": "image"}
+        yield _Part(f"{_RESULT}/{name}", values, said | ({"units": _UNITS[name]} if name in _UNITS else {}))
     if result.offset_unknown is not None:
-        data[_OFFSETS] = result.offset_unknown
-    _write_axes(data, result, maps[plotted[0]].shape if plotted else ())
+        yield _Part(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+    for name, positions in _axes_of(result, maps).items():
+        yield _Part(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 
 
-def _write_axes(data: h5py.Group, result: Result, plotted: Shape) -> None:
-    """Write what is known of a plot's axes: the turns, and where the pixels are."""
-    axes: dict[str, tuple[NDArray[Any], str | None]] = {}
-    if len(plotted) == 3:
-        axes["turn"] = np.arange(plotted[0], dtype=np.int32), None
+def _parts_of_process(result: Result) -> Iterator[_Part]:
+    """Yield how it came about; texts as bytes, whose number is known."""
+    for name, value in result.process.items():
+        if isinstance(value, str):
+            text = legible(value).encode() or b"\0"
+            yield _Part(f"{_PROCESS}/{name}", np.array(text, h5py.string_dtype("utf-8", len(text))), {})
+        else:
+            yield _Part(f"{_PROCESS}/{name}", np.asarray(value), {})
+
+
+def _axes_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    plotted = _plotted(maps)
+    axes: dict[str, NDArray[Any]] = {}
+    if plotted and maps[plotted[0]].ndim == 3:
+        axes["turn"] = np.arange(len(maps[plotted[0]]), dtype=np.int32)
     if result.x is not None and result.y is not None:
-        axes |= {"y": (result.y, "mm"), "x": (result.x, "mm")}
-    for name, (positions, unit) in axes.items():
-        data[name] = positions
-        if unit is not None:
-            data[name].attrs["units"] = unit
+        axes |= {"y": result.y, "x": result.x}
+    return axes
+
+
+def _plot_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return what tells a viewer what to plot unasked."""
+    plotted, axes = _plotted(maps), list(_axes_of(result, maps))
+    plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
     if axes:
-        data.attrs["axes"] = [*axes, *["."] * (len(plotted) - len(axes))]
+        plot["axes"] = [*axes, *["."] * ((maps[plotted[0]].ndim if plotted else 0) - len(axes))]
+    return plot
+
+
+def _plotted(maps: Mapping[str, NDArray[Any]]) -> list[str]:
+    """Name the maps that are plotted together.
+
+    They must be of one shape, so vectors are not among them. How to show those is left open: NeXus has no
+    word for a picture of vectors, and of one of colours viewers expect numbers from 0 to 1.
+    """
+    return [name for name in maps if name != _VECTORS]
 
 
 def open_result(path: str | Path) -> Result:
@@ -97,44 +144,62 @@ def open_result(path: str | Path) -> Result:
     InputError
         There is no such file, it is no result, or it is damaged.
     """
-    path = Path(path)
+    with _opened(Path(path)) as file:
+        maps: dict[str, NDArray[Any]] = {
+            name: file.read(node, shape, remedy=_AGAIN).astype(_DTYPES.get(name, np.float32), copy=False)
+            for name, (node, shape) in _find_maps(file).items()
+        }
+        maps |= _read_offsets(file, maps.get("component"))
+        return Result(**maps, process=_read_process(file, file.names(_PROCESS)))
+
+
+def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
+    """Read how a result came about, or only some of that; its maps are looked for, and not read.
+
+    What is not told is missing. See ``open_result``.
+    """
+    with _opened(Path(path)) as file:
+        for node, shape in _find_maps(file).values():
+            if getattr(node, "shape", None) != shape:
+                raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
+        return _read_process(file, names or file.names(_PROCESS))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Hdf5File]:
     with Hdf5File(path) as file:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
-        maps = _read_maps(file)
-        maps |= _read_offsets(file, maps.get("component"))
-        process = {
-            name: file.value(file.follow(f"{_PROCESS}/{name}", "reconstruct it again"))
-            for name in file.names(_PROCESS)
-        }
-    return Result(**maps, process=process)
+        yield file
 
 
-def _read_maps(file: Hdf5File) -> dict[str, NDArray[Any]]:
-    """Read the maps and axes that are there, all of one size, or of one for each turn."""
-    found = {name: file.find(f"{_RESULT}/{name}") for name in (*_MAPS, "x", "y")}
-    found = {name: node for name, node in found.items() if node is not None}
-    size = _size_of(found)
+def _read_process(file: Hdf5File, names: Iterable[str]) -> dict[str, ProcessValue]:
+    group = file.find(_PROCESS)
+    found = {} if group is None else {name: file.walk(group, name) for name in names}
+    return {name: file.value(node) for name, node in found.items() if node is not None}
+
+
+def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
+    """Find the maps and axes that are there, and the shapes of a result, or of one for each turn."""
+    group = file.find(_RESULT)
+    found = {} if group is None else {name: file.walk(group, name) for name in (*_MAPS, "x", "y")}
+    there = {name: node for name, node in found.items() if node is not None}
+    size = _size_of(there)
     if size is None:
-        raise InputError(f"{file.path}: {_RESULT} holds no maps: reconstruct it again")
+        raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
     shapes = {"x": size[-1:], "y": size[-2:-1], _VECTORS: (*size, 3)}
-    return {
-        name: file.read(node, shapes.get(name, size), remedy="reconstruct it again").astype(
-            _DTYPES.get(name, np.float32)
-        )
-        for name, node in found.items()
-    }
+    return {name: (node, shapes.get(name, size)) for name, node in there.items()}
 
 
 def _read_offsets(file: Hdf5File, component: NDArray[np.int32] | None) -> dict[str, NDArray[Any]]:
     """Read which components have an unknown offset, if that is told: a list, one number a component."""
     node = file.find(f"{_RESULT}/{_OFFSETS}")
     if component is not None and component.min(initial=-1) < -1:
-        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: reconstruct it again")
+        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: {_AGAIN}")
     if node is None or component is None:
         return {}
     count = int(component.max(initial=-1)) + 1
-    return {_OFFSETS: file.read(node, (count,), remedy="reconstruct it again").astype(_DTYPES[_OFFSETS])}
+    return {_OFFSETS: file.read(node, (count,), remedy=_AGAIN).astype(_DTYPES[_OFFSETS])}
 
 
 def _size_of(found: Mapping[str, Node]) -> Shape | None:

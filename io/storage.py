@@ -36,20 +36,24 @@ def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0) -> None
     InputError
         A filter that is not installed, chunks too large to unpack, or less data than the shape says.
     """
-    where = file.where(dataset)
     if depth > _VIRTUAL_DEEP:
+        where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
-    with plainly(where):
-        _check_filters(dataset, where, file.memory_limit)
-        if dataset.chunks and not dataset.is_virtual:
-            claimed = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+    with plainly(lambda: file.where(dataset)):
+        shape, offset = dataset.id.shape, dataset.id.get_offset()
+        claimed, unit = math.prod(shape) * dataset.id.dtype.itemsize, "bytes"
+        if offset is not None:
+            held = h5py.h5i.get_file_id(dataset.id).get_filesize() - offset
+        elif dataset.chunks and not dataset.is_virtual:
+            _check_filters(dataset, file.where(dataset), file.memory_limit)
+            claimed = math.prod(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
             held, unit = dataset.id.get_num_chunks(), "chunks"
         else:
-            claimed, unit = math.prod(dataset.shape) * dataset.dtype.itemsize, "bytes"
             held = _bytes_held(file, dataset, depth)
     if held < claimed:
         raise InputError(
-            f"{where} claims {claimed} {unit} and its file holds {held}: it was cut short; copy it again"
+            f"{file.where(dataset)} claims {claimed} {unit} and its file holds {held}: it was cut short; "
+            "copy it again"
         )
 
 
@@ -88,6 +92,7 @@ def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) 
 
 
 def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
+    """Return what there is of a dataset that lies elsewhere, in its header, or nowhere yet."""
     if dataset.is_virtual:
         elements = sum(_mapped(file, dataset, part, depth) for part in dataset.virtual_sources())
         return elements * int(dataset.dtype.itemsize)
@@ -95,19 +100,22 @@ def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
         what = f"the raw storage of {dataset.name}"
         parts = [(file.beside(dataset, name, what), offset, size) for name, offset, size in dataset.external]
         return sum(min(size, max(0, path.stat().st_size - offset)) for path, offset, size in parts)
-    offset = dataset.id.get_offset()
-    if offset is None:  # not stored yet, or so small that it lies in its header
-        return int(dataset.id.get_storage_size())
-    return int(dataset.file.id.get_filesize() - offset)
+    return int(dataset.id.get_storage_size())
 
 
-def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
-    """Return how many elements of a virtual dataset one of its sources holds."""
+def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dataset:
+    """Return the dataset that a part of a virtual one comes from; InputError if it is not there."""
     what = f"the virtual dataset {dataset.name}"
     origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
     source = file.walk(origin, part.dset_name)
     if not isinstance(source, h5py.Dataset):
         raise InputError(f"{file.where(dataset)} needs {part.dset_name} of {part.file_name}: it is not there")
+    return source
+
+
+def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
+    """Return how many elements of a virtual dataset one of its sources holds."""
+    source = virtual_source(file, dataset, part)
     check_storage(file, source, depth + 1)
     selected = part.src_space
     if selected.get_select_type() == h5py.h5s.SEL_ALL:

@@ -48,6 +48,9 @@ class Block:
         Row and column of the first pixel in the full picture.
     dropped : int
         Frames lost between the block before and this one.
+    lent : bool
+        Whether the frames lie in memory of the source's own that nobody writes to as long as they are
+        referred to, and that can be read 64 bytes beyond them, so that a device may work in it.
     """
 
     frames: NDArray[Any]
@@ -59,6 +62,7 @@ class Block:
     twist: Floats | None = None
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
+    lent: bool = False
 
 
 @dataclass(frozen=True, slots=True)

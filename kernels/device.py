@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 import os
 import re
 import threading
@@ -21,7 +20,8 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import pocl
-from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
+from mirrorskin.kernels.array import Array, Lent, Operand, pinned
+from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.shape import BESIDE, CORE
 
@@ -31,15 +31,7 @@ C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
-_PAGE = 4096
-_SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
-_NO_ROOM = {
-    cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
-    cl.status_code.OUT_OF_HOST_MEMORY,
-    cl.status_code.OUT_OF_RESOURCES,
-    cl.status_code.INVALID_BUFFER_SIZE,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +100,8 @@ class Device:
     Attributes
     ----------
     info : DeviceInfo
-    context, queue
-        The OpenCL objects.
+    context, queue, copies
+        The OpenCL objects; frames are brought on a queue of their own, beside the kernels.
     profile : Profile
         What was run on it so far.
     max_allocation : int
@@ -129,7 +121,10 @@ class Device:
         self.shape = CORE if self.info.kind == "cpu" else BESIDE
         self.measured = False
         self.context = cl.Context([device])
-        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        self.queue, self.copies = (
+            cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            for _ in range(2)
+        )
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
@@ -174,6 +169,35 @@ class Device:
         array.host[...] = values
         array.upload()
         return array
+
+    def lend(self, name: str, values: NDArray[Any]) -> Lent | None:
+        """Let kernels read memory of another owner's in place; the device must share the host's memory.
+
+        Some devices refuse memory that only may be read, such as a file's. Then it returns None.
+
+        Parameters
+        ----------
+        name : str
+            What the profile calls it.
+        values : ndarray
+            In C order, at a multiple of its item size, and followed by 64 bytes that may be read; nobody may
+            write to it as long as it is lent.
+        """
+        try:
+            return Lent(self, name, values)
+        except cl.Error as error:
+            _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
+            return None
+
+    def pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """Make room on the host from where copies to the device are fastest.
+
+        Raises
+        ------
+        DeviceMemoryError
+            It does not fit.
+        """
+        return pinned(self, shape, np.dtype(dtype))
 
     def kernel(self, file: str, name: str, **defines: str | int) -> Kernel:
         """Return a kernel of ``file.cl``, compiled once for each set of defines.
@@ -225,119 +249,6 @@ class Device:
         return program
 
 
-class Array:
-    """An array that host and device both see: one memory where they share it, a copy each otherwise.
-
-    The host writes it at first; ``upload`` hands it to the device and ``download`` brings it back, which
-    moves nothing on a device that shares the host's memory.
-    """
-
-    def __init__(self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        self.name = name
-        self._device = device
-        self._shared = device.info.shares_memory
-        self._mapped: cl.MemoryMap | None = None
-        self._buffer: cl.Buffer | None = None
-        nbytes = math.prod(shape) * dtype.itemsize
-        if nbytes > device.max_allocation:
-            raise DeviceMemoryError(_no_room(device, name, nbytes))
-        try:
-            self._memory = _aligned(nbytes + _SLACK)
-            self.host = self._memory[:nbytes].view(dtype).reshape(shape)
-        except MemoryError as error:
-            raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
-        self._allocate()
-        self.claim()
-
-    def __del__(self) -> None:
-        # A kernel may still be at work in this memory.
-        if self._shared and self._buffer is not None:
-            self._device.finish()
-
-    def claim(self) -> None:
-        """Let the host write anew, whatever the device holds."""
-        if self._shared and self._mapped is None:
-            view, _ = cl.enqueue_map_buffer(
-                self._device.queue,
-                self.buffer,
-                cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
-                0,
-                self.host.shape,
-                self.host.dtype,
-                is_blocking=True,
-            )
-            self._mapped = view.base
-
-    def upload(self, rows: int | None = None) -> None:
-        """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
-        if self._buffer is None:
-            self._allocate()
-        if not self._shared:
-            part = self.host[:rows]
-            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
-            self._device.profile.wait("upload", self.name, event, part.nbytes)
-
-    def download(self) -> NDArray[Any]:
-        """Wait for the device and return what it wrote, in the host's array."""
-        if self._shared:
-            self.claim()
-        else:
-            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
-            self._device.profile.wait("download", self.name, event, self.host.nbytes)
-        return self.host
-
-    def hand_over(self) -> NDArray[Any]:
-        """Wait for the device and give away what it wrote, without a copy; the array is no more of use."""
-        host = self.download()
-        if self._mapped is not None:
-            self._mapped.release()
-            self._mapped = None
-            self._device.finish()
-        if self._buffer is not None:
-            self._buffer.release()
-            self._buffer = None
-        return host
-
-    def park(self) -> None:
-        """Make room on the device: keep the content on the host until the next upload."""
-        if not self._shared and self._buffer is not None:
-            self.download()
-            self.drop()
-
-    def drop(self) -> None:
-        """Make room on the device, and forget what the device held."""
-        if not self._shared and self._buffer is not None:
-            self._buffer.release()
-            self._buffer = None
-
-    @property
-    def buffer(self) -> cl.Buffer:
-        """The device's side, for kernels; the host must not write while they run."""
-        if self._buffer is None:
-            raise RuntimeError(f"{self.name} is parked: upload it first")
-        if self._mapped is not None:
-            self._mapped.release()
-            self._mapped = None
-        return self._buffer
-
-    def _allocate(self) -> None:
-        flags = cl.mem_flags.READ_WRITE
-        try:
-            if self._shared:
-                self._buffer = cl.Buffer(
-                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
-                )
-            else:
-                self._buffer = cl.Buffer(self._device.context, flags, size=self._memory.nbytes)
-                # Drivers allocate at first use; asking for it here makes a lack of memory show here.
-                undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
-                cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
-        except cl.Error as error:
-            if error.code not in _NO_ROOM:
-                raise
-            raise DeviceMemoryError(_no_room(self._device, self.name, self.host.nbytes)) from error
-
-
 class Kernel:
     """A compiled kernel, ready to run over so many items."""
 
@@ -347,7 +258,7 @@ class Kernel:
         self._kernel = kernel
         self._group = group
 
-    def __call__(self, items: int, *args: Array | np.generic, moved: int) -> None:
+    def __call__(self, items: int, *args: Operand | np.generic, moved: int) -> None:
         """Put one run on the device's queue.
 
         Parameters
@@ -361,11 +272,15 @@ class Kernel:
         """
         group = self._group
         size = -(-items // group) * group
-        values = [arg.buffer if isinstance(arg, Array) else arg for arg in args]
+        values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
+        arrays = [arg for arg in args if isinstance(arg, Operand)]
+        copies = [array.arrived for array in arrays if array.arrived is not None]
         try:
-            event = self._kernel(self._device.queue, (size,), (group,), *values)
+            event = self._kernel(self._device.queue, (size,), (group,), *values, wait_for=copies)
         except cl.Error as error:
             raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
+        for array in arrays:
+            array.used = event
         self._device.profile.watch("kernel", self.name, event, moved)
 
 
@@ -453,20 +368,6 @@ def _default(devices: list[cl.Device]) -> cl.Device:
 @functools.cache
 def _open(device: cl.Device) -> Device:
     return Device(device)
-
-
-def _aligned(nbytes: int) -> NDArray[np.uint8]:
-    """Zeros that start on a page, so that a device sharing the memory need not copy them."""
-    raw = np.zeros(nbytes + _PAGE, np.uint8)
-    start = -raw.ctypes.data % _PAGE
-    return raw[start : start + nbytes]
-
-
-def _no_room(device: Device, name: str, nbytes: int) -> str:
-    return (
-        f"{device.info.title} has no room for {name} ({nbytes} bytes; "
-        f"one buffer holds at most {device.max_allocation})"
-    )
 
 
 def _explain_build(file: str, source: str, log: str, info: DeviceInfo) -> str:

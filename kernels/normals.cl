@@ -6,7 +6,7 @@
 // LANES    pixels side by side in a vector: 8 or 4
 // WORDS    vectors of one work-item
 // COUNT    frames of the turn
-// ROOM     frames that `turn` has room for
+// ROOM     frames that each of `tables` has room for
 // WEIGHTED 1 where frames have weights of their own
 // MAPS     1 where each pixel has a scale of its own, 0 where `scale` holds one for all
 // ENDS     1 where brightness is linear between some zeniths only
@@ -16,7 +16,8 @@
 // picture's:
 //
 // stack    `pixels` samples of each frame, one frame after the other; the turn begins with frame `start`
-// turn     planes of ROOM frames: cosine and sine of the phase, root of the weight, shares in mean, cosine and sine
+// tables   of several turns, of which `table` is this one's: planes of ROOM frames: cosine and sine of the phase, root of
+//          the weight, shares in mean, cosine and sine
 // scale    counts at zenith 0; radians per count; the zeniths between which brightness is linear
 // vectors  x, y and z of each pixel side by side
 //
@@ -382,8 +383,8 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 #define AT_REST (wave.mean < rest_below)
 
 #define ARGUMENTS                                                                                \
-    __global const FRAME *restrict stack, __global const float *restrict turn,                   \
-    __global const float *restrict scale, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
+    __global const FRAME *restrict stack, __global const float *restrict tables,                 \
+    __global const float *restrict scale, const int table, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
     const float sin_tilt, const float noise_base, const float noise_slope, const float noise_least, \
     const float noise_limit, const float limit, const float still_below, const float wild_above, const float rest_below,                         \
     __global float *restrict vectors, __global float *restrict sigma,                            \
@@ -393,6 +394,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 
 #define EACH_VECTOR                                                                              \
     __global const FRAME *frames = stack + (size_t)start * pixels;                               \
+    __global const float *restrict turn = tables + (size_t)table * 6 * ROOM;                     \
     const int first = (int)get_global_id(0) * WORDS * LANES;                                     \
     for (int p = first; p < LESSER(first + WORDS * LANES, pixels); p += LANES)
 

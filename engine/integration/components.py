@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.links import LinkRoom, Plane
-from mirrorskin.kernels.device import Array
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
 Labels = NDArray[np.int32]

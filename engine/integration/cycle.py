@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mirrorskin.engine.integration.hierarchy import Hierarchy, pair, part_of, place
-from mirrorskin.kernels.device import Array
+from mirrorskin.kernels.array import Array
 
 _STEPS = np.float32(1.3896), np.float32(0.5617)  # of Chebyshev's polynomial over the upper spectrum
 _TWICE = range(2, 5)  # levels that are gone through a second time, for what the first left over

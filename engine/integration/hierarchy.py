@@ -22,7 +22,8 @@ from mirrorskin.engine.integration.odd import (
     nothing_odd,
     step_over,
 )
-from mirrorskin.kernels.device import Array, Device, Kernel
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device, Kernel
 
 WIDTH = 8
 """Nodes side by side in a kernel's vectors."""

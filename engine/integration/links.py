@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.integration.inputs import Flags, Floats, Inputs
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import SLOPE
 
 Plane = tuple[float, float, float]

@@ -11,7 +11,7 @@ import numpy as np
 from mirrorskin.engine.integration.cycle import Cycle
 from mirrorskin.engine.integration.hierarchy import Hierarchy, part_of, place
 from mirrorskin.engine.integration.links import Links
-from mirrorskin.kernels.device import Array
+from mirrorskin.kernels.array import Array
 
 _CYCLES = 2  # that are enough where no tolerance is given
 _PATIENCE, _PROGRESS = (

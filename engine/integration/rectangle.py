@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.cosines import HALF, make_plan, work_of
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 
 SLOTS = 2 * HALF
 """Modes of a strip of the spectrum; see ``rectangle.cl``."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mirrorskin.engine.integration.inputs import Flags, Inputs
 from mirrorskin.engine.integration.links import Graph, Links
 from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.bilateral import DOWN, RIGHT
-from mirrorskin.kernels.device import Array
 
 BROKEN = 0.02
 """Part of its full weight below which a link leads across a discontinuity."""

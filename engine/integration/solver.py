@@ -18,7 +18,8 @@ from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.spread import find_sigma
 from mirrorskin.engine.integration.surface import IntegrationMethod, Surface
 from mirrorskin.io import InputError
-from mirrorskin.kernels.device import Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import KNOWN, LOST, SLOPE
 
 _STIFF = 100.0  # times a link's that known heights weigh, above which the direct solver loses too many digits

@@ -25,7 +25,7 @@ import numpy as np
 from mirrorskin.engine.integration.components import Labels, Settler
 from mirrorskin.engine.integration.inputs import Floats, Inputs
 from mirrorskin.engine.integration.links import LEVEL, LinkRoom, Links
-from mirrorskin.kernels.device import Array
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
 WAVES, DRAWS = 24, 32

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT, Band
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Staged, join_rows
 from mirrorskin.engine.press.references import reference_pair
 from mirrorskin.engine.press.search import Event, Onset, Search, check_stack
 from mirrorskin.engine.samples import travel_pairs
 from mirrorskin.io import Block, InputError
+from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
-from mirrorskin.kernels.device import C_TYPES, Array, Device, Kernel, open_device
+from mirrorskin.kernels.device import C_TYPES, Device, Kernel, open_device
 
 _EVIDENCE = 12.0  # log of how much likelier the samples must be with a change than without
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
@@ -190,8 +191,8 @@ class ChangePointSearch(Search):
         self._travel.extend(travel)
         for band in self._bands:
             with band.resident():
-                for start, count in band.stage(frames):
-                    self._take(band, count, first + start)
+                for staged in band.stage(frames, block.lent):
+                    self._take(band, staged, first + staged.frames.start)
 
     def result(self) -> Onset:
         """Return the maps of the frames so far.
@@ -206,7 +207,7 @@ class ChangePointSearch(Search):
         if self.passes == 2 and (self._weight is None or count + 1 != len(self._weight.host)):
             raise InputError("a change between unknown levels needs all frames twice: give dark and bright")
         maps = [self._heights(band, noise) for band in self._bands]
-        height, sigma, status, frame = (np.concatenate(parts) for parts in zip(*maps, strict=True))
+        height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
         return Onset(height, sigma, status, np.where(answered, frame, np.int32(-1)), noise)
@@ -221,9 +222,9 @@ class ChangePointSearch(Search):
             for name, values in maps.items():
                 band.write(name, values[band.rows])
 
-    def _take(self, band: Band, count: int, first: int) -> None:
-        """Let the kernel of this pass go through the frames that the band holds."""
-        block = np.int32(count), np.int32(band.pixels)
+    def _take(self, band: Band, staged: Staged, first: int) -> None:
+        """Let the kernel of this pass go through frames of a band."""
+        block = staged.array, np.int32(staged.count), np.int32(band.pixels)
         if self.passes == 1:
             level = round(self._level * UNIT)
             evidence = np.int32(level), np.int32(self._hold * (UNIT - level)), self._quiet()
@@ -236,13 +237,15 @@ class ChangePointSearch(Search):
             arguments = np.int32(first), "mean mean_rest", self._weight, state
             self._run("changepoint_split", band, *block, *arguments)
 
-    def _run(self, name: str, band: Band, count: np.int32, *arguments: str | Array | np.generic) -> None:
-        """Launch a kernel on the frames that the band holds; its maps are told by their names."""
+    def _run(
+        self, name: str, band: Band, frames: Operand, count: np.int32, *arguments: str | Array | np.generic
+    ) -> None:
+        """Launch a kernel on frames of a band; its maps are told by their names."""
         values: list[Array | np.generic] = []
         for argument in arguments:
             values += [band.maps[n] for n in argument.split()] if isinstance(argument, str) else [argument]
         moved = int(count) * band.pixels * self._dtype.itemsize
-        self._kernel(name)(self._items(band), band.frames, count, *values, moved=moved)
+        self._kernel(name)(self._items(band), frames, count, *values, moved=moved)
 
     def _heights(self, band: Band, noise: float) -> list[NDArray[Any]]:
         if self.passes == 2:

@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 
+from mirrorskin.engine.version import program_version
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.remember import keep, recall
@@ -38,7 +38,7 @@ def fit(device: Device, prepare: Callable[[Device], Run]) -> None:
         if device.measured:
             return
         info = device.info
-        circumstances = info.title, info.driver, info.compute_units, SHAPES, version("mirrorskin")
+        circumstances = info.title, info.driver, info.compute_units, SHAPES, program_version()
         known = recall("shape", circumstances)
         device.measured = True
         if known is not None and known.isdecimal() and int(known) < len(SHAPES):

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes, join_rows
 from mirrorskin.engine.press.fitting import fit
 from mirrorskin.engine.press.references import check_threshold, reference_maps
 from mirrorskin.engine.press.search import Event, Onset, Search, check_stack
 from mirrorskin.io import Block, InputError
-from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
+from mirrorskin.kernels.array import Array, Operand
+from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
 _PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
@@ -165,7 +166,7 @@ class OnsetSearch(Search):
         for band in self._bands:
             if self._subframe:
                 self._prepare(band, frames[0] if first == 0 else None)
-            self._scan(band, frames, first)
+            self._scan(band, block, first)
         self._sure_at = self._noise.value
 
     def result(self) -> Onset:
@@ -174,8 +175,8 @@ class OnsetSearch(Search):
         if noise is None or self._travel.count == 0:
             raise InputError(f"a press of {self._travel.count} frames has no onset: at least 2 are needed")
         maps = [self._answer(band, noise) for band in self._bands]
-        height, sigma, status, frame = (np.concatenate(parts) for parts in zip(*maps, strict=True))
-        return Onset(height, sigma, status, np.maximum(frame, DARK), noise)
+        height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
+        return Onset(height, sigma, status, np.maximum(frame, DARK, out=frame), noise)
 
     def _prepare(self, band: Band, first: NDArray[Any] | None) -> None:
         """Tell a band what is known of the plateaus: the first frame, and the noise once it is known."""
@@ -187,19 +188,17 @@ class OnsetSearch(Search):
             with band.resident():
                 self._launch(band, "onset_sure", band.stride, _SURELY * noise, "levels", "marks")
 
-    def _scan(self, band: Band, frames: NDArray[Any], first: int) -> None:
+    def _scan(self, band: Band, block: Block, first: int) -> None:
         # One frame alone tells no noise, and needs none: it is taken for dark.
         look = self._look(self._noise.value or 0.0)
-        arguments: list[str | float | Array] = ["marks", "closed", "busy", "times"]
+        arguments: list[str | float | Operand] = ["marks", "closed", "busy", "times"]
         if self._subframe:
             arguments = [*arguments, "levels", *self._travel.arguments, *look, "samples", "answers", "status"]
-        aligned = band.pixels * self._dtype.itemsize % (4 * self.device.shape.lanes) == 0
         with band.resident():
-            for start, count in band.stage(frames):
-                part = count, band.pixels, band.stride, first + start
-                self._launch(
-                    band, "onset_scan", band.frames, *part, *arguments, frames=count, aligned=aligned
-                )
+            for staged in band.stage(block.frames, block.lent):
+                part = staged.count, band.pixels, band.stride, first + staged.frames.start
+                known = staged.array, *part, *arguments
+                self._launch(band, "onset_scan", *known, frames=staged.count, aligned=staged.aligned)
 
     def _answer(self, band: Band, noise: float) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows as if no frame followed."""
@@ -225,20 +224,20 @@ class OnsetSearch(Search):
         self,
         band: Band,
         name: str,
-        *arguments: str | float | Array,
+        *arguments: str | float | Operand,
         frames: int = 0,
         aligned: bool = True,
     ) -> None:
         """Run a kernel over a band, or over so many frames of it; its maps are told by their names."""
-        values: list[Array | np.generic] = []
+        values: list[Operand | np.generic] = []
         for argument in arguments:
             if isinstance(argument, str):
                 values.append(band.maps[argument])
-            elif isinstance(argument, Array):
+            elif isinstance(argument, Operand):
                 values.append(argument)
             else:
                 values.append(np.float32(argument) if isinstance(argument, float) else np.int32(argument))
-        maps = sum(value.host.nbytes for value in values if isinstance(value, Array))
+        maps = sum(value.host.nbytes for value in values if isinstance(value, Operand))
         moved = frames * band.pixels * self._dtype.itemsize or maps
         kernel = self.device.kernel("onset", name, **self._macros, ALIGNED=int(aligned))
         shape = self.device.shape

@@ -48,12 +48,12 @@ def reference_maps(
     top = 0 if dtype.kind == "f" else np.iinfo(dtype).max
     low = _as_map("dark", 0 if dark is None else dark, shape)
     high = _as_map("bright", top if bright is None else bright, shape)
-    usable = _usable(low, high)
-    known = np.count_nonzero(np.isfinite(low) & np.isfinite(high))
+    both = np.isfinite(low) & np.isfinite(high)
+    known, usable = np.count_nonzero(both), np.count_nonzero(both & _above(high, low))
     if known == 0:
         raise InputError("no pixel has a dark and a bright that are numbers: take the references again")
-    if 2 * np.count_nonzero(usable) <= known:
-        share = 100 * (1 - np.count_nonzero(usable) / known)
+    if 2 * usable <= known:
+        share = 100 * (1 - usable / known)
         raise InputError(f"bright is not above dark at {share:.3g} % of the pixels: are they swapped?")
     return low, high
 
@@ -66,17 +66,17 @@ def reference_pair(
     Both are NaN where bright is not above dark: such a pixel, dead or hot, can answer nothing.
     """
     low, high = reference_maps(dark, bright, shape, dtype)
-    usable = _usable(low, high)
+    usable = np.isfinite(low) & np.isfinite(high) & _above(high, low)
     dark_map, bright_map = (
         np.broadcast_to(np.where(usable, part.astype(np.float64), np.nan), shape) for part in (low, high)
     )
     return dark_map, bright_map
 
 
-def _usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _above(bright: NDArray[np.float32], dark: NDArray[np.float32]) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
-        usable: NDArray[np.bool_] = np.isfinite(dark) & np.isfinite(bright) & (bright > dark)
-    return usable
+        above: NDArray[np.bool_] = bright > dark
+    return above
 
 
 def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:

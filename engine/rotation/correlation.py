@@ -160,7 +160,7 @@ class Correlator:
         frames = block.frames
         check_frames(frames, self._dtype, self._shape)
         phase = check_phase(block.phase, len(frames), "phase")
-        self._sums.push(frames, phase, check_weights(weights, len(frames)))
+        self._sums.push(frames, phase, check_weights(weights, len(frames)), block.lent)
 
     def result(self) -> Correlation:
         """Return the fit of the frames so far, or of those in the window; more may follow.

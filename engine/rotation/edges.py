@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.kernels.device import Array, Device, open_device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
 
 LIMITS = Limits(

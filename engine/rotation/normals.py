@@ -13,13 +13,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes, cut_into_bands
 from mirrorskin.engine.noise import thin_out, thinning
 from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
-from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights, fit_matrix
+from mirrorskin.engine.rotation.fits import TurnFit, fit_of
+from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave
-from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns, goes_round
+from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
 from mirrorskin.engine.samples import check_dtype, check_frames
 from mirrorskin.io import Block, InputError, check_phase
-from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.normals import MORE, contact_limits
 
 NormalMethod = Literal["exact", "paper"]
@@ -27,6 +29,8 @@ NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
 
 _LANES = 8  # pixels that are best worked on side by side, where a word has room for as many
 _MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
+_TOGETHER = 64  # turns whose tables the device has at once
+_TABLE_BYTES = 4 * 6 * LONGEST
 _ENOUGH = 500  # pixels to tell the noise from
 _MAP_BYTES = 33  # of a pixel, in all of them
 
@@ -227,8 +231,9 @@ class NormalEstimator:
             self._one_scale = self.device.array("scale", (4,), np.float32)
             self._one_scale.host[:] = self._scale.planes
             self._one_scale.upload()
-        self._table = self.device.array("turn", (6, LONGEST), np.float32)
-        self._written = b""
+        self._together = max(1, min(_TOGETHER, self.device.max_allocation // _TABLE_BYTES))
+        self._tables = self.device.array("turns", (self._together, 6, LONGEST), np.float32)
+        self._places: dict[TurnFit, int] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -306,13 +311,15 @@ class NormalEstimator:
 
     def _work(self, turns: list[slice]) -> None:
         """Estimate the normals of turns in the buffer, and keep the frames that come after them."""
-        closed = [self._close_up(turn) for turn in turns]
+        told = self._told([self._close_up(turn) for turn in turns])
         alone = len(self._bands) == 1
         if alone and turns:
             self._bands[0].frames.upload(len(self._phase))
-        for turn in closed:
-            if self._tells(turn):
-                self._estimate(turn)
+        for start in range(0, len(told), self._together):
+            group = told[start : start + self._together]
+            self._write_tables([fit for _, fit in group])
+            for turn, fit in group:
+                self._estimate(turn, fit)
         if alone:
             self._bands[0].frames.claim()
         end = turns[-1].stop if turns else 0
@@ -329,39 +336,36 @@ class NormalEstimator:
                 values[known] = values[there]
         return known
 
-    def _tells(self, turn: slice) -> bool:
-        """Tell whether a turn's phases determine a normal, and, after the first that does, go all round."""
-        phase = self._phase[turn]
-        try:
-            check_phases(phase, self._weights[turn])
-        except InputError:
-            return False
-        return self._turns == 0 or goes_round(phase)
+    def _told(self, turns: list[slice]) -> list[tuple[slice, TurnFit]]:
+        """Return the turns whose phases determine a normal, and, after the first that does, go all round."""
+        told: list[tuple[slice, TurnFit]] = []
+        for turn in turns:
+            fit = fit_of(self._phase[turn], self._weights[turn])
+            if fit is not None and (fit.goes_round or not (self._turns or told)):
+                told.append((turn, fit))
+        return told
 
-    def _estimate(self, turn: slice) -> None:
-        phase, weights = self._phase[turn], self._weights[turn]
-        matrix = fit_matrix(phase, weights)
+    def _estimate(self, turn: slice, fit: TurnFit) -> None:
+        count = turn.stop - turn.start
         if self._noise is None or self._tilt is None:
-            self._settle(self._buffer[turn], phase, weights, matrix)
-        self._write_table(np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *matrix]))
+            self._settle(turn, fit.matrix)
         self._turns += 1
-        self._frames += len(phase)
+        self._frames += count
         for band in self._bands:
             start = turn.start
             if len(self._bands) > 1:
                 band.frames.claim()
-                band.frames.host[: len(phase)] = self._buffer[turn, band.rows]
-                band.frames.upload(len(phase))
+                band.frames.host[:count] = self._buffer[turn, band.rows]
+                band.frames.upload(count)
                 start = 0
             with band.resident():
-                self._launch(
-                    band, start, len(phase), bool(np.any(weights != 1)), matrix @ (matrix / weights).T
-                )
+                self._launch(band, start, count, fit)
         if self._per_turn:
             self._each.append(self._maps())
 
-    def _settle(self, frames: NDArray[Any], phase: Doubles, weights: Doubles, matrix: Doubles) -> None:
+    def _settle(self, turn: slice, matrix: Doubles) -> None:
         """Tell from a turn what was not given: the noise, and the tilt."""
+        frames, phase, weights = self._buffer[turn], self._phase[turn], self._weights[turn]
         step = thinning(self._shape)
         samples, scale = frames.reshape(len(frames), -1)[:, ::step], self._scale.thinned(step)
         if self._noise is None:
@@ -371,18 +375,17 @@ class NormalEstimator:
         if self._tilt is None:
             self._tilt = estimate_tilt(samples, phase, weights, matrix, scale, self._noise)
 
-    def _write_table(self, rows: Doubles) -> None:
-        """Hand a turn's table to the device, unless it has it from the turn before."""
-        table = np.zeros(self._table.host.shape, np.float32)
-        table[:, : rows.shape[1]] = rows
-        key = table.tobytes()
-        if key != self._written:
-            self._table.claim()
-            self._table.host[:] = table
-            self._table.upload()
-            self._written = key
+    def _write_tables(self, fits: list[TurnFit]) -> None:
+        """Hand the tables of some turns to the device; unless it has them, that waits for all before."""
+        if all(fit in self._places for fit in fits):
+            return
+        self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
+        self._tables.claim()
+        for fit, place in self._places.items():
+            self._tables.host[place, :, : fit.table.shape[1]] = fit.table
+        self._tables.upload()
 
-    def _launch(self, band: Band, start: int, count: int, weighted: bool, covariance: Doubles) -> None:
+    def _launch(self, band: Band, start: int, count: int, fit: TurnFit) -> None:
         """Run the kernel over a band's samples of one turn."""
         assert self._tilt is not None
         assert self._noise is not None
@@ -397,7 +400,7 @@ class NormalEstimator:
             TOP=int(np.iinfo(self._dtype).max) if integer else 0,
             LANES=lanes,
             COUNT=count,
-            WEIGHTED=int(weighted),
+            WEIGHTED=int(fit.weighted),
             ROOM=LONGEST,
             MAPS=int(self._scale.per_pixel),
             ENDS=int(self._scale.ends),
@@ -405,7 +408,7 @@ class NormalEstimator:
         )
         limits = contact_limits(count - 3, tilt)
         apart = tilt if self._method == "exact" else 0.0  # what is told is how much more it is, or all
-        whole = np.array([start, band.pixels, band.stride], np.int32)
+        whole = np.array([self._places[fit], start, band.pixels, band.stride], np.int32)
         turns = np.int32(1 if self._per_turn else self._turns)
         noise = self._noise.base, self._noise.slope, self._noise.least
         reals = (
@@ -419,10 +422,10 @@ class NormalEstimator:
             limits.rest,
         )
         scale = band.maps["scale"] if self._scale.per_pixel else self._one_scale
-        arguments: list[Array | np.generic] = [band.frames, self._table, scale, *whole, turns]
+        arguments: list[Array | np.generic] = [band.frames, self._tables, scale, *whole, turns]
         arguments += [*np.array(reals, np.float32), *(band.maps[name] for name in _MAPS)]
         if self._method == "paper":
-            (mean, *_), (_, cosine, both), (*_, sine) = covariance
+            (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             arguments += [*np.array([mean, cosine, both, sine], np.float32)]
         moved = band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + 16 * self._scale.per_pixel)
         kernel(-(-band.pixels // (lanes * shape.words)), *arguments, moved=moved)

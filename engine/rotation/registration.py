@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.samples import check_dtype
 from mirrorskin.io import Block, Header, InputError, Motion, Source, check_phase, pixel_axes
-from mirrorskin.kernels.device import C_TYPES, Array, Device, open_device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.registration import BORDER
 
 _BLOCK = 16_000_000  # bytes of the source's frames that are read at a time
@@ -133,7 +134,7 @@ class Registered:
         phases = check_phase(block.phase, count, f"{self.name}: the phase of frames from {block.index} on")
         for frame, phase, registered in zip(block.frames, phases, out, strict=False):
             self._maps.resample(frame, self._geometry.shift(float(phase)), registered)
-        return replace(block, frames=out[:count])
+        return replace(block, frames=out[:count], lent=False)
 
     def __enter__(self) -> Self:
         self._source.__enter__()

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, Planes, cut_into_bands
+from mirrorskin.engine.bands import Band, Planes, Staged, cut_into_bands
 from mirrorskin.engine.rotation.phases import Doubles, basis
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
-from mirrorskin.kernels.device import C_TYPES, Array, Device
+from mirrorskin.kernels.device import C_TYPES, Device
 
 _STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
 _PIECE = 256  # frames that a kernel is told of at once
@@ -60,16 +61,16 @@ class Sums:
         """Return 1, cos alpha and sin alpha, (N, 3), in whole steps; zeros for other weights than 1."""
         return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * self._steps), 0)
 
-    def _stage(self, frames: NDArray[Any]) -> Iterator[tuple[Band, slice]]:
+    def _stage(self, frames: NDArray[Any], lent: bool) -> Iterator[tuple[Band, Staged]]:
         """Have each band at work on its rows of the frames; yield which of these are on the device."""
         for band in self._bands:
             with band.resident():
-                for start, count in band.stage(frames):
-                    yield band, slice(start, start + count)
+                for staged in band.stage(frames, lent):
+                    yield band, staged
 
-    def _run(self, band: Band, name: str, *arguments: str | int | Array | np.generic, moved: int) -> None:
+    def _run(self, band: Band, name: str, *arguments: str | int | Operand | np.generic, moved: int) -> None:
         """Run a kernel over a band, whose maps are told by their names; ``moved`` is bytes a pixel."""
-        values: list[Array | np.generic] = []
+        values: list[Operand | np.generic] = []
         for argument in arguments:
             if isinstance(argument, str):
                 values.append(band.maps[argument])
@@ -119,18 +120,18 @@ class TurnSums(Sums):
         """Return phases and weights of the frames so far."""
         return np.array(self._phase, np.float64), np.array(self._weight, np.float64)
 
-    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add some frames: whole counts as integers, until the first weight that is neither 0 nor 1."""
         if len(self._phase) + len(frames) > _MOST:
             raise InputError(f"sums hold {_MOST} frames: take the result of those so far, and reset")
         if self._counts is None:
             fractions = np.flatnonzero((weight != 0) & (weight != 1))
             whole = slice(fractions[0] if len(fractions) else len(frames))
-            self._add(frames[whole], phase[whole], weight[whole])
+            self._add(frames[whole], phase[whole], weight[whole], lent)
             frames, phase, weight = (part[whole.stop :] for part in (frames, phase, weight))
         if len(frames) > 0:
             self._convert()
-            self._sum(frames, phase, weight)
+            self._sum(frames, phase, weight, lent)
 
     def solve(self) -> list[NDArray[np.float32]]:
         """Return mean, cosine, sine and residual of all frames, (H, W) each."""
@@ -143,35 +144,38 @@ class TurnSums(Sums):
         _fill(self._fit, _fit_table(phase, rows))
         return self._answer("correlation_solve_pairs", lambda band: (band.pixels, *_PAIRS), moved=52)
 
-    def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+    def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames of weight 0 or 1 to integer sums."""
         rows = self._whole_rows(phase, weight)
-        for band, start, places in self._pieces(frames, weight):
-            _fill(self._whole, rows[start + places])
+        for band, staged, places in self._pieces(frames, weight, lent):
+            _fill(self._whole, rows[staged.frames.start + places])
             known = len(places), band.pixels, self._place, self._whole
             moved = self._size * len(places) + 64
-            self._run(band, "correlation_add", band.frames, *known, *_SUMS, moved=moved)
+            self._run(band, "correlation_add", staged.array, *known, *_SUMS, moved=moved)
         self._note(phase, weight)
 
-    def _sum(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+    def _sum(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames of any weight to sums that are pairs of floats."""
         rows, fresh = _real_rows(phase, weight), not any(self._weight)
-        for band, start, places in self._pieces(frames, weight):
+        for band, staged, places in self._pieces(frames, weight, lent):
+            start = staged.frames.start
             first = fresh and not np.any(weight[: start + places[0]])
             _fill(self._real, rows[start + places])
             known = len(places), band.pixels, int(first), self._place, self._real
             moved = self._size * len(places) + 72
-            self._run(band, "correlation_sum", band.frames, *known, *_PAIRS, moved=moved)
+            self._run(band, "correlation_sum", staged.array, *known, *_PAIRS, moved=moved)
         self._note(phase, weight)
 
-    def _pieces(self, frames: NDArray[Any], weight: Doubles) -> Iterator[tuple[Band, int, NDArray[np.intp]]]:
-        """Yield frames that count: the number of the first one on the device, and their places from there."""
-        for band, there in self._stage(frames):
-            used = np.flatnonzero(weight[there])
+    def _pieces(
+        self, frames: NDArray[Any], weight: Doubles, lent: bool
+    ) -> Iterator[tuple[Band, Staged, NDArray[np.intp]]]:
+        """Yield frames on the device, and the places in them of those that count."""
+        for band, staged in self._stage(frames, lent):
+            used = np.flatnonzero(weight[staged.frames])
             for piece in range(0, len(used), _PIECE):
                 places = used[piece : piece + _PIECE]
                 _fill(self._place, places)
-                yield band, there.start, places
+                yield band, staged, places
 
     def _note(self, phase: Doubles, weight: Doubles) -> None:
         self._phase += phase.tolist()
@@ -215,23 +219,23 @@ class WindowSums(Sums):
         """Return phases and weights of the frames in the window."""
         return self._phase, self._weight
 
-    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Move the window on; of a block that is longer than it, only the end is ever in it."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
         phase, weight = np.concatenate([self._phase, phase]), np.concatenate([self._weight, weight])
         rows = self._whole_rows(phase, weight)
         moves = np.hstack([rows[self._window :], rows[: len(frames)]])
-        for band, there in self._stage(frames):
-            count = there.stop - there.start
+        for band, staged in self._stage(frames, lent):
+            count, there = staged.count, staged.frames
             place = count, band.pixels, band.stride, self._next + there.start, self._window
             if not self._integer:
-                self._run(band, "correlation_keep", band.frames, *place, "ring", moved=2 * self._size * count)
+                moved = 2 * self._size * count
+                self._run(band, "correlation_keep", staged.array, *place, "ring", moved=moved)
                 continue
             _fill(self._whole, moves[there])
             moved = 3 * self._size * count + 8 * self._width
-            self._run(
-                band, "correlation_slide", band.frames, *place, self._whole, "ring", *_SUMS, moved=moved
-            )
+            known = *place, self._whole, "ring", *_SUMS
+            self._run(band, "correlation_slide", staged.array, *known, moved=moved)
         self._next = (self._next + len(frames)) % self._window
         self._phase, self._weight = phase[-self._window :], weight[-self._window :]
 

@@ -1,11 +1,13 @@
 """A picture that a device cannot hold in one piece is worked on in bands, with the same answer."""
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from presses import SPEC, assert_equal, random_press
 
 from mirrorskin.engine import OnsetSearch, find_onset
 from mirrorskin.io import Block
+from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.errors import DeviceError
 
 FRAMES = random_press("uint8", 30, (23, 31), seed=5)
@@ -44,7 +46,12 @@ def test_bands_leave_the_device_to_each_other(small_device):
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
     search.push(Block(FRAMES, 0, travel=TRAVEL))
     search.result()
-    arrays = [array for band in search._bands for array in (*band.maps.values(), band.frames)]
+    arrays = [
+        array
+        for band in search._bands
+        for array in (*band.maps.values(), band.frames, band._other)
+        if array is not None
+    ]
     on_device = [array._buffer is not None for array in arrays]
     assert all(on_device) if small_device.info.shares_memory else not any(on_device)
 
@@ -53,11 +60,13 @@ def test_frames_in_the_room_are_not_copied(device):
     search = OnsetSearch((23, 31), FRAMES.dtype, device=device)
     search.room[:30] = FRAMES
     band = search._bands[0]
-    pieces = list(band.stage(search.room[:30]))
-    assert pieces == [(0, 30)]
+    (staged,) = band.stage(search.room[:30])
+    assert staged.frames == slice(0, 30)
+    if device.info.shares_memory:
+        assert np.shares_memory(staged.array.host, search.room)
     every_other = search.room[:30:2]
-    list(band.stage(every_other))
-    np.testing.assert_array_equal(search.room[:15], FRAMES[::2])
+    for staged in band.stage(every_other):
+        np.testing.assert_array_equal(staged.array.download()[: staged.count], FRAMES[::2])
 
 
 def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
@@ -67,3 +76,63 @@ def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     search.push(Block(search.room[:30], 0, travel=TRAVEL))
     small_device.max_allocation = 10**9
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=small_device))
+
+
+def lent(frames, offset):
+    """Place frames so many bytes behind a page, as a mapped file may hold them."""
+    memory = np.zeros(frames.nbytes + 8192, np.uint8)
+    start = -memory.ctypes.data % 4096 + offset
+    placed = memory[start : start + frames.nbytes].view(frames.dtype).reshape(frames.shape)
+    placed[:] = frames
+    placed.flags.writeable = False
+    return placed
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("size", [(23, 31), (16, 64)])
+@pytest.mark.parametrize("offset", [0, 64, 1448, 8])
+def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size, offset):
+    frames = random_press(dtype, 40, size, seed=6)
+    travel = np.arange(40) * 0.1
+    placed = lent(frames, offset)
+    search = OnsetSearch(size, dtype, dark=SPEC[dtype][0], bright=SPEC[dtype][1], device=device)
+    room = search.room.copy()
+    for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
+        search.push(Block(placed[part], part.start, travel=travel[part], lent=True))
+    assert_equal(search.result(), find_onset(frames, travel, *SPEC[dtype], device=device))
+    np.testing.assert_array_equal(search.room, room)  # nothing was copied there
+
+
+def test_lent_frames_are_worked_on_where_they_lie(device):
+    placed = lent(FRAMES, 128)
+    search = OnsetSearch((23, 31), FRAMES.dtype, device=device)
+    (staged,) = search._bands[0].stage(placed, lent=True)
+    assert np.shares_memory(staged.array.host, placed) == device.info.shares_memory
+
+
+def test_lent_frames_stay_until_their_kernels_are_done(device):
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    for start in range(0, 30, 3):
+        part = slice(start, start + 3)
+        search.push(Block(lent(FRAMES[part], 64), start, travel=TRAVEL[part], lent=True))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
+
+
+def test_a_block_may_be_written_anew_after_it_was_pushed(device):
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    for start in range(0, 30, 3):
+        part = slice(start, start + 3)
+        block = FRAMES[part].copy()
+        search.push(Block(block, start, travel=TRAVEL[part]))
+        block[:] = 255 - block
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
+
+
+def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
+    def refuse(*_):
+        raise cl.LogicError("create_buffer", cl.status_code.INVALID_HOST_PTR, "read only")
+
+    monkeypatch.setattr(device_layer, "Lent", refuse)
+    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    search.push(Block(lent(FRAMES, 64), 0, travel=TRAVEL, lent=True))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))

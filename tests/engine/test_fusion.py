@@ -456,8 +456,11 @@ def test_recordings_are_told_by_their_hashes(tmp_path):
     ]
     with io.open_recording(paths[0]) as down, io.open_recording(paths[1]) as turn:
         result = engine.fuse_sources(down, turn)
-        hashes = down.sha256(), turn.sha256()
-    assert (result.process["vertical_source_sha256"], result.process["axial_source_sha256"]) == hashes
+        hashes = down.fingerprint(), turn.fingerprint()
+    assert (
+        result.process["vertical_source_fingerprint"],
+        result.process["axial_source_fingerprint"],
+    ) == hashes
     np.testing.assert_array_equal(result.height, fused().height)
     io.save_result(result, tmp_path / "both.h5")
     found = io.open_result(tmp_path / "both.h5")
@@ -558,3 +561,15 @@ def test_a_press_that_touched_nothing_has_no_height_to_fuse():
     dark = MadeUp(np.full((4, *SMALL), 20, np.uint8), DOWN.header, travel=np.arange(4.0))
     with pytest.raises(io.InputError, match="made up: no pixel turned light"):
         engine.fuse_sources(dark, rotation(SMALL, PIXEL))
+
+
+def test_other_regions_of_one_size_are_refused(tmp_path):
+    down = record(press(SMALL, PIXEL), tmp_path / "down.h5")
+    turn = record(rotation(SMALL, PIXEL), tmp_path / "round.h5")
+    regions = io.Region((0, 30), (5, 40)), io.Region((2, 32), (5, 40))
+    with (
+        io.open_recording(down, region=regions[0]) as vertical,
+        io.open_recording(turn, region=regions[1]) as axial,
+        pytest.raises(io.InputError, match="regions from column 5, row 0 and regions from column 5, row 2"),
+    ):
+        engine.fuse_sources(vertical, axial)

@@ -77,6 +77,22 @@ def test_a_recording_is_told_by_its_hash(tmp_path):
     path = record(sphere(), tmp_path / "ball.h5")
     with io.open_recording(path) as recording:
         process = sign(io.Result(), recording, open_device(None), {}).process
-        assert process["source_sha256"] == recording.sha256()
+        assert process["source_fingerprint"] == recording.fingerprint()
+        assert process["source_modified"] == recording.modified
         assert process["dataset"] == recording.dataset
         assert process["source"] == recording.name
+
+
+def test_pixels_of_a_part_lie_where_they_do_in_the_whole_picture(tmp_path):
+    path = record(sphere(), tmp_path / "ball.h5")
+    with io.open_recording(path) as recording:
+        whole = sign(io.Result(), recording, open_device(None), {})
+        count, rows, columns = recording.shape
+    part = io.Region((1, rows - 1), (2, columns - 1))
+    with io.open_recording(path, region=part, frames=(2, 5)) as recording:
+        signed = sign(io.Result(), recording, open_device(None), {})
+    np.testing.assert_array_equal(signed.x, whole.x[2:-1])
+    np.testing.assert_array_equal(signed.y, whole.y[1:-1])
+    assert signed.process["source_region"] == f"2,1,{columns - 3}x{rows - 2}"
+    assert signed.process["source_frames"] == "2:5"
+    assert whole.process["source_frames"] == f"0:{count}"

@@ -78,3 +78,50 @@ def test_heights_that_are_all_relative_are_refused(tmp_path):
     io.save_result(result, tmp_path / "r.h5")
     with pytest.raises(io.InputError, match="offset"):
         io.open_heights(tmp_path / "r.h5")
+
+
+ROWS, COLUMNS = (1, 4), (2, 6)
+
+
+def simulation(path):
+    twin = sphere()
+    return record(twin, path, truth=twin.truth), twin.truth.height
+
+
+def part_of(tmp_path, told, name="source_region", shape=(5, 7)):
+    """The heights in a result that tells which part it is of, cut for a region of a recording."""
+    rows, columns = shape
+    values = np.arange(rows * columns, dtype=np.float32).reshape(shape)
+    process = {} if told is None else {name: told}
+    io.save_result(io.Result(height=values, process=process), tmp_path / "h.h5")
+    path, _ = simulation(tmp_path / "r.h5")
+    with io.open_recording(path, region=io.Region(ROWS, COLUMNS)) as source:
+        return io.open_heights(tmp_path / "h.h5", source), values
+
+
+def test_the_truth_is_cut_for_a_region(tmp_path):
+    path, height = simulation(tmp_path / "r.h5")
+    with io.open_recording(path, region=io.Region(ROWS, COLUMNS)) as source:
+        np.testing.assert_array_equal(io.open_heights(path, source), height[1:4, 2:6])
+    with io.open_recording(path) as source:
+        np.testing.assert_array_equal(io.open_heights(path, source), height)
+
+
+@pytest.mark.parametrize("name", ["source_region", "vertical_source_region"])
+def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path, name):
+    for told in (None, "0,0,7x5"):
+        found, values = part_of(tmp_path, told, name)
+        np.testing.assert_array_equal(found, values[1:4, 2:6])
+    found, values = part_of(tmp_path, "1,1,6x3", name, (3, 6))
+    np.testing.assert_array_equal(found, values[:, 1:5])
+    found, values = part_of(tmp_path, "2,1,4x3", name, (3, 4))
+    np.testing.assert_array_equal(found, values)
+
+
+@pytest.mark.parametrize(
+    ("told", "shape"),
+    [("3,1,4x3", (3, 4)), ("2,2,4x3", (3, 4)), ("2,1,4x2", (2, 4)), (None, (3, 4)), (None, (6, 7))],
+)
+def test_heights_of_other_pixels_are_refused(tmp_path, told, shape):
+    with pytest.raises(io.InputError, match=r"h\.h5 holds the heights of rows .* and columns .*, where "):
+        part_of(tmp_path, told, shape=shape)

@@ -194,6 +194,18 @@ def test_the_recorder_passes_on_what_it_writes(tmp_path):
     np.testing.assert_array_equal(found.travel, TRAVEL)
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_raw_frames_begin_with_a_page(tmp_path, dtype):
+    stack = random_stack(dtype, (4, 600, 700))
+    header = io.Header("vertical", dark=np.ones((600, 700), "f4"))
+    path = record(MadeUp(stack, header, travel=TRAVEL[:4]), tmp_path / "a.h5")
+    with h5py.File(path) as file:
+        assert file["entry/data/frames"].id.get_offset() % 4096 == 0
+    with io.open_recording(path) as recording:
+        assert recording.read().frames.ctypes.data % 4096 == 0
+    assert path.stat().st_size < stack.nbytes + header.dark.nbytes + 40_000
+
+
 def test_drain_goes_block_by_block_and_tells_how_far_it_is(tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr("mirrorskin.io.recorder._BLOCK", 3 * math.prod(sphere().shape[1:]))

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mirrorskin.kernels import correlation
-from mirrorskin.kernels.device import C_TYPES, Array, Device
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import C_TYPES, Device
 
 PIXELS = [1, 1300]
 PHASES = np.array([0.1, 1.0, 1.7, 2.9, 3.3, 4.4, 5.2, 6.1, 7.0, 8.8, 9.1])

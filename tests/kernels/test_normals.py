@@ -79,8 +79,9 @@ class Answers:
         # As in an estimator's room: frames before, and one behind, of which the last vector may see some.
         frame = np.zeros_like(turn.frames[:1])
         stack = np.concatenate([*[frame] * start, turn.frames, frame])
-        table, scale = np.zeros((6, ROOM), np.float32), turn.scale.astype(np.float32)
-        table[:, :count] = turn.table
+        # Of several tables, it is not always the first.
+        tables, scale = np.full((start + 1, 6, ROOM), np.nan, np.float32), turn.scale.astype(np.float32)
+        tables[start, :, :count] = turn.table
         if scale.ndim == 2:
             scale = np.pad(scale, [(0, 0), (0, self.stride - self.pixels)], constant_values=np.nan)
         still = turn.limits.still - (turn.tilt if method == "exact" else 0)
@@ -93,8 +94,8 @@ class Answers:
             turn.limits.most - (turn.tilt if method == "exact" else 0),
             turn.limits.rest,
         )
-        whole = np.array([start, self.pixels, self.stride, self.turns], np.int32)
-        arrays = [self.put(stack), self.put(table), self.put(scale)]
+        whole = np.array([start, start, self.pixels, self.stride, self.turns], np.int32)
+        arrays = [self.put(stack), self.put(tables), self.put(scale)]
         arguments = [*arrays, *whole, *np.array(reals, np.float32), *self.maps.values()]
         if method == "paper":
             arguments += [*turn.spread.astype(np.float32)]

@@ -275,6 +275,20 @@ def test_after_a_reset_nothing_is_left(device: Device, dtype: str, window: int |
     same(used.result(), fresh.result())
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("window", [None, 8])
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_lent_frames_make_no_difference(device: Device, dtype: str, window: int | None, weights: str) -> None:
+    frames = swing(dtype, MEASURED)
+    memory = np.zeros(frames.nbytes + 64, np.uint8)  # what kernels may read beyond
+    lent = memory[: frames.nbytes].view(dtype).reshape(frames.shape)
+    lent[:] = frames
+    one, other = (Correlator(SHAPE, dtype, window=window, device=device) for _ in range(2))
+    one.push(Block(frames, 0, phase=MEASURED), WEIGHTS[weights])
+    other.push(Block(lent, 0, phase=MEASURED, lent=True), WEIGHTS[weights])
+    same(one.result(), other.result())
+
+
 @pytest.mark.parametrize("window", [None, 6])
 @pytest.mark.parametrize("weights", [None, [1, 1, 1, 0.5, 1, 1, 0, 1]])
 def test_frames_may_be_written_into_the_room(device: Device, window: int | None, weights: Any) -> None:

@@ -289,3 +289,15 @@ def test_a_device_without_room_says_so(small_device):
     small_device.max_allocation = 4 * 27 * 35 - 1  # a padded frame takes one byte more
     with pytest.raises(DeviceMemoryError, match="no room for padded"):
         Registered(made_up(ramp()), some_heights(), small_device)
+
+
+def test_registered_frames_are_not_lent(tmp_path):
+    frames = np.random.default_rng(1).integers(0, 200, (6, *SHAPE)).astype(np.uint8)
+    with io.Recorder(made_up(frames), tmp_path / "turn.h5") as recorder:
+        recorder.drain(lambda done: None)
+    with io.open_recording(tmp_path / "turn.h5") as recording:
+        room = np.empty((2, *SHAPE), np.uint8)
+        assert recording.read(room).lent
+        registered = Registered(recording, some_heights())
+        registered.rewind()
+        assert not registered.read(np.empty((2, *SHAPE), registered.dtype)).lent

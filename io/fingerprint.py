@@ -1,0 +1,139 @@
+"""What tells one recording from another, in less time than reading it takes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.plain import plainly
+from mirrorskin.io.storage import virtual_source
+from mirrorskin.io.types import InputError
+
+Spans = NDArray[np.int64]
+
+_EVERY, _TAKEN = 4 << 20, 4 << 10
+_PIECE = 1 << 20
+
+
+State = tuple[int, int, int, int]
+"""Of a file: device, number, bytes, and nanoseconds of its last change."""
+
+
+def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
+    """Return the files that frames lie in, the recording itself first, each as it was when it was opened."""
+    found: dict[Path, State] = {}
+
+    def visit(part: h5py.Dataset) -> None:
+        if part.is_virtual:
+            for source in part.virtual_sources():
+                visit(virtual_source(file, part, source))
+        for name, _, _ in part.external or ():
+            raw = file.beside(part, name, f"the raw storage of {part.name}")
+            found[raw] = _state(raw.stat())
+        add(part.file)
+
+    def add(opened: h5py.File) -> None:
+        found.setdefault(Path(opened.filename), _state(os.fstat(opened.id.get_vfd_handle())))
+
+    with plainly(f"{file.path}: {dataset.name}"):
+        add(file.root)
+        visit(dataset)
+    return found
+
+
+def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State]) -> str:
+    """Return a SHA-256, in hexadecimal, of a file: its length, all but the frames, and some of the frames.
+
+    Of the frames, joined in the order in which they are stored, the first 4 KiB of each 4 MiB are taken.
+    Where they lie in other files, as those of virtual and external datasets do, those files follow, in the
+    order in which the dataset names them.
+
+    Parameters
+    ----------
+    file : Hdf5File
+    dataset : h5py.Dataset
+        The frames.
+    origins : mapping
+        What ``origins`` returned when the file was opened.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, or is another than was opened.
+    """
+    spans: dict[Path, list[Spans]] = {path: [] for path in origins}
+    with plainly(f"{file.path}: {dataset.name}"):
+        for path, span in _stored(file, dataset):
+            spans[path].append(span)
+    digest = hashlib.sha256()
+    for path, parts in spans.items():
+        with plainly(str(path)), path.open("rb", buffering=0) as opened:
+            state = os.fstat(opened.fileno())
+            if _state(state) != origins[path]:
+                raise InputError(f"{path} was changed while it was open: start again")
+            digest.update(state.st_size.to_bytes(8, "little"))
+            for start, stop in _chosen(_joined(parts), state.st_size):
+                for place in range(start, stop, _PIECE):
+                    digest.update(os.pread(opened.fileno(), min(_PIECE, stop - place), place))
+    return digest.hexdigest()
+
+
+def modified(origins: Mapping[Path, State]) -> str:
+    """Return when the last of some files was written: ISO 8601, UTC, to the nanosecond."""
+    seconds, rest = divmod(max(changed for *_, changed in origins.values()), 10**9)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
+
+
+def _state(found: os.stat_result) -> State:
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _stored(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, Spans]]:
+    """Yield where a dataset's samples lie: the files, and where each part begins and ends there."""
+    own = Path(dataset.file.filename)
+    if dataset.is_virtual:
+        for part in dataset.virtual_sources():
+            yield from _stored(file, virtual_source(file, dataset, part))
+    elif dataset.external:
+        for name, offset, size in dataset.external:
+            raw = file.beside(dataset, name, f"the raw storage of {dataset.name}")
+            end = min(offset + size, raw.stat().st_size)
+            yield raw, np.array([[offset, end]], np.int64)
+    elif dataset.chunks:
+        found: list[h5py.h5d.StoreInfo] = []
+        dataset.id.chunk_iter(found.append)
+        chunks = np.array([(chunk.byte_offset, chunk.size) for chunk in found], np.int64).reshape(-1, 2)
+        yield own, np.cumsum(chunks, axis=1)
+    elif dataset.id.get_offset() is not None:
+        start = dataset.id.get_offset()
+        yield own, np.array([[start, start + dataset.id.get_storage_size()]], np.int64)
+    else:  # in its header
+        yield own, np.empty((0, 2), np.int64)
+
+
+def _joined(parts: list[Spans]) -> Spans:
+    """Sort spans, and join those that touch or overlap."""
+    spans = np.concatenate([np.empty((0, 2), np.int64), *parts])
+    spans = spans[np.argsort(spans[:, 0], kind="stable")]
+    reach = np.maximum.accumulate(spans[:, 1])
+    first = np.flatnonzero(np.append(True, spans[1:, 0] > reach[:-1])[: len(spans)])
+    return np.stack([spans[first, 0], np.maximum.reduceat(spans[:, 1], first)], 1) if len(spans) else spans
+
+
+def _chosen(frames: Spans, size: int) -> Iterator[tuple[int, int]]:
+    """Yield which bytes of a file are taken: all between the frames, and some of them."""
+    place = before = 0
+    for start, stop in np.minimum(frames, size).tolist():
+        yield place, start
+        for taken in range(start + -before % _EVERY, stop, _EVERY):
+            yield taken, min(taken + _TAKEN, stop)
+        before, place = before + stop - start, stop
+    yield place, size

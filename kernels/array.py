@@ -1,0 +1,236 @@
+"""Arrays that host and device both see, and memory of others that a device reads in place."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.errors import DeviceMemoryError
+
+if TYPE_CHECKING:
+    from mirrorskin.kernels.device import Device
+
+_PAGE = 4096
+_SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
+_NO_ROOM = {
+    cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
+    cl.status_code.OUT_OF_HOST_MEMORY,
+    cl.status_code.OUT_OF_RESOURCES,
+    cl.status_code.INVALID_BUFFER_SIZE,
+}
+
+
+class Array:
+    """An array that host and device both see: one memory where they share it, a copy each otherwise.
+
+    The host writes it at first; ``upload`` hands it to the device and ``download`` brings it back, which
+    moves nothing on a device that shares the host's memory.
+
+    Attributes
+    ----------
+    name : str
+    host : ndarray
+    arrived : pyopencl.Event or None
+        A copy under way that kernels have to wait for.
+    used : pyopencl.Event or None
+        The last kernel that it was given to.
+    """
+
+    def __init__(self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.name = name
+        self.arrived: cl.Event | None = None
+        self.used: cl.Event | None = None
+        self._brought = 0
+        self._device = device
+        self._shared = device.info.shares_memory
+        self._mapped: cl.MemoryMap | None = None
+        self._buffer: cl.Buffer | None = None
+        nbytes = math.prod(shape) * dtype.itemsize
+        if nbytes > device.max_allocation:
+            raise DeviceMemoryError(_no_room(device, name, nbytes))
+        try:
+            self._memory = _aligned(nbytes + _SLACK)
+            self.host = self._memory[:nbytes].view(dtype).reshape(shape)
+        except MemoryError as error:
+            raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
+        self._allocate()
+        self.claim()
+
+    def __del__(self) -> None:
+        # A kernel may still be at work in this memory.
+        if self._shared and self._buffer is not None:
+            self._device.finish()
+
+    def claim(self) -> None:
+        """Let the host write anew, whatever the device holds."""
+        if self._shared and self._mapped is None:
+            view, _ = cl.enqueue_map_buffer(
+                self._device.queue,
+                self.buffer,
+                cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
+                0,
+                self.host.shape,
+                self.host.dtype,
+                is_blocking=True,
+            )
+            self._mapped = view.base
+
+    def upload(self, rows: int | None = None) -> None:
+        """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
+        if self._buffer is None:
+            self._allocate()
+        if not self._shared:
+            part = self.host[:rows]
+            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
+            self._device.profile.wait("upload", self.name, event, part.nbytes)
+
+    def bring(self, values: NDArray[Any]) -> None:
+        """Begin to copy values from elsewhere on the host; kernels that are given this array wait for it.
+
+        The device has memory of its own, and the values stay as they are until ``settle``.
+        """
+        if self._buffer is None:
+            self._allocate()
+        self._brought = values.nbytes
+        after = [] if self.used is None else [self.used]
+        self._device.queue.flush()  # where that kernel waits
+        self.arrived = cl.enqueue_copy(
+            self._device.copies, self.buffer, values, is_blocking=False, wait_for=after
+        )
+        self._device.copies.flush()
+
+    def settle(self) -> None:
+        """Wait until what was brought is there."""
+        if self.arrived is not None:
+            self._device.profile.wait("upload", self.name, self.arrived, self._brought)
+            self.arrived = None
+
+    def download(self) -> NDArray[Any]:
+        """Wait for the device and return what it wrote, in the host's array."""
+        if self._shared:
+            self.claim()
+        else:
+            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
+            self._device.profile.wait("download", self.name, event, self.host.nbytes)
+        return self.host
+
+    def hand_over(self) -> NDArray[Any]:
+        """Wait for the device and give away what it wrote, without a copy; the array is no more of use."""
+        host = self.download()
+        if self._mapped is not None:
+            self._mapped.release()
+            self._mapped = None
+            self._device.finish()
+        if self._buffer is not None:
+            self._buffer.release()
+            self._buffer = None
+        return host
+
+    def park(self) -> None:
+        """Make room on the device: keep the content on the host until the next upload."""
+        if not self._shared and self._buffer is not None:
+            self.download()
+            self.drop()
+
+    def drop(self) -> None:
+        """Make room on the device, and forget what the device held."""
+        if not self._shared and self._buffer is not None:
+            self._buffer.release()
+            self._buffer = None
+
+    @property
+    def buffer(self) -> cl.Buffer:
+        """The device's side, for kernels; the host must not write while they run."""
+        if self._buffer is None:
+            raise RuntimeError(f"{self.name} is parked: upload it first")
+        if self._mapped is not None:
+            self._mapped.release()
+            self._mapped = None
+        return self._buffer
+
+    def _allocate(self) -> None:
+        flags = cl.mem_flags.READ_WRITE
+        try:
+            if self._shared:
+                self._buffer = cl.Buffer(
+                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
+                )
+            else:
+                self._buffer = cl.Buffer(self._device.context, flags, size=self._memory.nbytes)
+                # Drivers allocate at first use; asking for it here makes a lack of memory show here.
+                undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
+                cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
+        except cl.Error as error:
+            if error.code not in _NO_ROOM:
+                raise
+            raise DeviceMemoryError(_no_room(self._device, self.name, self.host.nbytes)) from error
+
+
+class Lent:
+    """Memory of another owner's that kernels read in place; it stays referred to until they are done.
+
+    Attributes
+    ----------
+    name : str
+    host : ndarray
+    buffer : pyopencl.Buffer
+    arrived, used
+        As of an ``Array``; there is no copy to wait for.
+    """
+
+    arrived = None
+
+    def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
+        self.name, self.host = name, values
+        self.used: cl.Event | None = None
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+        self.buffer = cl.Buffer(device.context, flags, hostbuf=values)
+
+    def __del__(self) -> None:
+        if self.used is not None:
+            self.used.wait()
+
+
+Operand = Array | Lent
+"""What a kernel can be given besides numbers."""
+
+
+def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Make room on the host from where copies to a device are fastest; see ``Device.pinned``."""
+    nbytes = math.prod(shape) * dtype.itemsize
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+    try:
+        buffer = cl.Buffer(device.context, flags, size=nbytes)
+        view, _ = cl.enqueue_map_buffer(
+            device.copies,
+            buffer,
+            cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
+            0,
+            shape,
+            dtype,
+            is_blocking=True,
+        )
+    except cl.Error as error:
+        if error.code not in _NO_ROOM:
+            raise
+        raise DeviceMemoryError(_no_room(device, "frames on the host", nbytes)) from error
+    room: NDArray[Any] = view
+    return room
+
+
+def _aligned(nbytes: int) -> NDArray[np.uint8]:
+    """Zeros that start on a page, so that a device sharing the memory need not copy them."""
+    raw = np.zeros(nbytes + _PAGE, np.uint8)
+    start = -raw.ctypes.data % _PAGE
+    return raw[start : start + nbytes]
+
+
+def _no_room(device: Device, name: str, nbytes: int) -> str:
+    return (
+        f"{device.info.title} has no room for {name} ({nbytes} bytes; "
+        f"one buffer holds at most {device.max_allocation})"
+    )

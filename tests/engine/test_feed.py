@@ -1,0 +1,77 @@
+"""The one loop: each frame once, in order, whatever room there is, and no harm where reading fails."""
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.feed import feed
+from mirrorskin.io import Block, Header, InputError
+
+
+class Source:
+    """So many frames, each of its own number; it may fail at one of them."""
+
+    name, header, motion, rewindable, dtype = "some", Header("vertical"), "vertical", True, np.dtype("uint16")
+
+    def __init__(self, count, fails=None):
+        self.shape = (count, 3, 5)
+        self.fails, self.next = fails, 7
+
+    def rewind(self):
+        self.next = 0
+
+    def read(self, out=None):
+        start, stop = self.next, min(self.next + len(out), self.shape[0])
+        if self.fails is not None and start <= self.fails < stop:
+            raise InputError(f"frame {self.fails} is damaged")
+        if start == stop:
+            return None
+        out[: stop - start] = np.arange(start, stop)[:, None, None]
+        self.next = stop
+        return Block(out[: stop - start], start)
+
+
+class Estimator:
+    """Keeps a copy of what it is given."""
+
+    def __init__(self, device, room, fails=None):
+        self.device = device
+        self.room = np.zeros((room, 3, 5), np.uint16)
+        self.seen, self.fails = [], fails
+
+    def push(self, block):
+        if self.fails in range(block.index, block.index + len(block.frames)):
+            raise InputError("no")
+        self.seen += [int(number) for frame in block.frames for number in np.unique(frame)]
+
+
+@pytest.mark.parametrize("room", [1, 2, 3, 10, 100])
+@pytest.mark.parametrize("wanted", [range(10), range(4, 10), range(2, 7), range(9, 10), range(0)])
+def test_each_frame_is_pushed_once_and_in_order(device, room, wanted):
+    told = []
+    estimator = Estimator(device, room)
+    feed(Source(10), estimator, wanted, told.append)
+    assert estimator.seen == list(wanted)
+    assert told == sorted(told)
+    assert told[-1:] == ([wanted.stop] if wanted else [])
+
+
+def test_a_source_that_ends_early_is_no_error(device):
+    estimator = Estimator(device, 4)
+    feed(Source(6), estimator, range(9))
+    assert estimator.seen == list(range(6))
+
+
+@pytest.mark.parametrize("fails", [0, 5, 9])
+def test_what_fails_in_reading_is_told_and_what_came_before_was_pushed(device, fails):
+    estimator = Estimator(device, 2)
+    with pytest.raises(InputError, match=f"frame {fails} is damaged"):
+        feed(Source(10, fails), estimator, range(10))
+    assert estimator.seen == list(range(len(estimator.seen)))
+    assert len(estimator.seen) <= fails
+
+
+def test_what_fails_in_the_estimator_ends_the_reading(device):
+    source = Source(100)
+    with pytest.raises(InputError, match="no"):
+        feed(source, Estimator(device, 2, fails=3), range(100))
+    assert source.next < 10

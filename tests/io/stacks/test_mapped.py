@@ -1,0 +1,147 @@
+"""Frames in one piece: lent where they lie in the file, and safe to keep."""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from fetching import GIVEN, compressible, ours, theirs, write
+
+from mirrorskin import io
+from mirrorskin.io.region import Region
+from mirrorskin.io.stacks.mapped import SPARE, Mapped
+from mirrorskin.io.stacks.stack import Cut, Place
+
+SHAPE = (9, 50, 70)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "a.h5", compressible(SHAPE, "u2"))
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
+@pytest.mark.parametrize("shape", [SHAPE, (2, 1, 1), (3, 1, 5), (7, 13, 1)])
+def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
+    path = write(tmp_path / "a.h5", compressible(shape, dtype))
+    for room in (1, 2, 4, 20):
+        frames, how = ours(path, room)
+        np.testing.assert_array_equal(frames, theirs(path))
+        assert how == "mapped"
+
+
+def test_lent_frames_cannot_be_written_to(path):
+    with io.open_recording(path, **GIVEN) as recording:
+        block = recording.read()
+        assert block.lent
+        with pytest.raises(ValueError, match="read-only"):
+            block.frames[...] = 0
+
+
+def test_lent_frames_outlive_their_recording(path):
+    frames = compressible(SHAPE, "u2")
+    with io.open_recording(path, **GIVEN) as recording:
+        kept = [recording.read(np.empty((3, 50, 70), "u2")).frames for _ in range(3)]
+    del recording
+    gc.collect()
+    np.testing.assert_array_equal(np.concatenate(kept), frames)
+
+
+def test_pages_go_with_the_last_frame(path):
+    def maps():
+        return Path("/proc/self/maps").read_text().count(str(path))
+
+    recording = io.open_recording(path, **GIVEN)
+    frames = recording.read().frames[0, 3:]
+    recording.close()
+    assert maps() == 1
+    del recording
+    assert maps() == 1
+    del frames
+    assert maps() == 0
+
+
+def test_a_region_or_a_range_is_cut_out(path):
+    for region in (None, Region((0, 50), (0, 70)), Region((3, 4), (0, 70)), Region((0, 50), (69, 70))):
+        for frames in ((0, None), (2, 4), (5, 9)):
+            found, _ = ours(path, 2, region=region, frames=frames)
+            np.testing.assert_array_equal(found, theirs(path, frames, region))
+    with io.open_recording(path, **GIVEN, region=Region((0, 50), (0, 69))) as recording:
+        assert not recording.read().lent
+    with io.open_recording(path, **GIVEN, frames=(4, None)) as recording:
+        assert recording.read().lent
+
+
+@pytest.mark.parametrize("spare", [0, 1, SPARE - 1, SPARE, SPARE + 1, mmap.PAGESIZE - 1])
+@pytest.mark.parametrize("more", [0, 1, SPARE, 5000])
+def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
+    """The last frame ends ``spare`` bytes before a page does, and the file ``more`` bytes behind it."""
+    frames = compressible((4, 8, 256), "u1")
+    offset = 3 * mmap.PAGESIZE - spare - frames.nbytes % mmap.PAGESIZE
+    data = bytes(offset) + frames.tobytes() + bytes(more)
+    (tmp_path / "raw").write_bytes(data)
+    whole = Cut((0, 4), Region.whole((8, 256)))
+    with (tmp_path / "raw").open("rb") as file:
+        stack = Mapped(file.fileno(), Place("raw", "x"), offset, frames.shape, frames.dtype, whole)
+    out = np.zeros_like(frames)
+    np.testing.assert_array_equal(stack.read(0, 4, out), frames)
+    assert np.array_equal(out, frames) == (more <= spare < SPARE)
+    out[...] = 0
+    assert stack.read(0, 3, out).base is not out  # those before it are lent in any case
+
+
+def test_frames_at_odd_addresses_are_copied(tmp_path):
+    frames = compressible(SHAPE, "u2")
+    (tmp_path / "raw").write_bytes(b"x" + frames.tobytes() + bytes(100))
+    whole = Cut((0, 9), Region.whole(SHAPE[1:]))
+    with (tmp_path / "raw").open("rb") as file:
+        stack = Mapped(file.fileno(), Place("raw", "x"), 1, SHAPE, frames.dtype, whole)
+    out = np.zeros_like(frames)
+    stack.read(0, 9, out)
+    np.testing.assert_array_equal(out, frames)
+
+
+@pytest.mark.parametrize("left", [0, 1000, 20_000, -1])
+def test_a_file_that_becomes_shorter_is_told_before_it_is_touched(path, left):
+    with io.open_recording(path, **GIVEN) as recording:
+        recording.read()
+        with h5py.File(path) as file:
+            end = file["x"].id.get_offset() + file["x"].nbytes
+        os.truncate(path, left if left >= 0 else end - 1)
+        line = r"a\.h5: frames 1 to 8 of /x cannot be read: it is truncated: copy it again"
+        with pytest.raises(io.InputError, match=line):
+            recording.read(np.empty((8, 50, 70), "u2"))
+
+
+CHILD = """
+import numpy as np, resource, sys
+from mirrorskin import io
+def peak():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]) << 10
+total = 0
+with io.open_recording(sys.argv[1], motion="horizontal") as recording:
+    out = np.empty((int(sys.argv[2]), *recording.shape[1:]), recording.dtype)
+    recording.read(out)
+    before = peak()
+    while (block := recording.read(out)) is not None:
+        total += int(block.frames.sum())
+print(total, peak() - before)
+"""
+
+
+def test_pages_that_were_used_do_not_pile_up(tmp_path):
+    frames = np.ones((320, 256, 1024), "u1")
+    path = write(tmp_path / "a.h5", frames)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, str(path), "16"], capture_output=True, text=True, check=True
+    )
+    total, more = map(int, done.stdout.split())
+    assert total == 304 * 256 * 1024
+    assert more < 4 * frames[:16].nbytes

@@ -1,0 +1,284 @@
+"""Chunks read past HDF5: what comes out is what HDF5 gives, and every chunk is unpacked once."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import itertools
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from fetching import ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mirrorskin import io
+from mirrorskin.io.region import Region
+
+SHAPE = (11, 13, 17)
+CHUNKS = {
+    "a frame": (1, 13, 17),
+    "some frames": (3, 13, 17),
+    "tiles of a frame": (1, 5, 17),
+    "tiles of some frames": (4, 5, 6),
+    "a pixel's time": (11, 1, 1),
+    "tiles of all frames": (11, 5, 6),
+    "rows of all frames": (11, 2, 17),
+    "everything": (11, 13, 17),
+}
+REGION = Region((3, 11), (4, 12))
+
+
+@pytest.mark.parametrize("chunks", CHUNKS)
+@pytest.mark.parametrize("packing", ["raw", "bitshuffle", "shuffled gzip", "blosc2"])
+def test_chunks_of_any_shape_give_what_hdf5_gives(tmp_path, monkeypatch, chunks, packing):
+    path = write(
+        tmp_path / "a.h5", compressible(SHAPE, "u2"), CHUNKS[chunks], (PACKINGS | ONLY_HDF5)[packing]
+    )
+    counts = count_unpacked(monkeypatch)
+    for room, region in itertools.product((1, 5, 40), (None, REGION)):
+        counts.clear()
+        frames, _ = ours(path, room, region=region)
+        np.testing.assert_array_equal(frames, theirs(path, region=region))
+        assert counts
+        assert set(counts.values()) == {1}
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_every_packing_is_unpacked_past_hdf5(tmp_path, packing, dtype):
+    for chunks, shape in (((1, 13, 17), SHAPE), ((4, 5, 6), (12, 15, 18))):
+        path = write(tmp_path / "a.h5", compressible(shape, dtype), chunks, PACKINGS[packing])
+        frames, how = ours(path, 4, threads=2)
+        np.testing.assert_array_equal(frames, theirs(path))
+        assert how == f"chunks {'read' if packing == 'raw' else 'decoded'} by 2 threads"
+
+
+@pytest.mark.parametrize("packing", ONLY_HDF5)
+def test_what_we_cannot_unpack_goes_through_hdf5(tmp_path, packing):
+    path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"), (3, 13, 17), ONLY_HDF5[packing])
+    frames, how = ours(path, 3)
+    np.testing.assert_array_equal(frames, theirs(path))
+    assert how.startswith("through HDF5 (")
+
+
+@pytest.mark.parametrize("dtype", [">u2", ">f4"])
+@pytest.mark.parametrize("chunks", [None, (1, 13, 17), (4, 5, 6)])
+def test_the_other_byte_order_goes_through_hdf5(tmp_path, dtype, chunks):
+    path = write(tmp_path / "a.h5", compressible(SHAPE, dtype[1:]).astype(dtype), chunks)
+    for room in (1, 3, 11):
+        frames, how = ours(path, room)
+        np.testing.assert_array_equal(frames, theirs(path))
+        assert how in ("through HDF5 (byte order)", "unpacked into memory")
+
+
+@pytest.mark.parametrize("left_out", [0, 1, 2, 3])
+def test_chunks_may_have_been_left_out_by_filters(tmp_path, left_out):
+    frames = compressible(SHAPE, "u2")
+    path = write(tmp_path / "a.h5", frames, (1, 13, 17), {"compression": "gzip", "shuffle": True})
+    shuffled = frames[4].reshape(-1, 1).view("u1").T.copy()
+    data = (frames[4] if left_out & 1 else shuffled).tobytes()
+    with h5py.File(path, "r+") as file:
+        packed = data if left_out & 2 else zlib.compress(data)
+        file["x"].id.write_direct_chunk((4, 0, 0), packed, filter_mask=left_out)
+    np.testing.assert_array_equal(theirs(path), frames)
+    found, how = ours(path, 3)
+    np.testing.assert_array_equal(found, frames)
+    assert how.startswith("chunks decoded")
+
+
+@pytest.mark.parametrize("packing", ["gzip", "shuffle"])
+def test_chunks_at_the_edge_may_be_raw(tmp_path, packing):
+    library = next(Path(h5py.__file__).parent.with_name("h5py.libs").glob("libhdf5-*"), None)
+    if library is None:
+        pytest.skip("this h5py does not bring its HDF5")
+    set_options = ctypes.CDLL(str(library)).H5Pset_chunk_opts
+    set_options.argtypes = [ctypes.c_int64, ctypes.c_uint]
+    frames, made = compressible(SHAPE, "u2"), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    made.set_chunk((2, 5, 17))
+    made.set_shuffle()
+    if packing == "gzip":
+        made.set_deflate(1)
+    assert set_options(made.id, 2) == 0  # H5D_CHUNK_DONT_FILTER_PARTIAL_CHUNKS
+    with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
+        space = h5py.h5s.create_simple(SHAPE)
+        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, made))[...] = frames
+    found, how = ours(tmp_path / "a.h5", 4)
+    np.testing.assert_array_equal(found, frames)
+    assert how == "through HDF5 (raw chunks at the edge)"
+
+
+def test_a_user_block_goes_through_hdf5(tmp_path):
+    frames = compressible(SHAPE, "u1")
+    with h5py.File(tmp_path / "a.h5", "w", userblock_size=1024) as file:
+        file.create_dataset("x", data=frames, chunks=(1, 13, 17), compression="gzip")
+    found, how = ours(tmp_path / "a.h5", 3)
+    np.testing.assert_array_equal(found, frames)
+    assert how == "through HDF5 (user block)"
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("maxshape", [SHAPE, (None, 13, 17), (None, None, 17)])
+def test_every_kind_of_index_is_read(tmp_path, libver, maxshape):
+    frames = compressible(SHAPE, "u1")
+    for chunks in ((1, 13, 17), (3, 4, 5), (20, 20, 20) if maxshape[1] is None else (11, 13, 17)):
+        with h5py.File(tmp_path / "a.h5", "w", libver=libver) as file:
+            file.create_dataset(
+                "x", data=frames, chunks=(*chunks[:2], 17), maxshape=maxshape, compression="lzf"
+            )
+        np.testing.assert_array_equal(ours(tmp_path / "a.h5", 4)[0], frames)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7])
+def test_more_threads_give_the_same(tmp_path, threads):
+    path = write(tmp_path / "a.h5", compressible((40, 30, 31), "u2"), (2, 7, 8), PACKINGS["bitshuffle"])
+    frames, how = ours(path, 16, threads=threads)
+    np.testing.assert_array_equal(frames, theirs(path))
+    assert how == f"chunks decoded by {threads} thread{'s' if threads > 1 else ''}"
+
+
+@st.composite
+def stacks(draw):
+    shape = tuple(draw(st.integers(least, 12)) for least in (2, 1, 1))
+    chunks = tuple(draw(st.integers(1, n)) for n in shape)
+    start = draw(st.integers(0, shape[0] - 2))
+    frames = (start, draw(st.integers(start + 2, shape[0])))
+    spans = []
+    for n in shape[1:]:
+        first = draw(st.integers(0, n - 1))
+        spans.append((first, draw(st.integers(first + 1, n))))
+    return shape, chunks, frames, Region(*spans)
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    stacks(),
+    st.sampled_from(sorted(PACKINGS | ONLY_HDF5)),
+    st.sampled_from(["<u1", "<u2", "<f4", ">u2", ">f4"]),
+    st.integers(1, 14),
+    st.sampled_from([None, 200, 2000]),
+)
+def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packing, dtype, room, limit):
+    shape, chunks, frames, region = what
+    packing = {} if packing == "scaleoffset" and "f" in dtype else (PACKINGS | ONLY_HDF5)[packing]
+    path = tmp_path_factory.mktemp("any") / "a.h5"
+    write(path, compressible(shape, dtype[1:]).astype(dtype), chunks, packing)
+    size = int(np.prod(chunks)) * np.dtype(dtype).itemsize
+    with pytest.MonkeyPatch.context() as patch:
+        counts = count_unpacked(patch)
+        found, _ = ours(path, room, frames=frames, region=region, memory_limit=limit and max(limit, size))
+    np.testing.assert_array_equal(found, theirs(path, frames, region))
+    assert set(counts.values()) == {1}
+    needed = [
+        -(-stop // c) - start // c
+        for (start, stop), c in zip((frames, region.rows, region.columns), chunks, strict=True)
+    ]
+    if packing:
+        assert len(counts) == np.prod(needed)
+
+
+def test_damage_is_told_with_the_frames(tmp_path):
+    path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (2, 50, 70), PACKINGS["bitshuffle"])
+    with h5py.File(path) as file:
+        chunk = file["x"].id.get_chunk_info(2)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + 12] ^= 0xFF
+    path.write_bytes(data)
+    for region in (None, REGION):
+        with pytest.raises(io.InputError, match=r"a\.h5: frames 4 to 5 of /x cannot be read: it is damaged"):
+            ours(path, 9, region=region)
+
+
+def test_chunks_that_are_not_in_the_file_are_told(tmp_path):
+    path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
+    data = path.read_bytes()
+    with h5py.File(path) as file:
+        chunk = file["x"].id.get_chunk_info(8)
+    where = chunk.byte_offset.to_bytes(8, "little")
+    assert data.count(where) == 1
+    path.write_bytes(data.replace(where, (len(data) - 1).to_bytes(8, "little")))
+    with pytest.raises(io.InputError, match=r"a\.h5: /x: it is truncated: copy it again"):
+        ours(path, 9)
+
+
+def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
+    path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
+    with io.open_recording(path, motion="horizontal") as recording:
+        recording.read()
+        with path.open("r+b") as file:
+            file.truncate(path.stat().st_size // 2)
+        line = "frames? .* of /x cannot be read: it is truncated: copy it again"
+        with pytest.raises(io.InputError, match=line):
+            recording.read(np.empty((9, 50, 70), "u2"))
+
+
+def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
+    from mirrorskin.io.stacks.packed import Packed
+
+    path = write(tmp_path / "a.h5", compressible((30, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
+    decode = Packed._decode
+
+    def interrupted(self, position, out, room):
+        if position[0] == 20:
+            raise KeyboardInterrupt
+        decode(self, position, out, room)
+
+    monkeypatch.setattr(Packed, "_decode", interrupted)
+    with io.open_recording(path, motion="horizontal", threads=3) as recording:
+        out = np.zeros((30, 50, 70), "u2")
+        with pytest.raises(KeyboardInterrupt):
+            recording.read(out)
+        out[:] = 0
+        assert not out.any()
+    assert not out.any()
+
+
+@pytest.mark.parametrize("chunks", [None, (1, 13, 17), (4, 13, 17)])
+def test_closing_twice_does_no_harm(tmp_path, chunks):
+    path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"), chunks, chunks and PACKINGS["bitshuffle"])
+    with io.open_recording(path, motion="horizontal") as recording:
+        recording.read(np.empty((3, 13, 17), "u1"))
+        recording.close()
+        others = [path.open("rb") for _ in range(3)]
+        recording.close()
+        assert all(other.read(4) == b"\x89HDF" for other in others)
+        with pytest.raises(io.InputError, match=r"frames? .* cannot be read"):
+            recording.read(np.empty((11, 13, 17), "u1"))
+    for other in others:
+        other.close()
+
+
+def test_what_is_dropped_is_closed(tmp_path):
+    path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"), (1, 13, 17), PACKINGS["bitshuffle"])
+    count = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(5):
+        recording = io.open_recording(path, motion="horizontal", threads=2)
+        recording.read(np.empty((3, 13, 17), "u1"))
+    del recording
+    gc.collect()
+    assert len(list(Path("/proc/self/fd").iterdir())) <= count + 1
+
+
+@pytest.mark.parametrize("second", ["deflate", "lzf"])
+def test_what_is_packed_twice_goes_through_hdf5(tmp_path, second):
+    frames, made = compressible(SHAPE, "u2"), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    made.set_chunk((1, 13, 17))
+    made.set_deflate(1)
+    if second == "lzf":
+        made.set_filter(h5py.h5z.FILTER_LZF, h5py.h5z.FLAG_OPTIONAL)
+    else:
+        made.set_shuffle()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        space = h5py.h5s.create_simple(SHAPE)
+        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, made))[...] = frames
+    found, how = ours(tmp_path / "a.h5", 3)
+    np.testing.assert_array_equal(found, frames)
+    assert how == "through HDF5 (packed twice)"

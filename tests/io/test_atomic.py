@@ -1,0 +1,89 @@
+"""Files that exist whole or not at all, and what is left of those whose writers were killed."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mirrorskin.io import InputError, atomic
+from mirrorskin.io.atomic import new_hdf5, remove_leftovers
+
+# Begins a file, says so, and waits to be killed.
+BEGIN = """
+import sys
+from pathlib import Path
+from mirrorskin.io.atomic import new_hdf5
+with new_hdf5(Path(sys.argv[1])) as new:
+    new.root["x"] = 1
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+def parts(folder):
+    return sorted(folder.glob(".mirrorskin-*.part"))
+
+
+def test_a_file_has_its_name_only_when_it_is_whole(tmp_path):
+    with new_hdf5(tmp_path / "a.h5") as new:
+        new.root["x"] = 1
+        (part,) = tmp_path.iterdir()
+        assert part.suffix == ".part"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_what_is_being_written_here_is_no_leftover(tmp_path):
+    with new_hdf5(tmp_path / "a.h5") as new:
+        assert remove_leftovers(tmp_path) == []
+        new.root["x"] = 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_only_what_a_killed_program_wrote_is_removed(tmp_path):
+    command = [sys.executable, "-c", BEGIN, str(tmp_path / "a.h5")]
+    (tmp_path / "other.part").touch()
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"begun\n"
+        (part,) = parts(tmp_path)
+        assert remove_leftovers(tmp_path) == []
+        writer.kill()
+    assert parts(tmp_path) == [part]
+    assert remove_leftovers(tmp_path) == [part]
+    assert [path.name for path in tmp_path.iterdir()] == ["other.part"]
+
+
+def test_a_file_that_was_taken_for_a_leftover_is_begun_again(tmp_path, monkeypatch):
+    made = atomic.tempfile.mkstemp
+    names = []
+
+    def make(**options):
+        handle, name = made(**options)
+        names.append(name)
+        if len(names) == 1:
+            assert remove_leftovers(tmp_path) == [Path(name)]
+        return handle, name
+
+    monkeypatch.setattr(atomic.tempfile, "mkstemp", make)
+    with new_hdf5(tmp_path / "a.h5") as new:
+        new.root["x"] = 1
+    assert len(names) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def without_locks(*_):
+    raise OSError(95, "no locks here")
+
+
+def test_where_there_are_no_locks_all_is_written_and_nothing_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic.fcntl, "flock", without_locks)
+    with new_hdf5(tmp_path / "a.h5") as new:
+        new.root["x"] = 1
+        assert remove_leftovers(tmp_path) == []
+    assert (tmp_path / "a.h5").is_file()
+
+
+def test_a_folder_that_is_not_there_has_no_leftovers(tmp_path):
+    assert remove_leftovers(tmp_path / "no") == []
+    with pytest.raises(InputError, match="there is no folder"), new_hdf5(tmp_path / "no" / "a.h5"):
+        pass
