@@ -1,10 +1,10 @@
-# make [demo|test|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
+# make [demo|test|soak|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test lint types bench portability clean
+.PHONY: demo test soak lint types bench portability clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -19,6 +19,10 @@ demo: $(READY)
 # A process for each core, each with files of its own: much of a test is compiling kernels, on one core.
 test: lint types
 	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# Batches that are killed at random, 20 times each, in one process, so that there is one table; 'make test' does each once.
+soak: $(READY)
+	@MIRRORSKIN_SOAK=20 $(BIN)/python -m pytest tests/soak
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet

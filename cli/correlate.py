@@ -22,6 +22,8 @@ def command(
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
     pixel_size: options.PixelSize = None,
+    region: options.Region = None,
+    frames: options.Frames = None,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
@@ -33,7 +35,14 @@ def command(
     from mirrorskin.cli.progress import progress
     from mirrorskin.cli.quantity import memory as bytes_of
 
-    known = given(options.MotionName.axial, None, None, phase_step, phases, None, pixel_size)
+    known = given(
+        motion=options.MotionName.axial,
+        phase_step=phase_step,
+        phases=phases,
+        pixel_size=pixel_size,
+        region=region,
+        frames=frames,
+    )
     limit = bytes_of(memory, "--memory")
     with io.open_recording(stack, dataset=dataset, memory_limit=limit, **known) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")

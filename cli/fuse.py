@@ -32,6 +32,7 @@ def command(
     phases: options.Phases = None,
     tilt: options.Tilt = None,
     pixel_size: options.PixelSize = None,
+    region: options.Region = None,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
     robust: options.Robust = False,
@@ -53,7 +54,15 @@ def command(
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
 
-    known = given(None, travel_step, travel_start, phase_step, phases, tilt, pixel_size)
+    known = given(
+        travel_step=travel_step,
+        travel_start=travel_start,
+        phase_step=phase_step,
+        phases=phases,
+        tilt=tilt,
+        pixel_size=pixel_size,
+        region=region,
+    )
     gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
     rotation = {"gain": gain, "offset": zenith_offset}
     limit = bytes_of(memory, "--memory")

@@ -30,9 +30,18 @@ def command(
     from mirrorskin.cli.progress import progress
 
     io.check_output(output, frames, phases)
-    known = given(motion, travel_step, travel_start, phase_step, phases, tilt, pixel_size)
-    header = io.Header(motion.value, title=frames.stem, tilt=known["tilt"], pixel_size=known["pixel_size"])
-    source = io.open_frames(frames, header, known["travel"], known["phase"])
+    known = given(
+        travel_step=travel_step,
+        travel_start=travel_start,
+        phase_step=phase_step,
+        phases=phases,
+        tilt=tilt,
+        pixel_size=pixel_size,
+    )
+    header = io.Header(
+        motion.value, title=frames.stem, tilt=known.get("tilt"), pixel_size=known.get("pixel_size")
+    )
+    source = io.open_frames(frames, header, known.get("travel"), known.get("phase"))
     with (
         io.Recorder(source, output, compression.value) as recorder,
         progress("importing", source.shape[0]) as show,

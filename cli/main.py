@@ -16,7 +16,19 @@ from typing import Annotated
 
 import typer
 
-from mirrorskin.cli import bench, correlate, demo, devices, fuse, import_, info, reconstruct, score, simulate
+from mirrorskin.cli import (
+    batch,
+    bench,
+    correlate,
+    demo,
+    devices,
+    fuse,
+    import_,
+    info,
+    reconstruct,
+    score,
+    simulate,
+)
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
@@ -39,7 +51,7 @@ def _common(
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
 
 
-for module in (demo, simulate, import_, reconstruct, correlate, fuse, score, info, devices, bench):
+for module in (demo, simulate, import_, reconstruct, correlate, fuse, batch, score, info, devices, bench):
     app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
 
 

@@ -57,6 +57,13 @@ Robust = Annotated[
 PixelSize = Annotated[
     str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
 ]
+Region = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,WxH", help="Only so many pixels, from column X and row Y on: 100,50,640x480."),
+]
+Frames = Annotated[
+    str | None, typer.Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")
+]
 Dataset = Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")]
 Memory = Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]

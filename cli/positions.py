@@ -9,49 +9,88 @@ from mirrorskin.cli.options import MotionName
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mirrorskin.io import Motion, Positions
+    from mirrorskin.io import Motion, Positions, Region
 
 
-class Given(TypedDict):
-    """The keywords of ``io.open_recording`` that describe a stack."""
+class Given(TypedDict, total=False):
+    """The keywords of ``io.open_recording`` that describe a stack; what nobody said is missing."""
 
-    motion: Motion | None
-    travel: Positions | None
-    phase: Positions | None
-    tilt: float | None
-    pixel_size: tuple[float, float] | None
+    motion: Motion
+    travel: Positions
+    phase: Positions
+    tilt: float
+    pixel_size: tuple[float, float]
+    region: Region
+    frames: tuple[int, int | None]
 
 
 def given(
-    motion: MotionName | None,
-    travel_step: str | None,
-    travel_start: str | None,
-    phase_step: str | None,
-    phases: Path | None,
-    tilt: str | None,
-    pixel_size: str | None,
+    *,
+    motion: MotionName | None = None,
+    travel_step: str | None = None,
+    travel_start: str | None = None,
+    phase_step: str | None = None,
+    phases: Path | None = None,
+    tilt: str | None = None,
+    pixel_size: str | None = None,
+    region: str | None = None,
+    frames: str | None = None,
+    where: str = "--",
 ) -> Given:
-    """Turn the options' words into numbers, in millimetres and radians."""
-    from mirrorskin.cli.phases import read_phases
-    from mirrorskin.cli.quantity import angle, length, lengths
-    from mirrorskin.io import InputError, Steps
+    """Turn the options' words into numbers, in millimetres and radians.
 
-    if travel_start is not None and travel_step is None:
-        raise InputError("--travel-start without --travel-step says nothing: give both")
+    Parameters
+    ----------
+    motion, travel_step, travel_start, phase_step, phases, tilt, pixel_size, region, frames
+        The options.
+    where : str
+        What stands before an option's name where it was written.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        One cannot be read, or does not go with another.
+    """
+    from mirrorskin.cli import part
+    from mirrorskin.cli.quantity import angle, lengths
+    from mirrorskin.io import InputError
+
     if phase_step is not None and phases is not None:
         raise InputError("--phase-step and --phases both tell the phases: give one of them")
-    travel: Positions | None = None
-    phase: Positions | None = None
-    if travel_step is not None:
-        travel = Steps(length(travel_step, "--travel-step"), length(travel_start or "0mm", "--travel-start"))
-    if phase_step is not None:
-        phase = Steps(angle(phase_step, "--phase-step"))
-    if phases is not None:
-        phase = read_phases(phases)
-    return Given(
-        motion=motion.value if motion else None,
-        travel=travel,
-        phase=phase,
-        tilt=None if tilt is None else angle(tilt, "--tilt"),
-        pixel_size=None if pixel_size is None else lengths(pixel_size, "--pixel-size"),
-    )
+    known = Given()
+    if motion is not None:
+        known["motion"] = motion.value
+    known |= _travel(travel_step, travel_start, where)
+    known |= _phase(phase_step, phases, where)
+    if tilt is not None:
+        known["tilt"] = angle(tilt, f"{where}tilt")
+    if pixel_size is not None:
+        known["pixel_size"] = lengths(pixel_size, f"{where}pixel-size")
+    if region is not None:
+        known["region"] = part.region(region, f"{where}region")
+    if frames is not None:
+        known["frames"] = part.frame_range(frames, f"{where}frames")
+    return known
+
+
+def _travel(step: str | None, start: str | None, where: str) -> Given:
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.io import InputError, Steps
+
+    if step is not None:
+        first = length(start or "0mm", f"{where}travel-start")
+        return {"travel": Steps(length(step, f"{where}travel-step"), first)}
+    if start is not None:
+        other = f"{where.rpartition(' ')[2]}travel-step"
+        raise InputError(f"{where}travel-start without {other} says nothing: give both")
+    return {}
+
+
+def _phase(step: str | None, phases: Path | None, where: str) -> Given:
+    from mirrorskin.cli.phases import read_phases
+    from mirrorskin.cli.quantity import angle
+    from mirrorskin.io import Steps
+
+    if step is not None:
+        return {"phase": Steps(angle(step, f"{where}phase-step"))}
+    return {} if phases is None else {"phase": read_phases(phases)}

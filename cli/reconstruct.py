@@ -63,6 +63,8 @@ def command(
         typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg, or 'estimate'."),
     ] = None,
     pixel_size: options.PixelSize = None,
+    region: options.Region = None,
+    frames: options.Frames = None,
     method: Annotated[
         MethodName | None,
         typer.Option(
@@ -115,8 +117,17 @@ def command(
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
 
-    told = None if tilt == _ESTIMATE else tilt
-    known = given(motion, travel_step, travel_start, phase_step, phases, told, pixel_size)
+    known = given(
+        motion=motion,
+        travel_step=travel_step,
+        travel_start=travel_start,
+        phase_step=phase_step,
+        phases=phases,
+        tilt=None if tilt == _ESTIMATE else tilt,
+        pixel_size=pixel_size,
+        region=region,
+        frames=frames,
+    )
     gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, **known) as source:
@@ -127,7 +138,7 @@ def command(
         if source.motion == MotionName.axial:
             asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
             asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else None
-            asked["heights"] = None if heights is None else io.open_heights(heights)
+            asked["heights"] = None if heights is None else io.open_heights(heights, source)
         else:
             asked |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
             asked |= {"dark": dark, "bright": bright, "fill": fill}

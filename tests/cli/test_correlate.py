@@ -81,7 +81,7 @@ def test_it_is_told_how_it_came_about():
     process = io.open_result("theirs-correlation.h5").process
     assert told["process"] == process
     assert (process["source"], process["dataset"], process["frames"]) == ("theirs.h5", "/some/stack", 8)
-    assert {"program", "version", "date", "device", "driver", "source_sha256"} <= set(process)
+    assert {"program", "version", "date", "device", "driver", "source_fingerprint"} <= set(process)
     assert io.open_result("theirs-correlation.h5").x[1] == -1.0
 
 

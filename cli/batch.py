@@ -1,0 +1,202 @@
+"""``mirrorskin batch``: many recordings become results."""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+import os
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mirrorskin.cli import options
+
+if TYPE_CHECKING:
+    from mirrorskin.cli.table import Show
+    from mirrorskin.engine.batch.jobs import Job
+    from mirrorskin.engine.batch.plan import Plan
+    from mirrorskin.engine.batch.work import Outcome
+
+# How the commands name results unasked.
+_RESULTS = ("-result.h5", "-correlation.h5", "-fused.h5")
+
+
+def command(
+    recordings: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE...", help="Recordings; '*' and '**' are understood, quoted as well."),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for results, made if missing.")
+    ],
+    settings: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation]."),
+    ] = None,
+    device: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Number or part of the name, as in 'mirrorskin devices'; may be given again.",
+            show_default="the default one, or all GPUs",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Use so many processes of this machine (Dask).")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Use a Dask cluster: tcp://node1:8786.")
+    ] = None,
+    memory: options.Memory = "256MB",
+    as_json: options.Json = False,
+) -> None:
+    """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
+    from mirrorskin.cli.quantity import memory as bytes_of
+    from mirrorskin.cli.settings import read_settings
+    from mirrorskin.cli.table import show_batch
+    from mirrorskin.engine.batch.jobs import make_jobs
+
+    _refuse_both(device, workers, scheduler)
+    plan = read_settings(settings, bytes_of(memory, "--memory"))
+    jobs = make_jobs(_find(recordings, output), output)
+    _prepare(output, jobs)
+    outcomes: list[Outcome] = []
+    start = time.perf_counter()
+    with (
+        _telling_of_interruption(outcomes, len(jobs)),
+        show_batch(len(jobs), as_json) as show,
+        closing(_run(jobs, plan, device, workers, scheduler, show)) as run,
+    ):
+        for outcome in run:
+            outcomes.append(outcome)
+            show.ended(outcome)
+    _report(outcomes, output, time.perf_counter() - start, as_json)
+    raise typer.Exit(int(any(outcome.state == "failed" for outcome in outcomes)))
+
+
+def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: str | None) -> None:
+    """Refuse to be told twice who does the work."""
+    from mirrorskin.io import InputError
+
+    given = {"--device": device, "--workers": workers, "--scheduler": scheduler}
+    names = [name for name, value in given.items() if value]
+    if len(names) > 1:
+        raise InputError(f"{' and '.join(names)} each tell who does the work: give one of them")
+
+
+def _find(words: Sequence[str], folder: Path) -> list[Path]:
+    """Find the recordings; results that lie among them are left out."""
+    from mirrorskin.io import InputError
+
+    found: list[Path] = []
+    for word in words:
+        if os.path.lexists(word) or not glob.has_magic(word):
+            found.append(Path(word))
+            continue
+        every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
+        answers = [path for path in every if path.is_file()]
+        if not answers:
+            raise InputError(f"{word}: no file answers to that: name recordings")
+        found += answers
+    recordings = [path for path in found if not _is_result(path, folder)]
+    if not recordings:
+        raise InputError(f"{words[0]}: nothing but results: name recordings")
+    if len(recordings) < len(found):
+        typer.echo(f"left out, as results: {len(found) - len(recordings)} files", err=True)
+    return recordings
+
+
+def _is_result(path: Path, folder: Path) -> bool:
+    """Tell whether a file is a result, or was one of those in a folder before it was damaged."""
+    from mirrorskin.io import InputError
+    from mirrorskin.io.hdf5 import Hdf5File
+    from mirrorskin.io.result import MARK
+
+    if not path.name.endswith(_RESULTS) or not path.is_file():
+        return False
+    try:
+        with Hdf5File(path) as file:
+            return file.marked(MARK)
+    except InputError:
+        return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
+    """Make the folder, see that it can be written to, and clear away what a killed batch left there."""
+    from mirrorskin import io
+    from mirrorskin.io.atomic import remove_leftovers
+    from mirrorskin.io.plain import plainly
+
+    with plainly(f"{folder} cannot be made", "choose another folder with -o"):
+        if folder.exists() and not folder.is_dir():
+            raise io.InputError(f"{folder} is no folder: name one with -o")
+        if not folder.parent.is_dir():
+            raise io.InputError(f"{folder}: there is no folder {folder.parent}: make it first")
+        folder.mkdir(exist_ok=True)
+    with plainly(f"{folder} cannot be written to", "choose another with -o"), TemporaryFile(dir=folder):
+        pass
+    for place in {job.target.parent for job in jobs} | {folder}:
+        if place.is_dir():
+            remove_leftovers(place)
+
+
+def _run(
+    jobs: Sequence[Job],
+    plan: Plan,
+    device: Sequence[str] | None,
+    workers: int | None,
+    scheduler: str | None,
+    show: Show,
+) -> Generator[Outcome, None, None]:
+    """Do the jobs here, or on a cluster."""
+    if workers is not None or scheduler is not None:
+        from mirrorskin.engine.batch.cluster import run_cluster
+
+        yield from run_cluster(jobs, plan, address=scheduler, workers=workers)
+        return
+    from mirrorskin.engine.batch.local import default_devices, run_local
+    from mirrorskin.kernels.device import open_device
+
+    named = [open_device(name) for name in device or ()]
+    yield from run_local(jobs, plan, list(dict.fromkeys(named)) or default_devices(), show.under_way)
+
+
+@contextmanager
+def _telling_of_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator[None]:
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        typer.echo(f"ended after {len(outcomes)} of {total}: the same command goes on from there", err=True)
+        raise
+
+
+def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: bool) -> None:
+    """Tell what became of all."""
+    from mirrorskin.cli.output import print_json
+    from mirrorskin.cli.table import printable, problem
+
+    states = Counter({"done": 0, "kept": 0, "failed": 0})
+    states.update(outcome.state for outcome in outcomes)
+    size = sum(outcome.bytes for outcome in outcomes)
+    if as_json:
+        told = {"output": str(folder), **states, "bytes": size, "seconds": seconds}
+        print_json(told | {"files": [_fields(outcome) for outcome in outcomes]})
+        return
+    for outcome in outcomes:
+        if outcome.state == "failed":
+            typer.echo(f"failed: {problem(outcome)}")
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
+    typer.echo(f"{printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
+
+
+def _fields(outcome: Outcome) -> dict[str, Any]:
+    fields = dataclasses.asdict(outcome)
+    job = fields.pop("job")
+    return {"source": str(job["source"]), "result": str(job["target"])} | fields

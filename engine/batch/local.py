@@ -1,0 +1,109 @@
+"""A batch on this machine: a thread a device, and each takes the next job."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from threading import Event, Thread
+
+from mirrorskin.engine.batch.jobs import Job
+from mirrorskin.engine.batch.memory import keep_memory
+from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.engine.batch.work import Outcome, do
+from mirrorskin.kernels.device import Device, list_devices, open_device
+
+Watch = Callable[[Job, int], None]
+
+
+class _Stopped(BaseException):  # no Exception: nobody may take it for a recording's failure
+    """The batch was ended; a job under way is given up."""
+
+
+def default_devices() -> list[Device]:
+    """Open the devices that a batch uses unasked: the default one, or all GPUs if that is one.
+
+    Raises
+    ------
+    mirrorskin.kernels.errors.DeviceError
+        There is none, or one cannot run a kernel.
+    """
+    first = open_device()
+    if first.info.kind != "gpu" or "PYOPENCL_CTX" in os.environ:
+        return [first]
+    kinds = [info.kind for info in list_devices()]
+    return [open_device(str(number)) for number, kind in enumerate(kinds) if kind == "gpu"]
+
+
+def run_local(
+    jobs: Sequence[Job], plan: Plan, devices: Sequence[Device], watch: Watch | None = None
+) -> Iterator[Outcome]:
+    """Do jobs on devices of this machine.
+
+    Leaving the iterator early, by an exception as well, ends the batch: each device gives up its job at the
+    next block of frames, or finishes it where all frames are read. Nothing half-written stays behind.
+
+    Parameters
+    ----------
+    jobs : sequence of Job
+    plan : Plan
+    devices : sequence of Device
+        At least one; each does one job at a time.
+    watch : callable, optional
+        Told, by the devices' threads, which job is under way and how many frames of it were read.
+
+    Yields
+    ------
+    Outcome
+        Of each job, as they are completed.
+    """
+    keep_memory()
+    todo: SimpleQueue[Job] = SimpleQueue()
+    for job in jobs:
+        todo.put(job)
+    told: SimpleQueue[Outcome | BaseException] = SimpleQueue()
+    stop = Event()
+
+    def work(device: Device) -> None:
+        try:
+            while not stop.is_set():
+                told.put(do(job := todo.get_nowait(), plan, device, _telling(job, watch, stop)))
+        except (Empty, _Stopped):
+            pass
+        except BaseException as error:
+            told.put(error)
+
+    threads = [Thread(target=work, args=(device,)) for device in devices]
+    try:
+        for thread in threads:
+            thread.start()
+        for _ in jobs:
+            outcome = told.get()
+            if isinstance(outcome, BaseException):
+                raise outcome
+            yield outcome
+    finally:
+        stop.set()
+        for thread in threads:
+            _wait(thread)
+
+
+def _wait(thread: Thread) -> None:
+    """Wait for a thread, however often Ctrl-C is pressed: OpenCL ends a program that leaves it at work."""
+    while thread.is_alive():
+        with suppress(KeyboardInterrupt, SystemExit):
+            thread.join()
+
+
+def _telling(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:
+    """Tell that a job begins; return what is to be told of its frames, and gives it up when all ends."""
+
+    def tell(frames: int) -> None:
+        if stop.is_set():
+            raise _Stopped
+        if watch is not None:
+            watch(job, frames)
+
+    tell(0)
+    return tell

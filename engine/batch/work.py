@@ -1,0 +1,123 @@
+"""One recording of a batch, from file to file: what every scheduler calls."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from mirrorskin import io
+from mirrorskin.engine.batch.jobs import Job
+from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.feed import Progress
+from mirrorskin.engine.provenance import naming
+from mirrorskin.engine.reconstruct import reconstruct
+from mirrorskin.engine.summary import summarise
+from mirrorskin.io import InputError, ProcessValue, Recording
+from mirrorskin.io.plain import plainly
+from mirrorskin.io.result import open_process
+from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.errors import DeviceError
+
+State = Literal["done", "kept", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a job. It can be pickled.
+
+    Attributes
+    ----------
+    job : Job
+    state : {"done", "kept", "failed"}
+        Kept: the result was there already, made of the same recording with the same parameters.
+    message : str
+        One line: what the result holds, or what is wrong and the remedy.
+    seconds : float
+    bytes : int
+        Of frames, unpacked, that were reconstructed; 0 where none were.
+    device : str
+        Its title; nothing where none was used.
+    motion : str
+        Of the recording; nothing where it could not be opened.
+    """
+
+    job: Job
+    state: State
+    message: str
+    seconds: float
+    bytes: int = 0
+    device: str = ""
+    motion: str = ""
+
+
+def do(job: Job, plan: Plan, device: str | Device | None = None, progress: Progress | None = None) -> Outcome:
+    """Make a job's result, unless it is there already.
+
+    Whatever goes wrong with one recording is told, not raised, so that the others go on.
+
+    Parameters
+    ----------
+    job : Job
+    plan : Plan
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+    progress : callable, optional
+        Told the number of frames so far.
+
+    Returns
+    -------
+    Outcome
+    """
+    start = time.perf_counter()
+    outcome = Outcome(job, "failed", "", 0.0)
+    try:
+        with io.open_recording(job.source, memory_limit=plan.memory_limit, **plan.opening) as source:
+            outcome = replace(outcome, motion=source.motion)
+            outcome = _done(outcome, source, plan, device, progress)
+    except (InputError, NotConverged, DeviceError) as error:
+        outcome = replace(outcome, message=str(error))
+    except Exception as error:
+        outcome = replace(outcome, message=f"unexpected {type(error).__name__}: {error}")
+    return replace(outcome, seconds=time.perf_counter() - start)
+
+
+def _done(
+    outcome: Outcome, source: Recording, plan: Plan, device: str | Device | None, progress: Progress | None
+) -> Outcome:
+    """Make the result of an open recording, or find it made."""
+    target, digest = outcome.job.target, plan.digest(source.motion)
+    if _is_made(outcome.job, source, digest):
+        return replace(outcome, state="kept", message="there already")
+    with plainly(f"{target.parent} cannot be made", "choose another folder for results"):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    io.check_output(target, outcome.job.source)
+    opened = open_device(device)
+    with naming(source):  # also says so if the file was written to meanwhile
+        result = reconstruct(source, device=opened, progress=progress, **plan.options(source.motion))
+    signed: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
+    io.save_result(replace(result, process=signed), target)
+    return replace(
+        outcome,
+        state="done",
+        message=str(summarise(result)),
+        bytes=math.prod(source.shape) * source.dtype.itemsize,
+        device=opened.info.title,
+    )
+
+
+def _is_made(job: Job, source: Recording, digest: str) -> bool:
+    """Tell whether a job's result is there, whole, and of this recording and these parameters."""
+    if not job.target.exists():
+        return False
+    wanted = {
+        "batch_parameters": digest,
+        "source_fingerprint": source.fingerprint(),
+        "source_modified": source.modified,
+    }
+    try:
+        return open_process(job.target, *wanted) == wanted
+    except InputError:
+        return False  # damaged, or something else: it is made anew

@@ -1,0 +1,296 @@
+"""``mirrorskin batch``: what it finds, what it says, and what it leaves behind."""
+
+import io as streams
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from batches import BAD, half_written, missing, press, rotation
+from commands import run
+
+from mirrorskin import io
+from mirrorskin.cli.main import main
+from mirrorskin.engine.batch import cluster
+from mirrorskin.engine.batch.jobs import make_jobs
+from mirrorskin.engine.batch.work import Outcome
+
+SOUND = {"press.h5": press, "turn.h5": rotation}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def results(place="out"):
+    return sorted(str(path.relative_to(place)) for path in Path(place).rglob("*") if path.is_file())
+
+
+def presses(*names):
+    for name in names:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        press(Path(name))
+
+
+def test_bad_recordings_of_every_kind_are_told_and_the_rest_is_done():
+    for name, make in SOUND.items():
+        make(Path(name))
+    bad = [make(Path(f"{make.__name__}.h5")).name for make in BAD]
+    code, out, said = run("batch", *bad, *SOUND, "-o", "out")
+    lines = out.splitlines()
+    assert (code, said) == (1, "")
+    assert results() == ["press-result.h5", "turn-result.h5"]
+    for name, words in zip(bad, BAD.values(), strict=True):
+        assert sum(line.startswith("failed: ") and name in line and words in line for line in lines) == 2
+    assert sum(line.startswith("done: press.h5 in ") and "height at 35 of 35" in line for line in lines) == 1
+    assert sum(line.startswith("done: turn.h5 in ") for line in lines) == 1
+    assert len(lines) == 2 * len(bad) + 2 + 1
+    assert lines[-1].startswith(f"out: {len(bad) + 2} recordings: 2 done, 0 kept, {len(bad)} failed; ")
+    assert "GB in" in lines[-1]
+
+
+def test_what_is_finished_is_kept_until_the_settings_change():
+    presses("a.h5", "b.h5")
+    assert run("batch", "a.h5", "-o", "out").code == 0
+    first = Path("out/a-result.h5").read_bytes()
+    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out")
+    assert (code, out.splitlines()[0]) == (0, "kept: a.h5")
+    assert "1 done, 1 kept, 0 failed" in out
+    assert Path("out/a-result.h5").read_bytes() == first
+    Path("batch.toml").write_text("[press]\nthreshold = 0.3\n")
+    assert "2 done, 0 kept" in run("batch", "a.h5", "b.h5", "-o", "out", "--settings", "batch.toml").out
+    assert io.open_result("out/a-result.h5").process["threshold"] == 0.3
+
+
+def test_settings_reach_each_motion():
+    for name, make in SOUND.items():
+        make(Path(name))
+    settings = '[stack]\npixel-size = "0.2mm"\n[press]\nhold = 1\n[rotation]\nmethod = "paper"\n'
+    Path("batch.toml").write_text(settings)
+    assert run("batch", *SOUND, "-o", "out", "--settings", "batch.toml").code == 0
+    pressed, turned = (io.open_result(f"out/{name}-result.h5") for name in ("press", "turn"))
+    assert (pressed.process["hold"], turned.process["method"]) == (1, "paper")
+    for result in (pressed, turned):
+        assert result.x[1] - result.x[0] == pytest.approx(0.2)
+
+
+def test_patterns_are_understood_when_quoted():
+    presses("a.h5", "b.h5", "deep/er/c.h5", "deep/d.nxs")
+    Path("e.h5").mkdir()
+    assert "2 done" in run("batch", "*.h5", "-o", "one").out
+    assert "3 done" in run("batch", "**/*.h5", "-o", "two").out
+    assert "2 done" in run("batch", "deep/**", "-o", "three").out
+    assert "2 done" in run("batch", str(Path("[ab].h5").absolute()), "b.h5", "-o", "four").out
+    assert results("three") == ["c-result.h5", "d-result.h5"]
+
+
+def test_a_file_whose_name_is_a_pattern_is_itself():
+    presses("[ab].h5", "a.h5")
+    run("batch", "[ab].h5", "-o", "out")
+    assert results() == ["[ab]-result.h5"]
+
+
+def test_results_are_no_recordings():
+    presses("a.h5", "deep/x-result.h5")
+    assert "2 done" in run("batch", "**/*.h5", "-o", ".").out
+    code, out, said = run("batch", "**/*.h5", "-o", ".")
+    assert (code, said) == (0, "left out, as results: 2 files\n")
+    assert "2 recordings: 0 done, 2 kept" in out
+    assert (
+        "2 recordings: 2 done" in run("batch", "a.h5", "a-result.h5", "deep/x-result.h5", "-o", "other").out
+    )
+    code, _, said = run("batch", "a-result.h5", "-o", ".")
+    assert (code, said) == (2, "mirrorskin: a-result.h5: nothing but results: name recordings\n")
+
+
+def test_a_damaged_result_among_the_recordings_is_made_anew():
+    presses("a.h5")
+    run("batch", "*.h5", "-o", ".")
+    Path("a-result.h5").write_bytes(b"no more")
+    assert "1 recordings: 1 done" in run("batch", "*.h5", "-o", ".").out
+    assert io.open_result("a-result.h5").height is not None
+
+
+def test_a_result_that_cannot_be_written_is_one_failure():
+    presses("a.h5", "b.h5")
+    Path("out/a-result.h5").mkdir(parents=True)
+    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out")
+    assert code == 1
+    assert "failed: a.h5: out/a-result.h5 is a folder" in out
+    assert "1 done, 0 kept, 1 failed" in out
+
+
+def test_remedies_are_those_of_a_batch():
+    foreign = {"x": np.zeros((8, 5, 7), np.uint8), "y": np.zeros((8, 5, 7), np.uint8)}
+    with h5py.File("a.h5", "w") as file:
+        file.update(foreign)
+    assert "choose with dataset in [stack] of --settings" in run("batch", "a.h5", "-o", "out").out
+    Path("batch.toml").write_text('[stack]\ndataset = "x"\n')
+    said = run("batch", "a.h5", "-o", "out", "--settings", "batch.toml").out
+    assert "give motion in [stack] of --settings, one of vertical" in said
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding):
+    for name in (b"a\xff.h5", b"a\nb.h5", "é.h5".encode()):
+        press(Path(os.fsdecode(name)))
+    out = streams.TextIOWrapper(streams.BytesIO(), encoding, errors="strict")
+    monkeypatch.setattr(sys, "argv", ["mirrorskin", "batch", "*.h5", os.fsdecode(b"no\xff"), "-o", "out"])
+    monkeypatch.setattr(sys, "stdout", out)
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    out.flush()
+    lines = out.buffer.getvalue().decode(encoding).splitlines()
+    assert [line.split(" in ")[0] for line in lines[:3]] == [
+        "done: a?b.h5",
+        "done: a?.h5",
+        "done: ?.h5" if encoding == "ascii" else "done: é.h5",
+    ]
+    assert lines[3] == lines[4] == "failed: no?: no such file"
+    assert "3 done, 0 kept, 1 failed" in lines[5]
+
+
+def test_recordings_of_one_name_keep_their_folders():
+    presses("mon/x.h5", "tue/x.h5", "y.h5")
+    run("batch", "**/*.h5", "-o", "out")
+    assert results() == ["mon/x-result.h5", "tue/x-result.h5", "y-result.h5"]
+
+
+def test_json_tells_of_every_file():
+    presses("a.h5")
+    missing(Path("b.h5"))
+    code, out, said = run("batch", "a.h5", "b.h5", "-o", "out", "--json")
+    told = json.loads(out)
+    assert (code, said) == (1, "")
+    assert {name: told[name] for name in ("output", "done", "kept", "failed", "bytes")} == {
+        "output": "out",
+        "done": 1,
+        "kept": 0,
+        "failed": 1,
+        "bytes": 8 * 5 * 7,
+    }
+    first, second = told["files"]
+    assert (first["source"], first["result"], first["state"]) == ("a.h5", "out/a-result.h5", "done")
+    assert (first["motion"], first["bytes"]) == ("vertical", 8 * 5 * 7)
+    assert (second["state"], second["message"]) == ("failed", "b.h5: no such file")
+
+
+def test_devices_can_be_named():
+    presses("a.h5", "b.h5")
+    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out", "--device", "0", "--device", "0", "--json")
+    assert code == 0
+    assert json.loads(out)["files"][0]["device"] == io.open_result("out/a-result.h5").process["device"]
+    code, out, said = run("batch", "a.h5", "-o", "out", "--device", "nothing like it")
+    assert (code, out) == (2, "")
+    assert "no such device" in said
+
+
+def test_half_written_files_of_the_killed_are_removed(folder):
+    presses("mon/x.h5", "tue/x.h5")
+    for place in ("out", "out/mon"):
+        Path(place).mkdir()
+        Path(place, ".mirrorskin-abc.part").write_bytes(b"half")
+    run("batch", "**/*.h5", "-o", "out")
+    assert not half_written(folder)
+
+
+class Terminal(streams.StringIO):
+    """What is no pipe."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_a_table(monkeypatch):
+    presses("a.h5", "b.h5")
+    screen, out = Terminal(), Terminal()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr(sys, "argv", ["mirrorskin", "batch", "a.h5", "b.h5", "nothing.h5", "-o", "out"])
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setattr(sys, "stdout", out)
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    shown = screen.getvalue()
+    for words in ("MB/s", "a.h5", "vertical", "nothing.h5: no such file", "3/3", "2 done, 1 failed"):
+        assert words in shown
+    assert out.getvalue().startswith("failed: nothing.h5: no such file\nout: 3 recordings: 2 done")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["x*.h5", "-o", "out"], "x*.h5: no file answers to that"),
+        (["a.h5", "-o", "no/out"], "there is no folder no: make it first"),
+        (["a.h5", "-o", "a.h5"], "a.h5 is no folder"),
+        (["a.h5", "-o", "/proc/out"], "/proc/out cannot be made"),
+        (["a.h5"], "-o"),
+        (["-o", "out"], "FILE..."),
+        (["a.h5", "-o", "out", "--memory", "5"], "a unit is needed"),
+        (["a.h5", "-o", "out", "--workers", "0"], "--workers"),
+        (["a.h5", "-o", "out", "--workers", "2", "--device", "0"], "--device and --workers"),
+        (["a.h5", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], "--workers and --scheduler"),
+        (["a.h5", "-o", "out", "--settings", "no.toml"], "no.toml cannot be read: No such file"),
+        (["out-result.h5", "out-result.nxs", "out-result.h5.h5", "-o", "out"], "would be the result of two"),
+    ],
+)
+def test_a_wrong_call_is_one_line_and_makes_nothing(folder, words, said):
+    presses("a.h5")
+    code, out, line = run("batch", *words)
+    assert (code, out) == (2, "")
+    assert said in line
+    assert line.count("\n") == 1
+    assert [path.name for path in folder.iterdir()] == ["a.h5"]
+
+
+def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(folder):
+    presses("a.h5")
+    for number in range(300):
+        Path(f"{number:03}.h5").symlink_to("a.h5")
+    words = [sys.executable, "-m", "mirrorskin.cli.main", "batch", "[0-9]*.h5", "-o", "out"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        first = child.stdout.readline()
+        for _ in range(3):  # who is in a hurry
+            child.send_signal(signal.SIGINT)
+            time.sleep(0.01)
+        rest, said = child.communicate(timeout=60)
+    assert child.returncode in (130, -signal.SIGINT)  # the last may come when the program has ended already
+    assert first.split(" in ")[0] == "done: 000.h5"
+    assert not half_written(folder)
+    found = results()
+    assert 1 <= len(found) < 300
+    assert all(io.open_result(f"out/{name}").height is not None for name in found)
+    told = 1 + rest.count("done: ")
+    assert said == f"ended after {told} of 300: the same command goes on from there\n"
+    assert len(found) - told in (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--workers", "3"], {"address": None, "workers": 3}),
+        (["--scheduler", "tcp://node1:8786"], {"address": "tcp://node1:8786", "workers": None}),
+    ],
+)
+def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
+    given = []
+
+    def run_cluster(jobs, plan, **where):
+        given.append((jobs, plan.memory_limit, where))
+        for job in jobs:
+            yield Outcome(job, "done", "well", 0.5, 1000, "a device", "axial")
+
+    monkeypatch.setattr(cluster, "run_cluster", run_cluster)
+    presses("a.h5", "b.h5")
+    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out", "--memory", "1MB", *words)
+    assert (code, out.splitlines()[0]) == (0, "done: a.h5 in 0.5 s, 0 MB/s: well")
+    assert given == [(make_jobs([Path("a.h5"), Path("b.h5")], Path("out")), 10**6, expected)]

@@ -1,0 +1,210 @@
+"""The settings of a batch: every key arrives, and what cannot be used is told with its place."""
+
+import math
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from mirrorskin import io
+from mirrorskin.cli.settings import read_settings
+from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.io.region import Region
+
+EVERYTHING = """
+[stack]
+dataset = "/entry/frames"
+motion = "vertical"
+travel-step = "0.1mm"
+travel-start = "1cm"
+phase-step = "45deg"
+tilt = "2.5deg"
+pixel-size = "0.03mm,40um"
+region = "100,50,64x48"
+frames = "10:200"
+
+[press]
+event = "release"
+method = "change-point"
+threshold = 0.25
+hold = 3
+subframe = true
+dark = 12
+bright = 200.5
+noise = 1.5
+fill = false
+
+[rotation]
+method = "paper"
+tilt = "3deg"
+zenith-gain = "5.7/deg"
+zenith-offset = 10
+noise = 2
+per-turn = true
+robust = true
+"""
+
+
+@pytest.fixture
+def settings(tmp_path, monkeypatch):
+    """Read settings of a text, from a file that is called b.toml."""
+    monkeypatch.chdir(tmp_path)
+
+    def read(text):
+        (tmp_path / "b.toml").write_text(text, encoding="utf-8")
+        return read_settings((tmp_path / "b.toml").relative_to(tmp_path), 1000)
+
+    return read
+
+
+def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
+    plan = settings(EVERYTHING)
+    assert plan.opening == {
+        "dataset": "/entry/frames",
+        "motion": "vertical",
+        "travel": io.Steps(0.1, 10.0),
+        "phase": io.Steps(pytest.approx(math.pi / 4)),
+        "tilt": pytest.approx(math.radians(2.5)),
+        "pixel_size": (0.03, pytest.approx(0.04)),
+        "region": Region(rows=(50, 98), columns=(100, 164)),
+        "frames": (10, 200),
+    }
+    assert plan.press == {
+        "event": "release",
+        "method": "change-point",
+        "threshold": 0.25,
+        "hold": 3,
+        "subframe": True,
+        "dark": 12.0,
+        "bright": 200.5,
+        "noise": 1.5,
+        "fill": False,
+    }
+    assert plan.rotation == {
+        "method": "paper",
+        "tilt": pytest.approx(math.radians(3)),
+        "gain": pytest.approx(5.7 * 180 / math.pi),
+        "offset": 10.0,
+        "noise": 2.0,
+        "per_turn": True,
+        "robust": True,
+    }
+    assert plan.memory_limit == 1000
+
+
+def test_every_key_is_an_option_of_reconstruct_too(settings):
+    import typer
+
+    from mirrorskin.cli.main import app
+
+    command = typer.main.get_command(app).commands["reconstruct"]
+    options = {name.removeprefix("--") for one in command.params for name in (*one.opts, *one.secondary_opts)}
+    assert set(re.findall(r"^([a-z-]+) =", EVERYTHING, re.MULTILINE)) <= options
+
+
+def test_what_is_not_said_is_left_to_the_recordings(settings):
+    assert settings("") == read_settings(None, 1000) == Plan(memory_limit=1000)
+    assert settings("[press]\n[stack]\n") == Plan(memory_limit=1000)
+
+
+def test_a_tilt_may_be_estimated(settings):
+    assert settings('[rotation]\ntilt = "estimate"').rotation == {"tilt": "estimate"}
+
+
+@pytest.mark.parametrize(
+    ("table", "line", "said"),
+    [
+        ("stack", 'motion = "sideways"', 'motion is "sideways": write one of "vertical", "axial"'),
+        ("stack", "motion = 5", "motion is 5: write one of"),
+        ("stack", "dataset = 5", "dataset is 5: a text in quotes is needed"),
+        ("stack", "travel-step = 0.1", 'travel-step is 0.1: a text in quotes is needed; write e.g. "0.1mm"'),
+        ("stack", 'travel-step = "0.1"', "travel-step 0.1: a unit is needed; write e.g. 0.1mm"),
+        ("stack", 'travel-step = "2deg"', "travel-step 2deg: degrees are not a length"),
+        ("stack", 'travel-start = "1mm"', "travel-start without travel-step says nothing: give both"),
+        ("stack", 'dataset = ""', 'dataset is "": a text in quotes'),
+        ("stack", 'pixel-size = "0mm"', "pixel-size: a length above 0"),
+        ("stack", 'pixel-size = "1mm,-1mm"', "pixel-size: a length above 0"),
+        ("stack", 'phase-step = "45"', "phase-step 45: a unit is needed"),
+        ("stack", 'tilt = "estimate"', "tilt estimate: a number and a unit are needed"),
+        ("stack", 'tilt = "50deg"', "tilt: tilt 50 deg: above 0 and up to 30 deg"),
+        ("stack", 'pixel-size = "1mm,1mm,1mm"', "pixel-size 1mm,1mm,1mm: one or two lengths"),
+        ("stack", 'region = "5,5,5"', "region 5,5,5: the first column and row"),
+        ("stack", "region = [5, 5]", "region is [5, 5]: a text in quotes"),
+        ("stack", 'frames = "5"', "frames 5: the first frame, from 0"),
+        ("press", 'event = "on"', 'event is "on": write one of "onset", "release"'),
+        ("press", 'method = "exact"', 'method is "exact": write one of "threshold", "change-point"'),
+        ("press", "threshold = 1.5", "threshold is 1.5: a share from 0 (dark) to 1 (bright) is needed"),
+        ("press", 'threshold = "0.5"', 'threshold is "0.5": a share'),
+        ("press", "threshold = true", "threshold is true: a share"),
+        ("press", "threshold = nan", "threshold is nan: a share"),
+        ("press", "hold = 0", "hold is 0: a number of frames from 1 on"),
+        ("press", "hold = 2.0", "hold is 2.0: a number of frames"),
+        ("press", "hold = true", "hold is true: a number of frames"),
+        ("press", "subframe = 1", "subframe is 1: write true or false"),
+        ("press", "dark = inf", "dark is inf: a number of counts"),
+        ("press", 'bright = "map"', 'bright is "map": a number of counts'),
+        ("press", "noise = -1", "noise is -1: a standard deviation in counts, not below 0, is needed"),
+        ("press", "dark = 1" + 400 * "0", "dark is 1000"),
+        ("press", "hold = 1" + 25 * "0", "hold is 1000"),
+        ("press", 'method = "change-point"\nsubframe = false', "subframe is false: a change-point lies"),
+        ("press", 'method = "change-point"\nthreshold = 0', "threshold: a change-point needs a share"),
+        ("press", 'fill = "no"', 'fill is "no": write true or false'),
+        ("rotation", 'method = "threshold"', 'method is "threshold": write one of "exact", "paper"'),
+        ("rotation", "tilt = 2.5", 'tilt is 2.5: a text in quotes is needed; write e.g. "2.5deg"'),
+        ("rotation", 'tilt = "0deg"', "tilt: tilt 0 deg: above 0"),
+        ("rotation", 'zenith-gain = "5.7"', "zenith-gain 5.7: a number over a unit of angle"),
+        ("rotation", "zenith-offset = []", "zenith-offset is []: a number of counts"),
+        ("rotation", "noise = 0", "noise is 0: a standard deviation in counts, above 0, is needed"),
+        ("rotation", 'zenith-gain = "0/deg"', 'zenith-gain is "0/deg": other than 0'),
+        ("rotation", "per-turn = 0", "per-turn is 0: write true or false"),
+        ("rotation", "robust = 'yes'", 'robust is "yes": write true or false'),
+        ("press", "zenith-gain = 1", "has a key 'zenith-gain' that is not known: there are event, method"),
+        ("stack", "travel_step = '1mm'", "has a key 'travel_step' that is not known: there are dataset"),
+    ],
+)
+def test_what_cannot_be_used_is_told_with_file_table_and_key(settings, table, line, said):
+    with pytest.raises(io.InputError) as refused:
+        settings(f"[{table}]\n{line}\n")
+    assert str(refused.value).startswith(f"b.toml: [{table}] {said}")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[presses]\n", "b.toml has a table 'presses' that is not known: there are stack, press, rotation"),
+        ("hold = 2\n", "b.toml has a table 'hold' that is not known"),
+        ("press = 2\n", "b.toml: [press] is no table"),
+        ("[press]\nhold = \n", "b.toml is no TOML: Invalid value (at line 2"),
+        ("[press]\nhold = 2\nhold = 3\n", "b.toml is no TOML: Cannot overwrite"),
+        ("[press]\nhold = 1" + 5000 * "0", "b.toml is no TOML: Exceeds the limit"),
+        ("[press]\nhold = " + 5000 * "[", "b.toml is no TOML: maximum recursion depth"),
+    ],
+)
+def test_a_file_that_makes_no_sense_is_told(settings, text, said):
+    with pytest.raises(io.InputError) as refused:
+        settings(text)
+    assert str(refused.value).startswith(said)
+
+
+def test_a_file_that_cannot_be_read_is_told(tmp_path):
+    with pytest.raises(io.InputError, match=r"no\.toml cannot be read: No such file or directory; name"):
+        read_settings(tmp_path / "no.toml", 1)
+    with pytest.raises(io.InputError, match="cannot be read: Is a directory"):
+        read_settings(tmp_path, 1)
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(io.InputError, match=r"b\.toml is no text"):
+        read_settings(tmp_path / "b.toml", 1)
+
+
+def test_the_page_tells_of_every_key_and_of_none_besides(settings):
+    page = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
+    told = {}
+    for table, text in re.findall(r"^### `\[([a-z]+)\]`.*?\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL):
+        firsts = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
+        told[table] = {name for first in firsts for name in re.findall("`([a-z-]+)`", first)}
+    said = tomllib.loads(EVERYTHING)
+    assert told == {table: set(keys) for table, keys in said.items()}
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert settings(example).press == {"method": "change-point", "fill": False}

@@ -1,0 +1,122 @@
+"""A batch on this machine's devices: all are used, and it ends when it is told to."""
+
+import os
+import signal
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+from batches import BAD, half_written, press
+
+from mirrorskin import io
+from mirrorskin.engine.batch import local, work
+from mirrorskin.engine.batch.jobs import make_jobs
+from mirrorskin.engine.batch.local import default_devices, run_local
+from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels.device import Device, open_device
+
+
+@pytest.fixture
+def device():
+    return open_device()
+
+
+@pytest.fixture
+def jobs(tmp_path):
+    return make_jobs([press(tmp_path / f"{name}.h5") for name in "abcd"], tmp_path / "out")
+
+
+def test_all_jobs_are_done(jobs, device):
+    outcomes = list(run_local(jobs, Plan(), [device]))
+    assert [one.job for one in outcomes] == jobs
+    assert {one.state for one in outcomes} == {"done"}
+    assert {one.state for one in run_local(jobs, Plan(), [device])} == {"kept"}
+
+
+def test_bad_recordings_do_not_stop_the_rest(tmp_path, jobs, device):
+    bad = make_jobs([make(tmp_path / f"{make.__name__}.h5") for make in BAD], tmp_path / "out")
+    mixed = [job for pair in zip(bad, jobs, strict=False) for job in pair] + bad[len(jobs) :]
+    outcomes = list(run_local(mixed, Plan(), [device]))
+    assert {one.job for one in outcomes if one.state == "failed"} == set(bad)
+    assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {job.target.name for job in jobs}
+
+
+def test_several_devices_work_at_the_same_time(jobs):
+    devices = [Device(device_layer._find()[0]) for _ in range(2)]
+    met = threading.Barrier(2)
+    threads = {}
+
+    def watch(job, frames):
+        if frames == 0 and len(threads) < 2:
+            threads[job] = threading.get_ident()
+            met.wait(timeout=30)
+
+    outcomes = list(run_local(jobs, Plan(), devices, watch))
+    assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
+    assert len(set(threads.values())) == 2
+    assert all(one.profile.records() for one in devices)
+
+
+def test_progress_is_told_job_by_job(jobs, device):
+    told = []
+    list(run_local(jobs[:2], Plan(), [device], lambda *words: told.append(words)))
+    assert told == [(jobs[0], 0), (jobs[0], 8), (jobs[1], 0), (jobs[1], 8)]
+
+
+def test_leaving_early_ends_the_batch(jobs, device):
+    threads = threading.active_count()
+    outcomes = run_local(jobs, Plan(), [device])
+    assert next(outcomes).job == jobs[0]
+    outcomes.close()
+    assert threading.active_count() == threads
+    assert not jobs[-1].target.exists()
+    assert not half_written(jobs[0].target.parent)
+
+
+def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, device):
+    done = []
+
+    def interrupt(job, frames):
+        if job == jobs[1] and 0 < frames < 8:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            time.sleep(0.5)
+
+    outcomes = run_local(jobs, Plan(memory_limit=4 * 5 * 7), [device], interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        done.extend(outcomes)
+    assert io.open_result(jobs[0].target).height is not None
+    assert [path.name for path in jobs[0].target.parent.iterdir()] == [jobs[0].target.name]
+    states = [one.state for one in run_local(jobs, Plan(memory_limit=4 * 5 * 7), [device])]
+    assert states == ["kept", "done", "done", "done"]
+
+
+def test_what_ends_the_program_reaches_it(jobs, device, monkeypatch):
+    def end(*_, **__):
+        raise SystemExit(7)
+
+    monkeypatch.setattr(work, "reconstruct", end)
+    with pytest.raises(SystemExit, match="7"):
+        list(run_local(jobs, Plan(), [device]))
+
+
+def test_no_jobs_are_no_batch(device):
+    assert not list(run_local([], Plan(), [device]))
+
+
+def test_the_default_is_the_default_device(device):
+    assert (default_devices() == [device]) == (device.info.kind != "gpu")
+
+
+def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):
+    kinds = ["cpu", "gpu", "gpu"]
+    devices = {str(n): SimpleNamespace(info=SimpleNamespace(kind=kind)) for n, kind in enumerate(kinds)}
+    devices[None] = devices["1"]
+    monkeypatch.setattr(local, "list_devices", lambda: [one.info for one in list(devices.values())[:3]])
+    monkeypatch.setattr(local, "open_device", lambda choice=None: devices[choice])
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    assert default_devices() == [devices["1"], devices["2"]]
+    monkeypatch.setitem(os.environ, "PYOPENCL_CTX", "0:1")
+    assert default_devices() == [devices["1"]]

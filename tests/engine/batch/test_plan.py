@@ -1,0 +1,79 @@
+"""A plan's key changes with what changes results, and with nothing else."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mirrorskin import io
+from mirrorskin.engine.batch import plan as plans
+from mirrorskin.engine.batch.plan import Plan
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (Plan(press={"threshold": 0.5}), Plan()),
+        (Plan(press={"hold": 3, "fill": False}), Plan(press={"fill": False, "hold": 3})),
+        (Plan(memory_limit=1000), Plan()),
+        (Plan(opening={"threads": 1}), Plan(opening={"threads": 2})),
+        (Plan(opening={"dataset": None}), Plan()),
+        (Plan(rotation={"tilt": 0.1}), Plan()),
+        (Plan(opening={"phase": io.Steps(0.1), "tilt": 0.1}), Plan()),
+    ],
+)
+def test_what_changes_no_press_changes_no_key_of_presses(one, other):
+    assert one.key("vertical") == other.key("vertical")
+    assert one.digest("vertical") == other.digest("vertical")
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Plan(press={"threshold": 0.4}),
+        Plan(press={"dark": np.zeros((5, 7))}),
+        Plan(press={"dark": np.ones((5, 7))}),
+        Plan(opening={"travel": io.Steps(0.1)}),
+        Plan(opening={"travel": io.Steps(0.1, 0.2)}),
+        Plan(opening={"pixel_size": (0.1, 0.1)}),
+        Plan(opening={"dataset": "/x"}),
+        Plan(opening={"frames": (2, None)}),
+    ],
+)
+def test_what_changes_a_press_changes_its_key(other):
+    keys = {plan.key("vertical") for plan in (Plan(), Plan(press={"dark": 5.0}), other)}
+    assert len(keys) == 3
+
+
+def test_a_rotation_s_key_has_nothing_of_presses():
+    assert Plan(press={"hold": 5}, opening={"travel": io.Steps(0.1)}).key("axial") == Plan().key("axial")
+    assert Plan(rotation={"robust": True}).key("axial") != Plan().key("axial")
+    assert Plan(opening={"tilt": 0.1}).key("axial") != Plan().key("axial")
+
+
+def test_another_version_has_another_key(monkeypatch):
+    before = Plan().key("vertical")
+    monkeypatch.setattr(plans, "program_version", lambda: "99.0")
+    assert Plan().key("vertical") != before
+
+
+def test_a_key_is_json_that_tells_defaults_too():
+    plan = Plan({"travel": io.Steps(0.1), "dataset": "/x", "file": Path("a")}, {"dark": np.float32(2)})
+    told = json.loads(plan.key("vertical"))
+    assert told["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}
+    assert (told["press"]["dark"], told["press"]["threshold"]) == (2.0, 0.5)
+    assert "memory_limit" not in told["press"]
+
+
+def test_a_plan_goes_to_other_processes():
+    plan = Plan({"travel": io.Steps(0.1)}, {"hold": 3}, {"tilt": "estimate"}, 5)
+    assert pickle.loads(pickle.dumps(plan)) == plan
+
+
+def test_each_motion_gets_its_own_options():
+    plan = Plan(press={"hold": 3}, rotation={"robust": True}, memory_limit=7)
+    assert plan.options("vertical") == {"hold": 3, "memory_limit": 7}
+    assert plan.options("axial") == {"robust": True, "memory_limit": 7}
+    assert plan.options("twist") == {"memory_limit": 7}
