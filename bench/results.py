@@ -38,7 +38,26 @@ class Row:
     @property
     def kernel_bandwidth(self) -> float:
         """Bytes per second by the device's account of its kernels; NaN where none ran."""
-        return self.bytes / self.measured.kernel
+        return self.bytes / (self.measured.kernel or float("nan"))
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One aim of a case, and whether it was reached.
+
+    Attributes
+    ----------
+    what : str
+        That is measured: ``file to result, warm``.
+    bound, measured : str
+        With their units, as people read them: ``at most 1.25 times the read``, ``1.17 times``.
+    met : bool
+    """
+
+    what: str
+    bound: str
+    measured: str
+    met: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +68,13 @@ class Case:
     ----------
     name, title : str
     rows : list of Row
-        First the limit of which the others are a share.
+        First the limit of which the others are a share. Empty where only `targets` are told.
     absent : dict of str
         Peers that were not run, and why.
     notes : tuple of str
         What else was found.
+    targets : tuple of Target
+        What was aimed at.
     """
 
     name: str
@@ -61,11 +82,14 @@ class Case:
     rows: list[Row]
     absent: dict[str, str]
     notes: tuple[str, ...] = ()
+    targets: tuple[Target, ...] = ()
 
     def share(self, row: Row) -> float:
-        """Return a work's bandwidth as a share of the limit's, both by the host's clock."""
-        return row.bandwidth / self.rows[0].bandwidth
+        """Return a work's bandwidth as a share of the limit's, both by the host's clock; NaN without one."""
+        limit = self.rows[0].bandwidth
+        return row.bandwidth / limit if limit else float("nan")
 
     def kernel_share(self, row: Row) -> float:
         """Return the same share by the device's account of its kernels; NaN where none ran."""
-        return row.kernel_bandwidth / self.rows[0].kernel_bandwidth
+        limit = self.rows[0].kernel_bandwidth
+        return row.kernel_bandwidth / limit if limit else float("nan")

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
 
 import numpy as np
 
+from mirrorskin.bench import accuracy, paths, scaling, sweep
+from mirrorskin.bench.accuracy import InaccurateError
 from mirrorskin.bench.correlation import CorrelationCase, run_correlation, run_sliding
 from mirrorskin.bench.integration import IntegrationCase, run_frames, run_mask, run_rectangle
 from mirrorskin.bench.live import run_live
@@ -126,15 +130,43 @@ _RUNS: dict[str, _Run] = {
     _CORRELATE.name: _correlation(_CORRELATE, run_correlation),
     _SLIDING.name: _correlation(_SLIDING, run_sliding),
     **{case.name: _integration(case, run) for case, run in _INTEGRATION.items()},
+    **sweep.CASES,
+    **paths.CASES,
+    **scaling.CASES,
+    **accuracy.CASES,
 }
 NAMES = tuple(_RUNS)
+_ACCURACY = frozenset(accuracy.CASES)
+
+
+def choose(patterns: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the cases that any of some patterns fits, in the order of `NAMES`.
+
+    Parameters
+    ----------
+    patterns : iterable of str
+        Names, or what stands for several: ``full-*``.
+
+    Raises
+    ------
+    InputError
+        A pattern fits no case.
+    """
+    wanted: set[str] = set()
+    for pattern in patterns:
+        fitting = [name for name in NAMES if fnmatchcase(name, pattern)]
+        if not fitting:
+            near = ", ".join(get_close_matches(pattern, NAMES, cutoff=0))
+            raise InputError(f"case {pattern!r}: no such case; the nearest are {near}; --list tells all")
+        wanted.update(fitting)
+    return tuple(name for name in NAMES if name in wanted)
 
 
 def run_suite(
     device: Device,
     names: Iterable[str] = NAMES,
     quick: bool = False,
-    progress: Callable[[int], None] = lambda done: None,
+    done: Callable[[Case], None] = lambda case: None,
 ) -> list[Case]:
     """Run cases in their order.
 
@@ -142,11 +174,11 @@ def run_suite(
     ----------
     device : Device
     names : iterable of str
-        Of `NAMES`.
+        Names or patterns; see `choose`.
     quick : bool
         Small stacks and one round: that all works agree is checked, the times mean nothing.
-    progress : callable
-        Is told how many cases are done.
+    done : callable
+        Is given each case as soon as it is done.
 
     Raises
     ------
@@ -155,12 +187,22 @@ def run_suite(
     DisagreementError
         Works that should return the same maps do not.
     """
-    wanted = set(names)
-    if unknown := wanted - set(NAMES):
-        raise InputError(f"case {min(unknown)!r}: no such case; there is {', '.join(NAMES)}")
     cases = []
-    for name in NAMES:
-        if name in wanted:
-            cases.append(_RUNS[name](device, quick))
-            progress(len(cases))
+    for name in choose(names):
+        cases.append(_RUNS[name](device, quick))
+        done(cases[-1])
     return cases
+
+
+def check_accuracy(cases: Iterable[Case]) -> None:
+    """Raise InaccurateError if a bound of accuracy was missed: a device that is quick and wrong fails."""
+    missed = [
+        f"{case.name}, {target.what}: {target.measured}, must be {target.bound}"
+        for case in cases
+        if case.name in _ACCURACY
+        for target in case.targets
+        if not target.met
+    ]
+    if missed:
+        more = f" (and {len(missed) - 1} more)" if len(missed) > 1 else ""
+        raise InaccurateError(f"the device is not accurate: {missed[0]}{more}")

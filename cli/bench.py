@@ -1,8 +1,12 @@
-"""``mirrorskin bench``: how fast, and how near the limit."""
+"""``mirrorskin bench``: how fast, and how near the limit; what changed since; and that as a page."""
 
 from __future__ import annotations
 
 import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,42 +15,143 @@ import typer
 from mirrorskin.cli import options
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from rich.console import Console
+
+    from mirrorskin.bench.results import Case
+
+_RUN = "RUN.json"
+_WIDTH = 100  # a pipe has 80, which would cut the names
+
+app = typer.Typer(invoke_without_command=True)
 
 
-def command(
+@app.callback()
+def suite(
+    context: typer.Context,
     case: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this case; may be given again.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only this case, or those like 'full-*'; may be given again."),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Small stacks, to see that all agree; the times mean nothing.")
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE.json", help="Write JSON there, and a table beside it."),
+        typer.Option("--output", "-o", metavar=_RUN, help="Write JSON there, and a table beside it."),
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="For files of 2 GB; else among temporary files."),
+    ] = None,
+    list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
 ) -> None:
-    """Time the kernels against the limit of memory and against others."""
+    """Time the kernels and whole paths against the limits and against others; check their accuracy."""
     from mirrorskin import bench
     from mirrorskin.cli.progress import progress
     from mirrorskin.kernels.device import open_device
 
+    if context.invoked_subcommand is not None:
+        _refuse_options(context)
+        return
+    names = bench.choose(case or bench.NAMES)
+    if list_:
+        typer.echo(json.dumps(names, indent=2) if as_json else "\n".join(names))
+        return
     page = _check(output)
-    names = case or bench.NAMES
     opened = open_device(device)
-    with progress("measuring", len(set(names))) as show:
-        data = bench.as_data(opened, bench.run_suite(opened, names, quick, show), quick)
-    text = json.dumps(data, indent=2)
+    cases: list[Case] = []
+    try:
+        with _temporary_files(folder), progress("measuring", len(names)) as show:
+
+            def done(one: Case) -> None:
+                cases.append(one)
+                show(len(cases))
+
+            bench.run_suite(opened, names, quick, done)
+    finally:
+        # Also before an error or Ctrl-C: what is done took minutes.
+        if cases:
+            _tell(bench.as_data(opened, cases, quick), output, page, as_json)
+    bench.check_accuracy(cases)
+
+
+@app.command()
+def compare(
+    before: Annotated[Path, typer.Argument(metavar="A.json", help="A run that 'mirrorskin bench -o' wrote.")],
+    after: Annotated[Path, typer.Argument(metavar="B.json", help="Another, later one.")],
+    as_json: options.Json = False,
+) -> None:
+    """Compare two runs, work by work: what changed by more than its turns vary."""
+    from mirrorskin import bench
+    from mirrorskin.bench import compare as comparing
+
+    runs = bench.open_run(before), bench.open_run(after)
+    found = comparing.compare(*runs)
     if as_json:
-        typer.echo(text)
-    else:
-        _print(data)
-    for path, content in ((output, text + "\n"), (page, bench.as_markdown(data))):
-        if path is not None:
-            _write(path, content)
-            typer.echo(f"written to {path}", err=True)
+        typer.echo(json.dumps(comparing.as_data(found, *runs), indent=2))
+        return
+    console = _console()
+    titles = (f"{word}: {bench.as_title(run)}" for word, run in zip("AB", runs, strict=True))
+    console.print(*titles, *(f"warning: {line}" for line in found.warnings), sep="\n", markup=False)
+    for name, rows in found.cases.items():
+        console.print(f"\n{name}", markup=False)
+        _print_table(console, comparing.HEAD, comparing.as_rows(rows))
+    console.print("", *found.targets, *found.apart, *found.summary, sep="\n", markup=False)
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar=_RUN, help="Runs that 'mirrorskin bench -o' wrote.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="PAGE.md", help="Page to write; its picture goes to images."),
+    ],
+) -> None:
+    """Make a page of runs: aims, a summary, a roofline, and every case. Needs no device."""
+    from mirrorskin import bench, io, view
+
+    if output.suffix != ".md":
+        raise io.InputError(f"{output}: name a page that ends in .md")
+    view.check_drawing()
+    io.check_output(output, *runs)
+    bench.write_page({path: bench.open_run(path) for path in runs}, output)
+    typer.echo(f"written to {output}", err=True)
+
+
+def _refuse_options(context: typer.Context) -> None:
+    """Refuse options of a run before the name of another command, where they would do nothing."""
+    from mirrorskin import io
+
+    given = [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if getattr(context.get_parameter_source(parameter.name or ""), "name", "") == "COMMANDLINE"
+    ]
+    if given:
+        command = context.invoked_subcommand
+        raise io.InputError(f"{given[0]} is of a run: 'bench {command}' takes its options behind its name")
+
+
+@contextmanager
+def _temporary_files(folder: Path | None) -> Iterator[None]:
+    """Let temporary files, also of programs that are started, go to a folder."""
+    from mirrorskin import io
+
+    if folder is None:
+        yield
+        return
+    if not os.access(folder, os.W_OK | os.X_OK) or not folder.is_dir():
+        raise io.InputError(f"{folder} is no folder that can be written to: choose another with --folder")
+    before, tempfile.tempdir = (tempfile.tempdir, os.environ.get("TMPDIR")), str(folder.resolve())
+    os.environ["TMPDIR"] = tempfile.tempdir
+    try:
+        yield
+    finally:
+        tempfile.tempdir = before[0]
+        os.environ.pop("TMPDIR")
+        os.environ.update({"TMPDIR": before[1]} if before[1] is not None else {})
 
 
 def _check(output: Path | None) -> Path | None:
@@ -63,31 +168,54 @@ def _check(output: Path | None) -> Path | None:
     return page
 
 
-def _write(path: Path, content: str) -> None:
-    from mirrorskin import io
+def _tell(data: Mapping[str, Any], output: Path | None, page: Path | None, as_json: bool) -> None:
+    from mirrorskin import bench
 
-    try:
-        path.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise io.InputError(f"{path} could not be written: {error.strerror}; make room") from error
+    text = json.dumps(data, indent=2)
+    if as_json:
+        typer.echo(text)
+    else:
+        _print(data)
+    for path, content in ((output, text + "\n"), (page, bench.as_markdown(data))):
+        if path is not None:
+            bench.write_text(path, content)
+            typer.echo(f"written to {path}", err=True)
 
 
 def _print(data: Mapping[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from mirrorskin import bench
 
-    console = Console(highlight=False)
-    console.width = max(console.width, 100)  # a pipe has 80, which would cut the names
+    console = _console()
     console.print(bench.as_title(data), bench.LEGEND, sep="\n", markup=False)
     for case in data["cases"]:
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-        for number, head in enumerate(bench.HEAD):
-            table.add_column(head, justify="right" if number else "left", no_wrap=True)
-        for row in bench.as_rows(case):
-            table.add_row(*row)
         console.print(f"\n{case['name']}: {case['title']}", markup=False)
-        console.print(table)
+        _print_table(console, bench.HEAD, bench.as_rows(case))
+        _print_table(console, bench.TARGET_HEAD, bench.as_targets(case), numbers=False)
         for note in bench.as_notes(case):
             console.print(note, markup=False)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = max(console.width, _WIDTH)
+    return console
+
+
+def _print_table(
+    console: Console, head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: bool = True
+) -> None:
+    """Print a table that has rows; numbers go to the right and are never broken."""
+    from rich.table import Table
+    from rich.text import Text
+
+    if not rows:
+        return
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for number, name in enumerate(head):
+        is_number = numbers and number > 0
+        table.add_column(name, justify="right" if is_number else "left", no_wrap=is_number)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console.print(table)

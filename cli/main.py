@@ -51,8 +51,9 @@ def _common(
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
 
 
-for module in (demo, simulate, import_, reconstruct, correlate, fuse, batch, score, info, devices, bench):
+for module in (demo, simulate, import_, reconstruct, correlate, fuse, batch, score, info, devices):
     app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
+app.add_typer(bench.app, name="bench")
 
 
 class _OneLine:

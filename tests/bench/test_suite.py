@@ -5,9 +5,25 @@ import json
 import numpy as np
 import pytest
 
-from mirrorskin.bench import NAMES, as_data, as_markdown, as_notes, as_rows, memory, onset, run_suite, twin
+from mirrorskin.bench import (
+    NAMES,
+    accuracy,
+    as_data,
+    as_markdown,
+    as_notes,
+    as_rows,
+    choose,
+    memory,
+    onset,
+    paths,
+    run_suite,
+    scaling,
+    sweep,
+    twin,
+)
 from mirrorskin.bench.peers.onset import Peer, numpy_
 from mirrorskin.bench.same import DisagreementError
+from mirrorskin.bench.summary import is_accuracy
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
 from mirrorskin.kernels.errors import DeviceError
@@ -16,6 +32,8 @@ TWIN = ["mirrorskin, vertical", "mirrorskin, rotation", "NumPy, vertical"]
 
 
 FRAME = 48 * 64  # pixels of a quick run
+# What has tests of its own.
+ELSEWHERE = ("integrate", "file-", "batch-", "sweep-", "accuracy-", "scaling-", "cold-start")
 
 
 def moved(name, row):
@@ -33,7 +51,7 @@ def moved(name, row):
     return FRAME * size * (1 if limit and name.startswith("live") else 12)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("integrate")])
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith(ELSEWHERE)])
 def test_a_case_agrees_on_every_device(device, name):
     (case,) = run_suite(device, [name], quick=True)
     names = [row.name for row in case.rows]
@@ -156,15 +174,35 @@ def test_a_device_without_room_for_the_stack_is_refused(small_device):
         run_suite(small_device, ["equation4-uint8"], quick=True)
 
 
-def test_an_unknown_case_is_refused_and_the_known_ones_are_listed(device):
-    with pytest.raises(InputError, match="case 'what': no such case; there is equation4-uint8, "):
-        run_suite(device, ["live", "what"])
+def test_an_unknown_case_is_refused_and_the_nearest_are_named():
+    with pytest.raises(InputError, match="case 'liver': no such case; the nearest are live, "):
+        run_suite(open_device(), ["live", "liver"])
 
 
-def test_progress_is_told_case_by_case(device):
+def test_cases_are_chosen_in_their_order_each_once():
+    assert choose(["live*", "full-uint?", "full-*", "live"]) == (
+        *(name for name in NAMES if name.startswith("full-")),
+        "live",
+        "live-random",
+    )
+    assert choose([]) == ()
+    assert choose("*") == NAMES
+
+
+def test_no_case_hides_another_of_its_name():
+    parts = [one.CASES for one in (accuracy, paths, scaling, sweep)]
+    merged = [name for part in parts for name in part]
+    assert len(set(merged)) == len(merged)
+    assert set(merged) < set(NAMES)
+    assert all(name.startswith(ELSEWHERE) for name in merged)
+    assert {name for name in NAMES if is_accuracy({"name": name})} == set(accuracy.CASES)
+
+
+def test_each_case_is_handed_over_when_it_is_done(device):
     done = []
-    run_suite(device, ["live", "hold2-uint8"], quick=True, progress=done.append)
-    assert done == [1, 2]
+    found = run_suite(device, ["live", "hold2-uint8"], quick=True, done=done.append)
+    assert [case.name for case in done] == ["hold2-uint8", "live"]
+    assert done == found
 
 
 def test_a_run_becomes_json_and_a_page(device):

@@ -201,7 +201,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
         (["import", ".", "--motion", "vertical", "-o", "a.h5"], "--travel-step"),
         (["score", "nothing.h5", "--truth", "nothing.h5"], "no such file"),
         (["info", "nothing.h5"], "no such file"),
-        (["bench", "--case", "what"], "there is equation4-uint8"),
+        (["bench", "--case", "what"], "no such case"),
         (["bench", "-o", "run.txt"], "ends in .json"),
         (["bench", "-o", "no/such/run.json"], "no folder"),
     ],

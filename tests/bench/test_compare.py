@@ -1,0 +1,163 @@
+"""Two runs: what changed, by more than its turns vary, and whether they may be compared at all."""
+
+import json
+import re
+
+import pytest
+from bench_runs import case, row, run, target
+
+from mirrorskin.bench.compare import HEAD, as_data, as_rows, compare
+from mirrorskin.io import InputError
+
+
+def one(seconds, **changes):
+    """Return a run of one work that takes so long."""
+    return run(case("press", row("mirrorskin", seconds, moved=1000, **changes)))
+
+
+def difference(before, after):
+    (found,) = compare(before, after).cases["press"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("seconds", "verdict"),
+    [(0.85, "quicker"), (0.95, "as before"), (1.0, "as before"), (1.05, "as before"), (1.15, "slower")],
+)
+def test_only_what_differs_by_more_than_its_spread_is_quicker_or_slower(seconds, verdict):
+    found = difference(one(1.0), one(seconds))
+    assert found.verdict == verdict
+    assert found.ratio == pytest.approx(seconds)
+    # Quartiles lie 5 % on either side.
+    assert found.lower == pytest.approx(seconds * 0.95 / 1.05)
+    assert found.upper == pytest.approx(seconds * 1.05 / 0.95)
+
+
+def test_a_wide_spread_hides_a_difference_and_a_narrow_one_shows_it():
+    assert difference(one(1.0, spread=0.3), one(1.3)).verdict == "as before"
+    assert difference(one(1.0, spread=0.001), one(1.01, spread=0.001)).verdict == "slower"
+
+
+def test_two_turns_have_no_spread():
+    assert difference(one(1.0, rounds=2), one(5.0)).verdict == "unknown"
+    assert difference(one(1.0), one(5.0, rounds=1)).verdict == "unknown"
+
+
+def test_limits_of_nearly_as_many_bytes_are_compared_for_as_much_work():
+    before = run(case("press", row("read limit", 1.0, moved=1000)))
+    after = run(case("press", row("read limit", 1.02, moved=1020)))
+    assert difference(before, after).ratio == pytest.approx(1)
+
+
+@pytest.mark.parametrize("changes", [{"moved": 1100}, {"moved": 0}, {"moved": 1000, "frames": 3}])
+def test_other_work_under_the_same_name_is_not_compared(changes):
+    frames = changes.pop("frames", 0)
+    other = row("mirrorskin", 1.0, **changes) | {"frames": frames}
+    same = row("NumPy", 2.0, moved=1000)
+    found = compare(
+        run(case("press", row("mirrorskin", 1.0, moved=1000), same)), run(case("press", other, same))
+    )
+    assert [one.name for one in found.cases["press"]] == ["NumPy"]
+    assert found.apart == ("press: not the same work in both, or in one alone: mirrorskin",)
+
+
+def test_works_and_limits_are_counted_apart():
+    def of(limit, mine, theirs):
+        return run(
+            case(
+                "press",
+                row("read limit", limit, moved=10),
+                row("mirrorskin", mine, moved=10),
+                row("NumPy", theirs, moved=10),
+            )
+        )
+
+    found = compare(of(1, 1, 1), of(2, 4, 1))
+    assert found.summary == (
+        "works: 1 slower, 1 as before; B takes 2.00 times as long as A (geometric mean)",
+        "limits of the machine: 1 slower; B takes 2.00 times as long as A (geometric mean)",
+    )
+
+
+def test_cases_and_works_of_one_run_alone_are_named():
+    shared = row("mirrorskin", 1.0)
+    before = run(case("gone", shared), case("press", shared, row("Numba", 1.0)))
+    after = run(case("press", shared, row("PyTorch", 1.0)), case("new", shared))
+    found = compare(before, after)
+    assert list(found.cases) == ["press"]
+    assert found.apart == (
+        "only in A: gone",
+        "only in B: new",
+        "press: not the same work in both, or in one alone: Numba, PyTorch",
+    )
+
+
+def test_runs_with_nothing_in_common_are_refused():
+    others = run(case("other", row("mirrorskin", 1.0)))
+    with pytest.raises(InputError, match="no work in common"):
+        compare(one(1.0), others)
+    with pytest.raises(InputError, match="no work in common"):
+        compare(one(1.0), run(case("press", row("mirrorskin", 1.0, moved=9))))
+    with pytest.raises(InputError, match="no work in common"):
+        compare(run(), run())
+
+
+GPU = {"name": "Other GPU", "platform": "Some platform", "driver": "1.0", "kind": "gpu"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"device": GPU}, "other machine or device: Some platform: Some GPU .* / Some platform: Other GPU"),
+        ({"processor": "Other"}, "other machine or device: .*; Some processor / .*; Other"),
+        ({"threads": 4}, "other machine or device: .* 2 threads.* 4 threads"),
+        ({"system": "Linux arm64"}, "other system: Linux x86_64 / Linux arm64"),
+        ({"versions": {"numpy": "3.0"}}, "other numpy: 2.4.6 / 3.0"),
+        ({"versions": {"torch": "2.13"}}, "other torch: none / 2.13"),
+        ({"quick": True}, "B: made with --quick; the times mean nothing"),
+    ],
+)
+def test_what_else_differs_is_warned_of(changes, said):
+    after = one(1.0)
+    found = compare(one(1.0), after | changes)
+    assert len(found.warnings) == 1
+    assert re.fullmatch(f"{said}.*", found.warnings[0])
+
+
+def test_another_commit_and_what_one_run_did_not_record_are_no_reason_for_a_warning():
+    versions = {"mirrorskin": "0.2.0", "Python": "3.11.7", "scipy": "1.17"}
+    assert compare(one(1.0), one(1.0) | {"commit": "fedcba", "versions": versions}).warnings == ()
+
+
+def test_aims_that_were_reached_in_one_run_alone_are_told():
+    def of(first, second):
+        return run(case("file", targets=(target("whole path", first), target("memory", second))))
+
+    found = compare(of(True, False), of(False, True))
+    assert found.targets == (
+        "file, whole path: missed now: 1.3 times before, 1.3 times now (at most 1.25 times)",
+        "file, memory: reached now: 1.3 times before, 1.3 times now (at most 1.25 times)",
+    )
+    assert compare(of(True, False), of(True, False)).targets == ()
+
+
+def test_a_comparison_becomes_json_and_a_table():
+    before, after = one(1.0, share=0.5), one(2.0, share=0.25)
+    found = compare(before, after)
+    told = as_data(found, before, after)
+    assert json.loads(json.dumps(told, allow_nan=False)) == json.loads(json.dumps(told))
+    (only,) = told["cases"]
+    assert only["name"] == "press"
+    assert only["rows"][0]["ratio"] == 2
+    assert told["before"]["commit"] == "0123456789abcdef"
+    (cells,) = as_rows(found.cases["press"])
+    assert dict(zip(HEAD, cells, strict=True)) == {
+        "work": "mirrorskin",
+        "A, ms": "1000",
+        "B, ms": "2000",
+        "B / A": "2.00",
+        "quartiles": "1.81-2.21",
+        "verdict": "slower",
+        "A, of limit": "50 %",
+        "B, of limit": "25 %",
+    }
