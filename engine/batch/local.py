@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from queue import Empty, SimpleQueue
 from threading import Event, Thread
 
@@ -15,6 +14,9 @@ from mirrorskin.engine.batch.work import Outcome, do
 from mirrorskin.kernels.device import Device, list_devices, open_device
 
 Watch = Callable[[Job, int], None]
+
+_INSISTS = 3  # times that Ctrl-C is pressed while a thread hangs, in a network disk perhaps
+_INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 
 
 class _Stopped(BaseException):  # no Exception: nobody may take it for a recording's failure
@@ -90,10 +92,15 @@ def run_local(
 
 
 def _wait(thread: Thread) -> None:
-    """Wait for a thread, however often Ctrl-C is pressed: OpenCL ends a program that leaves it at work."""
+    """Wait for a thread, as OpenCL aborts a program that leaves it at work; who insists ends it at once."""
+    interrupts = 0
     while thread.is_alive():
-        with suppress(KeyboardInterrupt, SystemExit):
+        try:
             thread.join()
+        except (KeyboardInterrupt, SystemExit):
+            interrupts += 1
+            if interrupts == _INSISTS:
+                os._exit(_INTERRUPTED)
 
 
 def _telling(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:

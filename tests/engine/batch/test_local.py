@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -120,3 +122,21 @@ def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):
     assert default_devices() == [devices["1"], devices["2"]]
     monkeypatch.setitem(os.environ, "PYOPENCL_CTX", "0:1")
     assert default_devices() == [devices["1"]]
+
+
+HANGS = """
+import signal, threading, time
+from mirrorskin.engine.batch import local
+thread = threading.Thread(target=time.sleep, args=(60,))
+thread.start()
+for wait in (0.5, 1.0, 1.5):
+    threading.Timer(wait, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
+local._wait(thread)
+"""
+
+
+def test_a_thread_that_hangs_does_not_keep_one_who_insists():
+    start = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", HANGS], check=False)
+    assert ended.returncode == 130
+    assert time.monotonic() - start < 40
