@@ -154,18 +154,19 @@ class _Dispatch:
 
     def _outcome(self, run: _Run) -> Outcome | None:
         """Return what became of a run that ended; None where its worker was lost, and it is queued again."""
+        if run.future.status == "error":
+            error = run.future.exception()
+            if isinstance(error, _distributed().KilledWorker):
+                return self._retry(run)
+            problem = f"unexpected {type(error).__name__} on worker {run.worker}: {error}"
+            return Outcome(run.job, "failed", " ".join(problem.split()), 0.0)
         if run.future.status == "finished":
             with contextlib.suppress(OSError, _distributed().CancelledError):
                 outcome: Outcome = run.future.result(timeout=_REACH)
                 return replace(outcome, job=run.job)
-            self._waiting.appendleft(run.job)  # its worker was lost when it was done: it will be kept
-            return None
-        if run.future.status == "error":
-            error = run.future.exception()
-            if not isinstance(error, _distributed().KilledWorker):
-                problem = f"unexpected {type(error).__name__} on worker {run.worker}: {error}"
-                return Outcome(run.job, "failed", " ".join(problem.split()), 0.0)
-        return self._retry(run)
+        # It was done when its worker was lost, and nobody was told yet: it will be kept.
+        self._waiting.appendleft(run.job)
+        return None
 
     def _retry(self, run: _Run) -> Outcome | None:
         """Queue a job whose worker was lost again, unless it seems to be what ends them."""

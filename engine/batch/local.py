@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from queue import Empty, SimpleQueue
-from threading import Event, Thread
+from threading import Event, Semaphore, Thread
 
 from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.memory import keep_memory
@@ -65,7 +66,7 @@ def run_local(
     for job in jobs:
         todo.put(job)
     told: SimpleQueue[Outcome | BaseException] = SimpleQueue()
-    stop = Event()
+    stop, ended = Event(), Semaphore(0)
 
     def work(device: Device) -> None:
         try:
@@ -75,11 +76,15 @@ def run_local(
             pass
         except BaseException as error:
             told.put(error)
+        finally:
+            ended.release()
 
-    threads = [Thread(target=work, args=(device,)) for device in devices]
+    threads: list[Thread] = []
     try:
-        for thread in threads:
+        for device in devices:
+            thread = Thread(target=work, args=(device,))
             thread.start()
+            threads.append(thread)
         for _ in jobs:
             outcome = told.get()
             if isinstance(outcome, BaseException):
@@ -87,20 +92,22 @@ def run_local(
             yield outcome
     finally:
         stop.set()
+        for _ in threads:
+            _wait(ended)
         for thread in threads:
-            _wait(thread)
-
-
-def _wait(thread: Thread) -> None:
-    """Wait for a thread, as OpenCL aborts a program that leaves it at work; who insists ends it at once."""
-    interrupts = 0
-    while thread.is_alive():
-        try:
             thread.join()
-        except (KeyboardInterrupt, SystemExit):
-            interrupts += 1
-            if interrupts == _INSISTS:
-                os._exit(_INTERRUPTED)
+
+
+def _wait(ended: Semaphore) -> None:
+    """Wait for a thread, as OpenCL aborts a program that leaves it at work; who insists ends it at once.
+
+    A thread's own join must not be interrupted: some Pythons then take the thread for ended.
+    """
+    for _ in range(_INSISTS):
+        with suppress(KeyboardInterrupt, SystemExit):
+            ended.acquire()
+            return
+    os._exit(_INTERRUPTED)
 
 
 def _telling(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:

@@ -475,3 +475,16 @@ def test_only_the_job_that_was_begun_is_blamed(monkeypatch, tmp_path):
     given = [name for name, _ in crew.given]
     assert given.count("first") == 4
     assert given.count("second") == 5  # four times behind the first, and then its turn
+
+
+def test_a_job_that_was_done_when_its_worker_was_lost_is_asked_for_again(monkeypatch, tmp_path, caplog):
+    def lose(self, timeout):
+        monkeypatch.undo()
+        raise TimeoutError
+
+    monkeypatch.setattr(Future, "result", lose)
+    crew = Unlucky(0)
+    (outcome,) = cluster._Dispatch(crew, crew, [Job(tmp_path / "a", tmp_path / "b")], PLAN).outcomes()
+    assert outcome.state == "done"
+    assert len(crew.given) == 2
+    assert "was lost" not in caplog.text  # nobody is blamed

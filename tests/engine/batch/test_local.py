@@ -125,13 +125,11 @@ def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):
 
 
 HANGS = """
-import signal, threading, time
+import signal, threading
 from mirrorskin.engine.batch import local
-thread = threading.Thread(target=time.sleep, args=(60,))
-thread.start()
 for wait in (0.5, 1.0, 1.5):
     threading.Timer(wait, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
-local._wait(thread)
+local._wait(threading.Semaphore(0))
 """
 
 
