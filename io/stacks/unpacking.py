@@ -19,6 +19,9 @@ from mirrorskin.io.region import Region
 from mirrorskin.io.stacks.mapped import SPARE, Mapped
 from mirrorskin.io.stacks.stack import Chunks, Cut, Place
 
+# What was unpacked is worked on next. For less than so many frames, each of them costs more.
+_CACHE, _AT_ONCE = 32 << 20, 32
+
 _log = logging.getLogger("mirrorskin.io")
 
 
@@ -54,8 +57,10 @@ class Ordered:
         return self._chunks.how if self._held is None else "unpacked into memory"
 
     def end(self, start: int, stop: int) -> int:
-        """End a read where chunks end, so that none is unpacked twice."""
+        """End a read where chunks end, so that none is unpacked twice, and while all is in the cache."""
         first, length = self._cut.frames[0], self._chunks.chunk[0]
+        size = math.prod(self.shape[1:]) * self.dtype.itemsize
+        stop = min(stop, start + max(length, _AT_ONCE, _CACHE // size))
         if (first + start) % length and start:
             return min(stop, self._slab(start)[1] - first)
         aligned = stop if stop == self.shape[0] else (first + stop) // length * length - first

@@ -137,7 +137,7 @@ def test_more_threads_give_the_same(tmp_path, threads):
     path = write(tmp_path / "a.h5", compressible((40, 30, 31), "u2"), (2, 7, 8), PACKINGS["bitshuffle"])
     frames, how = ours(path, 16, threads=threads)
     np.testing.assert_array_equal(frames, theirs(path))
-    assert how == f"chunks decoded by {threads} thread{'s' if threads > 1 else ''}"
+    assert how == f"chunks decoded by {'one thread' if threads == 1 else f'{threads} threads'}"
 
 
 @st.composite
