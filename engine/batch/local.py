@@ -81,10 +81,7 @@ def run_local(
 
     threads: list[Thread] = []
     try:
-        for device in devices:
-            thread = Thread(target=work, args=(device,))
-            thread.start()
-            threads.append(thread)
+        threads.extend(_started(work, device) for device in devices)
         for _ in jobs:
             outcome = told.get()
             if isinstance(outcome, BaseException):
@@ -92,10 +89,21 @@ def run_local(
             yield outcome
     finally:
         stop.set()
-        for _ in threads:
-            _wait(ended)
-        for thread in threads:
-            thread.join()
+        _finish(threads, ended)
+
+
+def _started(work: Callable[[Device], None], device: Device) -> Thread:
+    thread = Thread(target=work, args=(device,))
+    thread.start()
+    return thread
+
+
+def _finish(threads: Sequence[Thread], ended: Semaphore) -> None:
+    """Wait for all threads; each releases once at its end."""
+    for _ in threads:
+        _wait(ended)
+    for thread in threads:
+        thread.join()
 
 
 def _wait(ended: Semaphore) -> None:
