@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -98,9 +99,11 @@ def new_file(path: Path) -> Iterator[int]:
         It cannot be made; an older file of that name is left as it was.
     """
     check_output(path)
-    with plainly(f"{path} could not be written"):
-        descriptor, part = _new_part(path.parent)
+    # Its name is known before there is a file: whenever the program is ended, it is removed.
+    part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
+        with plainly(f"{path} could not be written"):
+            descriptor = _make(part)
         yield descriptor
         with plainly(f"{path} could not be written", MAKE_ROOM):
             os.close(os.dup(descriptor))  # some disks tell only then that they did not take all
@@ -108,7 +111,8 @@ def new_file(path: Path) -> Iterator[int]:
             part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-        os.close(descriptor)  # it was locked until it had its name
+        if descriptor >= 0:
+            os.close(descriptor)  # it was locked until it had its name
 
 
 @contextmanager
@@ -148,15 +152,15 @@ def remove_leftovers(folder: Path) -> list[Path]:
     return removed
 
 
-def _new_part(folder: Path) -> tuple[int, Path]:
-    """Make a file under a temporary name; it is locked as long as it is open."""
+def _make(part: Path) -> int:
+    """Make a file, which is locked as long as it is open, and return its descriptor."""
     while True:
-        handle, name = tempfile.mkstemp(prefix=_PREFIX, suffix=_SUFFIX, dir=folder)
+        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        if os.fstat(handle).st_nlink:  # else someone took it for a leftover before it was locked
-            return handle, Path(name)
-        os.close(handle)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if os.fstat(descriptor).st_nlink:  # else someone took it for a leftover before it was locked
+            return descriptor
+        os.close(descriptor)
 
 
 class _Disk(FileIO):

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,6 @@ from mirrorskin.io.atomic import new_hdf5, remove_leftovers
 # Begins a file, says so, and waits to be killed.
 BEGIN = """
 import sys
-from pathlib import Path
 from mirrorskin.io.atomic import new_hdf5
 with new_hdf5(Path(sys.argv[1])) as new:
     new.root["x"] = 1
@@ -54,20 +52,20 @@ def test_only_what_a_killed_program_wrote_is_removed(tmp_path):
 
 
 def test_a_file_that_was_taken_for_a_leftover_is_begun_again(tmp_path, monkeypatch):
-    made = atomic.tempfile.mkstemp
-    names = []
+    lock, locked = atomic.fcntl.flock, []
 
-    def make(**options):
-        handle, name = made(**options)
-        names.append(name)
-        if len(names) == 1:
-            assert remove_leftovers(tmp_path) == [Path(name)]
-        return handle, name
+    def late(file, how):
+        if not locked:
+            locked.append(file)
+            assert len(remove_leftovers(tmp_path)) == 1
+        elif how == atomic.fcntl.LOCK_EX:
+            locked.append(file)
+        lock(file, how)
 
-    monkeypatch.setattr(atomic.tempfile, "mkstemp", make)
+    monkeypatch.setattr(atomic.fcntl, "flock", late)
     with new_hdf5(tmp_path / "a.h5") as new:
         new.root["x"] = 1
-    assert len(names) == 2
+    assert len(locked) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
@@ -87,3 +85,13 @@ def test_a_folder_that_is_not_there_has_no_leftovers(tmp_path):
     assert remove_leftovers(tmp_path / "no") == []
     with pytest.raises(InputError, match="there is no folder"), new_hdf5(tmp_path / "no" / "a.h5"):
         pass
+
+
+def test_a_program_that_is_ended_while_the_file_is_made_leaves_none(tmp_path, monkeypatch):
+    def end(*_):
+        raise SystemExit(143)
+
+    monkeypatch.setattr(atomic.fcntl, "flock", end)
+    with pytest.raises(SystemExit), new_hdf5(tmp_path / "a.h5"):
+        pass
+    assert not list(tmp_path.iterdir())
