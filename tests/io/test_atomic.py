@@ -11,6 +11,7 @@ from mirrorskin.io.atomic import new_hdf5, remove_leftovers
 # Begins a file, says so, and waits to be killed.
 BEGIN = """
 import sys
+from pathlib import Path
 from mirrorskin.io.atomic import new_hdf5
 with new_hdf5(Path(sys.argv[1])) as new:
     new.root["x"] = 1
