@@ -17,9 +17,10 @@ def test_a_batch_goes_on_where_it_was_ended(number, seed, recordings, undisturbe
     said = batch.end(number, chance.randrange(len(recordings) - 2), chance.uniform(0, 0.1))
 
     before = soak.results(folder)
-    assert len(before) < len(recordings)
     assert soak.all_data(folder).items() <= undisturbed.items()
-    if number == signal.SIGKILL:
+    if batch.code == 0:  # on a quick machine, all was done before the signal came
+        assert len(before) == len(recordings)
+    elif number == signal.SIGKILL:
         assert batch.code == -number
     else:
         assert batch.code == 128 + number
