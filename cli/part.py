@@ -6,9 +6,6 @@ import re
 
 from mirrorskin.io import InputError, Region
 
-_NUMBER = "([0-9]{1,9})"
-_SIZE = "([1-9][0-9]{0,8})"
-
 
 def region(text: str, option: str = "") -> Region:
     """Read a rectangle of the picture, as in ``100,50,640x480``.
@@ -25,14 +22,13 @@ def region(text: str, option: str = "") -> Region:
     InputError
         It is not that.
     """
-    match = re.fullmatch(rf"{_NUMBER},{_NUMBER},{_SIZE}x{_SIZE}", "".join(text.split()))
-    if match is None:
+    found = Region.read("".join(text.split()))
+    if found is None:
         raise InputError(
             f"{option} {text}: the first column and row, and how many of each, are needed;"
             " write e.g. 100,50,640x480"
         )
-    column, row, columns, rows = map(int, match.groups())
-    return Region(rows=(row, row + rows), columns=(column, column + columns))
+    return found
 
 
 def frame_range(text: str, option: str = "") -> tuple[int, int | None]:

@@ -25,14 +25,13 @@ def sign(result: Result, source: Source, device: Device, process: dict[str, Proc
         x, y = _places(source, source.header.pixel_size)
     origin: dict[str, ProcessValue] = {"source": source.name}
     if isinstance(source, Recording):
-        count, rows, columns = source.shape
-        (row, column), first = source.origin, source.first_frame
+        first = source.first_frame
         origin |= {
             "dataset": source.dataset,
             "source_fingerprint": source.fingerprint(),
             "source_modified": source.modified,
-            "source_region": f"{column},{row},{columns}x{rows}",
-            "source_frames": f"{first}:{first + count}",
+            "source_region": source.region.text,
+            "source_frames": f"{first}:{first + source.shape[0]}",
         }
     made: dict[str, ProcessValue] = {
         "program": "mirrorskin",

@@ -9,6 +9,8 @@ from typing import Self
 
 from mirrorskin.io.types import InputError
 
+_TEXT = re.compile("([0-9]{1,9}),([0-9]{1,9}),([1-9][0-9]{0,8})x([1-9][0-9]{0,8})")
+
 
 @dataclass(frozen=True, slots=True)
 class Region:
@@ -42,6 +44,21 @@ class Region:
     def slices(self) -> tuple[slice, slice]:
         """What cuts it out of a map."""
         return slice(*self.rows), slice(*self.columns)
+
+    @classmethod
+    def read(cls, text: str) -> Self | None:
+        """Return the region that ``text`` tells as the property ``text`` does; None of anything else."""
+        found = _TEXT.fullmatch(text)
+        if found is None:
+            return None
+        column, row, columns, rows = map(int, found.groups())
+        return cls((row, row + rows), (column, column + columns))
+
+    @property
+    def text(self) -> str:
+        """Its first column and row, and how many of each, as in ``100,50,640x480``."""
+        (rows, columns), (row, column) = self.shape, self.origin
+        return f"{column},{row},{columns}x{rows}"
 
     def __str__(self) -> str:
         return f"rows {self.rows[0]}:{self.rows[1]} and columns {self.columns[0]}:{self.columns[1]}"
@@ -84,9 +101,5 @@ def part_of(process: Mapping[str, object]) -> Region | None:
     process : mapping
         Of the result; one of 'fuse' tells the part of both recordings, which is the same.
     """
-    for name in ("source_region", "vertical_source_region"):
-        found = re.fullmatch(r"(\d+),(\d+),(\d+)x(\d+)", str(process.get(name, "")))
-        if found:
-            column, row, columns, rows = map(int, found.groups())
-            return Region((row, row + rows), (column, column + columns))
-    return None
+    told = (Region.read(str(process.get(name, ""))) for name in ("source_region", "vertical_source_region"))
+    return next((region for region in told if region is not None), None)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -154,7 +156,7 @@ class Array:
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        try:
+        with _taking(self._device, self.name, self.host.nbytes):
             if self._shared:
                 self._buffer = cl.Buffer(
                     self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
@@ -164,10 +166,6 @@ class Array:
                 # Drivers allocate at first use; asking for it here makes a lack of memory show here.
                 undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
                 cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
-        except cl.Error as error:
-            if error.code not in _NO_ROOM:
-                raise
-            raise DeviceMemoryError(_no_room(self._device, self.name, self.host.nbytes)) from error
 
 
 class Lent:
@@ -203,7 +201,7 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDAr
     """Make room on the host from where copies to a device are fastest; see ``Device.pinned``."""
     nbytes = math.prod(shape) * dtype.itemsize
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-    try:
+    with _taking(device, "frames on the host", nbytes):
         buffer = cl.Buffer(device.context, flags, size=nbytes)
         view, _ = cl.enqueue_map_buffer(
             device.copies,
@@ -214,10 +212,6 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDAr
             dtype,
             is_blocking=True,
         )
-    except cl.Error as error:
-        if error.code not in _NO_ROOM:
-            raise
-        raise DeviceMemoryError(_no_room(device, "frames on the host", nbytes)) from error
     room: NDArray[Any] = view
     return room
 
@@ -227,6 +221,17 @@ def _aligned(nbytes: int) -> NDArray[np.uint8]:
     raw = np.zeros(nbytes + _PAGE, np.uint8)
     start = -raw.ctypes.data % _PAGE
     return raw[start : start + nbytes]
+
+
+@contextmanager
+def _taking(device: Device, name: str, nbytes: int) -> Iterator[None]:
+    """Say of what a device has no room, where it says that it has none."""
+    try:
+        yield
+    except cl.Error as error:
+        if error.code not in _NO_ROOM:
+            raise
+        raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
 
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:

@@ -26,6 +26,7 @@ from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.place import Place, do_at, look_around
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.batch.work import Outcome
+from mirrorskin.engine.version import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.plain import plainly
@@ -35,7 +36,6 @@ PATIENCE = 30.0
 
 _REACH = 10.0  # seconds, for a first answer
 _CHECK = 150.0  # seconds, for a worker to load everything from a slow disk and try its device
-_VERSION = version("mirrorskin")
 _LOOK = 1.0  # seconds between two looks at who the workers are
 _LOSSES = 3  # workers that a job may cost before it is held to be the cause
 _INSTALL = "pip install 'mirrorskin[cluster]'"
@@ -256,13 +256,13 @@ class _Crew:
     def _check_version(self, workers: list[str]) -> dict[str, str | None]:
         """Return what is wrong with those who cannot take part; None with one that was lost meanwhile."""
         # A function of Python's own: one of ours could not be read by another version, or by none.
-        found = self._run(workers, version, "mirrorskin")
+        found, own = self._run(workers, version, "mirrorskin"), program_version()
         return {
             worker: None
             if isinstance(one, OSError)
-            else f"has mirrorskin {_number(one)}, and this machine {_VERSION}: install the same on both"
+            else f"has mirrorskin {_number(one)}, and this machine {own}: install the same on both"
             for worker, one in found.items()
-            if one != _VERSION
+            if one != own
         }
 
     def _check_sight(self, places: Mapping[str, Place]) -> dict[str, str | None]:

@@ -258,7 +258,7 @@ def test_without_dask_a_remedy_is_told(recordings, tmp_path, monkeypatch):
 
 
 def test_another_version_on_a_worker_is_refused(recordings, address, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "_VERSION", "9.9")
+    monkeypatch.setattr(cluster, "program_version", lambda: "9.9")
     own = cluster.version("mirrorskin")
     message = refusal(make_jobs(recordings, tmp_path), address)
     assert f"has mirrorskin {own}, and this machine 9.9: install the same on both" in message
