@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import gc
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.press.onset import OnsetSearch
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
+from mirrorskin.io.types import Block
+
+SHAPE = (5, 7)
+SOON = 5.0  # seconds, that nothing here takes
+KINDS = [np.uint8, np.uint16, np.float32]
+
+
+def put(ring: Ring, number: int, lost: int = 0) -> None:
+    ring.slot()[...] = number
+    ring.put(time=100.0 + number, number=number, lost=lost)
+
+
+def fill(ring: Ring, start: int, stop: int) -> None:
+    for number in range(start, stop):
+        put(ring, number)
+
+
+def take_all(ring: Ring) -> list[int]:
+    """Take one by one, and let each go again."""
+    numbers: list[int] = []
+    while True:
+        try:
+            frames = ring.take(1, 0.0)
+        except HardwareError:
+            return numbers
+        assert np.all(frames.pixels == frames.number[0])
+        numbers += frames.number.tolist()
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_frames_come_out_as_they_went_in(dtype) -> None:
+    ring = Ring(SHAPE, dtype, 9)
+    rng = np.random.default_rng(3)
+    sent = rng.integers(0, 200, (4, *SHAPE)).astype(dtype)
+    for number, frame in enumerate(sent):
+        ring.slot()[...] = frame
+        ring.put(time=0.25 * number, number=10 + number)
+    frames = ring.take(4, SOON)
+    assert frames.pixels.dtype == dtype
+    np.testing.assert_array_equal(frames.pixels, sent)
+    assert frames.number.tolist() == [10, 11, 12, 13]
+    assert frames.time.tolist() == [0.0, 0.25, 0.5, 0.75]
+    assert frames.dropped == 0
+    assert (frames.number.dtype, frames.time.dtype) == (np.int64, np.float64)
+
+
+def test_frames_lie_side_by_side_in_the_rings_own_memory() -> None:
+    ring = Ring(SHAPE, np.uint16, 20)
+    place = ring.slot()
+    assert place.ctypes.data % 4096 == 0
+    fill(ring, 0, 6)
+    first = ring.take(3, SOON)
+    second = ring.take(3, SOON)
+    assert first.pixels.shape == (3, *SHAPE)
+    assert first.pixels.flags.c_contiguous
+    assert np.shares_memory(first.pixels, place)
+    assert second.pixels.ctypes.data == first.pixels.ctypes.data + first.pixels.nbytes
+
+
+def test_what_was_taken_cannot_be_written_to() -> None:
+    ring = Ring(SHAPE, np.uint8, 4)
+    put(ring, 1)
+    with pytest.raises(ValueError, match="read-only"):
+        ring.take(1, SOON).pixels[0, 0, 0] = 5
+
+
+def test_64_bytes_beyond_the_last_place_can_be_read(device) -> None:
+    ring = Ring((1, 1), np.uint8, 1)
+    for number in range(4):
+        put(ring, number)
+        frames = ring.take(1, SOON)
+        beyond = np.lib.stride_tricks.as_strided(frames.pixels.ravel(), (65,))
+        assert int(beyond.sum()) >= number  # reading it does not end the program
+        if device.info.shares_memory:
+            assert device.lend("frames", frames.pixels) is not None
+
+
+@pytest.mark.parametrize("slots", [1, 2, 3, 8])
+def test_a_place_that_is_referred_to_is_never_overwritten(slots) -> None:
+    ring = Ring(SHAPE, np.uint8, slots)
+    kept = []
+    for number in range(60):
+        put(ring, number)
+        if number % 3 == 0:
+            kept.append(ring.take(1, SOON))
+    fill(ring, 60, 100)
+    assert len({int(frames.number[0]) for frames in kept}) == 20
+    for frames in kept:
+        np.testing.assert_array_equal(frames.pixels, frames.number[0])
+
+
+def test_also_a_view_keeps_its_place() -> None:
+    ring = Ring(SHAPE, np.uint8, 4)
+    put(ring, 7)
+    corner = ring.take(1, SOON).pixels[0, ::2, 3:].T
+    gc.collect()
+    fill(ring, 8, 40)
+    np.testing.assert_array_equal(corner, 7)
+
+
+def test_a_place_that_nobody_refers_to_is_used_again() -> None:
+    ring = Ring(SHAPE, np.uint8, 4)
+    addresses = set()
+    for number in range(50):
+        put(ring, number)
+        addresses.add(ring.take(1, SOON).pixels.ctypes.data)
+    assert len(addresses) <= 6
+
+
+def test_a_reader_that_keeps_everything_loses_nothing() -> None:
+    ring = Ring(SHAPE, np.uint16, 4)
+    kept = []
+    for number in range(300):
+        put(ring, number)
+        kept.append(ring.take(1, SOON))
+    assert [int(frames.number[0]) for frames in kept] == list(range(300))
+    assert all(np.all(frames.pixels == frames.number[0]) for frames in kept)
+    assert ring.dropped == 0
+
+
+def test_copies_can_be_worked_on_in_place_as_well() -> None:
+    ring = Ring((3, 5), np.uint8, 1)
+    put(ring, 1)
+    first = ring.take(1, SOON).pixels
+    put(ring, 2)
+    second = ring.take(1, SOON).pixels
+    assert not np.shares_memory(first, second)
+    assert second.ctypes.data % 4096 == 0
+    assert second.flags.c_contiguous
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5])
+def test_of_too_many_frames_the_oldest_are_dropped_and_counted(slots) -> None:
+    ring = Ring(SHAPE, np.uint8, slots)
+    fill(ring, 0, 12)
+    assert ring.dropped == 12 - slots
+    frames = ring.take(1, SOON)
+    assert frames.number[0] == 12 - slots
+    assert frames.dropped == 12 - slots
+    assert take_all(ring) == list(range(13 - slots, 12))
+
+
+def test_drops_are_told_once() -> None:
+    ring = Ring(SHAPE, np.uint8, 2)
+    fill(ring, 0, 5)
+    assert [ring.take(1, SOON).dropped, ring.take(1, SOON).dropped] == [3, 0]
+    assert ring.dropped == 3
+
+
+def test_frames_lost_before_they_came_are_counted_where_they_are_missing() -> None:
+    ring = Ring(SHAPE, np.uint8, 20)
+    put(ring, 0)
+    put(ring, 1)
+    put(ring, 5, lost=3)
+    put(ring, 6)
+    before, after = ring.take(9, SOON), ring.take(9, SOON)
+    assert (before.number.tolist(), before.dropped) == ([0, 1], 0)
+    assert (after.number.tolist(), after.dropped) == ([5, 6], 3)
+    assert ring.dropped == 3
+
+
+def test_a_loss_before_a_frame_that_is_dropped_is_not_forgotten() -> None:
+    ring = Ring(SHAPE, np.uint8, 1)
+    put(ring, 4, lost=4)
+    put(ring, 5)
+    assert ring.take(1, SOON).dropped == 5
+    assert ring.dropped == 5
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 50])
+def test_frames_come_in_order_round_the_ring(most) -> None:
+    ring = Ring(SHAPE, np.uint8, 7)
+    seen: list[int] = []
+    put(ring, 0)
+    for number in range(1, 200):
+        put(ring, number)
+        frames = ring.take(most, SOON)
+        assert len(frames.pixels) <= most
+        assert frames.pixels.flags.c_contiguous
+        assert frames.number.tolist() == [int(frame[0, 0]) for frame in frames.pixels]
+        seen += frames.number.tolist()
+        while len(seen) <= number - 4:
+            seen += ring.take(most, SOON).number.tolist()
+    assert seen == list(range(len(seen)))
+    assert len(seen) > 190
+    assert ring.dropped == 0
+
+
+def test_forgotten_frames_are_not_dropped() -> None:
+    ring = Ring(SHAPE, np.uint8, 3)
+    fill(ring, 0, 6)
+    ring.flush()
+    with pytest.raises(HardwareError):
+        ring.take(1, 0.0)
+    put(ring, 6)
+    frames = ring.take(1, SOON)
+    assert (frames.number.tolist(), frames.dropped) == ([6], 0)
+    assert ring.dropped == 3
+
+
+def test_no_frame_in_time_is_an_error_that_names_the_camera() -> None:
+    ring = Ring(SHAPE, np.uint8, 3, name="camera 5")
+    begun = time.monotonic()
+    with pytest.raises(HardwareError, match=r"camera 5 gave no frame for 0.05 s"):
+        ring.take(1, 0.05)
+    assert time.monotonic() - begun >= 0.05
+
+
+def test_a_failure_wakes_a_reader_that_waits() -> None:
+    ring = Ring(SHAPE, np.uint8, 3)
+    timer = threading.Timer(0.05, ring.fail, [HardwareError("gone")])
+    timer.start()
+    begun = time.monotonic()
+    with pytest.raises(HardwareError, match="gone"):
+        ring.take(1, 60.0)
+    assert time.monotonic() - begun < 30.0
+    timer.join()
+
+
+def test_what_came_before_a_failure_can_still_be_taken() -> None:
+    ring = Ring(SHAPE, np.uint8, 3)
+    fill(ring, 0, 2)
+    ring.fail(HardwareError("gone"))
+    ring.fail(HardwareError("gone twice"))
+    assert ring.take(1, SOON).number.tolist() == [0]
+    assert ring.take(1, SOON).number.tolist() == [1]
+    with pytest.raises(HardwareError, match=r"^gone$"):
+        ring.take(1, SOON)
+    assert str(ring.error) == "gone"
+
+
+def test_a_fast_writer_and_a_slow_reader_never_meet_in_a_place() -> None:
+    ring = Ring((16, 16), np.uint16, 6)
+    count = 4000
+    sent = threading.Event()
+
+    def write() -> None:
+        for number in range(count):
+            ring.slot()[...] = number
+            ring.put(time=number, number=number)
+            if number % 50 == 0:
+                time.sleep(0)
+        sent.set()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    kept, seen, missed = [], [], 0
+    while not (sent.is_set() and seen and seen[-1] == count - 1):
+        frames = ring.take(4, SOON)
+        missed += frames.dropped
+        seen += frames.number.tolist()
+        kept = [*kept[-3:], frames]
+        for block in kept:
+            np.testing.assert_array_equal(block.pixels, block.number[:, None, None] * np.ones((1, 16, 16)))
+    writer.join()
+    assert seen == sorted(set(seen))
+    assert len(seen) + missed == count
+    assert missed == ring.dropped
+
+
+def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
+    count, shape = 40, (9, 13)
+    frames = np.random.default_rng(5).integers(0, 60, (count, *shape)).astype(np.uint8)
+    frames[17:, 2:7, 3:11] += 150
+    travel = np.linspace(0.0, 2.0, count)
+    whole = OnsetSearch(shape, np.uint8, device=device)
+    whole.push(Block(frames, 0, travel=travel))
+    ring = Ring(shape, np.uint8, 6)
+    search = OnsetSearch(shape, np.uint8, device=device)
+    sent = done = 0
+    for stop in range(2, count + 1, 2):
+        while sent < stop:
+            ring.slot()[...] = frames[sent]
+            ring.put(time=sent, number=sent)
+            sent += 1
+        while done < stop:
+            taken = ring.take(2, SOON)
+            part = slice(done, done + len(taken.pixels))
+            search.push(Block(taken.pixels, done, travel=travel[part], lent=True))
+            done = part.stop
+            ring.slot()[...] = 255  # a kernel that is still at work must not see it
+    for name in ("height", "status", "frame"):
+        np.testing.assert_array_equal(getattr(search.result(), name), getattr(whole.result(), name))
+
+
+def test_frames_outlive_their_ring() -> None:
+    ring = Ring(SHAPE, np.uint8, 4)
+    put(ring, 9)
+    pixels = ring.take(1, SOON).pixels
+    del ring
+    gc.collect()
+    np.testing.assert_array_equal(pixels, 9)
+
+
+def test_a_ring_without_slots_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1 slot"):
+        Ring(SHAPE, np.uint8, 0)
+
+
+def test_the_usual_ring_fills_its_memory_or_holds_half_a_second() -> None:
+    assert usual_slots((480, 640), np.uint8, 100.0) == MEMORY // (480 * 640)
+    assert usual_slots((480, 640), np.uint16) == MEMORY // (480 * 640 * 2)
+    assert usual_slots((480, 640), np.uint8, 1000.0) == 500
+    assert usual_slots((10000, 10000), np.float32) == 4
+    assert usual_slots((8, 8), np.uint8, 30.0) == 1024

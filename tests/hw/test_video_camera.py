@@ -1,0 +1,609 @@
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from mirrorskin.hw.camera import Tally
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.settings import CameraSettings
+from mirrorskin.hw.video import VideoCamera, camera, capture, source
+from mirrorskin.hw.video.grey import to_grey
+from mirrorskin.io import InputError
+
+FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
+SHAPE = (480, 640)
+SMALL = (24, 32)
+BYTE = np.dtype(np.uint8)
+SOON = 20.0  # seconds, that nothing here takes on the slowest machine
+_BITS = 16
+
+
+def settings(source, shape=SHAPE, dtype=BYTE, **more) -> CameraSettings:
+    return CameraSettings(source, shape, np.dtype(dtype), **more)
+
+
+def noise(count: int, shape=SMALL, dtype=np.uint8) -> np.ndarray:
+    top = np.iinfo(dtype).max
+    return np.random.default_rng(7).integers(0, top, (count, *shape), dtype=dtype, endpoint=True)
+
+
+def draw_number(number: int) -> np.ndarray:
+    """A grey ramp with the number in blocks of black and white, as wide as JPEG's biggest blocks or wider."""
+    picture = np.tile(np.linspace(40, 210, SHAPE[1]).astype(np.uint8), (SHAPE[0], 1))
+    for bit in range(_BITS):
+        picture[200:240, 32 * bit : 32 * bit + 32] = 255 * (number >> bit & 1)
+    return picture
+
+
+def read_number(picture: np.ndarray) -> int:
+    blocks = picture[208:232, : 32 * _BITS].reshape(24, _BITS, 32)[:, :, 8:24].mean(axis=(0, 2))
+    assert np.all((blocks < 20) | (blocks > 235)), "neither black nor white"
+    return sum(1 << bit for bit in range(_BITS) if blocks[bit] > 128)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def open_when_there(wanted: CameraSettings) -> VideoCamera:
+    """The server needs a moment for its start."""
+    deadline = time.monotonic() + SOON
+    while True:
+        try:
+            return VideoCamera(wanted)
+        except InputError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+
+
+def take(opened: VideoCamera, count: int) -> tuple[np.ndarray, np.ndarray]:
+    pixels: list[np.ndarray] = []
+    numbers: list[int] = []
+    while len(pixels) < count:
+        frames = opened.take(count - len(pixels), SOON)
+        pixels += [frame.copy() for frame in frames.pixels]
+        numbers += frames.number.tolist()
+    return np.array(pixels), np.array(numbers)
+
+
+def play_out(opened: VideoCamera, timeout: float) -> None:
+    """Take frames until there is an error."""
+    while True:
+        opened.take(10, timeout)
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SOON
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+class MjpegServer:
+    """FFmpeg that sends numbered frames as MJPEG to one client, at a rate that is measured here."""
+
+    def __init__(self, port: int, rate: float, first: int = 0) -> None:
+        self.url = f"http://127.0.0.1:{port}/"
+        self.sent: list[float] = []
+        self._rate, self._first = rate, first
+        raw = ["-f", "rawvideo", "-pixel_format", "gray", "-video_size", "640x480", "-framerate", f"{rate}"]
+        out = ["-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-q:v", "2", "-f", "mpjpeg", "-listen", "1", self.url]
+        self._ffmpeg = subprocess.Popen(
+            [FFMPEG, "-loglevel", "quiet", *raw, "-i", "pipe:0", *out], stdin=subprocess.PIPE
+        )
+        self._thread = threading.Thread(target=self._send)
+        self._thread.start()
+
+    def _send(self) -> None:
+        pipe = self._ffmpeg.stdin
+        assert pipe is not None
+        due = 0.0
+        try:
+            for number in range(self._first, 1 << _BITS):
+                pipe.write(draw_number(number).tobytes())
+                pipe.flush()
+                self.sent.append(time.monotonic())
+                due = max(due, self.sent[-1] - 0.2) + 1 / self._rate
+                time.sleep(max(0.0, due - time.monotonic()))
+        except OSError:
+            pass  # it was ended
+
+    def close(self) -> None:
+        self._ffmpeg.kill()
+        self._ffmpeg.wait()
+        self._thread.join()
+        assert self._ffmpeg.stdin is not None
+        with contextlib.suppress(OSError):
+            self._ffmpeg.stdin.close()
+
+
+def test_a_network_stream_has_the_right_frames_at_the_right_rate_and_comes_back(caplog) -> None:
+    port = free_port()
+    with contextlib.ExitStack() as leaving:
+        server = MjpegServer(port, rate=50.0)
+        leaving.callback(server.close)
+        opened = leaving.enter_context(open_when_there(settings(server.url, rate=50.0)))
+        pixels, numbers = take(opened, 100)
+        drawn = [read_number(picture) for picture in pixels]
+        assert np.all(np.diff(drawn) == np.diff(numbers))
+        np.testing.assert_allclose(pixels[50], draw_number(drawn[50]), atol=12)
+        sent = Tally()
+        for number in drawn:
+            sent.add(server.sent[number])
+        assert opened.counts.rate == pytest.approx(sent.counts().rate, rel=0.02)
+        server.close()
+        opened.flush()
+        with pytest.raises(HardwareError, match="was lost"):
+            play_out(opened, 0.3)
+        assert opened.error is None
+        server = MjpegServer(port, rate=50.0, first=1000)
+        leaving.callback(server.close)
+        again = opened.take(1, SOON)
+        assert again.number[0] > numbers[-1] + 1
+        assert again.dropped > 0
+        assert read_number(again.pixels[0]) >= 1000
+        assert opened.counts.reconnects == 1
+        told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert ["was lost after" in told[0], "is back after" in told[1]] == [True, True]
+
+
+class Y4mServer:
+    """Sends grey frames as YUV4MPEG2 over TCP, to one client after another, each the same from the start."""
+
+    def __init__(self, frames: np.ndarray, rate: float) -> None:
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._listening.settimeout(SOON)
+        self.url = f"tcp://127.0.0.1:{self._listening.getsockname()[1]}"
+        rows, columns = frames.shape[1:]
+        kind = "mono" if frames.dtype == np.uint8 else "mono16"
+        self._header = f"YUV4MPEG2 W{columns} H{rows} F{rate:.0f}:1 Ip A1:1 C{kind}\n".encode()
+        self._frames, self._rate = frames, rate
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        with self._listening:
+            client, _ = self._listening.accept()
+        with client:
+            try:
+                client.sendall(self._header)
+                for frame in self._frames:
+                    client.sendall(b"FRAME\n" + frame.tobytes())
+                    time.sleep(1 / self._rate)
+            except OSError:
+                pass  # the client left
+
+    def close(self) -> None:
+        self._thread.join()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_grey_stream_is_exact(dtype) -> None:
+    sent = noise(150, (96, 128), dtype)
+    server = Y4mServer(sent, rate=200.0)
+    opened = VideoCamera(settings(server.url, sent.shape[1:], dtype, rate=200.0), slots=200)
+    pixels, numbers = take(opened, 20)
+    opened.close()
+    server.close()
+    start = next(k for k, frame in enumerate(sent) if np.array_equal(frame, pixels[0]))
+    np.testing.assert_array_equal(pixels, sent[start + numbers - numbers[0]])
+
+
+def test_where_nobody_sends_there_is_no_camera() -> None:
+    with pytest.raises(InputError, match=r"^camera tcp://127\.0\.0\.1:\d+ cannot be opened"):
+        VideoCamera(settings(f"tcp://127.0.0.1:{free_port()}"))
+
+
+def write_y4m(path, frames: np.ndarray, rate: int) -> None:
+    rows, columns = frames.shape[1:]
+    kind = "mono" if frames.dtype == np.uint8 else "mono16"
+    with path.open("wb") as file:
+        file.write(f"YUV4MPEG2 W{columns} H{rows} F{rate}:1 Ip A1:1 C{kind}\n".encode())
+        for frame in frames:
+            file.write(b"FRAME\n" + frame.tobytes())
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_grey_file_is_exact_to_its_end(tmp_path, dtype) -> None:
+    frames = noise(40, dtype=dtype)
+    write_y4m(tmp_path / "film.y4m", frames, 400)
+    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, dtype), slots=50)
+    pixels, numbers = take(opened, 40)
+    with pytest.raises(HardwareError, match=r"film.y4m has ended after 40 frames$"):
+        opened.take(1, SOON)
+    assert "has ended" in str(opened.error)
+    counts = opened.counts
+    opened.close()
+    np.testing.assert_array_equal(pixels, frames)
+    assert numbers.tolist() == list(range(40))
+    assert (counts.frames, counts.dropped, counts.reconnects) == (40, 0, 0)
+
+
+def test_a_lossless_film_is_exact(tmp_path) -> None:
+    frames = noise(10)
+    raw = ["-f", "rawvideo", "-pixel_format", "gray", "-video_size", "32x24", "-framerate", "400"]
+    film = str(tmp_path / "film.mkv")
+    command = [FFMPEG, "-loglevel", "error", *raw, "-i", "pipe:0", "-c:v", "ffv1", film]
+    subprocess.run(command, input=frames.tobytes(), check=True)
+    opened = VideoCamera(settings(film, SMALL), slots=50)
+    pixels, _ = take(opened, 10)
+    opened.close()
+    np.testing.assert_array_equal(pixels, frames)
+
+
+def test_a_file_plays_at_its_own_rate(tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(20), 50)
+    begun = time.monotonic()
+    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL), slots=50)
+    with pytest.raises(HardwareError, match="has ended"):
+        play_out(opened, SOON)
+    opened.close()
+    assert opened.latest - begun >= 19 / 50
+
+
+def test_a_file_of_another_size_is_refused(tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(2), 50)
+    with pytest.raises(InputError, match="32 x 24, and 640 x 480 is asked for"):
+        VideoCamera(settings(str(tmp_path / "film.y4m")))
+
+
+def test_a_file_of_another_type_is_refused(tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(2), 50)
+    with pytest.raises(InputError, match="32 x 24 uint8, and 32 x 24 uint16 is asked for"):
+        VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, np.uint16))
+
+
+def test_no_file_no_device_and_no_video_are_refused(tmp_path, monkeypatch) -> None:
+    with pytest.raises(InputError, match="there is no such file"):
+        VideoCamera(settings(str(tmp_path / "none.avi")))
+    (tmp_path / "text.avi").write_text("no film")
+    with pytest.raises(InputError, match="cannot be opened: it is damaged, or no video"):
+        VideoCamera(settings(str(tmp_path / "text.avi")))
+    monkeypatch.setattr(source, "_DEVICES", tmp_path)
+    with pytest.raises(InputError, match="there is no such device; no camera is connected"):
+        VideoCamera(settings(3))
+    (tmp_path / "video0").touch()
+    with pytest.raises(InputError, match=r"there is no such device; there are .*video0$"):
+        VideoCamera(settings("3"))
+
+
+class Driver:
+    """A V4L2 camera without hardware, in the place of OpenCV's VideoCapture."""
+
+    def __init__(self) -> None:
+        self.pictures: queue.Queue[np.ndarray | None] = queue.Queue()
+        self.refuses: set[int] = set()
+        self.there = True
+        self.opened = 0
+        self.begins = threading.Event()
+        self.begins.set()
+        self.values: dict[int, float] = {}
+        self.stamp = 0.0
+        self._picture: np.ndarray | None = None
+
+    def __call__(self, target, backend, parameters) -> Driver:
+        assert backend == cv2.CAP_V4L2
+        assert self.begins.wait(SOON)
+        self.opened += 1
+        return self
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self.there
+
+    def set(self, code: int, value: float) -> bool:
+        if code not in self.refuses:
+            self.values[code] = value
+        return code not in self.refuses
+
+    def get(self, code: int) -> float:
+        if code == cv2.CAP_PROP_POS_MSEC:
+            return 1000 * self.stamp
+        return self.values.get(code, 0.0)
+
+    def grab(self) -> bool:
+        self._picture = self.pictures.get(timeout=SOON)
+        return self._picture is not None
+
+    def retrieve(self, _out) -> tuple[bool, np.ndarray | None]:
+        return True, self._picture
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def driver(tmp_path, monkeypatch):
+    made = Driver()
+    (tmp_path / "video0").touch()
+    monkeypatch.setattr(source, "_DEVICES", tmp_path)
+    monkeypatch.setattr(capture.cv2, "VideoCapture", made)
+    return made
+
+
+@pytest.fixture
+def open_camera(driver):
+    opened = []
+
+    def open_it(**more) -> VideoCamera:
+        opened.append(VideoCamera(settings(0, SMALL, **more)))
+        return opened[-1]
+
+    yield open_it
+    driver.pictures.put(None)
+    for one in opened:
+        one.close()
+
+
+def test_a_camera_is_given_what_is_asked_for(driver, open_camera, caplog) -> None:
+    driver.pictures.put(noise(1)[0])
+    open_camera(fourcc="Y16", exposure=0.004, gain=3.0, rate=60.0)
+    assert driver.values == {
+        cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"Y16 "),
+        cv2.CAP_PROP_FRAME_WIDTH: 32,
+        cv2.CAP_PROP_FRAME_HEIGHT: 24,
+        cv2.CAP_PROP_FPS: 60.0,
+        cv2.CAP_PROP_AUTO_EXPOSURE: 1,
+        cv2.CAP_PROP_EXPOSURE: 40.0,  # of 100 us
+        cv2.CAP_PROP_GAIN: 3.0,
+        cv2.CAP_PROP_CONVERT_RGB: 0,
+    }
+    assert not caplog.records
+
+
+def test_what_a_camera_does_not_take_is_told(driver, open_camera, caplog) -> None:
+    driver.refuses = {cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FPS}
+    driver.values[cv2.CAP_PROP_FPS] = 30.0
+    driver.values[cv2.CAP_PROP_FOURCC] = cv2.VideoWriter.fourcc(*"MJPG")
+    driver.pictures.put(noise(1)[0])
+    open_camera(fourcc="GREY", exposure=0.004, gain=3.0, rate=60.0)
+    told = " / ".join(record.getMessage() for record in caplog.records)
+    assert "rate 60 Hz was asked for, the camera set 30" in told
+    assert "exposure 0.004 s was asked for, the camera set 0" in told
+    assert "gain 3 was asked for, the camera set 0" in told
+    assert "fourcc GREY was asked for, the camera set MJPG" in told
+
+
+def test_a_camera_that_sets_another_size_is_refused(driver, open_camera) -> None:
+    driver.refuses = {cv2.CAP_PROP_FRAME_WIDTH}
+    driver.values[cv2.CAP_PROP_FRAME_WIDTH] = 40
+    with pytest.raises(InputError, match="40 x 24, and 32 x 24 is asked for"):
+        open_camera()
+
+
+@pytest.mark.parametrize(
+    ("picture", "what"),
+    [(np.zeros((24, 30), np.uint8), "30 x 24 uint8"), (np.zeros(SMALL, np.uint16), "32 x 24 uint16")],
+)
+def test_a_first_frame_of_another_size_or_type_is_refused(driver, open_camera, picture, what) -> None:
+    driver.pictures.put(picture)
+    with pytest.raises(InputError, match=f"{what}, and 32 x 24 uint8 is asked for"):
+        open_camera()
+
+
+def test_a_camera_that_opens_and_gives_nothing_is_refused(driver, open_camera) -> None:
+    driver.pictures.put(None)
+    with pytest.raises(InputError, match=r"video0 gives no picture$"):
+        open_camera()
+
+
+def test_the_drivers_time_is_taken_if_it_is_of_this_clock(driver, open_camera) -> None:
+    driver.stamp = time.monotonic()
+    driver.pictures.put(noise(1)[0])
+    opened = open_camera()
+    assert opened.take(1, SOON).time[0] == pytest.approx(driver.stamp, abs=1e-9)
+
+
+@pytest.mark.parametrize("ahead", [-3600.0, 5.0])
+def test_a_drivers_time_of_another_clock_is_not_taken(driver, open_camera, ahead) -> None:
+    begun = time.monotonic()
+    driver.stamp = begun + ahead
+    driver.pictures.put(noise(1)[0])
+    opened = open_camera()
+    assert begun <= opened.take(1, SOON).time[0] <= time.monotonic()
+
+
+def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
+    first, second = noise(2)
+    driver.pictures.put(first)
+    opened = open_camera()
+    opened.take(1, SOON)
+    driver.there = False
+    driver.pictures.put(None)
+    with pytest.raises(HardwareError, match="was lost"):
+        opened.take(1, 0.3)
+    assert opened.error is None
+    driver.there = True
+    driver.pictures.put(second)
+    frames = opened.take(1, SOON)
+    np.testing.assert_array_equal(frames.pixels[0], second)
+    assert (frames.number.tolist(), frames.dropped) == ([2], 1)
+    assert opened.counts.reconnects == 1
+    assert opened.counts.dropped == 1
+    told = [record.getMessage() for record in caplog.records]
+    assert ["was lost after 1 frames" in told[0], "is back after" in told[1]] == [True, True]
+
+
+def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monkeypatch) -> None:
+    monkeypatch.setattr(camera, "PATIENCE", 0.3)
+    driver.pictures.put(noise(1)[0])
+    opened = open_camera()
+    opened.take(1, SOON)
+    driver.there = False
+    driver.pictures.put(None)
+    wait_until(lambda: opened.error is not None)
+    with pytest.raises(HardwareError, match=r"was lost, and not back within 0.3 s"):
+        opened.take(1, SOON)
+    assert driver.opened > 2
+
+
+def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
+    monkeypatch.setattr(camera, "_FIRST", 0.2)
+    monkeypatch.setattr(camera, "_CLOSING", 0.2)
+    driver.begins.clear()
+    begun = time.monotonic()
+    with pytest.raises(InputError, match=r"gave no picture within 0.2 s"):
+        open_camera()
+    assert time.monotonic() - begun < SOON / 2
+    driver.begins.set()
+    driver.pictures.put(None)
+
+
+def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(camera, "_CLOSING", 0.2)
+    driver.pictures.put(noise(1)[0])
+    opened = open_camera()
+    begun = time.monotonic()
+    opened.close()
+    assert time.monotonic() - begun < SOON / 2
+    assert "does not let go" in caplog.text
+    with pytest.raises(HardwareError, match="is closed"):
+        play_out(opened, SOON)
+
+
+def test_a_password_is_not_told() -> None:
+    found = source.find_source("rtsp://me:secret@host/film")
+    assert (found.name, found.target) == ("camera rtsp://host/film", "rtsp://me:secret@host/film")
+
+
+def test_a_picture_that_does_not_say_when_is_due_a_period_later() -> None:
+    pace = camera._Pace(0.25)
+    start = pace.due(3.0)
+    due = [pace.due(position) - start for position in (3.5, 3.5, 0.0, 4.5)]
+    np.testing.assert_allclose(due, [0.5, 0.75, 1.0, 1.5], atol=1e-9)
+
+
+def test_the_rate_is_that_of_the_newest_frames_whatever_their_jitter() -> None:
+    tally = Tally()
+    rng = np.random.default_rng(1)
+    assert np.isnan(tally.counts().rate)
+    times = np.concatenate([np.arange(50) / 10, 5 + np.arange(200) / 80])
+    for at in times + rng.normal(0, 0.002, 250):
+        tally.add(at)
+    assert tally.counts().rate == pytest.approx(80, rel=0.005)
+    assert tally.latest == pytest.approx(times[-1], abs=0.01)
+    assert tally.counts().frames == 250
+
+
+@pytest.mark.parametrize("after", [1, 20, 64, 110, 200])
+def test_a_pause_does_not_change_the_rate_and_counts_as_one_late_frame(after) -> None:
+    tally = Tally()
+    for at in np.concatenate([np.arange(90) / 50, 30 + np.arange(after) / 50]):
+        tally.add(at)
+    counts = tally.counts(dropped=3, reconnects=2)
+    assert (counts.late, counts.dropped, counts.reconnects) == (1, 3, 2)
+    assert counts.rate == pytest.approx(50, rel=1e-6)
+
+
+def test_frames_in_bursts_have_the_rate_of_all() -> None:
+    tally = Tally()
+    for burst in range(40):
+        for frame in range(8):
+            tally.add(0.08 * burst + 1e-5 * frame)
+    assert tally.counts().rate == pytest.approx(100, rel=0.06)
+
+
+def test_late_is_more_than_one_and_a_half_periods() -> None:
+    tally = Tally()
+    for at in [*np.arange(20) / 10, 1.9 + 0.149, 1.9 + 0.149 + 0.151]:
+        tally.add(at)
+    assert tally.counts().late == 1
+
+
+def test_frames_at_the_same_instant_have_a_rate() -> None:
+    tally = Tally()
+    for _ in range(40):
+        tally.add(1.0)
+    assert tally.counts().rate > 0
+    assert tally.counts().late == 0
+
+
+def test_colours_become_the_luma_and_equal_ones_their_value() -> None:
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    out = np.empty_like(grey)
+    to_grey(np.repeat(grey[..., None], 3, axis=2), out, "it")
+    np.testing.assert_array_equal(out, grey)
+    colours = np.random.default_rng(2).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    to_grey(colours, out, "it")
+    np.testing.assert_allclose(out, colours @ [0.114, 0.587, 0.299], atol=0.51)
+    to_grey(np.dstack([grey, colours[..., 0]]), out, "it")
+    np.testing.assert_array_equal(out, grey)
+
+
+def test_16_bits_of_grey_stay() -> None:
+    grey = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    out = np.empty_like(grey)
+    for picture in (grey, grey[..., None], np.repeat(grey[..., None], 3, axis=2)):
+        out[:] = 0
+        to_grey(picture, out, "it")
+        np.testing.assert_array_equal(out, grey)
+
+
+class Vendor(ModuleType):
+    """The SDK that docs/camera.md takes for granted: a camera of five frames, of which it loses two."""
+
+    Error = RuntimeError
+    height, width, frame_rate = 24, 32, 100.0
+
+    def __init__(self, pictures: np.ndarray) -> None:
+        super().__init__("vendor")
+        self.opened: list[str] = []
+        self.closed = 0
+        self._left = [SimpleNamespace(pixels=pictures[n], counter=n) for n in (0, 1, 4)]
+
+    def open(self, serial: str) -> Vendor:
+        self.opened.append(serial)
+        return self
+
+    def wait(self, timeout: float) -> SimpleNamespace | None:
+        if not self._left:
+            raise RuntimeError("the cable is out")
+        return self._left.pop(0)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "camera.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    pictures = noise(5)
+    vendor = Vendor(pictures)
+    monkeypatch.setitem(sys.modules, "vendor", vendor)
+    made: dict[str, Any] = {}
+    exec(example, made)
+    with made["VendorCamera"]("40123456") as opened:
+        wait_until(lambda: opened.error is not None)
+        before, after = opened.take(9, SOON), opened.take(9, SOON)
+        with pytest.raises(HardwareError, match=r"^camera 40123456 failed: the cable is out$"):
+            opened.take(1, SOON)
+        assert (opened.shape, opened.counts.frames, opened.counts.dropped) == (SMALL, 3, 2)
+    assert [before.number.tolist(), after.number.tolist(), after.dropped] == [[0, 1], [4], 2]
+    np.testing.assert_array_equal(after.pixels[0], pictures[4])
+    assert (vendor.opened, vendor.closed) == (["40123456"], 1)
+
+
+def test_the_settings_of_a_stream_are_not_ours(caplog, tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(2), 50)
+    VideoCamera(replace(settings(str(tmp_path / "film.y4m"), SMALL), exposure=0.1, gain=2.0)).close()
+    assert "exposure and gain can only be set where it is sent from" in caplog.text
