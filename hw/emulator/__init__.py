@@ -1,0 +1,1 @@
+"""A rig without hardware: a GRBL controller behind a terminal, and the twin as its camera."""
