@@ -1,0 +1,95 @@
+"""``mirrorskin rig``: a stage and a camera, before they are used."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.output import print_json, print_table
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.rig.finding import Finding
+    from mirrorskin.hw.rig.settings import RigSettings
+
+app = typer.Typer(help="Look at a stage and a camera before they are used.", no_args_is_help=True)
+
+_COLOURS = {"ok": "green", "warning": "yellow", "failed": "red"}
+
+
+@app.command()
+def new(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
+) -> None:
+    """Write a rig file to begin with; docs/rig.md tells of every key."""
+    from mirrorskin.hw.rig.template import TEMPLATE
+    from mirrorskin.io import InputError
+
+    try:
+        with output.open("x", encoding="utf-8") as file:
+            file.write(TEMPLATE)
+    except FileExistsError as error:
+        raise InputError(f"{output} is there already; name another file with --output") from error
+    except OSError as error:
+        raise InputError(f"{output} cannot be written: {error.strerror}; name another file") from error
+    typer.echo(f"{output}: now set port, letters, zeros and limits, and try 'mirrorskin rig check {output}'")
+
+
+@app.command()
+def check(
+    rig: Annotated[Path, typer.Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")],
+    move: Annotated[bool, typer.Option("--move", help="Home it, and move each axis a little.")] = False,
+    as_json: options.Json = False,
+) -> None:
+    """Open a rig and tell whether it is as its file says; nothing moves without --move."""
+    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.hw.rig.file import load_rig
+
+    settings = load_rig(rig)
+    findings: list[Finding] = []
+    complete = False
+    try:
+        _look(settings, move, findings.append)
+        complete = True
+    finally:
+        if findings:
+            _print(settings, findings, complete, as_json)
+    failed = [finding for finding in findings if finding.verdict == "failed"]
+    if failed:
+        more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+        first = failed[0]
+        raise HardwareError(f"{rig}: {first.part}, {first.what}: {first.found}: {first.remedy}{more}")
+
+
+def _look(settings: RigSettings, move: bool, show: Callable[[Finding], object]) -> None:
+    """Show what is found, until all was looked at or something cannot be."""
+    from contextlib import closing
+
+    from mirrorskin.hw.rig.check import check_rig
+
+    with closing(check_rig(settings, move=move)) as findings:
+        for finding in findings:
+            show(finding)
+
+
+def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, as_json: bool) -> None:
+    if as_json:
+        sound = complete and all(finding.verdict != "failed" for finding in findings)
+        print_json({"rig": settings.name, "sound": sound, "findings": findings})
+        return
+    rows = [[one.verdict, one.part, one.what, one.found, one.remedy] for one in findings]
+    if not sys.stdout.isatty():
+        print_table(["", "part", "what", "found", "remedy"], rows)
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "part", "what", "found", "remedy", title=settings.name, box=None, pad_edge=False)
+    for verdict, *cells in rows:
+        table.add_row(Text(verdict, style=_COLOURS[verdict]), *map(Text, cells))
+    Console().print(table)

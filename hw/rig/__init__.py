@@ -1,0 +1,1 @@
+"""Stage and camera together: the rig file, scans, and where the body was in each frame."""

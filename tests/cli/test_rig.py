@@ -1,0 +1,218 @@
+"""Rig files on the command line: written to begin with, and checked on an emulated controller and a film."""
+
+import io
+import json
+import re
+import sys
+import time
+
+import numpy as np
+import pytest
+from commands import run
+
+from mirrorskin.cli import rig as command
+from mirrorskin.hw.emulator.machine import GrblMachine
+from mirrorskin.hw.emulator.pty import GrblPort
+from mirrorskin.hw.rig.file import load_rig
+from mirrorskin.hw.rig.finding import Finding
+
+RIG = """
+[stage]
+port = "{port}"
+home = {home}
+report_rate = 50
+press = 2.0
+[stage.travel]
+letter = "Z"
+direction = -1
+zero = -5.0
+limits = [-5.0, 3.0]
+speed = 10.0
+[stage.pitch]
+letter = "X"
+limits = [-5.0, 5.0]
+speed = 30.0
+[stage.roll]
+letter = "Y"
+limits = [-5.0, 5.0]
+speed = 30.0
+[camera]
+source = "film.y4m"
+size = [8, 6]
+rate = 50
+"""
+MACHINE = {24: 600.0, 25: 3000.0, 26: 10.0, 27: 0.3, 132: 10.0} | dict.fromkeys((110, 111, 112), 1800.0)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Work in a folder with a film of 5 s, and look at things for a shorter time than a user does."""
+    monkeypatch.chdir(tmp_path)
+    for module in ("stage_check", "camera_check"):
+        monkeypatch.setattr(f"mirrorskin.hw.rig.{module}._PERIOD", 0.1)
+    picture = np.arange(0, 96, 2, dtype=np.uint8).tobytes()
+    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + picture) * 250
+    (tmp_path / "film.y4m").write_bytes(film)
+    return tmp_path
+
+
+@pytest.fixture
+def controller(folder):
+    """Plug in a controller with these settings, and write its rig file with these changes."""
+    ports = []
+
+    def plug_in(home=False, changes=(), **settings):
+        told = MACHINE | {22: float(home)} | {int(name[1:]): value for name, value in settings.items()}
+        ports.append(GrblPort(GrblMachine(told, start=dict.fromkeys("XYZ", -1.0))))
+        text = RIG.format(port=ports[-1].url, home=str(home).lower())
+        for before, after in changes:
+            assert text.count(before) == 1
+            text = text.replace(before, after)
+        (folder / "rig.toml").write_text(text)
+        return ports[-1]
+
+    yield plug_in
+    for port in ports:
+        port.close()
+
+
+def test_a_sound_rig_is_told_in_a_table_and_nothing_moves(controller):
+    machine = controller().machine
+    before = machine.position()
+    ended = run("rig", "check", "rig.toml")
+    assert (ended.code, ended.said) == (0, "")
+    assert machine.position() == before
+    assert ended.out.split("\n")[0].split() == ["part", "what", "found", "remedy"]
+    for said in (
+        "stage +firmware +.*1[.]1",
+        "stage +state +idle",
+        "roll -?0.000 deg",
+        "camera +pictures +8 x 6 uint8",
+    ):
+        assert re.search(f"^ok +.*{said}", ended.out, re.MULTILINE), ended.out
+
+
+def test_a_rig_that_homes_and_moves_is_told_in_json_and_ends_where_it_homed(controller):
+    machine = controller(home=True).machine
+    ended = run("rig", "check", "rig.toml", "--move", "--json")
+    told = json.loads(ended.out)
+    assert (ended.code, ended.said, told["sound"], told["rig"]) == (0, "", True, "rig")
+    moves = {one["what"]: one["found"] for one in told["findings"] if one["part"] == "move"}
+    assert list(moves) == ["homing", "travel (Z)", "pitch (X)", "roll (Y)"]
+    assert moves["travel (Z)"] == "+0.5 mm and back, off by 0.0000 mm"
+    assert machine.position()["Z"] == pytest.approx(-0.3, abs=0.01)
+    assert not machine.moving()
+
+
+def test_a_file_that_is_faster_than_the_controller_is_warned_of_and_sound(controller):
+    controller(s112=300.0)
+    ended = run("rig", "check", "rig.toml", "--json")
+    warned = [one["remedy"] for one in json.loads(ended.out)["findings"] if one["verdict"] == "warning"]
+    assert ended.code == 0
+    assert [remedy for remedy in warned if "set stage.travel.speed = 5" in remedy]
+
+
+def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
+    port = controller(home=True, s22=0.0)
+    before = port.machine.position()
+    ended = run("rig", "check", "rig.toml", "--move")
+    assert ended.code == 1
+    assert ended.said.startswith(
+        "mirrorskin: rig.toml: stage, homing ($22): off: the file asks for homing; set stage.home"
+    )
+    assert ended.said.count("\n") == 1
+    assert "not tried" in ended.out
+    assert port.machine.position() == before
+
+
+def test_a_move_that_the_controller_refuses_ends_the_check(controller):
+    # Homed to -0.3 mm, it is sent up by 0.5 mm, and its soft limits refuse what lies above 0.
+    port = controller(home=True, changes=[("zero = -5.0", "zero = -3.0")], s20=1.0)
+    ended = run("rig", "check", "rig.toml", "--move", "--json")
+    assert ended.code == 1
+    assert json.loads(ended.out)["sound"] is False
+    assert re.fullmatch(r"mirrorskin: stage .*(error:15|ALARM:2) .*\n", ended.said)
+    assert not port.machine.moving()
+
+
+def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(controller):
+    controller(changes=[("film.y4m", "none.y4m")])
+    ended = run("rig", "check", "rig.toml")
+    assert ended.code == 2
+    assert "none.y4m" in ended.said
+    assert ended.said.count("\n") == 1
+    assert "firmware" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ([("size = [8, 6]", "size = [8, 7]")], "8 x 6"),
+        ([("press", "pres")], "rig.toml: stage.pres is not known: did you mean press?"),
+        (
+            [("limits = [-5.0, 3.0]", "limits = [3, -4]")],
+            "stage.travel.limits are out of order, 3 not below -4",
+        ),
+        ([('letter = "Z"', 'letter = "A"')], "the controller has no axis A"),
+    ],
+)
+def test_what_is_not_as_the_file_says_is_bad_input(controller, changes, said):
+    controller(changes=changes)
+    ended = run("rig", "check", "rig.toml")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert said in ended.said
+
+
+@pytest.mark.parametrize("name", ["none.toml", ".", "film.y4m"])
+def test_what_is_no_rig_file_is_bad_input(name):
+    ended = run("rig", "check", name)
+    assert (ended.code, ended.out, ended.said.count("\n")) == (2, "", 1)
+    assert ended.said.startswith(f"mirrorskin: {name} ")
+
+
+def test_a_missing_port_is_bad_input(folder):
+    (folder / "rig.toml").write_text(RIG.format(port="/dev/nowhere", home="true"))
+    begun = time.monotonic()
+    ended = run("rig", "check", "rig.toml", "--json")
+    assert (ended.code, ended.out, ended.said.count("\n")) == (2, "", 1)
+    assert "/dev/nowhere" in ended.said
+    assert time.monotonic() - begun < 30
+
+
+def test_on_a_terminal_the_table_has_colours(folder, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    (folder / "rig.toml").write_text(RIG.format(port="nowhere", home="true"))
+    findings = [Finding("stage", "state", "[b]idle"), Finding("camera", "rate", "1 Hz", "failed", "mend it")]
+    command._print(load_rig("rig.toml"), findings, True, False)
+    said = sys.stdout.getvalue()
+    assert "[b]idle" in said
+    assert "\x1b[31mfailed\x1b[0m" in said
+    assert "mend it" in said
+
+
+def test_a_new_rig_file_can_be_loaded_and_is_never_written_over_another(folder):
+    ended = run("rig", "new", "-o", "mine.toml")
+    assert (ended.code, ended.said) == (0, "")
+    assert "mirrorskin rig check mine.toml" in ended.out
+    assert load_rig("mine.toml").stage.limits.press == 2.0
+    before = (folder / "mine.toml").read_bytes()
+    ended = run("rig", "new", "-o", "mine.toml")
+    assert (ended.code, ended.said) == (
+        2,
+        "mirrorskin: mine.toml is there already; name another file with --output\n",
+    )
+    assert (folder / "mine.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["none/rig.toml", "film.y4m/rig.toml"])
+def test_a_new_rig_file_that_cannot_be_written_is_bad_input(name):
+    ended = run("rig", "new", "-o", name)
+    assert (ended.code, ended.out, ended.said.count("\n")) == (2, "", 1)
+    assert f"{name} cannot be written: " in ended.said

@@ -1,0 +1,407 @@
+"""What a check of a rig finds, on a stage and a camera that do as the test says."""
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw.camera import Counts, Frames
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.camera_check import check_camera
+from mirrorskin.hw.rig.check import check_rig
+from mirrorskin.hw.rig.move_check import check_moves
+from mirrorskin.hw.rig.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig.stage_check import check_stage
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io import InputError
+
+DEGREE = math.pi / 180
+TILT = {"low": -5 * DEGREE, "high": 4 * DEGREE, "speed": 20 * DEGREE, "unit": "deg"}
+TRAVEL = Axis("Z", -1, -20.0, -10.0, 3.0, 5.0, "mm")
+STAGE = StageSettings(
+    port="nowhere",
+    baud=115200,
+    home=True,
+    timeout=1.0,
+    report_rate=20.0,
+    travel=TRAVEL,
+    pitch=Axis("X", 1, 0.0, **TILT),
+    roll=Axis("Y", 1, 0.0, **TILT),
+    press=2.0,
+    pivot=None,
+)
+CAMERA = CameraSettings(source=0, shape=(5, 7), dtype=np.dtype(np.uint8))
+RIG = RigSettings(Path("r.toml"), "r", STAGE, CAMERA)
+# GRBL's settings of a machine that can do all that the file says.
+ABLE = {22: 1.0, 112: 300.0, 110: 1200.0, 111: 1200.0, 132: 13.0, 130: 9.0, 131: 9.0}
+
+
+class Clock:
+    """Time that passes when somebody waits."""
+
+    now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """Wait without waiting."""
+    clock = Clock()
+    for module in ("stage_check", "camera_check"):
+        monkeypatch.setattr(f"mirrorskin.hw.rig.{module}.time", clock)
+    monkeypatch.setattr(Stage, "clock", clock)
+    monkeypatch.setattr(Camera, "clock", clock)
+    return clock
+
+
+class Stage:
+    """A stage that is where it is sent at once, or as far off as it is told."""
+
+    firmware = "Grbl 1.1h"
+    round_trip = 0.004
+    clock = None
+
+    def __init__(
+        self, settings=STAGE, parameters=ABLE, at=(-15.0, 0.0, 0.0), state="idle", off=0.0, every=0.05
+    ):
+        self.limits, self.parameters = settings.limits, parameters
+        self._position, self._state, self._off, self._every = Position(*at), state, off, every
+        self.did = []
+
+    def report(self):
+        return Report(self.clock.now, self._position, self._state)
+
+    def history(self, since):
+        times = np.arange(since, self.clock.now, self._every)
+        return [Report(float(at), self._position, self._state) for at in times]
+
+    def home(self):
+        self.did.append("home")
+
+    def move(self, place, speed=None):
+        self.limits.check(place, "stage")
+        self.did.append(place)
+        self._position = replace(place, travel=place.travel + self._off)
+
+    def wait(self, timeout=None):
+        return self.report()
+
+    def close(self):
+        self.did.append("close")
+
+
+class Camera:
+    """A camera of a frame each 10 ms of its own clock, whose frames are all one picture."""
+
+    name, clock = "camera", None
+
+    def __init__(self, picture=None, rate=100.0, lost=0, **counts):
+        self._picture = np.arange(35, dtype=np.uint8).reshape(5, 7) if picture is None else picture
+        self.shape, self.dtype = self._picture.shape, self._picture.dtype
+        self.counts, self._after = Counts(rate=rate), counts
+        self._lost, self.closed = lost, False
+
+    def take(self, most, timeout):
+        self.clock.sleep(0.01)
+        lost, self._lost = (self._lost, 0) if self.counts.frames else (0, self._lost)
+        self.counts = replace(self.counts, frames=self.counts.frames + 1, **self._after)
+        return Frames(self._picture[None], np.zeros(1, np.int64), np.array([self.clock.now]), lost)
+
+    def flush(self):
+        pass
+
+    def close(self):
+        self.closed = True
+
+
+def look(stage, settings=STAGE):
+    return {one.what: one for one in check_stage(stage, settings)}
+
+
+def film(camera, **settings):
+    return {one.what: one for one in check_camera(camera, replace(CAMERA, **settings))}
+
+
+def test_a_stage_that_is_as_its_file_says_is_sound():
+    stage = Stage()
+    found = look(stage)
+    assert {one.verdict for one in found.values()} == {"ok"}
+    assert found["firmware"].found == "Grbl 1.1h"
+    assert found["position"].found == ("travel -15.000 mm, pitch 0.000 deg, roll 0.000 deg (before homing)")
+    assert found["travel: limits against $132"].found == "-10 to 3 mm, of 13 mm of the controller"
+    assert found["pitch: speed against $110"].found == "20 deg/s, of 20 deg/s of the controller"
+    assert found["reports"].found == "20.0 Hz, asked 20 Hz"
+    assert found["round trip of a report"].found == "4.0 ms"
+    assert stage.did == []
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "what", "said"),
+    [
+        (132, 12.9, "travel: limits against $132", "they are 13 mm apart, and the axis is shorter"),
+        (131, 8.9, "roll: limits against $131", "they are 9 deg apart, and the axis is shorter"),
+        (112, 240.0, "travel: speed against $112", "set stage.travel.speed = 4"),
+        (110, 600.0, "pitch: speed against $110", "set stage.pitch.speed = 10"),
+    ],
+)
+def test_a_file_beyond_the_controller_is_warned_of(number, value, what, said):
+    found = look(Stage(parameters=ABLE | {number: value}))
+    assert found[what].verdict == "warning"
+    assert said in found[what].remedy
+    assert [one.what for one in found.values() if one.verdict != "ok"] == [what]
+
+
+@pytest.mark.parametrize(
+    ("zero", "soft", "verdict"),
+    [(-3, 1, "ok"), (3, 1, "ok"), (-3.001, 1, "warning"), (-2.999, 1, "warning"), (-2.999, 0, "ok")],
+)
+def test_limits_that_the_controller_s_soft_limits_cut_are_warned_of(zero, soft, verdict):
+    # -3 to 3 mm from that zero; the machine goes from -6 to 0, or from 0 to 6.
+    travel = replace(TRAVEL, zero=zero, direction=1, low=-3.0, high=3.0)
+    settings = replace(STAGE, travel=travel)
+    found = look(Stage(settings, ABLE | {20: soft, 132: 6.0}), settings)["travel: limits against $132"]
+    assert found.verdict == verdict, found
+
+
+def test_what_the_controller_does_not_tell_is_no_fault():
+    found = look(Stage(parameters={22: 1.0}))
+    assert {one.verdict for one in found.values()} == {"ok"}
+    assert found["roll: limits against $131"].found == "-5 to 4 deg, of what the controller does not tell"
+
+
+def test_homing_that_the_controller_cannot_do_fails():
+    found = look(Stage(parameters=ABLE | {22: 0.0}))["homing ($22)"]
+    assert (found.verdict, found.found) == ("failed", "off")
+    assert "home = false" in found.remedy
+    by_hand = replace(STAGE, home=False)
+    assert look(Stage(by_hand, ABLE | {22: 0.0}, (0.0, 0.0, 0.0)), by_hand)["homing ($22)"].verdict == "ok"
+
+
+@pytest.mark.parametrize(("at", "verdict"), [((3.0, 0.0, 0.0), "warning"), ((2.0, 0.0, 0.0), "ok")])
+def test_a_stage_without_homing_is_told_if_it_stands_beyond_its_limits(at, verdict):
+    settings = replace(STAGE, home=False)
+    assert look(Stage(settings, at=at), settings)["position"].verdict == verdict
+
+
+def test_an_alarm_is_a_fault_unless_homing_ends_it():
+    assert look(Stage(state="alarm"))["state"].verdict == "ok"
+    found = look(Stage(state="alarm"), replace(STAGE, home=False))["state"]
+    assert (found.verdict, found.found) == ("failed", "alarm")
+    assert look(Stage(state="door"))["state"].verdict == "failed"
+
+
+def test_slow_and_missing_reports_are_told():
+    found = look(Stage(every=0.1))["reports"]
+    assert (found.verdict, found.found) == ("warning", "10.0 Hz, asked 20 Hz")
+    assert "set stage.report_rate = 10" in found.remedy
+    assert look(Stage(every=100.0))["reports"].verdict == "failed"
+    slow = Stage()
+    slow.round_trip = 0.2
+    assert look(slow)["round trip of a report"].verdict == "warning"
+
+
+def test_a_stage_that_only_presses_is_looked_at_without_tilts():
+    settings = replace(STAGE, pitch=None, roll=None)
+    found = look(Stage(settings), settings)
+    assert found["position"].found == "travel -15.000 mm (before homing)"
+    assert not [what for what in found if "pitch" in what]
+
+
+# Moves
+
+
+def moves(stage, settings=STAGE):
+    return list(check_moves(stage, settings))
+
+
+def test_each_axis_goes_a_little_there_and_back_within_the_limits():
+    stage = Stage()
+    found = moves(stage)
+    assert {one.verdict for one in found} == {"ok"}
+    assert [one.what for one in found] == ["homing", "travel (Z)", "pitch (X)", "roll (Y)"]
+    start, lean = Position(-10.0), pytest.approx(0.4 * DEGREE)
+    assert stage.did == [
+        "home",
+        start,
+        Position(-9.5),
+        start,
+        Position(-10.0, lean),
+        start,
+        Position(-10.0, 0.0, lean),
+        start,
+    ]
+    assert found[1].found == "+0.5 mm and back, off by 0.0000 mm"
+    assert found[2].found == "+0.4 deg and back, off by 0.0000 deg"
+
+
+def test_travel_goes_up_where_it_can_and_the_body_is_set_upright_first():
+    settings = replace(STAGE, home=False)
+    stage = Stage(settings, at=(5.0, 0.2, 0.1))
+    moves(stage, settings)
+    assert stage.did[:3] == [Position(2.0), Position(1.5), Position(2.0)]
+
+
+def test_a_short_travel_is_moved_by_a_tenth_of_it():
+    settings = replace(STAGE, travel=replace(TRAVEL, low=0.0), press=0.2, pitch=None, roll=None)
+    stage = Stage(settings)
+    moves(stage, settings)
+    assert stage.did == ["home", Position(0.0), Position(pytest.approx(0.02)), Position(0.0)]
+
+
+def test_an_axis_that_stops_elsewhere_fails():
+    found = moves(Stage(off=0.03))[1]
+    assert (found.verdict, found.found) == ("failed", "+0.5 mm and back, off by 0.0300 mm")
+    assert "steps per unit" in found.remedy
+    assert moves(Stage(off=0.015))[1].verdict == "ok"
+
+
+# The camera
+
+
+def test_a_camera_that_is_as_its_file_says_is_sound():
+    found = film(Camera(), rate=102.0)
+    assert {one.verdict for one in found.values()} == {"ok"}
+    assert found["pictures"].found == "7 x 5 uint8"
+    assert found["rate"].found == "100.00 Hz, asked 102 Hz"
+    assert found["brightness"].found == "0 to 34, median 17; 0.00% saturated, 2.86% black"
+    total = int(found["frames"].found.split()[0])
+    assert 90 <= total <= 110
+
+
+def test_a_camera_that_is_asked_for_nothing_is_measured_all_the_same():
+    assert list(film(Camera())) == ["pictures", "rate", "frames", "brightness"]
+
+
+def test_another_rate_than_asked_is_told():
+    found = film(Camera(rate=50.0), rate=60.0)["rate"]
+    assert (found.verdict, found.found) == ("warning", "50.00 Hz, asked 60 Hz")
+
+
+def test_lost_frames_and_reconnections_are_told():
+    assert film(Camera(lost=3))["frames"].verdict == "warning"
+    assert " 3 lost" in film(Camera(lost=3))["frames"].found
+    assert film(Camera(reconnects=1))["frames"].verdict == "warning"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_too_much_light_is_told(dtype):
+    picture = np.arange(35, dtype=dtype).reshape(5, 7)
+    picture[0, 0] = np.iinfo(dtype).max
+    found = film(Camera(picture))["brightness"]
+    assert found.verdict == "warning"
+    assert "2.86% saturated" in found.found
+    assert "shorten the exposure" in found.remedy
+
+
+@pytest.mark.parametrize("value", [0, 7])
+def test_a_picture_of_one_colour_is_told(value):
+    found = film(Camera(np.full((1, 1), value, np.float32)))["brightness"]
+    assert (found.verdict, "all pixels are alike" in found.remedy) == ("warning", True)
+
+
+def test_a_picture_of_floats_may_have_pixels_that_are_no_numbers():
+    picture = np.array([[np.nan, -1.0, 1e9]], np.float32)
+    found = film(Camera(picture))["brightness"]
+    assert (found.verdict, found.found.split(";")[0]) == ("ok", "-1 to 1e+09, median 5e+08")
+    assert film(Camera(np.full((2, 2), np.nan, np.float32)))["brightness"].verdict == "warning"
+
+
+# Both
+
+
+def opened(stage, camera, move=False):
+    return check_rig(RIG, move=move, open_stage=lambda settings: stage, open_camera=lambda settings: camera)
+
+
+@pytest.mark.parametrize("move", [False, True])
+def test_nothing_moves_unless_asked_and_both_are_closed(move):
+    stage, camera = Stage(), Camera()
+    parts = list(dict.fromkeys(one.part for one in opened(stage, camera, move)))
+    assert parts == ["stage", "camera", "move"][: 2 + move]
+    assert stage.did[-1] == "close"
+    assert (len(stage.did) > 1) == move
+    assert camera.closed
+
+
+def test_the_stage_is_closed_when_nobody_wants_to_know_more():
+    stage = Stage()
+    findings = opened(stage, Camera())
+    next(findings)
+    findings.close()
+    assert stage.did == ["close"]
+
+
+def test_the_stage_is_closed_when_the_camera_is_not_there_or_is_lost():
+    def refuse(settings):
+        raise InputError("camera 0 is not there")
+
+    stage = Stage()
+    with pytest.raises(InputError, match="camera 0 is not there"):
+        list(check_rig(RIG, open_stage=lambda settings: stage, open_camera=refuse))
+    assert stage.did == ["close"]
+
+    class Lost(Camera):
+        def take(self, most, timeout):
+            raise HardwareError("camera: no frame came")
+
+    stage, camera = Stage(), Lost()
+    with pytest.raises(HardwareError, match="no frame came"):
+        list(opened(stage, camera))
+    assert stage.did == ["close"]
+    assert camera.closed
+
+
+def test_a_stage_that_is_lost_while_the_camera_is_looked_at_is_told():
+    class Unplugged(Camera):
+        def close(self):
+            super().close()
+            stage.report = lambda: (_ for _ in ()).throw(HardwareError("stage: the line is lost"))
+
+    stage = Stage()
+    with pytest.raises(HardwareError, match="the line is lost"):
+        list(opened(stage, Unplugged()))
+    assert stage.did == ["close"]
+
+
+def test_what_hardware_warns_of_is_found_and_not_printed_besides(caplog):
+    log = logging.getLogger("mirrorskin.hw")
+
+    class Talking(Camera):
+        def take(self, most, timeout):
+            log.info("a frame")
+            return super().take(most, timeout)
+
+    def open_camera(settings):
+        log.warning("camera 0: gain %g was asked for, the camera set %g", 2, 3)
+        return Talking()
+
+    findings = list(check_rig(RIG, open_stage=lambda settings: Stage(), open_camera=open_camera))
+    assert [one.found for one in findings if one.verdict != "ok"] == [
+        "camera 0: gain 2 was asked for, the camera set 3"
+    ]
+    assert not caplog.records
+    log.warning("again")
+    assert [record.getMessage() for record in caplog.records] == ["again"]
+
+
+def test_nothing_is_moved_where_something_failed():
+    stage = Stage(parameters=ABLE | {22: 0.0})
+    last = list(opened(stage, Camera(), move=True))[-1]
+    assert (last.part, last.found, last.verdict) == ("move", "not tried", "failed")
+    assert stage.did == ["close"]
+
+
+@pytest.mark.parametrize(
+    ("pitch", "roll", "verdict"), [("Y", "X", "ok"), ("X", "A", "warning"), ("A", "B", "warning")]
+)
+def test_axes_that_have_no_arcs_are_told(pitch, roll, verdict):
+    settings = replace(STAGE, pitch=Axis(pitch, 1, 0.0, **TILT), roll=Axis(roll, 1, 0.0, **TILT))
+    assert look(Stage(settings, {22: 1.0}), settings)["arcs"].verdict == verdict
