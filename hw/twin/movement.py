@@ -78,6 +78,27 @@ def pose_at_press(travel: float) -> Pose:
     return Pose(np.eye(3), np.array([0.0, 0.0, travel]))
 
 
+def pose_at_lean(
+    travel: float, tilt: float, phase: float, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Pose:
+    """Lower the body, upright, by a travel; then tilt it about its pivot at a phase, see `Axial`.
+
+    Parameters
+    ----------
+    travel : float
+        Millimetres.
+    tilt, phase : float
+        Radians; without a tilt the body stays upright, whatever the phase.
+    pivot : (float, float, float)
+        From the rest sheet's centre, mm, in the body's frame.
+    """
+    if tilt == 0:
+        return pose_at_press(travel)
+    rotation = _about_z(phase) @ _about_y(tilt) @ _about_z(-phase)
+    centre = np.asarray(pivot, np.float64)
+    return Pose(rotation, rotation @ (np.array([0.0, 0.0, travel]) - centre) + centre)
+
+
 class _Upright:
     """What all movements share that do not tilt the body."""
 
@@ -198,11 +219,7 @@ class Axial:
 
     def pose(self, place: Floats, /) -> Pose:
         """Tilt the body about its pivot at a phase, radians."""
-        phase = float(place)
-        rotation = _about_z(phase) @ _about_y(self.tilt) @ _about_z(-phase)
-        pivot = np.asarray(self.pivot, np.float64)
-        lowered = np.array([0.0, 0.0, self.deepest])
-        return Pose(rotation, rotation @ (lowered - pivot) + pivot)
+        return pose_at_lean(self.deepest, self.tilt, float(place), self.pivot)
 
     def header(self) -> Header:
         """Tell motion, press, tilt and pivot."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from mirrorskin.io.types import Floats
 Light = NDArray[np.float32]
 
 _BLUR_POSES = 5  # poses that stand for the exposure of a moving body
+_BLUR = (np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5  # when, as shares of the exposure
 
 
 class Skin(Protocol):
@@ -99,7 +101,52 @@ class Film:
         return sheet
 
 
-class Press:
+class Anywhere:
+    """The body wherever it is, asked of someone who knows: for a camera that watches a stage.
+
+    Upright above its own place it is seen by the `Imprint`, where there is one. Of other poses the light of
+    the last few is kept: a body that stands still is worked out once.
+
+    Parameters
+    ----------
+    skin : Skin
+    optics : Optics
+    imprint : Imprint or None
+    exposure : float
+        Seconds.
+    """
+
+    def __init__(self, skin: Skin, optics: Optics, imprint: Imprint | None, exposure: float) -> None:
+        self._skin, self._optics, self._imprint = skin, optics, imprint
+        self._ends = exposure * np.array([-0.5, 0.0, 0.5]) if exposure > 0 else np.zeros(1)
+        self._moments = exposure * _BLUR if exposure > 0 else np.zeros(1)
+        self._kept: dict[bytes, Light] = {}
+
+    def light(self, pose_at: Callable[[float], Pose], /) -> Light:
+        """Return the mean light over an exposure; it holds until the next is asked for.
+
+        Parameters
+        ----------
+        pose_at : callable
+            Tells the pose so many seconds after the exposure's middle.
+        """
+        if self._imprint is not None:
+            poses = [pose_at(float(late)) for late in self._ends]
+            if all(pose.upright and not pose.shift[:2].any() for pose in poses):
+                return self._imprint.light(*(float(pose.shift[2]) for pose in poses))
+        lights = [self._at(pose_at(float(late))) for late in self._moments]
+        return lights[0] if len(lights) == 1 else np.mean(lights, axis=0, dtype=np.float32)
+
+    def _at(self, pose: Pose) -> Light:
+        key = pose.rotation.tobytes() + pose.shift.tobytes()
+        if key not in self._kept:
+            if len(self._kept) >= _BLUR_POSES:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = self._optics.light(self._skin.lie(pose))
+        return self._kept[key]
+
+
+class Imprint:
     """A press without resistance, seen from straight above, under a light that goes by slope alone.
 
     Then a pixel that touches looks the same however deep it is, and no frame needs more than its travel.
@@ -110,34 +157,31 @@ class Press:
         Of the object, mm; NaN where there is none.
     touched, untouched : ndarray, (H, W), float32
         Light of each pixel in contact and out of it.
-    travel : ndarray, (T,), float64
-        Millimetres.
-    share : float
-        Part of the time between frames that an exposure takes.
     """
 
-    def __init__(
-        self, height: Floats, touched: Light, untouched: Light, travel: Floats, share: float
-    ) -> None:
+    def __init__(self, height: Floats, touched: Light, untouched: Light) -> None:
         self._reached_at = np.where(np.isnan(height), np.inf, -height)
         self._untouched = untouched
         self._gained = touched - untouched
         self._glows = bool(untouched.any())
         # Fresh arrays would cost more, by their page faults, than what is written to them.
         self._touches, self._light = np.empty(height.shape, bool), np.empty_like(touched)
-        self._travel = travel
-        self._share = share
-        # Begin, middle and end of each exposure, with constant velocity in between.
-        self._passed = _passed(travel, np.array([-share / 2, 0.0, share / 2]))
 
-    def light(self, frame: int, /) -> Light:
-        """Return the mean light over a frame's exposure; it holds until the next is asked for."""
+    def light(self, *passed: float) -> Light:
+        """Return the light at one travel, or the mean over an exposure; it holds until the next is asked for.
+
+        Parameters
+        ----------
+        passed : float
+            The travel, or those at the exposure's begin, middle and end, with constant velocity in between,
+            mm.
+        """
         time: NDArray[Any] = self._touches
-        if self._share > 0:
-            begin, middle, end = map(float, self._passed[frame])
-            time = (self._time(begin, middle) + self._time(middle, end)) / np.float32(2)
+        if len(passed) == 1:
+            np.greater_equal(passed[0], self._reached_at, out=self._touches)
         else:
-            np.greater_equal(self._travel[frame], self._reached_at, out=self._touches)
+            begin, middle, end = passed
+            time = (self._time(begin, middle) + self._time(middle, end)) / np.float32(2)
         np.multiply(time, self._gained, out=self._light)
         if self._glows:
             self._light += self._untouched
@@ -152,6 +196,28 @@ class Press:
         return np.clip(ahead / np.float32(high - low), 0, 1, out=ahead)
 
 
+class Press:
+    """The frames of a vertical movement, by the `Imprint` of its press.
+
+    Parameters
+    ----------
+    imprint : Imprint
+    travel : ndarray, (T,), float64
+        Millimetres.
+    share : float
+        Part of the time between frames that an exposure takes.
+    """
+
+    def __init__(self, imprint: Imprint, travel: Floats, share: float) -> None:
+        self._imprint = imprint
+        ends = np.array([-share / 2, 0.0, share / 2]) if share > 0 else np.zeros(1)
+        self._passed = _passed(travel, ends)
+
+    def light(self, frame: int, /) -> Light:
+        """Return the mean light over a frame's exposure; it holds until the next is asked for."""
+        return self._imprint.light(*map(float, self._passed[frame]))
+
+
 def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]:
     """Return the places where the body is in some exposure, each once.
 
@@ -161,9 +227,7 @@ def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[
     number : ndarray, (T, m), intp
         Of each frame's m places.
     """
-    offsets = np.zeros(1)
-    if share > 0:
-        offsets = share * ((np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5)
+    offsets = share * _BLUR if share > 0 else np.zeros(1)
     passed = movement.reduced(_passed(movement.path, offsets))
     count, each, *place = passed.shape
     distinct, number = np.unique(passed.reshape(count * each, -1), axis=0, return_inverse=True)

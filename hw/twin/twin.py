@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.hw.twin.contact import Conform, Elastic
-from mirrorskin.hw.twin.movement import Movement, Vertical, pose_at_press
+from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object, check_fits, make_object
 from mirrorskin.hw.twin.optics import Ideal, Linear, Pattern, Uniform, Wall, make_pattern
 from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, ball_references, exact_references
-from mirrorskin.hw.twin.scene import Film, Press, Scene
+from mirrorskin.hw.twin.scene import Anywhere, Film, Imprint, Press, Scene
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.truth import tell_truth
 from mirrorskin.hw.twin.view import View
@@ -75,6 +76,8 @@ class Twin(Closing):
         Millimetres, of a vertical movement.
     frame_rate : float
         Frames in a second.
+    exposure : float
+        Seconds during which a frame gathers light.
 
     Raises
     ------
@@ -115,7 +118,7 @@ class Twin(Closing):
         self.travel = movement.positions if isinstance(movement, Vertical) else None
         self.shape = (len(movement.positions), *field)
         self.dtype = self._camera.dtype
-        self.frame_rate = self._camera.frame_rate
+        self.frame_rate, self.exposure = self._camera.frame_rate, self._camera.exposure
 
         check_fits(self._thing, self._body.radius)
         self._check_movement()
@@ -127,6 +130,7 @@ class Twin(Closing):
         self._pattern = make_pattern(pattern, self._body)
         self._sensor = Sensor(self._camera, field, open_device(device))
         self._skin = self._make_skin()
+        self._optics = self._make_optics(self._pattern)
         self._scene = self._make_scene()
         self._next = 0
 
@@ -207,6 +211,38 @@ class Twin(Closing):
         time = np.arange(first, self._next) / self._camera.frame_rate
         return self.movement.mark(Block(frames, index=first, time=time))
 
+    def look(self, pose_at: Callable[[float], Pose], number: int, out: NDArray[Any]) -> None:
+        """Render one frame with the body wherever it is, as a camera beside a stage sees it.
+
+        The counts are those that `read` gives of a frame of this number with the body at the same places. The
+        movement only bounds how far the body may go: in elastic contact what the object reaches elsewhere is
+        not looked for.
+
+        Parameters
+        ----------
+        pose_at : callable
+            Tells the pose so many seconds after the exposure's middle.
+        number : int
+            Of the frame, which decides the noise.
+        out : ndarray, (H, W), the source's dtype
+            Where to write.
+        """
+        self._sensor.expose(self._anywhere.light(pose_at), number, out)
+
+    @functools.cached_property
+    def _anywhere(self) -> Anywhere:
+        return Anywhere(self._skin, self._optics, self._imprint, self._camera.exposure)
+
+    @functools.cached_property
+    def _imprint(self) -> Imprint | None:
+        """What a press leaves, where no frame needs more than its travel."""
+        skin, optics, view = self._skin, self._optics, self._view
+        if not (isinstance(skin, Conform) and isinstance(optics, Ideal) and view.orthographic):
+            return None
+        touched, untouched = (skin.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
+        height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
+        return Imprint(height, optics.light(touched), optics.light(untouched))
+
     def _check_movement(self) -> None:
         rise = self.movement.rise(self._body.radius)
         if rise >= self._body.height:
@@ -238,19 +274,9 @@ class Twin(Closing):
 
     def _make_scene(self) -> Scene:
         share = self._camera.exposure * self._camera.frame_rate
-        skin, optics, view = self._skin, self._make_optics(self._pattern), self._view
-        if (
-            isinstance(self.movement, Vertical)
-            and isinstance(skin, Conform)
-            and isinstance(optics, Ideal)
-            and view.orthographic
-        ):
-            touched, untouched = (skin.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
-            height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
-            return Press(
-                height, optics.light(touched), optics.light(untouched), self.movement.positions, share
-            )
-        return Film(skin, optics, self.movement, share, view.shape, _MEMORY)
+        if isinstance(self.movement, Vertical) and self._imprint is not None:
+            return Press(self._imprint, self.movement.positions, share)
+        return Film(self._skin, self._optics, self.movement, share, self._view.shape, _MEMORY)
 
     def _zenith_scale(self) -> tuple[Floats, Floats] | None:
         """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""

@@ -144,3 +144,13 @@ def test_the_zenith_of_an_object_point_goes_round_as_equation_10_says(tilt: floa
         expected = np.cos(np.pi / 6) * np.cos(tilt) - np.sin(np.pi / 6) * np.sin(tilt) * swing
         zenith, _ = poses.angles(poses.normals(sheet.dz_dx, sheet.dz_dy))
         assert np.abs(zenith - np.arccos(expected))[chosen].max() <= TARGET
+
+
+def test_a_flat_top_is_met_without_a_hole() -> None:
+    # Its top is where rays are followed from: rounding must not put it above their first point.
+    for phase in (2.0, 3.0, 4.0):
+        movement = Axial([phase], 0.3, 1.0, (0.0, 0.0, 40.0))
+        touched = Twin(object="step", shape=SHAPE, pixel_size=0.1, movement=movement).sheet(0).contact
+        assert touched.sum() > 100
+        # In each row the contact is one piece.
+        assert np.abs(np.diff(touched.astype(int), axis=1)).sum(axis=1).max() == 1

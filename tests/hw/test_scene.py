@@ -10,7 +10,7 @@ from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
 from mirrorskin.hw.twin.contact import Conform
 from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
 from mirrorskin.hw.twin.optics import Ideal, Uniform
-from mirrorskin.hw.twin.scene import Film, Press
+from mirrorskin.hw.twin.scene import Film, Imprint, Press
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.view import View
 
@@ -255,7 +255,7 @@ STROKES: dict[str, list[float]] = {
 
 
 def press(travel: list[float], share: float) -> Press:
-    return Press(HEIGHT, AFTER, BEFORE, np.asarray(travel, np.float64), share)
+    return Press(Imprint(HEIGHT, AFTER, BEFORE), np.asarray(travel, np.float64), share)
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
@@ -300,7 +300,7 @@ def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
     height = BALL.height(VIEW.x, VIEW.y)
 
     def make(share: float) -> Press:
-        return Press(height, touched, untouched, movement.positions, share)
+        return Press(Imprint(height, touched, untouched), movement.positions, share)
 
     film = all_light(real(movement), movement)
     np.testing.assert_array_equal(film, all_light(make(0.0), movement))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import elementwise
 
-from mirrorskin.hw.twin.movement import Pose
+from mirrorskin.hw.twin.movement import TILT_MAX, Pose
 from mirrorskin.hw.twin.objects import Object
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats
@@ -18,6 +18,8 @@ STEEP = 1e6  # a slope that no mirror shows, for the very edge of an object, whe
 
 _NOWHERE = 1e3  # "far below", in mm, for where there is no object
 _PRECISION = 1e-9  # of a height, mm
+_RAYS = 32768  # followed at a time: what is worked out of them stays in the processor's cache
+_SECANTS = 5  # that take a smooth surface from a millimetre to the precision
 _JUMP = 1e-6  # more than G can be, by the precision, on any slope up to STEEP / 1000
 
 
@@ -32,6 +34,25 @@ class Obstacle(NamedTuple):
     dz_dy: Floats
 
 
+class _Vectors(NamedTuple):
+    """A vector of each ray; a component is one number where it is the same for all."""
+
+    x: Any
+    y: Any
+    z: Any
+
+    def of(self, rays: NDArray[np.intp]) -> _Vectors:
+        """Take those of some rays, numbered in C order."""
+        return _Vectors(*(part if np.ndim(part) == 0 else part.ravel()[rays] for part in self))
+
+
+class _End(NamedTuple):
+    """Heights on some rays, and G there."""
+
+    height: Floats
+    gap: Floats
+
+
 def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
     """Find the uppermost point of the object on each ray, where that is above the rest plane.
 
@@ -41,8 +62,9 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
 
     with l the height in the body's frame. Rays that are upright there need no search. The others are followed
     down from the object's highest point by steps of at most a pixel to the first change of sign of G, which
-    is then narrowed down to 1e-9 mm (Chandrupatla's method). Where G jumps, the ray meets an upright side of
-    the object, which is as steep as can be. What a ray meets and leaves again within a pixel it misses.
+    is then narrowed down to 1e-9 mm: by secants, and where these do not get there by Chandrupatla's method.
+    Where G jumps, the ray meets an upright side of the object, which is as steep as can be. What a ray meets
+    and leaves again within a pixel it misses.
 
     Parameters
     ----------
@@ -55,75 +77,141 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
     -------
     Obstacle
     """
-    # Row vectors times the rotation are vectors turned back, into the object's frame.
-    start = _stack(view.x, view.y, np.zeros_like(view.x)) - pose.shift
-    foot = start @ pose.rotation
-    lean = _stack(view.slope_x, view.slope_y, np.ones_like(view.x)) @ pose.rotation
-    x, y, z = foot[..., 0], foot[..., 1], foot[..., 2]
-    if lean[..., :2].any():
-        height, side = _search(thing, foot, lean, min(view.pixel_size))
-        x, y = x + height * lean[..., 0], y + height * lean[..., 1]
+    inside, sideways = np.zeros(view.shape, bool), 0.0
+    for first in range(0, inside.size, _RAYS):
+        some = slice(first, first + _RAYS)
+        foot, lean = _rays(pose, view, some)
+        inside.ravel()[some] = _gap(thing, foot, lean, np.zeros(1)) <= 0
+        sideways = max(sideways, float(np.max(-foot.z / lean.z * np.sqrt(lean.x**2 + lean.y**2))))
+    maps = np.full((3, *view.shape), np.nan)
+    reach = math.ceil(sideways / min(view.pixel_size)) if sideways > 0 else 0
+    near = np.flatnonzero(_spread(inside, reach) if reach else inside)
+    for first in range(0, near.size, _RAYS):
+        pixels = near[first : first + _RAYS]
+        _meet(thing, pose, *_rays(pose, view, pixels), reach, pixels, maps.reshape(3, -1))
+    return Obstacle(*maps)
+
+
+def _rays(pose: Pose, view: View, pixels: NDArray[np.intp] | slice) -> tuple[_Vectors, _Vectors]:
+    """Return where the rays of some pixels begin and how they lean, in the object's frame."""
+    left, down = view.x.ravel()[pixels] - pose.shift[0], view.y.ravel()[pixels] - pose.shift[1]
+    # Row vectors times the rotation are vectors turned back.
+    foot = (left * to[0] + down * to[1] - pose.shift[2] * to[2] for to in pose.rotation.T)
+    if view.orthographic:
+        return _Vectors(*foot), _Vectors(*pose.rotation[2])
+    away, up = view.slope_x.ravel()[pixels], view.slope_y.ravel()[pixels]
+    return _Vectors(*foot), _Vectors(*(away * to[0] + up * to[1] + to[2] for to in pose.rotation.T))
+
+
+def _spread(inside: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Add to the rays that begin inside the object those near them, and those near the picture's edge.
+
+    No other can meet it: below a point of the surface all is inside the object, and so is the point of the
+    rest plane straight below it, which is no farther off than a ray goes sideways.
+    """
+    import cv2
+
+    far = math.ceil(reach / math.cos(TILT_MAX)) + 1
+    square = np.ones((2 * far + 1, 2 * far + 1), np.uint8)
+    near = cv2.dilate(inside.view(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    return np.asarray(near, bool)
+
+
+def _meet(
+    thing: Object,
+    pose: Pose,
+    foot: _Vectors,
+    lean: _Vectors,
+    steps: int,
+    pixels: NDArray[np.intp],
+    maps: Floats,
+) -> None:
+    """Write height and slopes of some pixels, where there are any, to maps of (3, H x W)."""
+    if steps:
+        height, side = _search(thing, foot, lean, steps)
     else:
-        height, side = (thing.height(x, y) - z) / lean[..., 2], np.zeros(x.shape, bool)
-    here = height >= 0
-    slopes = _slopes(thing, pose, np.where(here, x, np.nan), np.where(here, y, np.nan))
-    dz_dx, dz_dy = (np.where(here, np.where(side, STEEP, slope), np.nan) for slope in slopes)
-    return Obstacle(np.where(here, height, np.nan), dz_dx, dz_dy)
-
-
-def _stack(x: Floats, y: Floats, z: Floats) -> Floats:
-    return np.stack([x, y, z], axis=-1)
+        height = (thing.height(foot.x, foot.y) - foot.z) / lean.z
+        side = np.zeros(height.shape, bool)
+    here = np.flatnonzero(height >= 0)
+    height, side, pixels = height[here], side[here], pixels[here]
+    foot, lean = foot.of(here), lean.of(here)
+    maps[0, pixels] = height
+    slopes = _slopes(thing, pose, foot.x + height * lean.x, foot.y + height * lean.y)
+    for slope, values in zip(maps[1:], slopes, strict=True):
+        slope[pixels] = np.where(side, STEEP, values)
 
 
 def _above(thing: Object, x: Floats, y: Floats, z: Floats) -> Floats:
     """Tell how far a point is above the surface, mm; far, where there is no object."""
     distance = z - thing.height(x, y)
-    return np.where(np.isnan(distance), _NOWHERE, distance)
+    distance[np.isnan(distance)] = _NOWHERE
+    return distance
 
 
-def _search(thing: Object, foot: Floats, lean: Floats, pixel: float) -> tuple[Floats, NDArray[np.bool_]]:
+def _search(thing: Object, foot: _Vectors, lean: _Vectors, steps: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Find the uppermost height above 0 at which each ray meets the object, and whether at an upright side.
 
     The height is NaN where a ray does not meet it.
     """
-    shape, foot, lean = foot.shape[:-1], foot.reshape(-1, 3), lean.reshape(-1, 3)
-    top = -foot[:, 2] / lean[:, 2]  # the object's highest point is at z = 0 of its own frame
-    found, side = np.full(len(foot), np.nan), np.zeros(len(foot), bool)
+    top = -foot.z / lean.z  # the object's highest point is at z = 0 of its own frame
+    found, side = np.full(top.shape, np.nan), np.zeros(top.shape, bool)
     rays = np.flatnonzero(top > 0)
-    if rays.size == 0:
-        return found.reshape(shape), side.reshape(shape)
-    sideways = float(np.max(top[rays] * np.hypot(lean[rays, 0], lean[rays, 1])))
-    steps = max(1, math.ceil(sideways / pixel))
-
-    def gap(height: Floats, *ray: Floats) -> Floats:
-        x, y, z, lean_x, lean_y, lean_z = ray
-        return _above(thing, x + height * lean_x, y + height * lean_y, z + height * lean_z)
-
     upper = top[rays]
+    over = _gap(thing, foot.of(rays), lean.of(rays), upper)
     for step in range(1, steps + 1):
         lower = top[rays] * (1 - step / steps)
-        line = (*foot[rays].T, *lean[rays].T)
-        inside = gap(lower, *line) <= 0
+        under = _gap(thing, foot.of(rays), lean.of(rays), lower)
+        met, left = np.flatnonzero(under <= 0), np.flatnonzero(under > 0)
+        if met.size:
+            ends = _End(lower[met], under[met]), _End(upper[met], over[met])
+            found[rays[met]], side[rays[met]] = _narrow(thing, foot.of(rays[met]), lean.of(rays[met]), *ends)
+        rays, upper, over = rays[left], lower[left], under[left]
+    return found, side
+
+
+def _gap(thing: Object, foot: _Vectors, lean: _Vectors, height: Floats) -> Floats:
+    """Return G at a height on each ray."""
+    return _above(thing, foot.x + height * lean.x, foot.y + height * lean.y, foot.z + height * lean.z)
+
+
+def _narrow(
+    thing: Object, foot: _Vectors, lean: _Vectors, lower: _End, upper: _End
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the height between two at which G changes its sign, and whether it jumps there."""
+    then, now = lower, upper
+    for _ in range(_SECANTS):
+        rise = now.gap - then.gap
+        step = np.divide(now.gap * (now.height - then.height), rise, out=np.zeros_like(rise), where=rise != 0)
+        height = np.clip(now.height - step, lower.height, upper.height)
+        then, now = now, _End(height, _gap(thing, foot, lean, height))
+        if np.abs(now.height - then.height).max() <= _PRECISION:
+            break
+    at = now.height
+    below, above = (_gap(thing, foot, lean, at + part * _PRECISION) for part in (-0.5, 0.5))
+    left = np.flatnonzero((below > 0) | (above <= 0) | (above - below > _JUMP))
+    side = np.zeros(at.shape, bool)
+    if left.size:
+        foot, lean = foot.of(left), lean.of(left)
         hit = elementwise.find_root(
-            gap,
-            (lower[inside], upper[inside]),
-            args=tuple(part[inside] for part in line),
+            lambda height, number: _gap(thing, foot.of(number), lean.of(number), height),
+            (lower.height[left], upper.height[left]),
+            args=(np.arange(left.size),),
             tolerances={"xatol": _PRECISION, "fatol": 0.0},
         )
-        found[rays[inside]] = hit.x
-        side[rays[inside]] = np.abs(hit.f_x) > _JUMP
-        rays, upper = rays[~inside], lower[~inside]
-    return found.reshape(shape), side.reshape(shape)
+        at[left] = np.where(hit.success, hit.x, at[left])
+        side[left] = np.abs(hit.f_x) > _JUMP
+    return at, side
 
 
 def _slopes(thing: Object, pose: Pose, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Return the slopes in the body's frame at points of the object's own."""
-    along_x, along_y = thing.slope(x, y)
+    along_x, along_y = map(_known, thing.slope(x, y))
     if pose.upright:
-        return _known(along_x), _known(along_y)
-    normal = _stack(-_known(along_x), -_known(along_y), np.ones_like(x)) @ pose.rotation.T
-    facing = np.maximum(normal[..., 2], 1 / STEEP)  # what faces away is as steep as can be
-    return -normal[..., 0] / facing, -normal[..., 1] / facing
+        return along_x, along_y
+    # The object's own normal is (-along_x, -along_y, 1).
+    across, up, facing = (to[2] - along_x * to[0] - along_y * to[1] for to in pose.rotation)
+    facing = np.maximum(facing, 1 / STEEP)  # what faces away is as steep as can be
+    return -across / facing, -up / facing
 
 
 def _known(slope: Floats) -> Floats:

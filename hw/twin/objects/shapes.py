@@ -112,5 +112,6 @@ class Cylinder:
 
 def _rise(radius: float, square_distance: Floats) -> Floats:
     """Return the height of a circle above its centre; NaN where it has none."""
-    square = radius**2 - square_distance
-    return np.sqrt(np.where(square > 0, square, np.nan))
+    square = np.asarray(radius**2 - square_distance)
+    square[square <= 0] = np.nan
+    return np.sqrt(square)

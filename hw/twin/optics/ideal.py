@@ -63,8 +63,11 @@ class Ideal:
         -------
         ndarray, (H, W), float32
         """
-        zenith = np.arctan(np.sqrt(sheet.dz_dx**2 + sheet.dz_dy**2))
-        return self.response(zenith).astype(np.float32)
+        square = sheet.dz_dx**2 + sheet.dz_dy**2
+        light = np.full(square.shape, self.response(np.zeros(1))[0], np.float32)
+        leans = square != 0  # most of a sheet often lies level
+        light[leans] = self.response(np.arctan(np.sqrt(square[leans])))
+        return light
 
     def response(self, zenith: Floats) -> Floats:
         """Return the share of full light that a mirror of given zenith shows.

@@ -1,0 +1,99 @@
+"""``mirrorskin twin serve``: a rig for anyone to try, without hardware."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.simulate import ContactName, OpticsName
+
+_LOOK = 0.2  # seconds from one look whether all is well to the next
+_PRESS = "vertical --stop 1.5mm --speed 0.5mm/s"
+_TURN = "axial --press 1mm --rate 0.5"  # which needs the zenith's scale
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def _group() -> None:
+    """Emulate a whole rig: its stage and its camera."""
+
+
+@app.command()
+def serve(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Where to write the rig file.")
+    ] = Path("emulated-rig"),
+    thing: Annotated[
+        str,
+        typer.Option("--object", metavar="NAME", help="What to press on, as in 'mirrorskin simulate'."),
+    ] = "sphere",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "320x240",
+    pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.04mm",
+    pattern: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="Of the wall: uniform, for presses; linear, for rotations; or a picture."
+        ),
+    ] = "uniform",
+    contact: Annotated[
+        ContactName, typer.Option(help="The sheet takes the object's shape (eq. 1), or resists.")
+    ] = ContactName.conform,
+    optics: Annotated[
+        OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")
+    ] = OpticsName.ideal,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    delay: Annotated[
+        str, typer.Option(metavar="TIME", help="From a frame's exposure to its sending.")
+    ] = "50ms",
+    jitter: Annotated[str, typer.Option(metavar="TIME", help="Of that delay, one sigma.")] = "0s",
+    seed: Annotated[int, typer.Option(help="Of noise and jitter.")] = 0,
+    device: options.Device = None,
+) -> None:
+    """Run an emulated rig: a stage behind a serial port, and the twin as its camera, until Ctrl-C."""
+    from mirrorskin.cli.quantity import duration, frame_size, lengths
+    from mirrorskin.hw.emulator.rig import EmulatedRig
+
+    columns, rows = frame_size(size, "--size")
+    rig = EmulatedRig(
+        thing,
+        shape=(rows, columns),
+        pixel_size=lengths(pixel_size, "--pixel-size"),
+        pattern=pattern,
+        contact=contact.value,
+        optics=optics.value,
+        rate=rate,
+        delay=duration(delay, "--delay"),
+        jitter=duration(jitter, "--jitter"),
+        seed=seed,
+        home=True,
+        device=device,
+    )
+    with rig, rig.serve() as server:
+        path = rig.write(output, server.url)
+        what = f"{thing} under {columns} x {rows} pixels at {rate:g} frames a second"
+        typer.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")
+        scale = rig.settings.camera.zenith_gain
+        typer.echo(_tell(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
+        try:
+            while True:
+                time.sleep(_LOOK)
+        except KeyboardInterrupt:
+            typer.echo("the rig has ended")
+
+
+def _tell(rig: Path, movements: list[str]) -> str:
+    """Say what can be tried."""
+    said = ["in another terminal, try", f"  mirrorskin rig check {rig}"]
+    for movement in movements:
+        name = movement.split()[0]
+        said += [
+            f"  mirrorskin capture {movement} --rig {rig} -o {name}.h5",
+            f"  mirrorskin reconstruct {name}.h5",
+            f"  mirrorskin live {movement} --rig {rig}",
+        ]
+    return "\n".join([*said, "Ctrl-C ends the rig"])

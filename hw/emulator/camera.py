@@ -1,0 +1,207 @@
+"""The twin as a camera that watches a stage: frames arrive in real time and show the body where it is."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.camera import Counts, Frames, Tally
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.ring import Ring, usual_slots
+from mirrorskin.hw.stage import Position
+from mirrorskin.hw.twin import Twin
+from mirrorskin.hw.twin.movement import Pose, pose_at_lean, pose_at_press
+from mirrorskin.io.types import Closing, InputError
+
+
+class _Frame(NamedTuple):
+    """A frame on its way: what it shows, its number, when it arrives, how many were lost before it."""
+
+    pixels: NDArray[Any]
+    number: int
+    arrival: float
+    lost: int
+
+
+class TwinCamera(Closing):
+    """A `mirrorskin.hw.camera.Camera` that sees what the twin sees, wherever the body is at that time.
+
+    Frame n is exposed about the time t = start + n / rate and arrives at t + delay + N(0, jitter), but not
+    before its exposure ends, nor before the frame ahead of it. Its time is that arrival, on the emulated
+    camera's clock: what a busy machine is late with adds nothing to it. A frame that cannot be worked out
+    until a period after its arrival is lost and counted, as in a camera that cannot keep up.
+
+    Parameters
+    ----------
+    twin : Twin
+        Sensor and object; its movement only bounds how far the body may go.
+    where : callable
+        Tells the body's `Position` at a time of `time.monotonic`, which is past.
+    rate : float, optional
+        Frames a second; the twin's camera's own otherwise.
+    delay, jitter : float
+        Of the arrival after the exposure's middle, mean and standard deviation, seconds.
+    seed : int
+        Of the jitter.
+    pivot : (float, float, float)
+        What the body turns about, from the rest sheet's centre, mm.
+
+    Attributes
+    ----------
+    name, shape, dtype, counts, latest, error
+        As for every camera.
+
+    Raises
+    ------
+    InputError
+        Rate, delay or jitter cannot be.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        where: Callable[[float], Position],
+        *,
+        rate: float | None = None,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+        seed: int = 0,
+        pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        rate = twin.frame_rate if rate is None else rate
+        _check(rate, delay, jitter, twin.exposure)
+        self.name = twin.name
+        self.shape, self.dtype = twin.shape[1:], twin.dtype
+        self._twin, self._where, self._pivot = twin, where, pivot
+        self._rate, self._delay, self._jitter = rate, delay, jitter
+        self._random = np.random.default_rng(seed)
+        self._ring = Ring(self.shape, self.dtype, usual_slots(self.shape, self.dtype, rate), self.name)
+        self._tally = Tally()
+        self._underway: deque[_Frame] = deque()
+        self._sent = threading.Condition()
+        self._stalled, self._ended = threading.Event(), threading.Event()
+        self._threads = [
+            threading.Thread(target=work, name=f"{self.name}: {work.__name__.strip('_')}")
+            for work in (self._expose, self._deliver)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def counts(self) -> Counts:
+        """What it did so far."""
+        return self._tally.counts(self._ring.dropped)
+
+    @property
+    def latest(self) -> float:
+        """When the newest frame arrived; -inf before the first."""
+        return self._tally.latest
+
+    @property
+    def error(self) -> HardwareError | None:
+        """Why no more frames will come."""
+        return self._ring.error
+
+    def take(self, most: int, timeout: float) -> Frames:
+        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
+        return self._ring.take(most, timeout)
+
+    def flush(self) -> None:
+        """Forget the frames that wait."""
+        self._ring.flush()
+
+    def stall(self) -> None:
+        """Let no more frames arrive, and say nothing, until it comes back."""
+        self._stalled.set()
+
+    def come_back(self) -> None:
+        """End a stall; the frames that did not arrive are lost."""
+        self._stalled.clear()
+
+    def lose(self) -> None:
+        """Be gone for good: no more frames arrive, and readers are told."""
+        self._stalled.set()
+        self._ring.fail(HardwareError(f"{self.name} was lost: see whether it has power, and its cable"))
+
+    def close(self) -> None:
+        """Stop; frames under way do not arrive. A second time does nothing."""
+        self._ended.set()
+        with self._sent:
+            self._sent.notify_all()
+        for thread in self._threads:
+            thread.join()
+        self._ring.fail(HardwareError(f"{self.name} is closed"))
+
+    def _expose(self) -> None:
+        """Render each frame when its exposure is over, or pass it over if it would come too late."""
+        # A device's first launch takes longer than later ones.
+        self._twin.look(lambda late: pose_at_press(0.0), 0, np.empty(self.shape, self.dtype))
+        start, period = time.monotonic(), 1 / self._rate
+        number = lost = 0
+        last = -math.inf
+        while True:
+            middle = start + number * period
+            over = middle + self._twin.exposure / 2
+            arrival = max(over, last, middle + self._delay + self._jitter * self._random.standard_normal())
+            if self._wait_until(over):
+                return
+            if self._stalled.is_set() or time.monotonic() > arrival + period:
+                lost += 1
+            else:
+                pixels = self._render(middle, number)
+                with self._sent:
+                    self._underway.append(_Frame(pixels, number, arrival, lost))
+                    self._sent.notify_all()
+                last, lost = arrival, 0
+            number += 1
+
+    def _render(self, middle: float, number: int) -> NDArray[Any]:
+        pixels = np.empty(self.shape, self.dtype)
+
+        def pose_at(late: float) -> Pose:
+            place = self._where(middle + late)
+            return pose_at_lean(place.travel, place.tilt, place.phase, self._pivot)
+
+        self._twin.look(pose_at, number, pixels)
+        return pixels
+
+    def _deliver(self) -> None:
+        """Let each frame arrive when it is due."""
+        missed = 0
+        while True:
+            with self._sent:
+                self._sent.wait_for(lambda: self._underway or self._ended.is_set())
+                if self._ended.is_set():
+                    return
+                frame = self._underway.popleft()
+            if self._wait_until(frame.arrival):
+                return
+            if self._stalled.is_set():
+                missed += 1 + frame.lost
+                continue
+            self._ring.slot()[:] = frame.pixels
+            self._ring.put(frame.arrival, frame.number, frame.lost + missed)
+            self._tally.add(frame.arrival)
+            missed = 0
+
+    def _wait_until(self, due: float) -> bool:
+        """Wait for a time, and return whether the camera was closed meanwhile."""
+        return self._ended.wait(max(0.0, due - time.monotonic()))
+
+
+def _check(rate: float, delay: float, jitter: float, exposure: float) -> None:
+    rules = {
+        "rate": (rate, rate > 0 and exposure * rate <= 1, f"frames a second, with {exposure:g} s for each"),
+        "delay": (delay, delay >= 0, "seconds, 0 or more"),
+        "jitter": (jitter, jitter >= 0, "seconds, 0 or more"),
+    }
+    for name, (value, holds, remedy) in rules.items():
+        if not (math.isfinite(value) and holds):
+            raise InputError(f"{name} {value} of the emulated camera cannot be: give {remedy}")

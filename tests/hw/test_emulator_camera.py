@@ -1,0 +1,283 @@
+"""The twin seen wherever its body is, and as a camera in real time.
+
+The emulated camera's clock does not depend on how busy the machine is, so times are compared exactly.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw.camera import Frames
+from mirrorskin.hw.emulator.camera import TwinCamera
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.stage import Position
+from mirrorskin.hw.twin import Axial, Body, Camera, Twin, Vertical
+from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_lean, pose_at_press
+from mirrorskin.io import InputError
+
+SHAPE = (33, 47)
+TRAVEL = [-0.3, 0.0, 0.2, 0.9, 1.4, 0.6]
+PHASES = [0.0, 0.3, 2.0, 3.9, -1.0, 7.0]
+TILT, PRESS, PIVOT = 0.06, 1.0, (0.5, -0.3, 5.0)
+PATIENCE = 20.0  # seconds, for a busy machine
+
+MOVEMENTS: dict[str, Movement] = {"press": Vertical(TRAVEL), "lean": Axial(PHASES, TILT, PRESS, PIVOT)}
+SCENES: dict[str, dict[str, Any]] = {
+    "the paper's": {},
+    "linear": {"pattern": "linear"},
+    "traced": {"optics": "cylinder", "body": Body(air_gap=0.5)},
+    "elastic": {"contact": "elastic"},
+    "a pinhole": {"camera": Camera(np.dtype(np.uint16), distance=150.0, electrons=40.0)},
+    "floats": {"camera": Camera(np.dtype(np.float32), gain_deviation=0.1, seed=5)},
+}
+
+
+def make_twin(movement: Movement, shape: tuple[int, int] = SHAPE, **scene: Any) -> Twin:
+    return Twin(object="sphere", shape=shape, pixel_size=0.2, movement=movement, **scene)
+
+
+def read_all(twin: Twin) -> NDArray[Any]:
+    block = twin.read(np.empty(twin.shape, twin.dtype))
+    assert block is not None
+    return block.frames
+
+
+def look(twin: Twin, number: int, pose_at: Callable[[float], Pose]) -> NDArray[Any]:
+    out = np.empty(twin.shape[1:], twin.dtype)
+    twin.look(pose_at, number, out)
+    return out
+
+
+def lean_at(place: Position) -> Pose:
+    return pose_at_lean(place.travel, place.tilt, place.phase, PIVOT)
+
+
+# The twin, anywhere.
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", MOVEMENTS)
+def test_what_is_seen_at_a_place_is_the_frame_of_a_movement_there(name: str, scene: str) -> None:
+    movement = MOVEMENTS[name]
+    twin = make_twin(movement, **SCENES[scene])
+    frames = read_all(make_twin(movement, **SCENES[scene]))
+    assert frames.std() > 0
+    for number in (4, 0, 3, 3, 5, 1, 2):
+        pose = movement.pose(movement.path[number])
+        np.testing.assert_array_equal(look(twin, number, lambda late, pose=pose: pose), frames[number])
+
+
+@pytest.mark.parametrize("name", ["press", "lean"])
+def test_the_movement_of_the_twin_that_looks_does_not_matter(name: str) -> None:
+    other = make_twin(MOVEMENTS["lean" if name == "press" else "press"])
+    movement = MOVEMENTS[name]
+    for number, frame in enumerate(read_all(make_twin(movement))):
+        pose = movement.pose(movement.path[number])
+        np.testing.assert_array_equal(look(other, number, lambda late, pose=pose: pose), frame)
+
+
+@pytest.mark.parametrize("name", ["press", "lean"])
+def test_an_exposure_is_that_of_a_movement_at_the_same_speed(name: str) -> None:
+    camera = Camera(exposure=0.02, frame_rate=25.0, noise=0.0)
+    even = Vertical(0.1 + 0.12 * np.arange(7)) if name == "press" else Axial(0.4 * np.arange(7), TILT, PRESS)
+    twin = make_twin(even, camera=camera)
+    frames = read_all(make_twin(even, camera=camera))
+    for number in (2, 3, 4):
+        step = even.path[1] - even.path[0]
+
+        def pose_at(late: float, number: int = number, step: float = step) -> Pose:
+            return even.pose(np.asarray(even.path[number] + late * 25.0 * step))
+
+        seen = look(twin, number, pose_at)
+        # Where the body was is rounded differently: a count may fall on either side of a half.
+        assert np.abs(seen.astype(int) - frames[number]).max() <= 1
+        assert np.mean(seen != frames[number]) < 0.001
+        middle = pose_at(0.0)
+        still = look(twin, number, lambda late, middle=middle: middle)
+        assert np.mean(seen != still) > 0.01
+
+
+def test_a_position_is_the_lean_of_the_precession_there() -> None:
+    for phase in PHASES:
+        place = Position(PRESS, TILT * math.cos(phase), TILT * math.sin(phase))
+        expected = Axial([phase], TILT, PRESS, PIVOT).pose(np.asarray(phase))
+        found = lean_at(place)
+        np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-15)
+        np.testing.assert_allclose(found.shift, expected.shift, atol=1e-14)
+
+
+def test_a_body_that_does_not_lean_is_upright_at_any_phase() -> None:
+    assert pose_at_lean(0.7, 0.0, 1.3, PIVOT).upright
+    np.testing.assert_array_equal(pose_at_lean(0.7, 0.0, 1.3, PIVOT).shift, pose_at_press(0.7).shift)
+
+
+# As a camera.
+
+
+@contextmanager
+def running(
+    where: Callable[[float], Position], rate: float = 100.0, twin: Twin | None = None, **timing: Any
+) -> Iterator[TwinCamera]:
+    before = threading.active_count()
+    with TwinCamera(twin or make_twin(MOVEMENTS["press"]), where, rate=rate, **timing) as camera:
+        yield camera
+    assert threading.active_count() == before
+
+
+def still(at: float) -> Position:
+    return Position(travel=0.8)
+
+
+def take(camera: TwinCamera, count: int) -> list[Frames]:
+    taken: list[Frames] = []
+    while sum(len(frames.number) for frames in taken) < count:
+        taken.append(camera.take(count, PATIENCE))
+    return taken
+
+
+def drain(camera: TwinCamera, timeout: float = PATIENCE) -> Iterator[Frames]:
+    """Take until an error ends it."""
+    while True:
+        yield camera.take(8, timeout)
+
+
+def times_of(taken: list[Frames]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    return np.concatenate([f.number for f in taken]), np.concatenate([f.time for f in taken])
+
+
+def test_frames_come_at_the_rate_by_the_cameras_own_clock() -> None:
+    with running(still) as camera:
+        number, arrived = times_of(take(camera, 30))
+        assert (camera.shape, camera.dtype, camera.name) == (SHAPE, np.uint8, "twin: sphere")
+    np.testing.assert_allclose(np.diff(arrived), np.diff(number) / 100.0, atol=1e-9)
+
+
+def test_a_frame_shows_the_body_where_it_was_when_it_was_exposed() -> None:
+    began = time.monotonic()
+
+    def where(at: float) -> Position:
+        return Position(1.0, 0.05 * math.cos(at - began), 0.05 * math.sin(at - began))
+
+    twin = make_twin(MOVEMENTS["press"])
+    with running(where, 20.0, delay=0.03, pivot=PIVOT) as camera:
+        taken = take(camera, 4)
+    for frames in taken:
+        for pixels, number, arrived in zip(frames.pixels, frames.number, frames.time, strict=True):
+            pose = lean_at(where(float(arrived) - 0.03))
+            seen = look(twin, int(number), lambda late, pose=pose: pose)
+            assert np.mean(pixels != seen) < 0.001  # times are rounded
+
+
+def test_frames_arrive_late_by_delay_and_jitter_and_in_order() -> None:
+    exposed: list[float] = []
+
+    def where(at: float) -> Position:
+        exposed.append(at)
+        return still(at)
+
+    with running(where, 200.0, delay=0.03, jitter=0.004, seed=3) as camera:
+        number, arrived = times_of(take(camera, 150))
+        assert time.monotonic() > arrived[-1]
+    assert (np.diff(arrived) >= 0).all()
+    late = arrived - (exposed[0] + (number - number[0]) / 200.0)
+    assert abs(late.mean() - 0.03) < 0.002
+    assert 0.002 < late.std() < 0.005
+
+
+def test_no_frame_arrives_before_its_exposure_ends() -> None:
+    twin = make_twin(MOVEMENTS["press"], camera=Camera(exposure=0.02, frame_rate=40.0))
+    moments: list[float] = []
+
+    def where(at: float) -> Position:
+        moments.append(at)
+        return still(at)
+
+    with running(where, 40.0, twin) as camera:
+        arrived = take(camera, 1)[0].time[0]
+    assert arrived == pytest.approx(moments[1] + 0.01)
+
+
+def test_a_camera_that_cannot_keep_up_loses_frames_and_counts_them() -> None:
+    def where(at: float) -> Position:
+        time.sleep(0.02)
+        return still(at)
+
+    with running(where, 200.0) as camera:
+        taken = take(camera, 8)
+        counts = camera.counts
+    number, arrived = times_of(taken)
+    assert number[-1] > 2 * len(number)
+    assert sum(frames.dropped for frames in taken) == number[-1] + 1 - len(number) > 0
+    assert counts.dropped >= sum(frames.dropped for frames in taken)
+    np.testing.assert_allclose(np.diff(arrived), np.diff(number) / 200.0, atol=1e-9)
+
+
+def test_a_stalled_camera_says_nothing_and_comes_back() -> None:
+    with running(still, delay=0.02) as camera:
+        last = times_of(take(camera, 3))[0][-1]
+        camera.stall()
+        time.sleep(0.05)
+        latest = camera.latest
+        waiting = drain(camera, 0.1)
+        left: list[Frames] = []
+        with pytest.raises(HardwareError, match="no frame"):
+            left.extend(waiting)
+        assert camera.error is None
+        assert camera.latest == latest
+        camera.come_back()
+        again = camera.take(1, PATIENCE)
+        missed = int(again.number[0] - max([last, *(frames.number[-1] for frames in left)]) - 1)
+        assert again.dropped == missed >= 5
+
+
+def test_a_lost_camera_tells_readers() -> None:
+    with running(still) as camera:
+        take(camera, 2)
+        camera.lose()
+        assert camera.error is not None
+        with pytest.raises(HardwareError, match="lost"):
+            list(drain(camera))
+
+
+def test_a_closed_camera_tells_readers_and_closes_twice() -> None:
+    camera = TwinCamera(make_twin(MOVEMENTS["press"]), still, rate=50.0)
+    camera.close()
+    camera.close()
+    with pytest.raises(HardwareError, match="closed"):
+        list(drain(camera))
+
+
+def test_frames_that_wait_can_be_forgotten() -> None:
+    with running(still) as camera:
+        take(camera, 2)
+        time.sleep(0.05)
+        forgotten = camera.latest
+        camera.flush()
+        frames = camera.take(1, PATIENCE)
+        assert frames.time[0] >= forgotten
+        assert frames.dropped == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"rate": 0.0}, "rate"),
+        ({"rate": math.inf}, "rate"),
+        ({"rate": 60.0}, "rate 60.0 .* 0.02 s"),
+        ({"delay": -0.1}, "delay"),
+        ({"jitter": math.nan}, "jitter"),
+    ],
+)
+def test_what_cannot_be_is_refused(given: dict[str, float], message: str) -> None:
+    twin = make_twin(MOVEMENTS["press"], camera=Camera(exposure=0.02))
+    with pytest.raises(InputError, match=message):
+        TwinCamera(twin, still, **given)

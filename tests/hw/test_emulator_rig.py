@@ -1,0 +1,206 @@
+"""The emulated stage and the twin on it, as one: what is commanded is what is seen."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import threading
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.emulator.rig_file import write_rig
+from mirrorskin.hw.rig.file import load_rig
+from mirrorskin.hw.stage import Position
+from mirrorskin.hw.twin import Axial, Camera, Twin, Vertical
+from mirrorskin.io import InputError
+
+PATIENCE = 20.0  # seconds, for a busy machine
+SMALL: dict[str, Any] = {"shape": (31, 42), "pixel_size": 0.3, "rate": 100.0}
+
+
+@contextmanager
+def say(rig: EmulatedRig) -> Iterator[Any]:
+    """Open the port by hand; nothing of the project's own serial code is asked."""
+    line = os.open(rig.port.url, os.O_RDWR | os.O_NOCTTY)
+
+    def command(words: str) -> str:
+        os.write(line, f"{words}\n".encode())
+        heard = b""
+        until = time.monotonic() + PATIENCE
+        while b"ok" not in heard and b"error" not in heard:
+            assert time.monotonic() < until
+            if select.select([line], [], [], 0.1)[0]:
+                heard += os.read(line, 1000)
+        return heard.decode()
+
+    try:
+        yield command
+    finally:
+        os.close(line)
+
+
+def rest(rig: EmulatedRig) -> None:
+    until = time.monotonic() + PATIENCE
+    while rig.machine.moving() or rig.machine.state != "Idle":
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+def newest(rig: EmulatedRig) -> tuple[int, NDArray[Any]]:
+    """Return a frame that was exposed from now on."""
+    now = time.monotonic()
+    while True:
+        frames = rig.camera.take(1, PATIENCE)
+        if frames.time[0] - 0.011 > now:
+            return int(frames.number[0]), frames.pixels[0].copy()
+
+
+def direct(twin: Twin, number: int) -> NDArray[Any]:
+    twin.skip(number)
+    block = twin.read()
+    assert block is not None
+    return block.frames[0]
+
+
+def test_what_the_stage_does_is_what_the_camera_sees() -> None:
+    before = threading.active_count()
+    with EmulatedRig(**SMALL) as rig, say(rig) as command:
+        assert rig.where(time.monotonic()) == Position(-4.0, 0.0, 0.0)
+        _, lifted = newest(rig)
+        assert lifted.max() < 30
+        command("G21 G90 G1 Z-5.25 F900")  # 4 mm down are at the object
+        rest(rig)
+        number, pressed = newest(rig)
+        assert pressed.max() > 200
+        np.testing.assert_array_equal(pressed, direct(rig.twin(Vertical(np.full(number + 1, 1.25))), number))
+    assert threading.active_count() == before
+
+
+def test_pitch_and_roll_are_the_lean_of_a_precession() -> None:
+    pivot = (0.5, -0.2, 3.0)
+    with EmulatedRig(pattern="linear", pivot=pivot, **SMALL) as rig, say(rig) as command:
+        command("G21 G90 G1 X1.5 Y-2 Z-5 F2000")
+        rest(rig)
+        number, seen = newest(rig)
+        phase, tilt = math.atan2(-2.0, 1.5), math.radians(2.5)
+        place = rig.where(time.monotonic())
+        assert (place.travel, place.tilt, place.phase) == pytest.approx((1.0, tilt, phase))
+        there = Axial(np.full(number + 1, phase), tilt, 1.0, pivot)
+        assert np.mean(seen != direct(rig.twin(there), number)) < 0.001  # the angles are rounded
+
+
+def test_an_arc_goes_round_at_the_tilt() -> None:
+    with EmulatedRig(**SMALL) as rig, say(rig) as command:
+        command("G21 G90 G17 G1 X2 F2400")
+        command("G3 X-2 Y0 I-2 J0 F2400")
+        rest(rig)
+        end = time.monotonic()
+        places = [rig.where(float(at)) for at in np.linspace(end - 0.15, end, 30)]
+        assert places[-1].phase == pytest.approx(math.pi)
+        round_it = [place for place in places if place.phase > 0.1]
+        assert len(round_it) > 5
+        assert [place.tilt for place in round_it] == pytest.approx(
+            [math.radians(2.0)] * len(round_it), rel=2e-3
+        )
+
+
+def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then() -> None:
+    with EmulatedRig(home=True, **SMALL) as rig, say(rig) as command:
+        assert rig.machine.state == "Alarm"
+        assert rig.where(time.monotonic()) == Position(-4.0, 0.0, 0.0)
+        assert "error" in command("G1 X1 F100")
+        assert "ok" in command("$H")
+        assert "ok" in command("G21 G90 G53 G1 X-10 Y-10 Z-6 F2000")
+        rest(rig)
+        place = rig.where(time.monotonic())
+        assert (place.travel, place.tilt) == pytest.approx((1.0, 0.0), abs=1e-9)
+
+
+def test_all_places_that_the_settings_allow_lie_on_the_axes() -> None:
+    for home in (False, True):
+        with EmulatedRig(home=home, **SMALL) as rig:
+            stage = rig.settings.stage
+            lengths = {"X": 20.0, "Y": 20.0, "Z": 10.0}
+            assert stage.port == rig.port.url
+            for axis in stage.axes.values():
+                scale = math.degrees(1.0) if axis.unit == "deg" else 1.0
+                ends = [axis.zero + axis.direction * value * scale for value in (axis.low, axis.high)]
+                assert abs(ends[0] - ends[1]) < lengths[axis.letter]
+                if home:
+                    assert -lengths[axis.letter] < min(ends)
+                    assert max(ends) <= -0.5 + 1e-9  # where homing ends
+
+
+def test_references_and_scale_are_the_twins() -> None:
+    rig = EmulatedRig(pattern="linear", camera=Camera(np.dtype(np.uint16)), **SMALL)
+    header = rig.twin(Vertical([0.0])).header
+    dark, bright = rig.references()
+    np.testing.assert_array_equal(dark, header.dark)
+    np.testing.assert_array_equal(bright, header.bright)
+    with rig:
+        camera = rig.settings.camera
+    assert (camera.shape, camera.dtype, camera.rate) == (SMALL["shape"], np.uint16, 100.0)
+    assert (camera.pixel_size, camera.bright) == ((0.3, 0.3), 224.0 * 16)
+    assert (camera.zenith_gain, camera.zenith_offset) == pytest.approx(
+        (float(np.mean(header.zenith_gain)), float(np.mean(header.zenith_offset))), rel=1e-5
+    )
+
+
+def test_the_rig_file_says_what_the_settings_say(tmp_path: Path) -> None:
+    with EmulatedRig(pattern="linear", home=True, **SMALL) as rig:
+        folder = tmp_path / "a new one"
+        path = rig.write(folder, "tcp://127.0.0.1:1234")
+        found, said = load_rig(path), rig.settings
+        assert found.name == said.name
+        assert (
+            replace(found.stage, travel=said.stage.travel, pitch=said.stage.pitch, roll=said.stage.roll)
+            == said.stage
+        )
+        for name, axis in said.stage.axes.items():
+            read = found.stage.axes[name]
+            assert (read.letter, read.direction, read.zero, read.unit) == (
+                axis.letter,
+                axis.direction,
+                axis.zero,
+                axis.unit,
+            )
+            assert (read.low, read.high, read.speed) == pytest.approx((axis.low, axis.high, axis.speed))
+        assert found.camera.source == "tcp://127.0.0.1:1234"
+        assert found.camera.zenith_gain == pytest.approx(said.camera.zenith_gain)
+        assert replace(found.camera, source="", bright=None, zenith_gain=None) == replace(
+            said.camera, source="", bright=None, zenith_gain=None
+        )
+        assert isinstance(found.camera.bright, Path)
+        np.testing.assert_array_equal(np.load(found.camera.bright), rig.references()[1])
+
+
+def test_only_its_own_rig_file_is_replaced(tmp_path: Path) -> None:
+    with EmulatedRig(**SMALL) as rig:
+        path = rig.write(tmp_path, "tcp://127.0.0.1:1")
+        rig.write(tmp_path, "tcp://127.0.0.1:2")
+        assert tomllib.loads(path.read_text())["camera"]["source"].endswith(":2")
+        path.write_text("# mine\n")
+        with pytest.raises(InputError, match="someone else"):
+            rig.write(tmp_path, "tcp://127.0.0.1:3")
+        assert path.read_text() == "# mine\n"
+        (tmp_path / "file").write_text("")
+        with pytest.raises(InputError, match="cannot be written"):
+            write_rig(rig.settings, np.ones((31, 42), np.float32), tmp_path / "file" / "below")
+
+
+def test_a_rig_that_cannot_be_leaves_nothing_running() -> None:
+    before = threading.active_count()
+    with pytest.raises(InputError, match="delay"), EmulatedRig(delay=-1.0, **SMALL):
+        pass
+    assert threading.active_count() == before
