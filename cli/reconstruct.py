@@ -65,6 +65,10 @@ def command(
     pixel_size: options.PixelSize = None,
     region: options.Region = None,
     frames: options.Frames = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Only the frames that a live run used, where it thought the body was."),
+    ] = False,
     method: Annotated[
         MethodName | None,
         typer.Option(
@@ -130,7 +134,7 @@ def command(
     )
     gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(recording, dataset=dataset, memory_limit=limit, **known) as source:
+    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
         io.check_output(target, recording, phases, heights)

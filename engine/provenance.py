@@ -25,13 +25,12 @@ def sign(result: Result, source: Source, device: Device, process: dict[str, Proc
         x, y = _places(source, source.header.pixel_size)
     origin: dict[str, ProcessValue] = {"source": source.name}
     if isinstance(source, Recording):
-        first = source.first_frame
         origin |= {
             "dataset": source.dataset,
             "source_fingerprint": source.fingerprint(),
             "source_modified": source.modified,
             "source_region": source.region.text,
-            "source_frames": f"{first}:{first + source.shape[0]}",
+            "source_frames": source.which,
         }
     made: dict[str, ProcessValue] = {
         "program": "mirrorskin",

@@ -5,16 +5,18 @@ from mirrorskin.io.describe import describe
 from mirrorskin.io.frames import open_frames
 from mirrorskin.io.heights import open_heights
 from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
-from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
+from mirrorskin.io.recorder import Recorder
 from mirrorskin.io.recording import Recording, Steps, open_recording
 from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result, save_result
+from mirrorskin.io.streaming import StreamRecorder
 from mirrorskin.io.types import (
     FRAME_DTYPES,
     MOTIONS,
     Block,
     Header,
     InputError,
+    LiveSource,
     Motion,
     ProcessValue,
     Result,
@@ -22,6 +24,7 @@ from mirrorskin.io.types import (
     Truth,
     pixel_axes,
 )
+from mirrorskin.io.writing import COMPRESSIONS, Compression
 
 __all__ = [
     "COMPRESSIONS",
@@ -31,6 +34,7 @@ __all__ = [
     "Compression",
     "Header",
     "InputError",
+    "LiveSource",
     "Motion",
     "Positions",
     "ProcessValue",
@@ -40,6 +44,7 @@ __all__ = [
     "Result",
     "Source",
     "Steps",
+    "StreamRecorder",
     "Truth",
     "check_output",
     "check_phase",

@@ -39,7 +39,8 @@ def check_output(path: Path, *keep: Path | None) -> None:
     Raises
     ------
     InputError
-        Its folder does not exist or cannot be written to, it is a folder itself, or it is the input.
+        Its folder does not exist or cannot be written to, it is a folder itself, it is the input, or an HDF5
+        file that is being written.
     """
     with plainly(f"{path} cannot be written", "choose another place with -o"):
         if path.is_dir():
@@ -52,8 +53,20 @@ def check_output(path: Path, *keep: Path | None) -> None:
             inputs = [one for one in keep if one is not None and one.exists()]
             if any(path.samefile(one) or path.parent.samefile(one) for one in inputs):
                 raise InputError(f"{path} is the input, or part of it: name another output with -o")
+            if is_locked(path) and not _readable(path):
+                raise InputError(f"{path} is being written by another program: name another output with -o")
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+
+
+def is_locked(path: Path) -> bool:
+    """Tell whether a program has a file open and keeps others from writing, as all do that write HDF5."""
+    with suppress(OSError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # or the file system does not tell
+            return True
+    return False
 
 
 class NewHdf5:
@@ -161,6 +174,15 @@ def _make(part: Path) -> int:
         if os.fstat(descriptor).st_nlink:  # else someone took it for a leftover before it was locked
             return descriptor
         os.close(descriptor)
+
+
+def _readable(path: Path) -> bool:
+    """Tell whether HDF5 may read a file, which it may not while the file is being written."""
+    try:
+        h5py.File(path, "r").close()
+    except OSError:
+        return False
+    return True
 
 
 class _Disk(FileIO):

@@ -51,6 +51,10 @@ def _recording(recording: Recording) -> dict[str, str]:
         "frames": f"{count} of {columns} x {rows}, {recording.dtype}",
         "storage": recording.storage,
     }
+    if recording.used is not None and recording.dropped is not None:
+        facts["state"] = recording.state
+        facts["used"] = f"{np.count_nonzero(recording.used)} of {count} frames"
+        facts["dropped"] = f"{np.sum(recording.dropped)} frames"
     if header.pixel_size is not None:
         x, y = header.pixel_size
         facts["pixel size"] = f"{x:g} x {y:g} mm, field {x * columns:g} x {y * rows:g} mm"

@@ -49,12 +49,15 @@ def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
     return found
 
 
-def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State]) -> str:
+def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State], frames: int) -> str:
     """Return a SHA-256, in hexadecimal, of a file: its length, all but the frames, and some of the frames.
 
     Of the frames, joined in the order in which they are stored, the first 4 KiB of each 4 MiB are taken.
     Where they lie in other files, as those of virtual and external datasets do, those files follow, in the
     order in which the dataset names them.
+
+    Of a file that is being written, or was when its writer died, only so many frames count, in their order,
+    and the values of all other datasets.
 
     Parameters
     ----------
@@ -63,12 +66,17 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
         The frames.
     origins : mapping
         What ``origins`` returned when the file was opened.
+    frames : int
+        How many frames there were then.
 
     Raises
     ------
     InputError
         A file cannot be read, or is another than was opened.
     """
+    if file.root.swmr_mode:
+        with plainly(f"{file.path}: {dataset.name}"):
+            return _of_growing(file.root, dataset, frames)
     spans: dict[Path, list[Spans]] = {path: [] for path in origins}
     with plainly(f"{file.path}: {dataset.name}"):
         for path, span in _stored(file, dataset):
@@ -83,6 +91,31 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
             for start, stop in _chosen(_joined(parts), state.st_size):
                 for place in range(start, stop, _PIECE):
                     digest.update(os.pread(opened.fileno(), min(_PIECE, stop - place), place))
+    return digest.hexdigest()
+
+
+def _of_growing(file: h5py.File, dataset: h5py.Dataset, frames: int) -> str:
+    """Return a SHA-256 that stays the same however the file grows."""
+    digest = hashlib.sha256()
+
+    def add(_: str, node: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(node, h5py.Dataset) and node != dataset:
+            grows = node.ndim and node.maxshape[0] is None
+            value = np.asarray(node[:frames] if grows else node[()])
+            digest.update(str(node.name).encode())
+            digest.update(value.tobytes() if value.dtype.kind != "O" else str(value).encode())
+
+    file.visititems(add)
+    chunks: list[h5py.h5d.StoreInfo] = []
+    dataset.id.chunk_iter(chunks.append)
+    before = 0
+    for chunk in sorted(chunks, key=lambda one: one.chunk_offset):
+        if chunk.chunk_offset[0] < frames:
+            stop = chunk.byte_offset + chunk.size
+            for taken in range(chunk.byte_offset + -before % _EVERY, stop, _EVERY):
+                size = min(_TAKEN, stop - taken)
+                digest.update(os.pread(file.id.get_vfd_handle(), size, taken))
+            before += chunk.size
     return digest.hexdigest()
 
 

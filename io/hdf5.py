@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -10,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.plain import is_flagged, plainly
 from mirrorskin.io.storage import check_storage
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.units import factor
@@ -107,7 +108,14 @@ class Hdf5File(Closing):
             self.root.visititems(visit)
         return dict(sorted(found.items()))
 
-    def read(self, node: Node, *shapes: Shape, unit: str | None = None, remedy: str = "") -> NDArray[Any]:
+    def read(
+        self,
+        node: Node,
+        *shapes: Shape,
+        unit: str | None = None,
+        remedy: str = "",
+        rows: int | None = None,
+    ) -> NDArray[Any]:
         """Read numbers, once it is sure that they are there.
 
         Parameters
@@ -119,6 +127,8 @@ class Hdf5File(Closing):
             The unit to return; the attribute ``units`` is obeyed, and without one it is in this unit.
         remedy : str, optional
             The end of the message if it does not fit.
+        rows : int, optional
+            How many rows are wanted of a dataset that may have more by now.
 
         Raises
         ------
@@ -130,12 +140,14 @@ class Hdf5File(Closing):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
                 raise InputError(f"{self.where(node)} holds no numbers{remedy}")
             shape = node.id.shape
+            if rows is not None and shape:
+                shape = (min(shape[0], rows), *shape[1:])
         if shape not in shapes:
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
-        check_storage(self, node)
+        check_storage(self, node, frames=rows)
         with plainly(lambda: self.where(node)):
-            values = _values(node.id)
+            values = _values(node.id) if rows is None else node[:rows]
             stated = unit is not None and h5py.h5a.exists(node.id, b"units")
             given = str(_first(_attribute(node.id, b"units")) or unit) if stated else unit
         if given is None or unit is None or given == unit:
@@ -252,9 +264,13 @@ def _open_file(path: Path) -> h5py.File:
         raise InputError(f"{path} is no regular file: save what it gives in one first")
     try:
         return h5py.File(os.path.realpath(path), "r")
-    except OSError:
+    except OSError as error:
         with path.open("rb"):
             pass
+        if is_flagged(error):
+            # It may be read while it is written, or its writer died: a lock tells which, so none is taken.
+            with suppress(OSError):
+                return h5py.File(os.path.realpath(path), "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
             raise
         raise InputError(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any, TypeGuard, cast
 
+import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
+from mirrorskin.io.plain import plainly
 from mirrorskin.io.positions import check_phase, check_stroke
 from mirrorskin.io.stacks import Cut
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
@@ -25,6 +29,62 @@ SERIES = {
     "displacement": (f"{STAGE}/displacement", "mm"),
     "twist": (f"{STAGE}/twist", "rad"),
 }
+# Of recordings that are written while frames come: the positions as they were known then, whether a frame
+# was used, how many were lost before it, and whether all is well.
+LIVE = {"travel": (f"{STAGE}/travel_live", "mm"), "phase": (f"{STAGE}/phase_live", "rad")}
+USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
+UNDER_WAY, COMPLETE, CUT_SHORT = "under way", "complete", "cut short: "
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """How a recording was taken.
+
+    Attributes
+    ----------
+    count : int
+        Frames of which all is known. While a recording is written, frames and what is said of each grow
+        one after the other.
+    state : str
+        "under way", "complete", or "cut short: " and why; every stack of other programs is complete.
+    used : ndarray, (count,), bool, or None
+        Whether a live reconstruction used a frame.
+    dropped : ndarray, (count,), int, or None
+        How many frames were lost before a frame.
+    """
+
+    count: int
+    state: str = COMPLETE
+    used: NDArray[np.bool_] | None = None
+    dropped: NDArray[np.int32] | None = None
+
+    def of(self, frames: slice | NDArray[np.intp]) -> Taken:
+        """Return what is told of some frames."""
+        used = None if self.used is None else self.used[frames]
+        return replace(self, used=used, dropped=None if self.dropped is None else self.dropped[frames])
+
+
+def how_taken(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> Taken:
+    """Read how far a recording has come, and what is told of it as a whole."""
+    node = file.find(STATE) if ours else None
+    if node is None:
+        return Taken(int(stack.shape[0]))
+    state = str(file.value(node))
+    if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
+        state = f"{CUT_SHORT}its writer was killed"
+    places = [place for place, _ in (*SERIES.values(), *LIVE.values())]
+    with plainly(str(file.path)):
+        found = {place: file.find(place) for place in (*places, USED, DROPPED)}
+        grown = {place: node for place, node in found.items() if _grows(node)}
+        count = min(int(node.shape[0]) for node in (stack, *grown.values()))
+    used, dropped = (
+        file.read(grown[place], (count,), rows=count) if place in grown else None for place in (USED, DROPPED)
+    )
+    return Taken(count, state, None if used is None else used != 0, dropped)
+
+
+def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
+    return isinstance(node, h5py.Dataset) and node.ndim > 0 and node.maxshape[0] is None
 
 
 class Layout:
@@ -73,33 +133,53 @@ class Layout:
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
         )
 
-    def time(self) -> Floats | None:
-        """Read the seconds of each frame, if they are known."""
-        return self._cut_series("time", (self._count,))
+    def positions(
+        self, motion: Motion, travel: ArrayLike | None, phase: ArrayLike | None
+    ) -> dict[str, Floats | None]:
+        """Read where the body was in each frame, and when, if it is not given; check it.
 
-    def travel(self, given: ArrayLike | None) -> Floats:
-        """Read the travel of each frame of a vertical motion, mm, if it is not given; check it."""
+        Returns
+        -------
+        dict
+            "time", s, if it is known, and what the motion has: "travel", mm, "phase", radians,
+            "displacement", mm, or "twist", radians.
+        """
+        found = {"time": self._cut_series("time", (self._count,))}
+        if motion == "vertical":
+            found["travel"] = self._travel(travel)
+        elif motion == "axial":
+            found["phase"] = self._phase(phase)
+        elif motion == "horizontal":
+            found["displacement"] = self._cut_series("displacement", (self._count, 2))
+        else:
+            found["twist"] = self._cut_series("twist", (self._count,))
+        return found
+
+    def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
+        """Read when some frames of the cut were taken, and where a live run thought the body to be then."""
+        name = {"vertical": "travel", "axial": "phase"}.get(motion, "")
+        place, unit = LIVE.get(name, ("", ""))
+        values = self._grown(place, (self._count,), unit) if name else None
+        if values is None:
+            raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
+        time = self._cut_series("time", (self._count,))
+        check = check_stroke if name == "travel" else check_phase
+        rows = values[slice(*self._cut.frames)][chosen]
+        where = f"{self._file.path}: {place} of the frames that were used"
+        return {name: check(rows, len(chosen), where), "time": None if time is None else time[chosen]}
+
+    def _travel(self, given: ArrayLike | None) -> Floats:
         if given is not None:
             return check_stroke(given, self._count, f"{self._file.path}: the travel given", self._cut.frames)
         values = self._positions("travel", "give --travel-step")
-        return check_stroke(
-            values, self._count, f"{self._file.path}: {SERIES['travel'][0]}", self._cut.frames
-        )
+        where = f"{self._file.path}: {SERIES['travel'][0]}"
+        return check_stroke(values, self._count, where, self._cut.frames)
 
-    def phase(self, given: ArrayLike | None) -> Floats:
-        """Read the phase of each frame of an axial rotation, radians, if it is not given; check it."""
+    def _phase(self, given: ArrayLike | None) -> Floats:
         if given is not None:
             return check_phase(given, self._count, f"{self._file.path}: the phase given", self._cut.frames)
         values = self._positions("phase", "give --phase-step or --phases")
         return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}", self._cut.frames)
-
-    def displacement(self) -> Floats | None:
-        """Read where the body was along x and y in each frame of a horizontal motion, mm, if it is known."""
-        return self._cut_series("displacement", (self._count, 2))
-
-    def twist(self) -> Floats | None:
-        """Read how far the body was turned in each frame of a twist, radians, if it is known."""
-        return self._cut_series("twist", (self._count,))
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
@@ -128,7 +208,12 @@ class Layout:
 
     def _series(self, name: str, shape: Shape, remedy: str = "") -> Floats | None:
         where, unit = SERIES[name]
-        return self._read(where, shape, unit=unit, remedy=remedy)
+        return self._grown(where, shape, unit, remedy)
+
+    def _grown(self, name: str, shape: Shape, unit: str, remedy: str = "") -> Floats | None:
+        """Read what there is one of a frame; while a recording is written, there may be more already."""
+        rows = shape[0] if self._find(STATE) is not None else None
+        return self._read(name, shape, unit=unit, remedy=remedy, rows=rows)
 
     def _positions(self, name: str, remedy: str) -> Floats:
         values = self._series(name, (self._count,), remedy)
@@ -182,16 +267,18 @@ class Layout:
             raise InputError(f"{self._file.path}: {name} is {values}, which is not finite: {remedy}")
         return values
 
-    def _read(self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "") -> Floats | None:
-        values = self._numbers(name, *shapes, unit=unit, remedy=remedy)
+    def _read(
+        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "", rows: int | None = None
+    ) -> Floats | None:
+        values = self._numbers(name, *shapes, unit=unit, remedy=remedy, rows=rows)
         return None if values is None else values.astype(np.float64, copy=False)
 
     def _numbers(
-        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = ""
+        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "", rows: int | None = None
     ) -> NDArray[Any] | None:
         """Read numbers of whatever type, if they are there."""
         node = self._find(name)
-        return None if node is None else self._file.read(node, *shapes, unit=unit, remedy=remedy)
+        return None if node is None else self._file.read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
 
     def _text(self, name: str) -> str:
         node = self._find(name)

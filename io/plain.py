@@ -45,7 +45,7 @@ def reason(error: Exception) -> str:
     """Return what went wrong: a few words instead of HDF5's many."""
     number = getattr(error, "errno", None)
     text = str(error.args[-1]) if error.args else type(error).__name__
-    if number == errno.EAGAIN or "already open for write" in text:
+    if number == errno.EAGAIN or is_flagged(error):
         return "another program is writing it: wait until it is done ('h5clear -s' if it died)"
     if number:
         return os.strerror(number)
@@ -53,6 +53,11 @@ def reason(error: Exception) -> str:
         return "it is truncated: copy it again"
     inner = text.partition("(")[2].removesuffix(")") or text
     return f"it is damaged ({' '.join(inner.split())[:_LONGEST]}): copy it again"
+
+
+def is_flagged(error: Exception) -> bool:
+    """Tell whether HDF5 refused a file because a writer left its mark in it, or this process writes it."""
+    return any(said in str(error) for said in ("already open for write", "locking flag values don't match"))
 
 
 def legible(text: str) -> str:

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.layout import MARK, STACK, Layout
+from mirrorskin.io.layout import MARK, STACK, Layout, Taken, how_taken
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.region import Region
 from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.stacks import Cut, Stack, open_stack
+from mirrorskin.io.stacks import Cut, Picked, Stack, open_stack
 from mirrorskin.io.storage import check_storage, describe_storage
 from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
 
@@ -61,6 +61,12 @@ class Recording(Closing):
         Number of the first frame in the whole stack.
     full_shape : (int, int, int)
         Frames, rows and columns of the whole stack.
+    state : str
+        "under way", "complete", or "cut short: " and why.
+    used, dropped : ndarray, (T,), bool and int, or None
+        Whether a live run used a frame, and how many were lost before it.
+    which : str
+        Which frames of the whole stack these are, for people.
     storage : str
         How the frames are stored, for people.
     """
@@ -76,6 +82,8 @@ class Recording(Closing):
         header: Header,
         positions: Mapping[str, Floats | None],
         truth: Truth | None,
+        taken: Taken,
+        live: bool = False,
     ) -> None:
         self.path = file.path
         self.name = str(file.path)
@@ -84,9 +92,11 @@ class Recording(Closing):
         self.motion = header.motion
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.full_shape = _shape(dataset)
+        self.full_shape = (taken.count, *_shape(dataset)[1:])
+        self.state, self.used, self.dropped = taken.state, taken.used, taken.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
+        self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
         self.truth = truth
         self.storage = describe_storage(dataset)
         self._file = file
@@ -143,7 +153,7 @@ class Recording(Closing):
         InputError
             The file was changed, or another took its name, after it was opened.
         """
-        return fingerprint(self._file, self._dataset, self._origins)
+        return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
 
     @property
     def how(self) -> str:
@@ -174,6 +184,7 @@ def open_recording(
     frames: tuple[int, int | None] | None = None,
     threads: int | None = None,
     memory_limit: int | None = None,
+    live: bool = False,
 ) -> Recording:
     """Open a stack of frames in HDF5.
 
@@ -195,11 +206,13 @@ def open_recording(
         How many unpack chunks; by default as many as there are cores.
     memory_limit : int, optional
         Bytes that chunks of frames may take when they are unpacked.
+    live : bool, optional
+        Only the frames that a live run used, where it thought the body to be then.
 
     Returns
     -------
     Recording
-        Close it, or use it in a ``with``.
+        Close it, or use it in a ``with``. Of a file that is being written, the frames that are there now.
 
     Raises
     ------
@@ -209,21 +222,21 @@ def open_recording(
     with ExitStack() as opening:
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
-        stack = _find_stack(file, dataset, ours)
-        shape = _shape(stack)
+        stack, taken = _find_stack(file, dataset, ours)
+        shape = (taken.count, *_shape(stack)[1:])
         cut = _cut(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size)
-        positions = {
-            "time": layout.time(),
-            "travel": layout.travel(_along(travel, shape[0])) if header.motion == "vertical" else None,
-            "phase": layout.phase(_along(phase, shape[0])) if header.motion == "axial" else None,
-            "displacement": layout.displacement() if header.motion == "horizontal" else None,
-            "twist": layout.twist() if header.motion == "twist" else None,
-        }
-        truth = layout.truth()
-        fetched = open_stack(stack, str(path), cut, memory_limit, threads)
-        recording = Recording(file, stack, fetched, cut, header, positions, truth)
+        told, truth = taken.of(slice(*cut.frames)), layout.truth()
+        if live:
+            chosen = _used(str(path), told, travel, phase)
+            told, positions = told.of(chosen), layout.live(header.motion, chosen)
+        else:
+            positions = layout.positions(header.motion, _along(travel, shape[0]), _along(phase, shape[0]))
+        fetched = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
+        if live:
+            fetched = Picked(fetched, chosen)
+        recording = Recording(file, stack, fetched, cut, header, positions, truth, told, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
 
@@ -253,8 +266,24 @@ def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
     return given.positions(count) if isinstance(given, Positions) else given
 
 
-def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> h5py.Dataset:
-    """Find the stack that is meant, and refuse what is none or cannot be read."""
+def _used(
+    path: str, taken: Taken, travel: ArrayLike | Positions | None, phase: ArrayLike | Positions | None
+) -> NDArray[np.intp]:
+    """Return the numbers of the frames that a live run used."""
+    if travel is not None or phase is not None:
+        raise InputError(f"{path}: a live run has its own positions: leave --live out, or those given")
+    if taken.used is None:
+        raise InputError(f"{path} does not say which frames a live run used: leave --live out")
+    used = np.flatnonzero(taken.used)
+    if len(used) < 2:
+        raise InputError(
+            f"{path}: a live run used {len(used)} frames: at least 2 are needed; leave --live out"
+        )
+    return used
+
+
+def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.Dataset, Taken]:
+    """Find the stack that is meant, and how far it has come; refuse what is none or cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
     stack = file.follow(dataset, "name the stack with --dataset")
@@ -269,10 +298,11 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> h5py.Dataset
         raise InputError(f"{where} is of type {dtype}: frames are uint8, uint16 or float32; convert it first")
     if 0 in shape[1:]:
         raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it anew")
-    if shape[0] < 2:
-        raise InputError(f"{where} holds {shape[0]} frames: at least 2 are needed; record more")
-    check_storage(file, stack)
-    return stack
+    taken = how_taken(file, ours and dataset == STACK, stack)
+    if taken.count < 2:
+        raise InputError(f"{where} holds {taken.count} frames: at least 2 are needed; record more")
+    check_storage(file, stack, frames=taken.count)
+    return stack, taken
 
 
 def _only_stack(file: Hdf5File) -> str:

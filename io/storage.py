@@ -20,7 +20,7 @@ _VIRTUAL_DEEP = 4
 PLUGIN_FILTERS = hdf5plugin.FILTERS
 
 
-def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0) -> None:
+def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
     """Refuse a dataset that HDF5 could not deliver, or would make up with fill values.
 
     Parameters
@@ -30,6 +30,8 @@ def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0) -> None
     dataset : h5py.Dataset
     depth : int, optional
         How many virtual datasets led here.
+    frames : int, optional
+        How many there must be, along the first axis, where more are yet to be written.
 
     Raises
     ------
@@ -41,6 +43,8 @@ def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0) -> None
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
     with plainly(lambda: file.where(dataset)):
         shape, offset = dataset.id.shape, dataset.id.get_offset()
+        if frames is not None:
+            shape = (frames, *shape[1:])
         claimed, unit = math.prod(shape) * dataset.id.dtype.itemsize, "bytes"
         if offset is not None:
             held = h5py.h5i.get_file_id(dataset.id).get_filesize() - offset

@@ -159,6 +159,29 @@ class Source(Protocol):
     ) -> None: ...
 
 
+class LiveSource(Source, Protocol):
+    """A source whose frames come while something happens: the first of ``shape`` is how many are expected.
+
+    The positions in its blocks are those that were known when the frames came. A block's ``dropped`` counts
+    the frames that were lost between the block before and this one.
+    """
+
+    def now(self) -> float:
+        """Return the time, in seconds on the scale of ``Block.time``."""
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return the positions of all frames read so far, as well as they are known by now.
+
+        It can be asked after the source was left, too; NaN stands where nothing better is known than what
+        the blocks said.
+
+        Returns
+        -------
+        mapping
+            ``travel``, mm, or ``phase``, radians; one value a frame.
+        """
+
+
 @dataclass(frozen=True, slots=True)
 class Truth:
     """What a simulation knows of its object, in the mean pose: pressed, upright, neither moved nor twisted.

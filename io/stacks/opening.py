@@ -26,6 +26,7 @@ def open_stack(
     cut: Cut,
     memory_limit: int | None = None,
     threads: int | None = None,
+    frames: int | None = None,
 ) -> Stack:
     """Open the frames of a dataset.
 
@@ -41,6 +42,8 @@ def open_stack(
         Bytes that unpacked frames may take which are kept for later reads.
     threads : int, optional
         How many unpack chunks; as many as there are cores by default.
+    frames : int, optional
+        How many of its frames there are, if it is yet to be finished.
 
     Raises
     ------
@@ -55,14 +58,16 @@ def open_stack(
             why = "in its header"
         if why:
             return Ordered(Through(dataset, place, why), place, cut, limit)
+        shape = (frames or dataset.shape[0], *dataset.shape[1:])
         file = _open_again(dataset.file)
         try:
-            if offset is not None:
-                return Mapped(file, place, offset, dataset.shape, dataset.dtype, cut)
-            chunks = _open_chunks(dataset, file, place, _threads(dataset, threads, limit))
-            if isinstance(chunks, Packed):
-                file = -1
-            return Ordered(chunks, place, cut, limit)
+            if offset is None:
+                chunks = _open_chunks(dataset, shape, file, place, _threads(dataset, threads, limit))
+                if not isinstance(chunks, int):
+                    file = -1 if isinstance(chunks, Packed) else file
+                    return Ordered(chunks, place, cut, limit)
+                offset = chunks
+            return Mapped(file, place, offset, shape, dataset.dtype, cut)
         finally:
             if file >= 0:
                 os.close(file)
@@ -95,13 +100,19 @@ def _only_hdf5(dataset: h5py.Dataset) -> str:
     return ""
 
 
-def _open_chunks(dataset: h5py.Dataset, file: int, place: Place, threads: int) -> Chunks:
+def _open_chunks(
+    dataset: h5py.Dataset, shape: tuple[int, int, int], file: int, place: Place, threads: int
+) -> Chunks | int:
+    """Return what fetches chunks; of raw frames that lie in one piece, where that begins."""
     codecs = find_codecs(dataset)
     if isinstance(codecs, str):
         return Through(dataset, place, codecs)
-    index = chunk_index(dataset, os.fstat(file).st_size)
+    index = chunk_index(dataset, shape, os.fstat(file).st_size)
     if isinstance(index, str):
         return Through(dataset, place, index)
     if not codecs:
         index = index.frame_by_frame(dataset.dtype.itemsize)
-    return Packed(file, place, dataset.shape, dataset.dtype, index, codecs, threads)
+        start = index.piece(shape)
+        if start is not None:
+            return start
+    return Packed(file, place, shape, dataset.dtype, index, codecs, threads)

@@ -55,8 +55,14 @@ def compressible(shape, dtype, seed=0):
 
 
 def write(path, frames, chunks=None, packing=None):
+    """Write a stack; raw chunks from the last to the first, so that they do not lie in one piece."""
     with h5py.File(path, "w") as file:
-        file.create_dataset("x", data=frames, chunks=chunks, **(packing or {}))
+        if chunks is None or packing:
+            file.create_dataset("x", data=frames, chunks=chunks, **(packing or {}))
+        else:
+            stack = file.create_dataset("x", frames.shape, frames.dtype, chunks=chunks, rdcc_nbytes=0)
+            for start in reversed(range(0, len(frames), chunks[0])):
+                stack[start : start + chunks[0]] = frames[start : start + chunks[0]]
     return path
 
 

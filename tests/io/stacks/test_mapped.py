@@ -145,3 +145,17 @@ def test_pages_that_were_used_do_not_pile_up(tmp_path):
     total, more = map(int, done.stdout.split())
     assert total == 304 * 256 * 1024
     assert more < 4 * frames[:16].nbytes
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
+def test_raw_chunks_that_lie_in_one_piece_are_mapped(tmp_path, dtype):
+    frames = compressible(SHAPE, dtype)
+    for length in (1, 2, 9):
+        with h5py.File(tmp_path / "a.h5", "w", libver="latest", meta_block_size=1 << 16) as file:
+            stack = file.create_dataset("x", SHAPE, dtype, chunks=(length, *SHAPE[1:]), rdcc_nbytes=0)
+            for start in range(0, len(frames), length):
+                stack[start : start + length] = frames[start : start + length]
+        for region, given in ((None, {}), (Region((3, 40), (5, 60)), {"frames": (2, 8)})):
+            found, how = ours(tmp_path / "a.h5", 4, region=region, **given)
+            np.testing.assert_array_equal(found, theirs(tmp_path / "a.h5", region=region, **given))
+            assert how == "mapped"

@@ -41,10 +41,12 @@ def test_chunks_of_any_shape_give_what_hdf5_gives(tmp_path, monkeypatch, chunks,
     counts = count_unpacked(monkeypatch)
     for room, region in itertools.product((1, 5, 40), (None, REGION)):
         counts.clear()
-        frames, _ = ours(path, room, region=region)
+        frames, how = ours(path, room, region=region)
         np.testing.assert_array_equal(frames, theirs(path, region=region))
-        assert counts
-        assert set(counts.values()) == {1}
+        if (packing, chunks) == ("raw", "everything"):
+            assert how == "mapped"
+        else:
+            assert set(counts.values()) == {1}
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])

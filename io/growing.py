@@ -1,0 +1,208 @@
+"""A recording in HDF5 that others can read while it grows."""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.columns import Column, Marks
+from mirrorskin.io.layout import DROPPED, LIVE, SERIES, STATE, UNDER_WAY, USED
+from mirrorskin.io.reserve import Reserve
+from mirrorskin.io.types import Block, Closing, Floats, Header
+from mirrorskin.io.writing import POSITIONS, Compression, new_stack, packing, write_header, write_plot
+
+# Files for HDF5 1.10 and later, the first that could read what is being written.
+_VERSIONS = ("v110", "v110")
+_STATE_LENGTH = 240  # bytes; their place is made before the first frame
+_PAGE, _STEP, _SPARE, _MOST_META = 4 << 10, 64 << 20, 2 << 20, 4 << 20
+
+
+class GrowingRecording(Closing):
+    """A recording to which frames are appended; from ``publish`` on others can watch.
+
+    Raw frames follow each other without a gap as long as there are no more of them than expected.
+
+    Parameters
+    ----------
+    path : Path
+        What to call it in messages.
+    descriptor : int
+        Of an empty file that is locked; it may be closed afterwards, and stays locked.
+    header : Header
+    shape : (int, int, int)
+        Frames that are expected, rows and columns.
+    dtype : dtype
+    compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
+
+    Attributes
+    ----------
+    count : int
+        Frames so far.
+
+    Raises
+    ------
+    InputError
+        The disk is full.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        descriptor: int,
+        header: Header,
+        shape: tuple[int, int, int],
+        dtype: np.dtype[Any],
+        compression: Compression,
+    ) -> None:
+        self.count = 0
+        self._raw = compression == "raw"
+        self._frame = math.prod(shape[1:]) * dtype.itemsize
+        # Indices of chunks and the like lie in one piece before the frames, not among them.
+        meta = min((1 << 16) + 24 * shape[0], _MOST_META)
+        self._spare = _SPARE + 2 * meta
+        with ExitStack() as opening:
+            self._descriptor = os.dup(descriptor)
+            opening.callback(os.close, self._descriptor)
+            self._reserve = Reserve(path, self._descriptor, min(_STEP, shape[0] * self._frame))
+            room = self._spare + 32 * math.prod(shape[1:])  # for the maps of the header, too
+            self._reserve.hold(room)
+            self._file = opening.enter_context(_new_hdf5(self._descriptor, meta, self._frame))
+            self._reserve.hold(room)  # once more: HDF5 has emptied the file
+            write_header(self._file, header)
+            self._make(shape, dtype, compression, POSITIONS[header.motion])
+            write_plot(self._file, header.motion, {"time", POSITIONS[header.motion]})
+            self._file.flush()  # all but the frames has its place now
+            self._exit = opening.pop_all()
+
+    def append(self, block: Block) -> None:
+        """Write frames, and keep what is known of each until the next ``flush``.
+
+        Raises
+        ------
+        InputError
+            The disk is full; the frames before are sound.
+        """
+        frames, n = block.frames, len(block.frames)
+        self._hold(n * (self._frame + self._frame // 8 + _PAGE))
+        self._frames.resize(self.count + n, axis=0)
+        for number, frame in enumerate(frames, self.count):
+            if self._raw:
+                self._frames.id.write_direct_chunk((number, 0, 0), np.ascontiguousarray(frame))
+            else:
+                self._frames[number] = frame
+        for name, columns in self._series.items():
+            for column in columns:
+                column.append(getattr(block, name), n)
+        self._dropped.append(np.array([block.dropped, *[0] * (n - 1)], np.int32), n)
+        self.count += n
+
+    def mark(self, index: int, used: NDArray[np.bool_]) -> None:
+        """Say whether frames, from number ``index`` on, were used; unless marked, they were."""
+        self._marks.mark(index, used)
+
+    def flush(self) -> None:
+        """Hand everything to the system, so that it can be read and outlives this process.
+
+        Raises
+        ------
+        InputError
+            The disk is full; nothing was lost.
+        """
+        self._hold(0)
+        self._flush()
+
+    def publish(self) -> None:
+        """Let others read from now on; they can still not write."""
+        self.flush()
+        self._file.swmr_mode = True
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(self._descriptor, fcntl.LOCK_SH)
+
+    def finish(self, positions: Mapping[str, Floats], state: str) -> None:
+        """Write what is known only now.
+
+        Parameters
+        ----------
+        positions : mapping
+            By name, better ones than those that came with the frames; these stay beside them.
+        state : str
+            What becomes of ``/entry/state``.
+        """
+        if self._frames.shape[0] > self.count:  # it failed to write some
+            self._frames.resize(self.count, axis=0)
+        self._flush()
+        for name, values in positions.items():
+            if name in self._series:
+                self._series[name][0].correct(np.asarray(values, np.float64))
+        self._tell(state)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Let go of the file, and give back the room that was not needed."""
+        if self._file:
+            os.ftruncate(self._descriptor, self._file.id.get_filesize())
+        self._exit.close()
+
+    def _make(
+        self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, position: str
+    ) -> None:
+        """Make what grows: afterwards nothing new can be made."""
+        file, (expected, rows, columns) = self._file, shape
+        chunks, most = (1, rows, columns), (None, rows, columns)
+        storage = {"chunks": chunks, "maxshape": most, **packing(compression)}
+        # Without a cache, a chunk is packed when it is written.
+        self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
+        self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
+        self._tell(UNDER_WAY)
+        width = (2,) if position == "displacement" else ()
+        series = {"time": [SERIES["time"]], position: [SERIES[position]]}
+        if position in LIVE:
+            series[position].append(LIVE[position])
+        self._series = {
+            name: [
+                Column(file, place, unit, np.float64, expected, () if name == "time" else width)
+                for place, unit in places
+            ]
+            for name, places in series.items()
+        }
+        self._dropped = Column(file, DROPPED, None, np.int32, expected)
+        self._marks = Marks(Column(file, USED, None, np.uint8, expected))
+
+    def _flush(self) -> None:
+        """Do so; the room that was reserved last is enough for it."""
+        self._frames.flush()  # the frames are there before anything says so
+        for columns in self._series.values():
+            for column in columns:
+                column.flush()
+        self._dropped.flush()
+        self._marks.flush(self.count)
+        self._file.flush()
+
+    def _tell(self, state: str) -> None:
+        self._state[()] = state.encode()[:_STATE_LENGTH].decode(errors="ignore")
+
+    def _hold(self, size: int) -> None:
+        """See that the disk takes so many bytes of frames, and what belongs to them."""
+        self._reserve.hold(self._file.id.get_filesize() + size + self._spare)
+
+
+def _new_hdf5(descriptor: int, meta: int, frame: int) -> h5py.File:
+    """Make an HDF5 file of an open one: blocks of so many bytes for indices, and frames of so many."""
+    return h5py.File(
+        f"/proc/self/fd/{descriptor}",
+        "w",
+        libver=_VERSIONS,
+        locking=False,  # HDF5 lets go of its lock when others may read; ours stays
+        meta_block_size=meta,
+        alignment_threshold=frame,
+        alignment_interval=math.gcd(frame, _PAGE),
+    )

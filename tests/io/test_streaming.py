@@ -1,0 +1,454 @@
+"""Recordings that are written while frames come: what is in them, and what is left when something fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from growing import SHAPE, Feed, frames_of, stream
+from stacks import plot_of, read_all
+
+from mirrorskin import io
+from mirrorskin.io import growing, streaming
+from mirrorskin.io.reserve import Reserve
+
+DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
+SUPPORT = Path(__file__).parents[1] / "support"
+
+
+def held(path):
+    """Read all that grows in a file, by h5py alone."""
+    with h5py.File(path) as file:
+        series = {
+            name: node[()]
+            for group in (file[DETECTOR], file[STAGE])
+            for name, node in group.items()
+            if node.maxshape and node.maxshape[0] is None
+        }
+        return series | {"state": file["/entry/state"].asstr()[()]}
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
+@pytest.mark.parametrize("packing", io.COMPRESSIONS)
+def test_what_comes_is_what_is_in_the_file(tmp_path, packing, dtype):
+    blocks = stream(Feed(20, (1, 4, 3), dtype=dtype), tmp_path / "a.h5", packing)
+    numbers = np.arange(20)
+    found = held(tmp_path / "a.h5")
+    np.testing.assert_array_equal(found["data"], frames_of(numbers, dtype=dtype))
+    np.testing.assert_array_equal(found["frame_time"], numbers)
+    np.testing.assert_array_equal(found["travel_live"], 0.01 * numbers)
+    np.testing.assert_array_equal(found["travel"], 0.01 * numbers + 0.001)
+    np.testing.assert_array_equal(found["used"], 1)
+    lost = np.zeros(20)
+    lost[[block.index for block in blocks]] = [block.index % 3 for block in blocks]
+    np.testing.assert_array_equal(found["dropped"], lost)
+    assert found["state"] == "complete"
+    assert found["data"].dtype == np.dtype(dtype)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (13, 1), (64, 64)])
+@pytest.mark.parametrize("cuts", [(20,), (2, 5)])
+def test_frames_of_any_size_in_blocks_of_any_cut_read_back(tmp_path, shape, cuts):
+    stream(Feed(20, cuts, shape=shape, dtype="u2"), tmp_path / "a.h5")
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        found = read_all(recording, 6)
+        assert recording.how == "mapped"
+        assert (recording.state, recording.full_shape) == ("complete", (20, *shape))
+    np.testing.assert_array_equal(found.frames, frames_of(np.arange(20), shape, "u2"))
+    np.testing.assert_array_equal(found.travel, 0.01 * np.arange(20) + 0.001)
+
+
+@pytest.mark.parametrize("announced", [3, 400])
+def test_more_frames_or_fewer_may_come_than_were_expected(tmp_path, announced):
+    stream(Feed(150, (4,), announced=announced), tmp_path / "a.h5")
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        np.testing.assert_array_equal(read_all(recording, 40).frames, frames_of(np.arange(150)))
+
+
+def test_raw_frames_lie_in_one_piece_behind_little_else(tmp_path):
+    stream(Feed(3000, (7,), shape=(16, 32)), tmp_path / "a.h5", period=0.001)
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        assert recording.how == "mapped"
+    assert (tmp_path / "a.h5").stat().st_size < 3000 * 16 * 32 + (1 << 18)
+
+
+@pytest.mark.parametrize("motion", io.MOTIONS)
+def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
+    stream(Feed(8, motion=motion), tmp_path / "a.h5")
+    _, signal, axes = plot_of(tmp_path / "a.h5")
+    np.testing.assert_array_equal(signal, frames_of(np.arange(8)))
+    name = {"vertical": "travel", "axial": "phase", "horizontal": "frame_time", "twist": "twist"}[motion]
+    assert axes == [name, ".", "."]
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        found = read_all(recording, 3)
+        assert recording.header.press == (None if motion == "vertical" else 1.0)
+    for series, values in Feed(motion=motion).positions_of(np.arange(8), 0.001).items():
+        np.testing.assert_array_equal(getattr(found, series), values)
+    live = {"vertical": {"travel_live"}, "axial": {"phase_live"}}.get(motion, set())
+    assert {series for series in held(tmp_path / "a.h5") if series.endswith("_live")} == live
+
+
+def test_blocks_go_by_as_they_came_and_the_recorder_is_a_live_source(tmp_path):
+    source = Feed(6, (4,))
+    with io.StreamRecorder(source, tmp_path / "a.h5") as recorder:
+        assert (recorder.name, recorder.motion, recorder.shape) == ("feed", "vertical", (6, *SHAPE))
+        assert recorder.header is source.header
+        assert recorder.dtype == np.uint8
+        block = recorder.read()
+        assert block.lent
+        assert (recorder.count, recorder.now()) == (4, 4.0)
+        np.testing.assert_array_equal(recorder.positions()["travel"], source.positions()["travel"])
+        with pytest.raises(RuntimeError, match="cannot be rewound"):
+            recorder.rewind()
+
+
+def test_frames_that_are_not_lent_are_copied(tmp_path):
+    stream(Feed(40, (3,), lent=False), tmp_path / "a.h5", period=60)
+    np.testing.assert_array_equal(held(tmp_path / "a.h5")["data"], frames_of(np.arange(40)))
+
+
+def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
+    with io.StreamRecorder(Feed(10), tmp_path / "a.h5", period=60) as recorder:
+        lent = [weakref.ref(recorder.read().frames) for _ in range(2)]
+        until = time.monotonic() + 30
+        while any(frames() is not None for frames in lent):
+            assert time.monotonic() < until
+            time.sleep(0.001)
+
+
+def test_marks_reach_frames_that_are_written_and_frames_that_are_yet_to_come(tmp_path):
+    with io.StreamRecorder(Feed(12, (3,)), tmp_path / "a.h5", period=0.0) as recorder:
+        recorder.read()
+        recorder.mark(8, np.array([False, True]))
+        recorder.read()
+        recorder.read()
+        recorder.mark(1, np.array([False]))
+        recorder.mark(4, np.array([False, False]))
+        recorder.mark(5, np.array([True]))
+        recorder.read()
+        recorder.mark(11, np.zeros(5, bool))
+    np.testing.assert_array_equal(held(tmp_path / "a.h5")["used"], [1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 0])
+
+
+def test_blocks_without_time_and_positions_are_told_when_read(tmp_path):
+    class Blind(Feed):
+        def read(self, out=None, /):
+            block = super().read(out)
+            return block and io.Block(block.frames, block.index, lent=True)
+
+        def positions(self):
+            return {}
+
+    stream(Blind(4), tmp_path / "a.h5")
+    with pytest.raises(io.InputError, match=r"travel is nan at frame 0"):
+        io.open_recording(tmp_path / "a.h5")
+    with io.open_recording(tmp_path / "a.h5", travel=np.arange(4)) as recording:
+        np.testing.assert_array_equal(read_all(recording, 4).frames, frames_of(np.arange(4)))
+
+
+def test_corrected_positions_replace_those_that_are_known(tmp_path):
+    class Partly(Feed):
+        def positions(self):
+            return {"travel": np.array([7.0, np.nan, 9.0]), "unheard of": np.zeros(3)}
+
+    stream(Partly(5), tmp_path / "a.h5")
+    np.testing.assert_array_equal(held(tmp_path / "a.h5")["travel"], [7.0, 0.01, 9.0, 0.03, 0.04])
+
+
+def test_a_source_of_other_frames_than_it_announced_is_a_defect(tmp_path):
+    class Other(Feed):
+        def read(self, out=None, /):
+            return replace(super().read(), frames=np.zeros((1, 5, 8), "u1"))
+
+    with pytest.raises(ValueError, match="and announced"):
+        stream(Other(4), tmp_path / "a.h5")
+    assert not list(tmp_path.iterdir())
+
+
+# What is there before and after.
+
+
+def test_an_older_file_is_replaced_when_the_first_frame_has_come(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"older")
+    with pytest.raises(KeyboardInterrupt):
+        stream(Feed(fails=(0, KeyboardInterrupt())), path)
+    with pytest.raises(io.InputError, match="feed gave no frames: nothing was written"):
+        stream(Feed(0, announced=5), path)
+    assert path.read_bytes() == b"older"
+    with pytest.raises(KeyboardInterrupt):
+        stream(Feed(fails=(1, KeyboardInterrupt())), path)
+    assert len(held(path)["data"]) == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_a_source_that_cannot_be_entered_leaves_nothing(tmp_path):
+    class Broken(Feed):
+        def __enter__(self):
+            raise io.InputError("no such port")
+
+    with pytest.raises(io.InputError, match="no such port"):
+        stream(Broken(), tmp_path / "a.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_being_written_is_not_overwritten(tmp_path):
+    path, line = tmp_path / "a.h5", r"a\.h5 is being written by another program: name another output"
+    with io.StreamRecorder(Feed(20), path) as recorder:
+        while not path.exists():
+            recorder.read()
+        second = Feed()
+        with pytest.raises(io.InputError, match=line):
+            stream(second, path)
+        assert not second.entered
+        with pytest.raises(io.InputError, match=line):
+            io.check_output(path)
+    stream(Feed(4), path)
+    with io.open_recording(path):  # who reads a file loses nothing when another takes its name
+        stream(Feed(5), path)
+    assert len(held(path)["data"]) == 5
+
+
+@pytest.mark.parametrize("name", ["no/a.h5", "."])
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_source_is_entered(tmp_path, name):
+    source = Feed()
+    with pytest.raises(io.InputError):
+        stream(source, tmp_path / name)
+    assert not source.entered
+
+
+def test_an_unknown_compression_is_refused(tmp_path):
+    with pytest.raises(io.InputError, match="unknown compression 'zip'"):
+        io.StreamRecorder(Feed(), tmp_path / "a.h5", "zip")
+
+
+# What is left when something fails.
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (KeyboardInterrupt(), "stopped by the user"),
+        (SystemExit(1), "the program was ended"),
+        (GeneratorExit(), "the program was ended"),
+        (io.InputError("the camera is lost: plug it in\nagain"), "the camera is lost: plug it in"),
+        (RuntimeError(), "RuntimeError"),
+        (ValueError("ä" * 300), "ä" * 114),
+    ],
+)
+def test_what_was_taken_is_kept_whatever_ends_it(tmp_path, error, why):
+    source = Feed(20, (3,), fails=(11, error))
+    with pytest.raises(type(error)):
+        stream(source, tmp_path / "a.h5")
+    assert source.left
+    found = held(tmp_path / "a.h5")
+    assert found.pop("state") == f"cut short: {why}"
+    assert {len(values) for values in found.values()} == {12}
+    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(12) + 0.001)
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        assert recording.state == f"cut short: {why}"
+        np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of(np.arange(12)))
+
+
+def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_path):
+    class Lost(Feed):
+        def positions(self):
+            raise ZeroDivisionError("no reports")
+
+    with pytest.raises(ZeroDivisionError):
+        stream(Lost(5), tmp_path / "a.h5")
+    found = held(tmp_path / "a.h5")
+    assert found["state"] == "cut short: no reports"
+    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(5))
+    with pytest.raises(io.InputError, match="camera"):
+        stream(Lost(5, fails=(3, io.InputError("camera"))), tmp_path / "a.h5")
+    assert held(tmp_path / "a.h5")["state"] == "cut short: camera"
+
+
+def test_a_source_that_fails_when_it_is_left_cuts_it_short(tmp_path):
+    class Stuck(Feed):
+        def __exit__(self, *error):
+            raise io.InputError("the stage does not stop")
+
+    with pytest.raises(io.InputError, match="does not stop"):
+        stream(Stuck(5), tmp_path / "a.h5")
+    assert held(tmp_path / "a.h5")["state"] == "cut short: the stage does not stop"
+
+
+def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch):
+    source, append = Feed(3), growing.GrowingRecording.append
+
+    def waits(self, block):
+        until_left.wait(30)
+        append(self, block)
+
+    until_left = threading.Event()
+    source.__class__ = type("Telling", (Feed,), {"__exit__": lambda self, *error: until_left.set()})
+    monkeypatch.setattr(growing.GrowingRecording, "append", waits)
+    stream(source, tmp_path / "a.h5")
+    assert until_left.is_set()
+    assert len(held(tmp_path / "a.h5")["data"]) == 3
+
+
+def test_a_disk_that_is_too_slow_ends_it_and_nothing_waits(tmp_path, monkeypatch):
+    append, released = growing.GrowingRecording.append, threading.Event()
+
+    def slow(self, block):
+        assert released.wait(30)
+        append(self, block)
+
+    class Released(Feed):
+        def __exit__(self, *error):
+            released.set()
+
+    monkeypatch.setattr(growing.GrowingRecording, "append", slow)
+    monkeypatch.setattr(streaming, "_BACKLOG", 6 * 35)
+    with pytest.raises(io.InputError, match=r"a\.h5: the disk is too slow: 0 MB of frames wait for it; take"):
+        stream(Released(20, (2,)), tmp_path / "a.h5")
+    found = held(tmp_path / "a.h5")
+    assert found["state"].startswith("cut short: ")
+    assert "the disk is too slow" in found["state"]
+    np.testing.assert_array_equal(found["data"], frames_of(np.arange(6)))
+
+
+FULL = r"a\.h5: the disk is full \(File too large\); make room, or choose another place with -o"
+
+
+def hold_full(path, limit):
+    """Hold a recording that filled its disk to be sound."""
+    found = held(path)
+    assert re.fullmatch(f"cut short: .*{FULL}", found.pop("state"))
+    (count,) = {len(values) for values in found.values()}
+    assert count >= 40
+    np.testing.assert_array_equal(found["data"], frames_of(np.arange(count), (100, 300)))
+    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(count) + 0.001)
+    assert path.stat().st_size <= limit
+
+
+def test_a_full_disk_keeps_what_it_took(tmp_path):
+    limit = 5_000_000
+    code = f"""
+import resource
+from growing import Feed, stream
+from mirrorskin import io
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, resource.RLIM_INFINITY))
+try:
+    stream(Feed(10**6, (3, 1), shape=(100, 300), announced=200), "a.h5")
+except io.InputError as error:
+    print(error)
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.fspath(SUPPORT)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert re.fullmatch(FULL + "\n", told.stdout)
+    assert not told.stderr
+    hold_full(tmp_path / "a.h5", limit)
+
+
+@pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
+def test_whatever_is_packed_a_full_disk_is_met_between_two_writes(tmp_path, monkeypatch, packing):
+    limit, fallocate = 4_000_000, os.posix_fallocate
+
+    def most(descriptor, start, size):
+        if start + size > limit:
+            raise OSError(errno.EFBIG, "full")
+        fallocate(descriptor, start, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", most)
+    with pytest.raises(io.InputError, match=FULL):
+        stream(Feed(10**6, (5,), shape=(100, 300), announced=200), tmp_path / "a.h5", packing, period=0.01)
+    hold_full(tmp_path / "a.h5", limit)
+
+
+def test_a_disk_that_is_full_from_the_first_frame_on_leaves_the_older_file(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    (tmp_path / "a.h5").write_bytes(b"older")
+    with pytest.raises(io.InputError, match=r"a\.h5: the disk is full \(No space left on device\)"):
+        stream(Feed(100), tmp_path / "a.h5")
+    assert (tmp_path / "a.h5").read_bytes() == b"older"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_disk_that_promises_nothing_is_believed(tmp_path, monkeypatch):
+    def unable(*_):
+        raise OSError(errno.EOPNOTSUPP, "unable")
+
+    monkeypatch.setattr(os, "posix_fallocate", unable)
+    stream(Feed(20), tmp_path / "a.h5")
+    assert len(held(tmp_path / "a.h5")["data"]) == 20
+
+
+def test_a_block_that_was_written_in_part_is_left_out(tmp_path):
+    class Half(np.ndarray):
+        def __iter__(self):
+            yield np.asarray(self[0])
+            raise OSError(errno.EIO, "dead")
+
+    class Dying(Feed):
+        def read(self, out=None, /):
+            block = super().read(out)
+            return replace(block, frames=block.frames.view(Half)) if block and block.index == 6 else block
+
+    with pytest.raises(io.InputError, match=r"a\.h5 could not be written: Input/output error; make room"):
+        stream(Dying(10**6, (3,)), tmp_path / "a.h5")
+    found = held(tmp_path / "a.h5")
+    assert found.pop("state").startswith("cut short: ")
+    assert {len(values) for values in found.values()} == {6}
+    np.testing.assert_array_equal(found["data"], frames_of(np.arange(6)))
+
+
+def test_the_last_bytes_of_a_disk_are_used_and_lost_ones_are_asked_for_again(tmp_path, monkeypatch):
+    asked, left = [], 1000
+
+    def most(_, start, size):
+        asked.append((start, size))
+        if start + size > left:
+            raise OSError(errno.ENOSPC, "full")
+        os.ftruncate(file.fileno(), start + size)
+
+    monkeypatch.setattr(os, "posix_fallocate", most)
+    with (tmp_path / "a").open("wb") as file:
+        reserve = Reserve(tmp_path / "a", file.fileno(), 400)
+        reserve.hold(100)
+        reserve.hold(500)
+        reserve.hold(800)
+        assert asked == [(0, 500), (500, 700), (500, 300)]
+        file.truncate(700)
+        asked.clear()
+        reserve.hold(750)
+        assert asked == [(700, 450), (700, 50)]
+        with pytest.raises(io.InputError, match="the disk is full"):
+            reserve.hold(1001)
+    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(errno.EIO, "dead")))
+    with (tmp_path / "a").open("wb") as file, pytest.raises(OSError, match="dead"):
+        Reserve(tmp_path / "a", file.fileno(), 400).hold(1)
+
+
+def test_where_there_are_no_locks_it_is_written_all_the_same(tmp_path, monkeypatch):
+    def without(*_):
+        raise OSError(errno.ENOLCK, "no locks here")
+
+    monkeypatch.setattr("mirrorskin.io.atomic.fcntl.flock", without)
+    for count in (4, 5):
+        stream(Feed(count), tmp_path / "a.h5")
+        assert len(held(tmp_path / "a.h5")["data"]) == count

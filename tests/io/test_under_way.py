@@ -1,0 +1,297 @@
+"""Recordings that are being written, or whose writer was killed; and what a live run made of one."""
+
+from __future__ import annotations
+
+import random
+import re
+import signal
+import time
+
+import h5py
+import numpy as np
+import pytest
+from commands import run
+from growing import SHAPE, Feed, frames_of, started, stream
+from stacks import MadeUp, ball, read_all
+
+from mirrorskin import engine, io
+from mirrorskin.io.atomic import remove_leftovers
+from mirrorskin.io.growing import GrowingRecording
+
+DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
+
+
+def kill(child):
+    child.send_signal(signal.SIGKILL)
+    assert child.wait(60) == -signal.SIGKILL
+
+
+def opened(path, **given):
+    """Open a recording as soon as it holds two frames."""
+    until = time.monotonic() + 60
+    while True:
+        try:
+            return io.open_recording(path, **given)
+        except io.InputError as error:
+            if "at least 2 are needed" not in str(error) or time.monotonic() > until:
+                raise
+        time.sleep(0.01)
+
+
+def hold(recording):
+    """Hold a recording of a feed to be right: every frame, and whatever is told of it."""
+    count = recording.shape[0]
+    found = read_all(recording, 7)
+    np.testing.assert_array_equal(found.frames, frames_of(np.arange(count)))
+    np.testing.assert_array_equal(found.travel, 0.01 * np.arange(count))
+    assert len(found.time) == len(recording.used) == len(recording.dropped) == count
+    assert recording.used.all()
+    assert np.all(np.diff(found.time) >= 0)
+    return count
+
+
+@pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
+def test_others_watch_while_it_grows_and_what_is_left_when_it_is_killed_is_sound(tmp_path, packing):
+    path = tmp_path / "a.h5"
+    child = started(path, packing)
+    try:
+        counts = []
+        while len(counts) < 4 or counts[-1] == counts[0]:
+            with opened(path) as recording:
+                assert recording.state == "under way"
+                before = recording.fingerprint()
+                counts.append(hold(recording))
+                assert recording.how.startswith("mapped" if packing == "raw" else "chunks decoded")
+                assert recording.fingerprint() == before
+        assert sorted(counts) == counts
+        facts = io.describe(path)
+        assert (facts["kind"], facts["state"]) == ("recording", "under way")
+        assert re.fullmatch(r"(\d+) of \1 frames", facts["used"])
+        with pytest.raises(io.InputError, match="is being written by another program"):
+            io.check_output(path)
+    finally:
+        kill(child)
+    with io.open_recording(path) as recording:
+        assert hold(recording) >= counts[-1]
+        assert recording.state == "cut short: its writer was killed"
+        left = recording.fingerprint()
+    with io.open_recording(path) as recording:
+        assert recording.fingerprint() == left
+    with io.open_recording(path, frames=(0, 2)) as recording:
+        np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of([0, 1]))
+    stream(Feed(4), path)  # its name is free again
+    with io.open_recording(path) as recording:
+        assert recording.fingerprint() != left
+
+
+@pytest.mark.parametrize("packing", ["raw", "bitshuffle", "lzf"])
+def test_kill_loses_at_most_the_last_second(tmp_path, packing):
+    path = tmp_path / "a.h5"
+    child = started(path, packing, rate=2000)
+    time.sleep(random.uniform(0.0, 0.6))
+    at = time.monotonic()
+    kill(child)
+    try:
+        recording = io.open_recording(path)
+    except io.InputError as error:
+        assert "at least 2 are needed" in str(error)  # noqa: PT017
+        return
+    with recording:
+        hold(recording)
+        assert recording.time[-1] > at - 2.0  # a period of 0.1 s, and whatever keeps this machine busy
+    remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def growing(path, frames, **given):
+    """Make a recording of so many frames that nobody finishes."""
+    source = Feed(max(frames, 1), (max(frames, 1),), **given)
+    with path.open("w+b") as file:
+        made = GrowingRecording(path, file.fileno(), source.header, source.shape, source.dtype, "raw")
+        with made:
+            if frames:
+                made.append(source.read())
+            made.flush()
+    return path
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_fewer_frames_than_two_are_told(tmp_path, frames):
+    path = growing(tmp_path / "a.h5", frames)
+    with pytest.raises(io.InputError, match=rf"a\.h5: {DETECTOR}/data holds {frames} frames: at least 2 are"):
+        io.open_recording(path)
+
+
+@pytest.mark.parametrize("shorter", ["data", "frame_time", "used", "dropped", "travel_live"])
+def test_what_is_short_of_something_is_left_out(tmp_path, shorter):
+    path = growing(tmp_path / "a.h5", 9)
+    with h5py.File(path, "r+") as file:
+        group = file[STAGE if shorter == "travel_live" else DETECTOR]
+        group[shorter].resize(6, axis=0)
+    with io.open_recording(path) as recording:
+        assert recording.shape == recording.full_shape == (6, *SHAPE)
+        assert hold(recording) == 6
+        assert recording.state == "cut short: its writer was killed"
+    with pytest.raises(io.InputError, match="frames 2 to 7 of 6"):
+        io.open_recording(path, frames=(2, 7))
+
+
+def test_frames_that_have_room_but_are_yet_to_be_written_are_not_read(tmp_path):
+    path = growing(tmp_path / "a.h5", 5)
+    with h5py.File(path, "r+") as file:
+        file[f"{DETECTOR}/data"].resize(8, axis=0)
+    with io.open_recording(path) as recording:
+        assert hold(recording) == 5
+
+
+def test_a_file_of_ours_that_did_not_grow_may_not_miss_anything(tmp_path):
+    stream(Feed(9), tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file[f"{STAGE}/travel"].resize(6, axis=0)
+        del file["/entry/state"]
+    with pytest.raises(io.InputError, match=r"travel has shape \(6,\) where \(9,\) is needed"):
+        io.open_recording(tmp_path / "a.h5")
+
+
+def test_others_grow_files_too(tmp_path):
+    path, frames = tmp_path / "theirs.h5", frames_of(np.arange(5))
+    with h5py.File(path, "w", libver="latest") as file:
+        file.create_dataset("x", data=frames, chunks=(1, *SHAPE), maxshape=(None, *SHAPE))
+        file.swmr_mode = True
+        file.flush()
+        (tmp_path / "left.h5").write_bytes(path.read_bytes())  # as if its writer had been killed now
+    with io.open_recording(tmp_path / "left.h5", motion="vertical", travel=io.Steps(0.1)) as recording:
+        np.testing.assert_array_equal(read_all(recording, 2).frames, frames)
+        assert recording.state == "complete"
+        first = recording.fingerprint()
+    with h5py.File(path, "r+") as file:
+        file["x"][4, 0, 0] ^= 1
+    with io.open_recording(path, motion="vertical", travel=io.Steps(0.1)) as recording:
+        assert recording.fingerprint() != first
+
+
+def test_a_process_may_look_at_what_it_writes(tmp_path):
+    path = tmp_path / "a.h5"
+    with io.StreamRecorder(Feed(20), path, period=0.001) as recorder:
+        while not path.exists() or recorder.count < 10:
+            recorder.read()
+        with opened(path) as recording:
+            assert recording.state == "under way"
+            frames = read_all(recording, 3).frames
+            np.testing.assert_array_equal(frames, frames_of(np.arange(len(frames))))
+        while recorder.read() is not None:
+            pass
+    with io.open_recording(path) as recording:
+        assert (recording.state, recording.shape[0]) == ("complete", 20)
+
+
+def test_info_tells_how_it_was_taken(tmp_path):
+    with io.StreamRecorder(Feed(9), tmp_path / "a.h5") as recorder:
+        for _ in range(9):
+            recorder.read()
+        recorder.mark(2, np.zeros(3, bool))
+    facts = io.describe(tmp_path / "a.h5")
+    assert {name: facts[name] for name in ("state", "used", "dropped", "frames")} == {
+        "state": "complete",
+        "used": "6 of 9 frames",
+        "dropped": "9 frames",
+        "frames": "9 of 7 x 5, uint8",
+    }
+    told = run("info", tmp_path / "a.h5").out
+    assert re.search(r"used +6 of 9 frames", told)
+
+
+# What a live run used, where it thought the body was.
+
+USED = np.array([1, 1, 0, 1, 0, 0, 1, 1, 1, 1, 0, 1], bool)
+
+
+def run_live(path, packing="raw", motion="vertical"):
+    with io.StreamRecorder(Feed(len(USED), motion=motion), path, packing) as recorder:
+        recorder.read()
+        recorder.mark(0, USED)
+        while recorder.read() is not None:
+            pass
+    return path
+
+
+@pytest.mark.parametrize("motion", ["vertical", "axial"])
+@pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
+def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, packing):
+    path = run_live(tmp_path / "a.h5", packing, motion)
+    where = "travel" if motion == "vertical" else "phase"
+    numbers = np.flatnonzero(USED)
+    with io.open_recording(path, live=True) as recording:
+        for room in (1, 2, 40):
+            found = read_all(recording, room)
+            np.testing.assert_array_equal(found.frames, frames_of(numbers))
+            np.testing.assert_array_equal(getattr(found, where), 0.01 * numbers)
+            np.testing.assert_array_equal(found.time, numbers)
+            recording.rewind()
+        assert recording.shape == (len(numbers), *SHAPE)
+        assert recording.full_shape == (len(USED), *SHAPE)
+        assert recording.used.all()
+        assert recording.which == "0:12, used live"
+    with io.open_recording(path, live=True, frames=(2, 9), region=io.Region((1, 4), (2, 7))) as recording:
+        part = numbers[(numbers >= 2) & (numbers < 9)]
+        found = read_all(recording, 3)
+        np.testing.assert_array_equal(found.frames, frames_of(part)[:, 1:4, 2:7])
+        np.testing.assert_array_equal(getattr(found, where), 0.01 * part)
+        assert recording.which == "2:9, used live"
+    with io.open_recording(path) as recording:
+        assert recording.which == "0:12"
+
+
+@pytest.mark.parametrize(
+    ("prepare", "given", "line"),
+    [
+        ("mark", {}, r"a\.h5: a live run used 1 frames: at least 2 are needed; leave --live out"),
+        ("used", {}, r"a\.h5 does not say which frames a live run used: leave --live out"),
+        ("live", {}, r"a\.h5 holds no positions of a live run: leave --live out"),
+        ("", {"travel": np.arange(9)}, r"a live run has its own positions: leave --live out, or those given"),
+        ("", {"motion": "twist"}, r"a\.h5 holds no positions of a live run"),
+        ("back", {}, r"travel_live of the frames that were used runs back at frame 3"),
+    ],
+)
+def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, line):
+    stream(Feed(9), tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        if prepare == "mark":
+            file[f"{DETECTOR}/used"][1:] = 0
+        elif prepare == "used":
+            del file[f"{DETECTOR}/used"]
+        elif prepare == "live":
+            del file[f"{STAGE}/travel_live"]
+        elif prepare == "back":
+            file[f"{STAGE}/travel_live"][3:5] = 0.0
+            file[f"{STAGE}/travel_live"][8] = 0.02
+    with pytest.raises(io.InputError, match=line):
+        io.open_recording(tmp_path / "a.h5", live=True, **given)
+
+
+def test_a_live_run_is_reconstructed_again_from_its_recording(tmp_path):
+    travel = np.linspace(0.0, 1.0, 24)
+    twin = ball((9, 11), (0.3, 0.3), travel)
+    frames, used = np.concatenate([twin.read().frames.copy() for _ in travel]), np.arange(24) % 5 != 2
+
+    class Press(Feed):
+        def read(self, out=None, /):
+            block = super().read(out)
+            if block is None:
+                return None
+            part = slice(block.index, block.index + len(block.frames))
+            return io.Block(frames[part], block.index, block.time, travel=travel[part], lent=True)
+
+        def positions(self):
+            return {"travel": travel + 0.05}
+
+    source = Press(24, (4,), shape=(9, 11), dtype=frames.dtype)
+    with io.StreamRecorder(source, tmp_path / "a.h5") as recorder:
+        while recorder.read() is not None:
+            pass
+        recorder.mark(0, used)
+    ended = run("reconstruct", tmp_path / "a.h5", "--live", "-o", tmp_path / "r.h5")
+    assert ended.code == 0, ended.said
+    expected = engine.reconstruct(MadeUp(frames[used], source.header, travel=travel[used]))
+    np.testing.assert_array_equal(io.open_result(tmp_path / "r.h5").height, expected.height)
+    assert np.isfinite(expected.height).any()
