@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +23,7 @@ from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource
 from mirrorskin.io.writing import Compression, check_compression
 
+_LOOK = 0.5  # seconds from one look whether the program is still there to the next
 _BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
 
 
@@ -109,9 +110,9 @@ class StreamRecorder:
 
     def __enter__(self) -> Self:
         check_output(self.path)
-        self._writer.start()
         with ExitStack() as opening:
             opening.push(self._finish)
+            self._writer.start()
             opening.enter_context(self.source)
             self._exit = opening.pop_all()
         return self
@@ -175,13 +176,15 @@ class StreamRecorder:
         """Have the thread write what is known only now, and wait for it."""
         positions: Mapping[str, Floats] = {}
         failure = error
-        if self.count:
-            try:
+        try:
+            if self.count:
                 positions = self.source.positions()
-            except Exception as failed:  # the frames are kept all the same
-                failure = failure or failed
-        self._queue.put(_End(positions, COMPLETE if failure is None else _cut_short(failure)))
-        self._writer.join()
+        except BaseException as failed:  # Ctrl-C, too: the frames are kept all the same
+            failure = failure or failed
+        finally:
+            self._queue.put(_End(positions, COMPLETE if failure is None else _cut_short(failure)))
+        if self._writer.ident is not None:  # it was started
+            self._writer.join()
         if error is None:
             failure = self._error or failure
             if failure is not None:
@@ -203,7 +206,8 @@ class StreamRecorder:
 
     def _begin(self) -> GrowingRecording | None:
         """Make the file with the first block in it, and give it its name; None if no block comes."""
-        block = self._queue.get()
+        while (block := self._wait(_LOOK)) is None:
+            pass
         if not isinstance(block, Block):
             return None
         with ExitStack() as opening:
@@ -222,17 +226,14 @@ class StreamRecorder:
                 return self._append_all(file)
         except InputError as error:
             self._error = error
-            while not isinstance(item := self._queue.get(), _End):
+            while not isinstance(item := self._wait(_LOOK), _End):
                 pass
             return _End(item.positions, _cut_short(error))
 
     def _append_all(self, file: GrowingRecording) -> _End:
         due = time.monotonic() + self._period
         while True:
-            try:
-                item = self._queue.get(timeout=max(0.0, due - time.monotonic()))
-            except queue.Empty:
-                item = None
+            item = self._wait(max(0.0, due - time.monotonic()))
             if isinstance(item, _End):
                 return item
             if isinstance(item, _Mark):
@@ -243,6 +244,12 @@ class StreamRecorder:
             if time.monotonic() >= due:
                 file.flush()
                 due = time.monotonic() + self._period
+
+    def _wait(self, timeout: float) -> Block | _Mark | _End | None:
+        """Return what is queued next, None if nothing comes in time; the end, where the program just left."""
+        with suppress(queue.Empty):
+            return self._queue.get(timeout=timeout)
+        return None if threading.main_thread().is_alive() else _End({}, _cut_short(SystemExit()))
 
     def _append(self, file: GrowingRecording, block: Block) -> None:
         file.append(block)

@@ -276,6 +276,17 @@ def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_pat
     assert held(tmp_path / "a.h5")["state"] == "cut short: camera"
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_a_program_that_is_ended_while_positions_are_corrected_keeps_what_was_taken(tmp_path, error):
+    class Late(Feed):
+        def positions(self):
+            raise error
+
+    with pytest.raises(error):
+        stream(Late(5), tmp_path / "a.h5")
+    assert held(tmp_path / "a.h5")["state"].startswith("cut short: ")
+
+
 def test_a_source_that_fails_when_it_is_left_cuts_it_short(tmp_path):
     class Stuck(Feed):
         def __exit__(self, *error):
