@@ -12,25 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Counts, Frames, Tally
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.ring import Ring, usual_slots
+from mirrorskin.hw.running import RunningCamera
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Twin
 from mirrorskin.hw.twin.movement import Pose, pose_at_lean, pose_at_press
-from mirrorskin.io.types import Closing, InputError
+from mirrorskin.io.types import InputError
 
 
 class _Frame(NamedTuple):
-    """A frame on its way: what it shows, its number, when it arrives, how many were lost before it."""
+    """A frame on its way: what it shows, when it arrives, how many were lost before it."""
 
     pixels: NDArray[Any]
-    number: int
     arrival: float
     lost: int
 
 
-class TwinCamera(Closing):
+class TwinCamera(RunningCamera):
     """A `mirrorskin.hw.camera.Camera` that sees what the twin sees, wherever the body is at that time.
 
     Frame n is exposed about the time t = start + n / rate and arrives at t + delay + N(0, jitter), but not
@@ -77,13 +74,10 @@ class TwinCamera(Closing):
     ) -> None:
         rate = twin.frame_rate if rate is None else rate
         _check(rate, delay, jitter, twin.exposure)
-        self.name = twin.name
-        self.shape, self.dtype = twin.shape[1:], twin.dtype
+        super().__init__(twin.name, twin.shape[1:], twin.dtype, rate)
         self._twin, self._where, self._pivot = twin, where, pivot
         self._rate, self._delay, self._jitter = rate, delay, jitter
         self._random = np.random.default_rng(seed)
-        self._ring = Ring(self.shape, self.dtype, usual_slots(self.shape, self.dtype, rate), self.name)
-        self._tally = Tally()
         self._underway: deque[_Frame] = deque()
         self._sent = threading.Condition()
         self._stalled, self._ended = threading.Event(), threading.Event()
@@ -93,29 +87,6 @@ class TwinCamera(Closing):
         ]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def counts(self) -> Counts:
-        """What it did so far."""
-        return self._tally.counts(self._ring.dropped)
-
-    @property
-    def latest(self) -> float:
-        """When the newest frame arrived; -inf before the first."""
-        return self._tally.latest
-
-    @property
-    def error(self) -> HardwareError | None:
-        """Why no more frames will come."""
-        return self._ring.error
-
-    def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
-        return self._ring.take(most, timeout)
-
-    def flush(self) -> None:
-        """Forget the frames that wait."""
-        self._ring.flush()
 
     def stall(self) -> None:
         """Let no more frames arrive, and say nothing, until it comes back."""
@@ -128,7 +99,7 @@ class TwinCamera(Closing):
     def lose(self) -> None:
         """Be gone for good: no more frames arrive, and readers are told."""
         self._stalled.set()
-        self._ring.fail(HardwareError(f"{self.name} was lost: see whether it has power, and its cable"))
+        self._fail(f"{self.name} was lost: see whether it has power, and its cable")
 
     def close(self) -> None:
         """Stop; frames under way do not arrive. A second time does nothing."""
@@ -137,7 +108,7 @@ class TwinCamera(Closing):
             self._sent.notify_all()
         for thread in self._threads:
             thread.join()
-        self._ring.fail(HardwareError(f"{self.name} is closed"))
+        self._fail(f"{self.name} is closed")
 
     def _expose(self) -> None:
         """Render each frame when its exposure is over, or pass it over if it would come too late."""
@@ -157,7 +128,7 @@ class TwinCamera(Closing):
             else:
                 pixels = self._render(middle, number)
                 with self._sent:
-                    self._underway.append(_Frame(pixels, number, arrival, lost))
+                    self._underway.append(_Frame(pixels, arrival, lost))
                     self._sent.notify_all()
                 last, lost = arrival, 0
             number += 1
@@ -186,9 +157,8 @@ class TwinCamera(Closing):
             if self._stalled.is_set():
                 missed += 1 + frame.lost
                 continue
-            self._ring.slot()[:] = frame.pixels
-            self._ring.put(frame.arrival, frame.number, frame.lost + missed)
-            self._tally.add(frame.arrival)
+            self._slot()[:] = frame.pixels
+            self._put(frame.arrival, frame.lost + missed)
             missed = 0
 
     def _wait_until(self, due: float) -> bool:
