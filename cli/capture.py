@@ -1,0 +1,110 @@
+"""``mirrorskin capture``: move the stage, record the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+
+from mirrorskin.cli import options, scans
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.rig.scan import Scan
+    from mirrorskin.io import StreamRecorder
+
+_TOGETHER = 64
+"""Frames that are read at a time, at most."""
+
+
+def command(
+    motion: scans.Motion,
+    rig_file: scans.RigFile,
+    output: options.NewRecording,
+    start: scans.Start = None,
+    stop: scans.Stop = None,
+    step: scans.Step = None,
+    speed: scans.Speed = None,
+    press: scans.Press = None,
+    tilt: scans.Tilt = None,
+    turns: scans.Turns = None,
+    phase_step: scans.PhaseStep = None,
+    rate: scans.Rate = None,
+    settle: scans.Settle = None,
+    frames: scans.StepFrames = None,
+    compression: options.Compression = options.CompressionName.raw,
+) -> None:
+    """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
+    from mirrorskin import io
+    from mirrorskin.hw.rig.file import load_rig
+    from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.kernels.correlation import WINDOW
+
+    settings = load_rig(rig_file)
+    plan = scans.make_plan(
+        motion,
+        {
+            "start": start,
+            "stop": stop,
+            "step": step,
+            "speed": speed,
+            "press": press,
+            "tilt": tilt,
+            "turns": turns,
+            "phase_step": phase_step,
+            "rate": rate,
+        },
+    )
+    scans.check_steps(plan, settle, frames)
+    plan.check(settings.stage.limits, settings.name)
+    io.check_output(output, rig_file)
+    with open_rig(settings) as rig:
+        # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
+        scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
+        recorder = io.StreamRecorder(scan, output, compression.value)
+        with _kept(recorder):
+            _drain(recorder)
+        typer.echo(f"{output}: {_summary(scan)}")
+
+
+def _drain(recorder: StreamRecorder) -> None:
+    import numpy as np
+
+    from mirrorskin.cli.progress import progress
+
+    with recorder, progress("capturing", recorder.shape[0]) as show:
+        room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
+        while recorder.read(room) is not None:
+            show(recorder.count)
+
+
+@contextmanager
+def _kept(recorder: StreamRecorder) -> Iterator[None]:
+    """Say of a capture that was cut short what was kept of it."""
+    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.io import InputError
+
+    try:
+        yield
+    except (HardwareError, InputError) as error:
+        if not recorder.count:
+            raise
+        raise HardwareError(f"{error}; {_remains(recorder)}") from error
+    except (KeyboardInterrupt, SystemExit):
+        if recorder.count:
+            typer.echo(_remains(recorder), err=True)
+        raise
+
+
+def _remains(recorder: StreamRecorder) -> str:
+    return f"{recorder.path} was cut short and holds {recorder.count} frames"
+
+
+def _summary(scan: Scan) -> str:
+    counts = scan.rig.camera.counts
+    _, rows, columns = scan.shape
+    return (
+        f"{scan.count} frames of {columns} x {rows} at {counts.rate:.4g} Hz, {scan.dropped} dropped,"
+        f" {counts.late} late{scan.remark}"
+    )

@@ -1,0 +1,170 @@
+"""What a rig is to do: the options that capture and live share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+
+import typer
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
+    from mirrorskin.hw.rig.rig import Rig
+    from mirrorskin.hw.rig.steps import StepScan
+    from mirrorskin.hw.rig.sweep import SweepScan
+
+SETTLE = "100ms"
+"""From rest to the first exposure of a step."""
+
+_START = "0mm"
+_TILT = "2.5deg"
+_TURNS = 1.0
+
+
+class ScanName(StrEnum):
+    """Motions that a rig can do."""
+
+    vertical = "vertical"
+    axial = "axial"
+
+
+def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
+    return typer.Option(metavar=metavar, help=text, show_default=False if default is None else str(default))
+
+
+Motion = Annotated[ScanName, typer.Argument(help="How the body moves.")]
+RigFile = Annotated[Path, typer.Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
+Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
+Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
+Step = Annotated[str | None, _option("LENGTH", "Vertical, in steps: from place to place.")]
+Speed = Annotated[str | None, _option("LENGTH/s", "Vertical, without a halt: 0.5mm/s.")]
+Press = Annotated[str | None, _option("LENGTH", "Axial: how far the body is lowered.")]
+Tilt = Annotated[str | None, _option("ANGLE", "Axial: half-angle of the precession.", _TILT)]
+Turns = Annotated[float | None, _option("N", "Axial: how often it goes round.", 1)]
+PhaseStep = Annotated[str | None, _option("ANGLE", "Axial, in steps: from place to place, 45deg.")]
+Rate = Annotated[float | None, _option("HZ", "Axial, without a halt: turns a second.")]
+Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first exposure.", SETTLE)]
+StepFrames = Annotated[int | None, typer.Option("--frames", min=1, help="In steps: at each place.")]
+
+
+class Words(TypedDict):
+    """The options as they were given; None where not."""
+
+    start: str | None
+    stop: str | None
+    step: str | None
+    speed: str | None
+    press: str | None
+    tilt: str | None
+    turns: float | None
+    phase_step: str | None
+    rate: float | None
+
+
+_OWN: Mapping[ScanName, tuple[str, ...]] = {
+    ScanName.vertical: ("start", "stop", "step", "speed"),
+    ScanName.axial: ("press", "tilt", "turns", "phase_step", "rate"),
+}
+
+
+def make_plan(motion: ScanName, words: Words) -> Plan:
+    """Turn the options into a plan.
+
+    Raises
+    ------
+    InputError
+        An option belongs to the other motion, is missing, or cannot be.
+    """
+    from mirrorskin.io import InputError
+
+    foreign = [name for name, value in words.items() if value is not None and name not in _OWN[motion]]
+    if foreign:
+        raise InputError(
+            f"{_spelled(foreign[0])} says nothing of a motion that is {motion.value}: leave it out, or choose"
+            " the other"
+        )
+    return _vertical(words) if motion == ScanName.vertical else _axial(words)
+
+
+def make_scan(
+    rig: Rig, plan: Plan, settle: str | None, frames: int | None, turn_frames: int | None = None
+) -> StepScan | SweepScan:
+    """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``.
+
+    Raises
+    ------
+    InputError
+        The plan goes beyond the rig's limits, or an option of steps was given and it has none.
+    """
+    from mirrorskin.cli.quantity import duration
+    from mirrorskin.hw.rig.steps import StepScan
+    from mirrorskin.hw.rig.sweep import SweepScan
+
+    check_steps(plan, settle, frames)
+    if plan.in_steps:
+        return StepScan(rig, plan, duration(settle or SETTLE, "--settle"), frames or 1)
+    return SweepScan(rig, plan, turn_frames)
+
+
+def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
+    """Refuse options of steps where the body does not halt; to be asked before a rig is opened."""
+    from mirrorskin.cli.quantity import duration
+    from mirrorskin.io import InputError
+
+    if settle is not None and duration(settle, "--settle") < 0:
+        raise InputError(f"--settle {settle}: a time is 0 or more")
+    for name, value in (("--settle", settle), ("--frames", frames)):
+        if value is not None and not plan.in_steps:
+            raise InputError(f"{name} says nothing of a motion without a halt: leave it out, or give a step")
+
+
+def _vertical(words: Words) -> VerticalPlan:
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.hw.rig.plans import VerticalPlan
+
+    step, speed = words["step"], words["speed"]
+    return VerticalPlan(
+        length(words["start"] or _START, "--start"),
+        length(_needed(words["stop"], "--stop", "2mm"), "--stop"),
+        None if step is None else length(step, "--step"),
+        None if speed is None else _speed(speed),
+    )
+
+
+def _axial(words: Words) -> AxialPlan:
+    from mirrorskin.cli.quantity import angle, length
+    from mirrorskin.hw.rig.plans import AxialPlan
+
+    step, turns = words["phase_step"], words["turns"]
+    return AxialPlan(
+        length(_needed(words["press"], "--press", "1mm"), "--press"),
+        angle(words["tilt"] or _TILT, "--tilt"),
+        _TURNS if turns is None else turns,
+        None if step is None else angle(step, "--phase-step"),
+        words["rate"],
+    )
+
+
+def _speed(text: str) -> float:
+    """Read a speed, as in ``0.5mm/s``, in mm/s."""
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.io import InputError
+
+    distance, slash, second = text.strip().rpartition("/")
+    if not slash or second.strip() != "s":
+        raise InputError(f"--speed {text}: a length for each second is needed; write e.g. 0.5mm/s")
+    return length(distance, "--speed")
+
+
+def _needed(value: str | None, option: str, example: str) -> str:
+    from mirrorskin.io import InputError
+
+    if value is None:
+        raise InputError(f"{option} is missing: say how far the body goes, as in {option} {example}")
+    return value
+
+
+def _spelled(name: str) -> str:
+    return "--" + name.replace("_", "-")

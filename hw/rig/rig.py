@@ -1,0 +1,289 @@
+"""A stage and a camera as one: whatever goes wrong with either, the stage stops."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+
+from mirrorskin.hw.camera import Camera, Frames
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.settings import RigSettings
+from mirrorskin.hw.stage import Position, Report, Stage
+from mirrorskin.io.types import Closing
+
+_TICK = 0.02
+"""Seconds from one look of the guard to the next."""
+
+_STALL = 0.1
+_STALL_PERIODS = 3
+_SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
+_PATIENCE = 5.0  # seconds that a camera may take for its first frame
+_JOIN = 5.0
+
+
+class Move:
+    """A move of the stage that is under way; a thread waits for its end.
+
+    Parameters
+    ----------
+    stage : Stage
+        It has taken the move.
+    began : float
+        When it was told to begin, seconds of `time.monotonic`.
+
+    Attributes
+    ----------
+    began : float
+        As given.
+    ended : float
+        When it was known to rest; infinite before.
+    error : Exception or None
+        Why it did not come to its end.
+    rest : Report or None
+        Where it came to rest.
+    """
+
+    def __init__(self, stage: Stage, began: float) -> None:
+        self._stage = stage
+        self.began, self.ended = began, math.inf
+        self.error: Exception | None = None
+        self.rest: Report | None = None
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._wait, name=f"{stage.name}: waits")
+        self._thread.start()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended, well or not."""
+        return self._over.is_set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for its end, at most so many seconds, and return whether it came."""
+        return self._over.wait(timeout)
+
+    def close(self) -> None:
+        """Wait for the thread, of a stage that was stopped or rests."""
+        self._thread.join(_JOIN)
+
+    def _wait(self) -> None:
+        try:
+            self.rest = self._stage.wait()
+        except Exception as error:  # handed to whoever reads; see Rig.check
+            self._stage.stop()
+            self.error = error
+        self.ended = time.monotonic()
+        self._over.set()
+
+
+class Rig(Closing):
+    """Stage and camera, guarded. A context manager: leaving it, for whatever reason, stops the stage first.
+
+    While a move is under way a thread looks fifty times a second whether frames still arrive and whether
+    stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
+    the rig for anything is told why. Frames are missed after 0.1 s or three periods, whichever is longer; a
+    computer that is too busy to look that often gives the camera more time.
+
+    Parameters
+    ----------
+    stage : Stage
+    camera : Camera
+    settings : RigSettings
+
+    Attributes
+    ----------
+    stage, camera, settings
+        As given. To move the stage, use the rig: only then is the move guarded.
+    name : str
+        What to call it in messages.
+    """
+
+    def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
+        self.stage, self.camera, self.settings = stage, camera, settings
+        self.name = settings.name
+        self._stall = _STALL
+        self._move: Move | None = None
+        self._fault: HardwareError | None = None
+        self._closing = threading.Event()
+        self._guard = threading.Thread(target=self._watch, name=f"{self.name}: guard")
+        self._guard.start()
+
+    @property
+    def rate(self) -> float:
+        """Frames a second: as measured, or as the rig file says."""
+        measured = self.camera.counts.rate
+        said = self.settings.camera.rate
+        return measured if math.isfinite(measured) and measured > 0 else said or math.nan
+
+    @property
+    def period(self) -> float:
+        """Seconds from frame to frame; 0 as long as nobody knows."""
+        rate = self.rate
+        return 1 / rate if math.isfinite(rate) else 0.0
+
+    @property
+    def moving(self) -> bool:
+        """Whether a move is under way."""
+        return self._move is not None and not self._move.over
+
+    def check(self) -> None:
+        """Raise what went wrong, if anything did.
+
+        Raises
+        ------
+        HardwareError
+            Stage or camera failed; the stage was stopped.
+        """
+        move = self._move
+        if self._fault is None and move is not None and move.error is not None:
+            if not isinstance(move.error, HardwareError):
+                raise move.error
+            self._fault = move.error
+        if self._fault is not None:
+            raise self._fault
+
+    def begin(self, move: Callable[[], None]) -> Move:
+        """Tell the stage to move, and return while it does.
+
+        Parameters
+        ----------
+        move : callable
+            Calls ``move`` or ``precess`` of the stage.
+        """
+        self.check()
+        if self.camera.latest == -math.inf:
+            self.take(1)  # a camera that is still starting is not missed later
+        began = time.monotonic()
+        move()
+        self._move = Move(self.stage, began)
+        return self._move
+
+    def end(self, move: Move) -> Report:
+        """Wait until a move is over.
+
+        Returns
+        -------
+        Report
+            Where the body rests.
+
+        Raises
+        ------
+        HardwareError
+            Stage or camera failed; the stage was stopped.
+        """
+        while not move.join(_SLICE):
+            self.check()
+        self.check()
+        if move.rest is None:
+            raise HardwareError(f"{self.stage.name} did not say where it came to rest: look at its cable")
+        return move.rest
+
+    def go(self, place: Position, speed: float | None = None) -> Report:
+        """Move the body to a place and wait until it rests there; see ``end``."""
+        return self.end(self.begin(lambda: self.stage.move(place, speed)))
+
+    def take(self, most: int) -> Frames:
+        """Take the frames that wait, or wait for one; see ``Camera.take``.
+
+        Raises
+        ------
+        HardwareError
+            None came, or stage or camera failed.
+        """
+        until = time.monotonic() + _PATIENCE
+        while True:
+            self.check()
+            try:
+                return self.camera.take(most, _SLICE + 2 * self.period)
+            except HardwareError:
+                self.check()
+                if self.camera.error is not None or time.monotonic() > until:
+                    raise
+
+    def stop(self) -> None:
+        """Stop the stage at once; raises nothing."""
+        self.stage.stop()
+
+    def close(self) -> None:
+        """Stop the stage if it moves, and let go of everything."""
+        self._leave(self.moving)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self._leave(kind is not None or self.moving)
+
+    def _leave(self, stop: bool) -> None:
+        with ExitStack() as leaving:  # the last is done first, and all of it whatever fails
+            leaving.callback(self.camera.close)
+            leaving.callback(self.stage.close)
+            leaving.callback(self._end_threads)
+            if stop:
+                self.stop()
+
+    def _end_threads(self) -> None:
+        self._closing.set()
+        self._guard.join()
+        if self._move is not None:
+            self._move.close()
+
+    def _watch(self) -> None:
+        """Guard: stop the stage when something is wrong while it moves."""
+        looked, seen, without, last = self._move, -math.inf, 0.0, time.monotonic()
+        while not self._closing.wait(_TICK):
+            # Who sleeps much longer than it wanted to is not alone; the camera may be waiting, too.
+            passed, last = time.monotonic() - last, time.monotonic()
+            move, latest = self._move, self.camera.latest
+            if move is None or move.over:
+                continue
+            if move is not looked or latest != seen:
+                looked, seen, without = move, latest, 0.0
+            else:
+                without += _TICK if passed < 2 * _TICK else _TICK / 2
+            fault = self._find(without)
+            if fault is not None:
+                self._fault = self._fault or fault  # first, or the stop would pass for the cause
+                self.stop()
+                return
+
+    def _find(self, without: float) -> HardwareError | None:
+        """Return what is wrong after so many seconds without a frame."""
+        wrong = self.stage.error or self.camera.error
+        if wrong is not None:
+            return wrong
+        if without < max(self._stall, _STALL_PERIODS * self.period):
+            return None
+        return HardwareError(
+            f"{self.camera.name} gave no frame for {without:.2f} s while the stage moved, which was stopped:"
+            " look at its cable and its load"
+        )
+
+
+def open_rig(settings: RigSettings) -> Rig:
+    """Open the stage and the camera that a rig file describes, and wait for the first frame.
+
+    A stage that has switches, and does not know where it is, is homed.
+
+    Raises
+    ------
+    InputError
+        One of them is missing, busy, or not what the file says.
+    HardwareError
+        No frame came.
+    """
+    from mirrorskin.hw.grbl import GrblStage
+    from mirrorskin.hw.video import VideoCamera
+
+    with ExitStack() as opening:
+        camera = VideoCamera(settings.camera)
+        opening.callback(camera.close)
+        camera.take(1, _PATIENCE)
+        stage = GrblStage(settings.stage)
+        opening.callback(stage.close)
+        if settings.stage.home and stage.report().state == "alarm":
+            stage.home()
+        opening.pop_all()
+    return Rig(stage, camera, settings)

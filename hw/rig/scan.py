@@ -1,0 +1,200 @@
+"""What all scans of a rig have in common: they check, lift, take references, and leave no stage moving."""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.rig.plans import AxialPlan, Plan
+from mirrorskin.hw.rig.references import given_reference, take_dark
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io.types import Block, Closing, Floats, Header
+
+UNKNOWN_DELAY = 0.2
+"""Seconds that a camera's frames are taken to be late at most, where nobody said."""
+
+_UPRIGHT = 1e-4  # rad
+
+
+class Scan(Closing):
+    """A `mirrorskin.io.types.LiveSource`: the stage moves as planned, the camera watches.
+
+    When the header is asked for, or the scan is entered, it lifts the body clear, takes the references and
+    goes to where the scan begins. Left without an error, it lifts the body again; left in the middle of a
+    move, or by an error, it stops the stage.
+
+    Parameters
+    ----------
+    rig : Rig
+        Open; whoever opened it closes it.
+    plan : VerticalPlan or AxialPlan
+
+    Attributes
+    ----------
+    rig : Rig
+    plan : VerticalPlan or AxialPlan
+    name, header, shape, dtype, motion, rewindable
+        As of every source; of ``shape``, the first is the number of frames expected.
+    count, dropped : int
+        Frames given so far, and lost between them.
+
+    Raises
+    ------
+    InputError
+        The plan goes beyond the stage's limits.
+    """
+
+    rewindable = False
+
+    def __init__(self, rig: Rig, plan: Plan) -> None:
+        self.rig, self.plan = rig, plan
+        self.name, self.motion = rig.name, plan.motion
+        self.dtype = rig.camera.dtype
+        self.count = self.dropped = 0
+        self._origin: float | None = None
+        self._complete = False
+        self._live: list[Floats] = []
+        plan.check(rig.stage.limits, rig.stage.name)
+
+    @property
+    def expected(self) -> int:
+        """Frames that the scan is expected to give."""
+        raise NotImplementedError
+
+    @property
+    def remark(self) -> str:
+        """What else there is to say of the scan, to be put behind a list; often nothing."""
+        return ""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames expected, rows and columns."""
+        return (self.expected, *self.rig.camera.shape)
+
+    @functools.cached_property
+    def header(self) -> Header:
+        """What holds for all frames; it is made ready for the scan when it is asked for."""
+        header = self._known()
+        dark = given_reference(self.rig, "dark")
+        bright = given_reference(self.rig, "bright")
+        lifted = self.lift()
+        if dark is None:
+            late = max(UNKNOWN_DELAY, self.rig.settings.camera.delay or 0.0) + self.rig.period
+            dark = take_dark(self.rig, lifted.time + late)
+        self._prepare()
+        return replace(header, dark=dark, bright=bright)
+
+    def now(self) -> float:
+        """Return the seconds since the first frame was asked for, the scale of ``Block.time``."""
+        return 0.0 if self._origin is None else time.monotonic() - self._origin
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return the positions of all frames so far; see ``LiveSource``."""
+        return {self._what: np.concatenate([np.empty(0), *self._live])}
+
+    def rewind(self) -> None:
+        """Refuse: time does not run back."""
+        raise RuntimeError("a live source cannot be rewound")
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Return the next frames, at most ``len(out)``, as lent memory; None when the plan is done.
+
+        Raises
+        ------
+        HardwareError
+            Stage or camera failed; the stage was stopped.
+        """
+        if self._complete:
+            return None
+        if self._origin is None:
+            _ = self.header
+            self._origin = time.monotonic()
+        block = self._next(1 if out is None else len(out), self._origin)
+        if block is None:
+            self._complete = True
+            return None
+        self.count += len(block.frames)
+        self.dropped += block.dropped
+        self._live.append(getattr(block, self._what))
+        return block
+
+    def lift(self) -> Report:
+        """Bring the body upright, and lift it to the upper end of its travel."""
+        limits = self.rig.stage.limits
+        here = self.rig.stage.report().position
+        if math.hypot(here.pitch, here.roll) > _UPRIGHT:
+            low, high = limits.travel[0], min(limits.travel[1], limits.press)
+            self.rig.go(Position(min(max(here.travel, low), high)))
+        return self.rig.go(Position(limits.travel[0]))
+
+    def close(self) -> None:
+        """Lift the body; stop the stage, if it is under way."""
+        if self.rig.moving:
+            self.rig.stop()
+        elif "header" in self.__dict__:  # otherwise it has not moved yet
+            self.lift()
+
+    def __enter__(self) -> Self:
+        _ = self.header
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.rig.stop()
+
+    @property
+    def _what(self) -> str:
+        return "phase" if isinstance(self.plan, AxialPlan) else "travel"
+
+    def _next(self, most: int, origin: float) -> Block | None:
+        """Return the next frames, of which the first may have to be waited for."""
+        raise NotImplementedError
+
+    def _block(
+        self, frames: NDArray[Any], arrival: Floats, place: Floats, dropped: int, origin: float
+    ) -> Block:
+        block = Block(
+            frames, index=self.count, time=arrival - origin, dropped=dropped, lent=frames.flags.c_contiguous
+        )
+        if self._what == "phase":
+            return replace(block, phase=place)
+        return replace(block, travel=place)
+
+    def _prepare(self) -> None:
+        """Go to where the scan begins; the body leans only when it is pressed."""
+        if isinstance(self.plan, AxialPlan):
+            self.rig.go(Position(self.plan.press))
+        self.rig.go(self.plan.first)
+
+    def _known(self) -> Header:
+        """Say what is known before anything moves."""
+        stage, camera = self.rig.settings.stage, self.rig.settings.camera
+        header = Header(
+            self.motion,
+            title=f"{self.name}, {self.motion} motion",
+            start_time=datetime.now(UTC).isoformat(timespec="seconds"),
+            pixel_size=camera.pixel_size,
+            zenith_gain=_scalar(camera.zenith_gain),
+            zenith_offset=_scalar(camera.zenith_offset),
+        )
+        if isinstance(self.plan, AxialPlan):
+            return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)
+        return header
+
+
+def _scalar(value: float | None) -> Floats | None:
+    return None if value is None else np.asarray(value, np.float64)

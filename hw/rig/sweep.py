@@ -1,0 +1,174 @@
+"""A scan without a halt: the body moves on while frames come, and where it was follows from reports."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.camera import Frames
+from mirrorskin.hw.rig.calibration import measure_delay
+from mirrorskin.hw.rig.delay import Delay
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
+from mirrorskin.hw.rig.rig import Move, Rig
+from mirrorskin.hw.rig.scan import Scan
+from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
+from mirrorskin.hw.stage import Position
+from mirrorskin.io.types import Block, Floats
+
+_SLOWER = 1.01  # than planned a turn may be, and still not have too many frames
+_MARGIN = 0.3  # seconds of frames besides those of the move
+
+
+class SweepScan(Scan):
+    """Records while the body moves on; see ``Scan``.
+
+    The live position of a frame is that of the planned way, locked to the latest reports, at the frame's
+    arrival less the camera's delay. Afterwards ``positions`` tells it better: from all reports, and from
+    the even times at which a camera exposes. A delay that the rig file does not give is measured first, by a
+    short move there and back.
+
+    Parameters
+    ----------
+    rig : Rig
+    plan : VerticalPlan or AxialPlan
+        With a speed or a rate.
+    turn_frames : int, optional
+        Frames that a turn has at most: only every second, third, ... frame is given, as it takes.
+    """
+
+    def __init__(self, rig: Rig, plan: Plan, turn_frames: int | None = None) -> None:
+        self._path = plan.path
+        super().__init__(rig, plan)
+        self._turn_frames = turn_frames
+        self._move: Move | None = None
+        self._every = 1
+        self._live_track = LiveTrack(self._path, math.inf)
+        self._progress = Progress(plan)
+        self._reports: list[tuple[float, float]] = []
+        self._frames: list[tuple[NDArray[np.int64], Floats]] = []
+
+    @property
+    def expected(self) -> int:
+        """Frames that the scan is expected to give."""
+        rate = self.rig.rate
+        all_frames = (self._path.duration + _MARGIN) * rate
+        return math.ceil(all_frames / self.every) if math.isfinite(rate) else 1
+
+    @property
+    def every(self) -> int:
+        """How many of the camera's frames one is given of."""
+        plan, rate = self.plan, self.rig.rate
+        if self._turn_frames is None or not isinstance(plan, AxialPlan) or not math.isfinite(rate):
+            return 1
+        turn = Trapezoid.planned(math.tau, self._path.speed).duration
+        return max(1, math.ceil(_SLOWER * turn * rate / self._turn_frames))
+
+    @property
+    def remark(self) -> str:
+        """How late the camera was."""
+        late = f"; frames {1e3 * self.delay.seconds:.1f} ms after their exposure"
+        measured = f" (+- {1e3 * self.delay.error:.1f} ms, measured)" if self.delay.error else ""
+        thinned = f"; 1 of {self._every} frames kept" if self._every > 1 else ""
+        return late + measured + thinned
+
+    @functools.cached_property
+    def delay(self) -> Delay:
+        """How late the camera's frames come: as the rig file says, or measured when it is asked for."""
+        said = self.rig.settings.camera.delay
+        return measure_delay(self.rig, self.plan) if said is None else Delay(said, 0.0)
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return where the body was in the frames, from all reports once it has come to the end."""
+        if not self._complete:
+            return super().positions()
+        number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
+        times, ways = zip(*self._reports, strict=True)
+        track = Track(times, ways, self._path)
+        return {self._what: self._place(track.at(even_times(number, arrival) - self.delay.seconds))}
+
+    def _prepare(self) -> None:
+        super()._prepare()
+        _ = self.delay
+
+    def _next(self, most: int, origin: float) -> Block | None:
+        if self._move is None:
+            taken, rest = self._begin(most)
+            if not isinstance(self.plan, AxialPlan):
+                return self._give(taken, rest, np.zeros(rest.stop - rest.start), origin)
+        while True:
+            taken = self.rig.take(most)
+            self._follow()
+            exposed = taken.time - self.delay.seconds
+            way = self._live_track.at(exposed)
+            part = self._thinned(taken, self._part(exposed, way))
+            if part.start < part.stop:
+                return self._give(taken, part, way[part], origin)
+            if part.stop < len(way):
+                self._end()
+                return None
+
+    def _give(self, taken: Frames, part: slice, way: Floats, origin: float) -> Block:
+        """Make a block of a part of the frames, and remember when they came."""
+        time = taken.time[part]
+        self._frames.append((taken.number[part], time))
+        return self._block(taken.pixels[part], time, self._place(way), taken.dropped, origin)
+
+    def _begin(self, most: int) -> tuple[Frames, slice]:
+        """Wait until frames show the body at rest, and begin to move; return these frames."""
+        plan, stage = self.plan, self.rig.stage
+        self._every = self.every  # of the rate as it is now
+        self.rig.camera.flush()
+        rests = stage.report().time + self.delay.seconds
+        while (taken := self.rig.take(most)).time[-1] <= rests:
+            pass
+        if isinstance(plan, AxialPlan):
+            tilt, turns, rate = plan.tilt, plan.turns, plan.rate or 0.0
+            self._move = self.rig.begin(lambda: stage.precess(tilt, turns, rate))
+        else:
+            stop, speed = Position(plan.stop), plan.speed
+            self._move = self.rig.begin(lambda: stage.move(stop, speed))
+        self._live_track = LiveTrack(self._path, self._move.began)
+        self._reports = [(self._move.began, 0.0)]
+        return taken, slice(int(np.searchsorted(taken.time, rests, side="right")), len(taken.time))
+
+    def _end(self) -> None:
+        """Wait for the end of the move, and for the last reports."""
+        if self._move is not None:
+            self.rig.end(self._move)
+        self._follow()
+
+    def _follow(self) -> None:
+        """Take in the reports that came since."""
+        if self._move is None:
+            return
+        for report in self.rig.stage.history(self._reports[-1][0]):
+            way = self._progress(report)
+            self._reports.append((report.time, way))
+            self._live_track.add(report.time, way)
+
+    def _part(self, exposed: Floats, way: Floats) -> slice:
+        """Tell which of some frames belong to the scan.
+
+        A press has frames at rest on either side. A rotation has none: they would count one phase too often.
+        """
+        began, ended = (self._move.began, self._move.ended) if self._move else (math.inf, math.inf)
+        end = int(np.searchsorted(exposed, ended, side="right"))
+        if not isinstance(self.plan, AxialPlan):
+            return slice(0, end)
+        end = min(end, int(np.searchsorted(way, self._path.length)))
+        return slice(min(end, int(np.searchsorted(exposed, began))), end)
+
+    def _thinned(self, taken: Frames, part: slice) -> slice:
+        """Leave out of a part of some frames what is not to be given."""
+        if part.start >= part.stop:
+            return part
+        skipped = -int(taken.number[part.start]) % self._every
+        return slice(min(part.start + skipped, part.stop), part.stop, self._every)
+
+    def _place(self, way: Floats) -> Floats:
+        """Return travel or phase so far along the way."""
+        return way if isinstance(self.plan, AxialPlan) else self.plan.start + way

@@ -1,0 +1,269 @@
+"""Where the body was: from a stage's reports, which are few, late and uneven, to any time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid, VerticalPlan
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io.types import Floats
+
+_LOCK = 8  # of the latest reports, that tell how far the way has come
+_SLOPES = (0.2, 2.0)  # of a planned second, that may pass in one
+_AT_REST = 1e-3  # of the way's length, that the body may seem to have moved
+_RAMPS = (0.004, 2.0)  # seconds in which a stage reaches its speed
+_LEAST = 4  # reports under way, to tell more than when the move began
+_SPREAD = 1.4826  # standard deviations in a median magnitude, of a normal distribution
+_ORDER = 1.5  # by which the plan's deviations exceed chance
+_SMOOTH = 5  # reports on either side
+_GAP = 0.6  # periods more than one, between two frames, among which one may have been lost
+_NEAR = 9  # frames on either side of a gap
+
+
+class Progress:
+    """Tells how far along a plan's way each report is: mm, or radians without jumps.
+
+    Parameters
+    ----------
+    plan : VerticalPlan or AxialPlan
+        It goes without a halt.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._last: tuple[float, float] | None = None
+
+    def __call__(self, report: Report) -> float:
+        """Return the way so far; reports come in the order of their times."""
+        if isinstance(self._plan, VerticalPlan):
+            return min(
+                max(report.position.travel - self._plan.start, 0.0), self._plan.stop - self._plan.start
+            )
+        now = self._near(report.position, self._expected(report.time, self._plan))
+        self._last = report.time, now
+        return now
+
+    def _expected(self, time: float, plan: AxialPlan) -> float:
+        """Go on as planned from the last report, half as far: the body may have rested meanwhile."""
+        if self._last is None:
+            return 0.0
+        before, way = self._last
+        ahead = min(plan.path.speed * (time - before) / 2, math.pi)
+        return way + ahead
+
+    @staticmethod
+    def _near(position: Position, expected: float) -> float:
+        turns = round((expected - position.phase) / math.tau)
+        return position.phase + math.tau * turns
+
+
+class LiveTrack:
+    """Where the body is, as far as it is known while it moves: the planned way, locked to the latest reports.
+
+    The reports of the last moments tell by a straight line which of the plan's seconds it is at, and how
+    fast these pass; the plan tells the place. It never runs back.
+
+    Parameters
+    ----------
+    path : Trapezoid
+        The planned way.
+    began : float
+        When the move was told to begin, seconds.
+    """
+
+    def __init__(self, path: Trapezoid, began: float) -> None:
+        self._path = path
+        self._reports: list[tuple[float, float]] = []
+        self._line = began, 0.0, 1.0
+        self._last = 0.0
+        self._done = math.inf
+
+    def add(self, time: float, way: float) -> None:
+        """Take a report: how far the body had come at a time, seconds."""
+        rest = _AT_REST * self._path.length
+        if way <= rest:
+            self._line = max(time, self._line[0]), 0.0, 1.0
+        elif way >= self._path.length - rest:
+            self._done = min(self._done, time)
+        else:
+            self._reports = [*self._reports[1 - _LOCK :], (time, float(self._path.time(way)))]
+            self._line = self._lock()
+
+    def at(self, times: ArrayLike) -> Floats:
+        """Return the way so far at some times that increase, of the shape of `times`."""
+        t = np.asarray(times, np.float64)
+        origin, start, slope = self._line
+        way = self._path.place(start + slope * (t - origin))
+        way = np.where(t >= self._done, self._path.length, way)
+        way = np.maximum.accumulate(np.maximum(way, self._last))
+        self._last = float(way[-1]) if way.size else self._last
+        return way
+
+    def _lock(self) -> tuple[float, float, float]:
+        """Return a time, the plan's second at it, and how many of these pass in one."""
+        time, planned = np.array(self._reports).T
+        slope = 1.0
+        if len(time) >= 3:
+            spread = time - time.mean()
+            slope = float(np.clip(spread @ planned / (spread @ spread), *_SLOPES))
+        return float(time.mean()), float(planned.mean()), slope
+
+
+class Track:
+    """Where the body was, once the move is over: fitted to all of the reports.
+
+    A stage speeds up, keeps its speed and slows down; when, how fast and how quickly comes from all reports
+    together, so that the uneven times of single ones hardly count. Where the reports show that it went
+    otherwise, what they agree on is added.
+
+    Parameters
+    ----------
+    times, ways : array_like, (n,)
+        Of the reports: seconds, and how far the body had come, mm or radians.
+    path : Trapezoid
+        The planned way.
+
+    Attributes
+    ----------
+    began : float
+        When the body began to move, seconds.
+    path : Trapezoid
+        The way as it was gone.
+    reports : int
+        How many there are.
+    spread : float
+        Standard deviation of the reports about the result, mm or radians.
+    """
+
+    def __init__(self, times: ArrayLike, ways: ArrayLike, path: Trapezoid) -> None:
+        time, way = np.asarray(times, np.float64), np.asarray(ways, np.float64)
+        self.began, self.path = _fit(time, way, path)
+        left = way - self.path.place(time - self.began)
+        self._extra = _agreed(left)
+        self._time = time
+        self.reports = len(time)
+        self.spread = _deviation(left - self._extra)
+
+    @property
+    def ended(self) -> float:
+        """When the body came to rest, seconds."""
+        return self.began + self.path.duration
+
+    def at(self, times: ArrayLike) -> Floats:
+        """Return how far the body had come at some times that increase; it never runs back."""
+        t = np.asarray(times, np.float64)
+        way = self.path.place(t - self.began)
+        if self._extra.any():
+            way = np.clip(way + np.interp(t, self._time, self._extra), 0, self.path.length)
+        return np.maximum.accumulate(way)
+
+
+def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
+    """Find the beginning, the speed and the acceleration that suit all reports best."""
+    from scipy.optimize import least_squares
+
+    rest = _AT_REST * path.length
+    moving = (way > rest) & (way < path.length - rest)
+    if not moving.any():
+        before = time[way <= rest]
+        return (float(before[-1]) if len(before) else float(time[0])), path
+    began = float(np.median(time[moving] - path.time(way[moving])))
+    if np.count_nonzero(moving) < _LEAST:
+        return began, path
+
+    def gone(values: Floats) -> tuple[float, Trapezoid]:
+        shift, speed, ramp = values
+        faster = path.speed * math.exp(speed)
+        return began + shift, Trapezoid(path.length, faster, faster / math.exp(ramp))
+
+    def misses(values: Floats) -> Floats:
+        start, trial = gone(values)
+        return trial.place(time - start) - way
+
+    scale = _deviation(misses(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
+    low, high = (math.log(ramp) for ramp in _RAMPS)
+    best = min(
+        (
+            least_squares(
+                misses,
+                [0.0, 0.0, math.log(ramp)],
+                loss="soft_l1",
+                f_scale=0.3 * scale,
+                bounds=([-np.inf, -3.0, low], [np.inf, 3.0, high]),
+                x_scale=[0.01, 0.01, 0.3],
+            )
+            for ramp in (0.02, 0.1, 0.5)
+        ),
+        key=lambda fit: float(fit.cost),
+    )
+    return gone(best.x)
+
+
+def _agreed(left: Floats) -> Floats:
+    """Return what neighbouring reports agree on of what is left; nothing where it looks like chance."""
+    chance = _deviation(np.diff(left)) / math.sqrt(2)
+    if len(left) <= 2 * _SMOOTH or _deviation(left) <= _ORDER * chance:
+        return np.zeros_like(left)
+    weights = (1 - (np.abs(np.arange(-_SMOOTH, _SMOOTH + 1)) / (_SMOOTH + 1)) ** 3) ** 3
+    edges = np.pad(left, _SMOOTH, mode="edge")
+    return np.asarray(np.convolve(edges, weights / weights.sum(), mode="valid"))
+
+
+def _deviation(values: Floats) -> float:
+    """Return the standard deviation, of which outliers take no notice."""
+    return float(_SPREAD * np.median(np.abs(values))) if values.size else 0.0
+
+
+def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Floats:
+    """Take the unevenness out of the times at which a camera's frames arrived.
+
+    A camera exposes evenly, whatever happens to its frames on their way. Each time is taken from a straight
+    line through those of the frames around, by their numbers. Frames that were lost but not counted are seen
+    by the whole periods by which all later ones are late.
+
+    Parameters
+    ----------
+    number : array_like, (n,)
+        Of the frames; those lost are counted, as far as anyone noticed.
+    arrival : array_like, (n,)
+        Seconds.
+    window : int
+        Frames on either side that count.
+
+    Returns
+    -------
+    ndarray, (n,), float64
+        Seconds; never decreasing.
+    """
+    t = np.asarray(arrival, np.float64)
+    if len(t) < 3:
+        return t
+    n = _mended(np.asarray(number, np.float64), t)
+    frame = np.arange(len(n))
+    first, end = np.maximum(frame - window, 0), np.minimum(frame + window + 1, len(n))
+
+    def mean(values: Floats) -> Floats:
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray((total[end] - total[first]) / (end - first))
+
+    # Counted from the middle, and as deviations from an even clock, so that nothing cancels.
+    n = n - n.mean()
+    pace = (t[-1] - t[0]) / (n[-1] - n[0])
+    late = t - t[0] - pace * n
+    mean_n, mean_late = mean(n), mean(late)
+    slope = (mean(n * late) - mean_n * mean_late) / (mean(n * n) - mean_n**2)
+    return np.maximum.accumulate(t[0] + pace * n + mean_late + slope * (n - mean_n))
+
+
+def _mended(number: Floats, arrival: Floats) -> Floats:
+    """Count frames that nobody noticed were lost: from a gap on, all frames are whole periods late."""
+    period = float(np.median(np.diff(arrival) / np.diff(number)))
+    late = arrival - period * (number - number[0])
+    mended = number.copy()
+    for gap in np.flatnonzero(np.diff(late) > _GAP * period) + 1:
+        before, after = late[max(0, gap - _NEAR) : gap], late[gap : gap + _NEAR]
+        mended[gap:] += max(0, round((np.median(after) - np.median(before)) / period))
+    return mended

@@ -1,0 +1,138 @@
+"""``mirrorskin capture`` from the command line to the file, on an emulated rig and its stream."""
+
+import re
+
+import pytest
+from commands import run
+
+from mirrorskin import io
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.grbl.link import Link
+from mirrorskin.hw.rig import rig as rigs
+
+SHAPE = (24, 32)
+
+
+@pytest.fixture(scope="module")
+def emulated(tmp_path_factory):
+    """The rig's file; its emulators run as long as the tests of this module."""
+    folder = tmp_path_factory.mktemp("rig")
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        EmulatedRig(shape=SHAPE, pixel_size=0.2, rate=40.0, delay=0.02) as rig,
+        rig.serve() as server,
+    ):
+        # Emulators are late where other programs have the processors; that is no fault here.
+        patch.setattr(rigs, "_STALL", 5.0)
+        patch.setattr(Link, "_limit", lambda link: 5.0)
+        file = rig.write(folder, server.url)
+        known = file.read_text().replace("[camera]", "[camera]\ndelay = 0.02\ndark = 16")
+        file.write_text(known)
+        yield rig, file
+
+
+def capture(emulated, *words):
+    return run("capture", *words, "--rig", emulated[1])
+
+
+def test_a_press_in_steps_becomes_a_recording(emulated, tmp_path):
+    path = tmp_path / "press.h5"
+    words = ("--stop", "1mm", "--step", "500um", "--settle", "0s", "--frames", "2")
+    ended = capture(emulated, "vertical", "-o", path, *words)
+    assert ended.code == 0, ended.said
+    assert re.fullmatch(rf"{path}: 6 frames of 32 x 24 at \d+\.?\d* Hz, 0 dropped, \d+ late\n", ended.out)
+    assert ended.said == ""
+    with io.open_recording(path) as recording:
+        assert recording.shape == (6, *SHAPE)
+        assert recording.state == "complete"
+        assert list(recording.travel) == [0, 0, 0.5, 0.5, 1, 1]
+        assert recording.header.dark is not None
+        assert recording.header.bright is not None
+
+
+def test_a_rotation_without_a_halt_becomes_a_recording(emulated, tmp_path):
+    path = tmp_path / "turn.h5"
+    ended = capture(emulated, "axial", "-o", path, "--press", "1mm", "--rate", "1", "--compression", "lzf")
+    assert ended.code == 0, ended.said
+    assert "late; frames 20.0 ms after their exposure" in ended.out
+    with io.open_recording(path) as recording:
+        assert recording.state == "complete"
+        assert recording.header.press == 1
+        assert recording.phase[-1] == pytest.approx(6.28, abs=0.3)
+        assert recording.shape[0] > 15
+
+
+def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monkeypatch):
+    path = tmp_path / "short.h5"
+    rig, _ = emulated
+    appended = io.StreamRecorder.read
+
+    def read(recorder, out=None, /):
+        if recorder.count > 10:
+            raise io.InputError("the disk is full: make room")
+        return appended(recorder, out)
+
+    monkeypatch.setattr(io.StreamRecorder, "read", read)
+    ended = capture(emulated, "vertical", "-o", path, "--stop", "2mm", "--speed", "0.5mm/s")
+    assert ended.code == 1
+    kept = re.fullmatch(rf"mirrorskin: .* full: make room; {path} .* holds (\d+) frames\n", ended.said)
+    assert kept is not None, ended.said
+    with io.open_recording(path) as recording:
+        assert recording.shape[0] == int(kept[1])
+        assert recording.state.startswith("cut short")
+    assert not rig.machine.moving()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["vertical", "--stop", "9mm", "--step", "1mm"], "beyond the axis"),
+        (["axial", "--press", "1mm", "--tilt", "20deg", "--rate", "1"], "beyond"),
+        (["vertical", "--step", "1mm"], "--stop is missing"),
+        (["axial", "--rate", "1"], "--press is missing"),
+        (["vertical", "--stop", "1mm"], "either a step"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--speed", "1mm/s"], "either a step"),
+        (["vertical", "--stop", "1mm", "--speed", "1mm"], "write e.g. 0.5mm/s"),
+        (["vertical", "--stop", "1mm", "--speed", "1mm/s", "--settle", "1s"], "without a halt"),
+        (["vertical", "--stop", "1mm", "--speed", "1mm/s", "--frames", "2"], "without a halt"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--settle", "-1s"], "0 or more"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--press", "1mm"], "--press says nothing"),
+        (["axial", "--press", "1mm", "--phase-step", "45deg", "--stop", "1mm"], "--stop says nothing"),
+        (["horizontal", "--stop", "1mm"], "horizontal"),
+    ],
+)
+def test_a_call_that_cannot_be_moves_nothing(emulated, tmp_path, words, said):
+    path = tmp_path / "none.h5"
+    ended = capture(emulated, *words, "-o", path)
+    assert ended.code == 2
+    assert said in ended.said
+    assert ended.said.count("\n") == 1
+    assert not path.exists()
+    assert not emulated[0].machine.moving()
+
+
+def test_a_rig_file_that_is_missing_is_named(tmp_path):
+    ended = run(
+        "capture", "vertical", "--rig", tmp_path / "no.toml", "-o", tmp_path / "a.h5", "--stop", "1mm"
+    )
+    assert ended.code == 2
+    assert "no.toml" in ended.said
+
+
+def test_a_recording_is_not_written_over_the_rig_file(emulated):
+    words = ("vertical", "--stop", "1mm", "--step", "1mm", "-o", emulated[1])
+    ended = capture(emulated, *words)
+    assert ended.code == 2
+    assert "input" in ended.said
+
+
+def test_a_port_that_is_missing_is_one_line(emulated, tmp_path):
+    file = tmp_path / "rig.toml"
+    text = re.sub(r'port = ".*"', f'port = "{tmp_path}/none"', emulated[1].read_text())
+    file.write_text(text.replace('bright = "bright.npy"', ""))
+    ended = run(
+        "capture", "vertical", "--rig", file, "-o", tmp_path / "a.h5", "--stop", "1mm", "--step", "1mm"
+    )
+    assert ended.code == 2
+    assert "none" in ended.said
+    assert ended.said.count("\n") == 1

@@ -1,0 +1,90 @@
+import math
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.delay import block_means, estimate_delay
+from mirrorskin.hw.rig.plans import Trapezoid
+
+PATH = Trapezoid(1.0, 0.6, 10.0)
+THERE, BACK = 0.3, 2.4
+
+
+def place(time):
+    """There and back again."""
+    return PATH.place(time - THERE) - PATH.place(time - BACK)
+
+
+def pictures(where, noise, random, width=0.05):
+    """Light that spreads as the body goes down, in 64 places."""
+    edge = 0.1 + 0.8 * np.linspace(0, 1, 64)
+    light = 200 / (1 + np.exp((edge - where[:, None]) / width))
+    return light + noise * random.standard_normal(light.shape)
+
+
+def watch(seed, delay, jitter=0.005, noise=0.5, rate=60.0):
+    random = np.random.default_rng(seed)
+    exposed = np.arange(0, BACK + 3, 1 / rate) + random.uniform(0, 1 / rate)
+    arrival = exposed + delay + jitter * random.standard_normal(len(exposed))
+    return arrival, pictures(place(exposed), noise, random)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("rate", [30.0, 100.0])
+def test_a_delay_of_50_ms_is_found_within_2_ms_although_frames_jitter_by_5(seed, rate):
+    found = estimate_delay(*watch(seed, 0.05, rate=rate), place)
+    assert found.seconds == pytest.approx(0.05, abs=0.002)
+    assert found.error < 0.001
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0123, 0.21, 0.45])
+def test_a_steady_delay_is_found_within_a_tenth_of_a_millisecond(delay):
+    found = estimate_delay(*watch(0, delay, jitter=0.0, noise=0.1), place)
+    assert found.seconds == pytest.approx(delay, abs=1e-4)
+
+
+def test_the_standard_error_is_what_the_estimate_scatters_by():
+    found = [estimate_delay(*watch(seed, 0.05), place) for seed in range(12)]
+    scatter = np.std([one.seconds for one in found])
+    told = np.mean([one.error for one in found])
+    assert 0.5 < scatter / told < 1.7
+
+
+def test_lamps_that_warm_up_do_not_matter():
+    arrival, seen = watch(0, 0.05)
+    warm = np.linspace(0, 20, len(arrival))[:, None]
+    assert estimate_delay(arrival, seen + warm, place).seconds == pytest.approx(0.05, abs=0.002)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_picture_that_does_not_change_is_refused(noise):
+    random = np.random.default_rng(0)
+    arrival, _ = watch(0, 0.05)
+    with pytest.raises(HardwareError, match=r"press deeper.*rig file.*delay"):
+        estimate_delay(arrival, 50 + noise * random.standard_normal((len(arrival), 64)), place, "cam")
+
+
+def test_a_delay_beyond_what_is_looked_for_is_refused():
+    with pytest.raises(HardwareError, match="delay"):
+        estimate_delay(*watch(0, 1.1), place)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("shape", [(48, 64), (37, 53), (5, 70), (1, 1)])
+def test_block_means_are_the_means_of_blocks(dtype, shape):
+    frames = np.random.default_rng(2).integers(0, 255, (3, *shape)).astype(dtype)
+    means = block_means(frames)
+    rows, columns = (min(16, size) for size in shape)
+    assert means.shape == (3, rows * columns)
+    tall, wide = (np.linspace(0, size, min(16, size) + 1).astype(int) for size in shape)
+    for k in range(rows * columns):
+        y, x = divmod(k, columns)
+        block = frames[:, tall[y] : tall[y + 1], wide[x] : wide[x + 1]].astype(float)
+        np.testing.assert_allclose(means[:, k], block.mean(axis=(1, 2)))
+
+
+def test_a_single_pixel_tells_the_delay():
+    arrival, seen = watch(3, 0.08, noise=0.1)
+    found = estimate_delay(arrival, seen[:, 30:31], place)
+    assert math.isclose(found.seconds, 0.08, abs_tol=0.006)

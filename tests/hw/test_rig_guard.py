@@ -1,0 +1,161 @@
+"""Whatever goes wrong, the stage stops; on made-up hardware that can go wrong at will."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from rig_fakes import FakeCamera, FakeStage, settings
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.stage import Position
+
+DEADLINE = 1.0  # seconds: far more than it takes, for machines with much else to do
+
+
+@pytest.fixture
+def rig():
+    stage = FakeStage()
+    camera = FakeCamera(stage.position, lambda place: np.zeros((2, 2), np.uint8), rate=100.0)
+    with Rig(stage, camera, settings((2, 2))) as opened:
+        yield opened
+
+
+def stopped(stage):
+    """Wait until the stage was stopped."""
+    until = time.monotonic() + DEADLINE
+    while not stage.stops and time.monotonic() < until:
+        time.sleep(0.005)
+    return bool(stage.stops)
+
+
+def begin(rig):
+    return rig.begin(lambda: rig.stage.move(Position(2.0), 0.5))
+
+
+def test_a_camera_that_stalls_stops_the_stage_while_everyone_is_busy(rig):
+    begin(rig)
+    rig.camera.stall()
+    began = time.monotonic()
+    assert stopped(rig.stage)  # nobody asked the rig for anything
+    assert rig.stage.stops[0] - began > 0.05
+    with pytest.raises(HardwareError, match=r"fake camera gave no frame for 0\.1"):
+        rig.take(1)
+
+
+def test_a_camera_that_is_lost_stops_the_stage_and_is_named(rig):
+    begin(rig)
+    rig.camera.lose()
+    assert stopped(rig.stage)
+    with pytest.raises(HardwareError, match="fake camera was lost"):
+        rig.check()
+
+
+def test_a_stage_that_fails_is_stopped_and_named(rig):
+    begin(rig)
+    rig.stage.error = HardwareError("fake stage: ALARM:1")
+    assert stopped(rig.stage)
+    with pytest.raises(HardwareError, match="ALARM:1"):
+        rig.take(1)
+
+
+def test_waiting_for_a_move_ends_with_the_fault(rig):
+    move = begin(rig)
+    rig.camera.stall()
+    with pytest.raises(HardwareError, match="no frame"):
+        rig.end(move)
+    assert rig.stage.stops
+
+
+def test_a_camera_that_stalls_at_rest_stops_nothing(rig):
+    rig.go(Position(-0.9))
+    rig.camera.stall()
+    time.sleep(0.3)
+    assert rig.stage.stops == []
+    rig.check()
+
+
+def test_no_move_begins_after_a_fault(rig):
+    begin(rig)
+    rig.camera.lose()
+    assert stopped(rig.stage)
+    count = len(rig.stage.moves)
+    with pytest.raises(HardwareError, match="was lost"):
+        rig.go(Position(0.0))
+    assert len(rig.stage.moves) == count
+
+
+class Order(list):
+    """Writes down what is called, in order."""
+
+    def watch(self, owner, name):
+        call = getattr(owner, name)
+
+        def told(*args):
+            self.append(name if owner is not self.camera else f"camera {name}")
+            return call(*args)
+
+        setattr(owner, name, told)
+
+
+def end_by(kind, rig):
+    with rig:
+        begin(rig)
+        raise kind
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, ValueError, HardwareError, GeneratorExit])
+def test_the_stage_stops_first_whatever_ends_it(kind):
+    stage = FakeStage()
+    camera = FakeCamera(stage.position, lambda place: np.zeros((2, 2), np.uint8))
+    order = Order()
+    order.camera = camera
+    for owner, name in ((stage, "stop"), (stage, "close"), (camera, "close")):
+        order.watch(owner, name)
+    threads = threading.active_count()
+    with pytest.raises(kind):
+        end_by(kind, Rig(stage, camera, settings((2, 2))))
+    assert order[0] == "stop"
+    assert order[-2:] == ["close", "camera close"]
+    assert threading.active_count() == threads
+
+
+def test_a_rig_that_is_left_while_it_moves_is_stopped():
+    stage = FakeStage()
+    camera = FakeCamera(stage.position, lambda place: np.zeros((2, 2), np.uint8))
+    with Rig(stage, camera, settings((2, 2))) as rig:
+        begin(rig)
+    assert stage.stops
+    assert stage.closed
+    assert camera.closed
+
+
+def test_a_rig_that_rests_is_left_without_a_stop():
+    stage = FakeStage()
+    camera = FakeCamera(stage.position, lambda place: np.zeros((2, 2), np.uint8))
+    with Rig(stage, camera, settings((2, 2))) as rig:
+        assert rig.go(Position(-0.9)).position == Position(-0.9)
+    assert stage.stops == []
+    assert stage.closed
+
+
+def test_all_is_closed_even_if_closing_fails():
+    stage = FakeStage()
+    camera = FakeCamera(stage.position, lambda place: np.zeros((2, 2), np.uint8))
+    threads = threading.active_count()
+
+    def fail():
+        raise OSError("gone")
+
+    stage.close = fail
+    with pytest.raises(OSError, match="gone"), Rig(stage, camera, settings((2, 2))):
+        pass
+    assert camera.closed
+    assert threading.active_count() == threads
+
+
+def test_a_defect_while_the_stage_waits_is_not_hidden(rig):
+    rig.stage.wait = lambda: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        rig.go(Position(0.0))

@@ -1,0 +1,134 @@
+import math
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan
+from mirrorskin.hw.stage import Limits, Position
+from mirrorskin.io import InputError
+
+LIMITS = Limits((-5.0, 3.0), math.radians(5), 2.0)
+NAN, INF = math.nan, math.inf
+
+ways = pytest.mark.parametrize(
+    ("length", "speed", "acceleration"),
+    [(1.0, 0.5, 10.0), (1.0, 100.0, 3.0), (2e-3, 0.1, 5.0), (6.0, 2.0, 1e5)],
+)
+
+
+@ways
+def test_a_way_is_what_its_speed_adds_up_to(length, speed, acceleration):
+    path = Trapezoid(length, speed, acceleration)
+    time = np.linspace(0, path.duration, 200_001)
+    pace = np.minimum(np.minimum(acceleration * time, acceleration * (time[-1] - time)), speed)
+    gone = np.concatenate([[0], np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(time))])
+    assert gone[-1] == pytest.approx(length, rel=1e-6)
+    np.testing.assert_allclose(path.place(time), gone, atol=1e-6 * length)
+
+
+@ways
+def test_the_time_of_a_place_is_when_it_is_there(length, speed, acceleration):
+    path = Trapezoid(length, speed, acceleration)
+    time = np.linspace(0, path.duration, 101)
+    np.testing.assert_allclose(path.time(path.place(time)), time, atol=1e-6 * path.duration)
+
+
+def test_a_body_rests_before_and_after_its_way():
+    path = Trapezoid.planned(3.0, 1.0)
+    np.testing.assert_array_equal(path.place([-5, 0, path.duration, 99]), [0, 0, 3, 3])
+    assert path.duration == pytest.approx(3.1)
+
+
+def test_a_press_in_steps_takes_every_place_to_its_end():
+    plan = VerticalPlan(0.1, 0.7, step=0.1)
+    np.testing.assert_allclose(plan.values, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+    assert [place.travel for place in plan.places] == list(plan.values)
+    assert plan.first == Position(0.1)
+
+
+def test_a_press_in_steps_never_goes_beyond_its_end():
+    np.testing.assert_allclose(VerticalPlan(0.0, 1.0, step=0.3).values, [0, 0.3, 0.6, 0.9])
+
+
+def test_a_turn_in_steps_does_not_take_its_beginning_twice():
+    np.testing.assert_allclose(
+        np.degrees(AxialPlan(1.0, 0.04, phase_step=math.radians(45)).values), np.arange(0, 360, 45)
+    )
+    assert len(AxialPlan(1.0, 0.04, turns=3, phase_step=math.tau / 7).values) == 21
+
+
+def test_a_rotation_leans_by_its_tilt_towards_each_phase():
+    plan = AxialPlan(1.0, 0.04, phase_step=math.radians(30))
+    for place, phase in zip(plan.places, plan.values, strict=True):
+        assert place.travel == 1.0
+        assert place.tilt == pytest.approx(0.04)
+        assert math.cos(place.phase - phase) == pytest.approx(1)
+
+
+def test_a_rotation_without_a_halt_goes_round_at_its_rate():
+    path = AxialPlan(1.0, 0.04, turns=2, rate=0.5).path
+    assert path.length == pytest.approx(4 * math.pi)
+    assert path.speed == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize(
+    ("plan", "limit"),
+    [
+        (VerticalPlan(-6.0, 1.0, speed=1), "-5"),
+        (VerticalPlan(0.0, 2.5, speed=1), "2 mm"),
+        (VerticalPlan(0.0, 3.5, step=1), "3 mm"),
+        (AxialPlan(2.5, 0.02, rate=1), "2 mm"),
+        (AxialPlan(1.0, math.radians(6), rate=1), "6 degrees"),
+        (AxialPlan(1.0, math.radians(6), phase_step=1), "6 degrees"),
+    ],
+)
+def test_a_plan_beyond_the_limits_is_refused(plan, limit):
+    with pytest.raises(InputError, match=limit):
+        plan.check(LIMITS, "stage")
+
+
+@pytest.mark.parametrize("plan", [VerticalPlan(-5.0, 2.0, speed=1), AxialPlan(2.0, math.radians(5), rate=1)])
+def test_a_plan_up_to_the_limits_is_not(plan):
+    plan.check(LIMITS, "stage")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (0, 0, 1, None),
+        (1, 0, 1, None),
+        (NAN, 1, 1, None),
+        (0, INF, 1, None),
+        (0, 1, None, None),
+        (0, 1, 1, 1),
+        (0, 1, 0, None),
+        (0, 1, -1, None),
+        (0, 1, None, 0),
+        (0, 1, None, NAN),
+        (0, 1, 2, None),
+        (0, 1, 1e-9, None),
+    ],
+)
+def test_a_press_that_cannot_be_is_refused(values):
+    with pytest.raises(InputError):
+        VerticalPlan(*values)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (NAN, 0.04, 1, 1, None),
+        (1, 0, 1, 1, None),
+        (1, -0.04, 1, 1, None),
+        (1, 0.04, 0, 1, None),
+        (1, 0.04, INF, None, 1),
+        (1, 0.04, 1, None, None),
+        (1, 0.04, 1, 1, 1),
+        (1, 0.04, 1, None, -1),
+        (1, 0.04, 1, 2.5, None),
+        (1, 0.04, 1, 1e-9, None),
+    ],
+)
+def test_a_rotation_that_cannot_be_is_refused(values):
+    with pytest.raises(InputError):
+        AxialPlan(*values)

@@ -1,0 +1,270 @@
+"""Scans of a stage and a camera that are made up, so that every frame tells where it was exposed."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rig_fakes import FakeCamera, FakeStage, settings, spreading
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig import calibration
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.steps import StepScan
+from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io import InputError
+
+TILT = 0.04
+SHAPE = (3, 4)
+ROOM = np.empty((8, *SHAPE), np.uint8)
+
+
+def told(place):
+    """A picture that tells travel and lean: 100 counts a mm from 100 at 0, 1000 counts a radian."""
+    picture = np.zeros(SHAPE, np.uint8)
+    picture[0] = np.clip(100 + 100 * place.travel, 0, 255)
+    picture[1] = np.clip(100 + 1000 * place.pitch, 0, 255)
+    picture[2] = np.clip(100 + 1000 * place.roll, 0, 255)
+    return picture
+
+
+def make_rig(picture=told, rate=250.0, delay=0.03, jitter=0.0, late=0.0, seed=0, **camera):
+    stage = FakeStage(late=late, seed=seed)
+    eye = FakeCamera(stage.position, picture, rate=rate, delay=delay, jitter=jitter, seed=seed)
+    return Rig(stage, eye, settings(eye.shape, **{"delay": delay, "dark": 5.0, **camera}))
+
+
+def drain(scan, room=ROOM):
+    """Return all blocks, with copies of their frames."""
+    blocks = []
+    while (block := scan.read(room)) is not None:
+        blocks.append(replace(block, frames=block.frames.copy()))
+    return blocks
+
+
+def joined(blocks, name):
+    return np.concatenate([getattr(block, name) for block in blocks])
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A press without a halt: the scan, its blocks, and where the body truly was in each frame."""
+    plan = VerticalPlan(0.0, 1.0, speed=1.5)
+    with make_rig(rate=100.0, jitter=0.003, late=0.002) as rig, SweepScan(rig, plan) as scan:
+        blocks = drain(scan)
+    return scan, blocks, *_exposed(scan)
+
+
+def _exposed(scan):
+    number = np.concatenate([numbers for numbers, _ in scan._frames])
+    camera = scan.rig.camera
+    places = [scan.rig.stage.position(camera._start + k / camera._rate) for k in number]
+    return (places,)
+
+
+def test_each_frame_of_steps_shows_the_place_that_it_tells():
+    with make_rig() as rig, StepScan(rig, VerticalPlan(0.0, 1.0, step=0.25), settle=0.02, frames=3) as scan:
+        assert scan.shape == (15, *SHAPE)
+        blocks = drain(scan, ROOM[:2])
+        assert [place.travel for place in rig.stage.moves[-5:]] == [0, 0.25, 0.5, 0.75, 1]
+    travel = joined(blocks, "travel")
+    np.testing.assert_allclose(travel, np.repeat([0, 0.25, 0.5, 0.75, 1], 3))
+    np.testing.assert_allclose(joined(blocks, "frames")[:, 0, 0], 100 + 100 * travel, atol=1)
+    np.testing.assert_array_equal(scan.positions()["travel"], travel)
+    assert max(len(block.frames) for block in blocks) <= 2
+    assert [block.index for block in blocks] == list(np.cumsum([0, *(len(b.frames) for b in blocks)])[:-1])
+    assert all(block.lent and block.dropped == 0 for block in blocks)
+    assert scan.count == 15
+
+
+def test_each_frame_of_a_stepwise_turn_shows_its_phase():
+    with make_rig() as rig, StepScan(rig, AxialPlan(0.5, TILT, phase_step=math.tau / 5), settle=0.0) as scan:
+        blocks = drain(scan)
+    phase, frames = joined(blocks, "phase"), joined(blocks, "frames")
+    np.testing.assert_allclose(phase, math.tau / 5 * np.arange(5))
+    np.testing.assert_allclose(frames[:, 1, 0], 100 + 1000 * TILT * np.cos(phase), atol=1)
+    np.testing.assert_allclose(frames[:, 2, 0], 100 + 1000 * TILT * np.sin(phase), atol=1)
+    np.testing.assert_array_equal(frames[:, 0, 0], 150)
+    assert scan.header.press == 0.5
+    assert scan.header.tilt == TILT
+    assert scan.header.pivot == (0, 0, 0)
+
+
+def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):
+    scan, blocks, places = pressed
+    true = np.array([place.travel for place in places])
+    live, corrected = joined(blocks, "travel"), scan.positions()["travel"]
+    for travel, near in ((live, 0.1), (corrected, 0.02)):
+        assert np.all(np.diff(travel) >= 0)
+        assert abs(travel - true).max() < near
+    assert live[0] == 0
+    assert corrected[-1] == pytest.approx(1, abs=1e-3)
+    assert true[0] == 0
+    assert true[-1] == pytest.approx(1)
+
+
+def test_the_times_of_frames_are_those_of_the_scans_clock(pressed):
+    scan, blocks, _ = pressed
+    time = joined(blocks, "time")
+    assert time[0] >= 0
+    assert np.all(np.diff(time) >= 0)
+    assert time[-1] <= scan.now()
+
+
+def test_a_rotation_without_a_halt_has_no_frames_at_rest():
+    plan = AxialPlan(0.5, TILT, turns=1.5, rate=3.0)
+    with make_rig(rate=200.0) as rig, SweepScan(rig, plan) as scan:
+        blocks = drain(scan)
+    (places,) = _exposed(scan)
+    phase = scan.positions()["phase"]
+    true = np.unwrap([place.phase for place in places])
+    assert np.all(np.diff(phase) >= 0)
+    np.testing.assert_allclose(phase, true, atol=0.06)
+    np.testing.assert_allclose(joined(blocks, "phase"), true, atol=0.5)
+    assert np.count_nonzero(phase < 1e-3) < 5
+    assert np.count_nonzero(phase > 3 * math.pi - 1e-3) < 5
+    assert len(phase) == pytest.approx(100, abs=20)
+
+
+@pytest.mark.parametrize(("most", "every"), [(None, 1), (60, 3)])
+def test_of_many_frames_a_turn_only_some_are_given(most, every):
+    with make_rig(rate=200.0) as rig, SweepScan(rig, AxialPlan(0.5, TILT, rate=2.0), most) as scan:
+        blocks = drain(scan)
+    number = np.concatenate([numbers for numbers, _ in scan._frames])
+    np.testing.assert_array_equal(np.diff(number), every)
+    assert len(joined(blocks, "frames")) == len(joined(blocks, "phase")) == len(number)
+    assert len(number) <= (most or 999)
+    assert ("frames kept" in scan.remark) == (every > 1)
+    phase = joined(blocks, "phase")
+    np.testing.assert_allclose(joined(blocks, "frames")[:, 2, 0], 100 + 1000 * TILT * np.sin(phase), atol=16)
+
+
+@pytest.fixture
+def hurry(monkeypatch):
+    """Less time for the calibration move than a rig takes."""
+    monkeypatch.setattr(calibration, "_SECONDS", 0.6)
+    monkeypatch.setattr(calibration, "_LONGEST_DELAY", 0.2)
+
+
+@pytest.mark.usefixtures("hurry")
+def test_a_delay_that_nobody_told_is_measured():
+    with make_rig(spreading((24, 24)), 100.0, delay=0.05, jitter=0.005, late=0.002) as rig:
+        rig.settings = settings((24, 24), dark=5.0)
+        scan = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0))
+        delay = scan.delay
+    assert delay.seconds == pytest.approx(0.05, abs=0.002)
+    assert 0 < delay.error < 0.002
+    assert "measured" in scan.remark
+
+
+@pytest.mark.usefixtures("hurry")
+def test_a_picture_that_never_changes_tells_what_to_write_into_the_rig_file():
+    with make_rig(lambda place: np.full(SHAPE, 9, np.uint8), 100.0, delay=0.0) as rig:
+        rig.settings = settings(SHAPE, dark=5.0)
+        scan = SweepScan(rig, AxialPlan(0.5, TILT, rate=1.0))
+        with pytest.raises(HardwareError, match="'delay'"):
+            _ = scan.delay
+
+
+def test_the_dark_reference_is_of_the_lifted_body():
+    with make_rig(lambda place: np.full(SHAPE, 20 if place.travel < -4 else 200, np.uint8)) as rig:
+        rig.settings = settings(SHAPE, delay=0.03, bright=220.0)
+        header = StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).header
+    np.testing.assert_array_equal(header.dark, np.full(SHAPE, 20, np.float32))
+    np.testing.assert_array_equal(header.bright, np.full(SHAPE, 220, np.float32))
+    assert header.dark.dtype == header.bright.dtype == np.float32
+
+
+def test_references_and_scale_of_the_rig_file_are_the_scans():
+    with make_rig(pixel_size=(0.1, 0.2), zenith_gain=300.0, zenith_offset=7.0) as rig:
+        header = StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).header
+    np.testing.assert_array_equal(header.dark, np.full(SHAPE, 5, np.float32))
+    assert header.bright is None
+    assert header.pixel_size == (0.1, 0.2)
+    assert (header.zenith_gain, header.zenith_offset) == (300, 7)
+    assert header.start_time
+
+
+@pytest.mark.parametrize("plan", [VerticalPlan(0.0, 2.5, speed=1.0), AxialPlan(1.0, 0.2, rate=1.0)])
+def test_a_plan_beyond_the_limits_is_refused_before_anything_moves(plan):
+    with make_rig() as rig:
+        with pytest.raises(InputError):
+            SweepScan(rig, plan)
+        assert rig.stage.moves == []
+
+
+@pytest.mark.parametrize(("settle", "frames"), [(-0.1, 1), (math.nan, 1), (math.inf, 1), (0.1, 0)])
+def test_settling_and_frames_that_cannot_be_are_refused(settle, frames):
+    with make_rig() as rig, pytest.raises(InputError):
+        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle, frames)
+
+
+def test_a_scan_that_is_done_lifts_the_body():
+    with make_rig() as rig:
+        with StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan:
+            drain(scan)
+        assert rig.stage.position() == Position(-5.0)
+        assert rig.stage.stops == []
+
+
+def test_a_leaning_body_is_brought_upright_before_it_is_lifted():
+    with make_rig() as rig:
+        rig.go(Position(0.5, TILT))
+        scan = StepScan(rig, AxialPlan(0.5, TILT, phase_step=2.0))
+        scan.lift()
+        assert rig.stage.moves[-2:] == [Position(0.5), Position(-5.0)]
+
+
+def test_a_scan_that_is_left_between_two_moves_lifts_the_body():
+    with make_rig() as rig:
+        with StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan:
+            scan.read(ROOM)
+        assert rig.stage.position() == Position(-5.0)
+        assert rig.stage.stops == []
+
+
+def test_a_scan_that_did_nothing_moves_nothing():
+    with make_rig() as rig:
+        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).close()
+        assert rig.stage.moves == []
+        assert rig.stage.stops == []
+
+
+def test_a_scan_that_is_left_in_the_middle_of_a_move_stops_the_stage():
+    with make_rig() as rig:
+        with SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0)) as scan:
+            scan.read(ROOM)
+        assert rig.stage.stops
+        assert rig.stage.moves[-1] == Position(1.0)
+
+
+def interrupt(scan, blocks):
+    with scan:
+        blocks.extend(scan.read(ROOM) for _ in range(20))
+        raise KeyboardInterrupt
+
+
+def test_positions_of_a_scan_that_was_cut_short_are_the_live_ones():
+    blocks = []
+    with make_rig() as rig:
+        scan = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=2.0))
+        with pytest.raises(KeyboardInterrupt):
+            interrupt(scan, blocks)
+    np.testing.assert_array_equal(scan.positions()["travel"], joined(blocks, "travel"))
+
+
+def test_a_stage_that_rests_elsewhere_is_not_believed(monkeypatch):
+    with make_rig() as rig:
+        astray = Report(0.0, Position(0.4), "idle")
+        scan = StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0)
+        _ = scan.header
+        monkeypatch.setattr(rig, "go", lambda place, speed=None: astray)
+        with pytest.raises(HardwareError, match="from where it was sent"):
+            drain(scan)
+
+
+def test_a_scan_cannot_be_rewound():
+    with make_rig() as rig, pytest.raises(RuntimeError):
+        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).rewind()

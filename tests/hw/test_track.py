@@ -1,0 +1,159 @@
+import math
+
+import numpy as np
+import pytest
+
+from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan
+from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
+from mirrorskin.hw.stage import Position, Report
+
+LENGTH, SPEED = 2.0, 1.0
+TRUE = Trapezoid(LENGTH, 0.97, 8.0)  # a stage that is slower than planned
+PLAN = Trapezoid.planned(LENGTH, SPEED)
+BEGAN = 100.3
+
+
+def reports(seed, jitter=0.004, lag=0.07):
+    """Reports at 20 Hz, rounded as GRBL does, of which each tells a time that is wrong by some ms."""
+    random = np.random.default_rng(seed)
+    time = np.arange(BEGAN - 0.2, BEGAN + 2.6, 0.05) + random.uniform(0, 0.05)
+    way = np.round(TRUE.place(time - BEGAN - lag), 3)
+    return time + jitter * random.standard_normal(len(time)), way
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_track_finds_the_way_better_than_single_reports(seed):
+    time, way = reports(seed)
+    track = Track(time, way, PLAN)
+    frames = np.linspace(BEGAN - 0.5, BEGAN + 3, 500)
+    error = track.at(frames) - TRUE.place(frames - BEGAN - 0.07)
+    assert np.sqrt(np.mean(error**2)) < 0.002  # mm; a report errs by 4
+    assert abs(error).max() < 0.008
+    assert 0.001 < track.spread < 0.01
+
+
+def test_one_report_that_is_far_off_hardly_counts():
+    time, way = reports(0)
+    time[20] += 0.1
+    frames = np.linspace(BEGAN, BEGAN + 2.5, 500)
+    error = Track(time, way, PLAN).at(frames) - TRUE.place(frames - BEGAN - 0.07)
+    assert abs(error).max() < 0.008
+
+
+def test_exact_reports_give_the_exact_way():
+    time = np.arange(BEGAN - 0.2, BEGAN + 2.6, 0.05)
+    track = Track(time, TRUE.place(time - BEGAN), PLAN)
+    assert track.began == pytest.approx(BEGAN, abs=1e-5)
+    assert track.path.speed == pytest.approx(0.97, rel=1e-5)
+    assert track.path.acceleration == pytest.approx(8.0, rel=1e-2)
+
+
+def test_a_stage_that_waits_on_its_way_is_followed():
+    time = np.arange(0.0, 5.0, 0.05)
+    way = np.interp(time, [1, 2, 3, 4], [0, 1, 1, 2])
+    frames = np.linspace(0, 5, 300)
+    error = Track(time, way, PLAN).at(frames) - np.interp(frames, [1, 2, 3, 4], [0, 1, 1, 2])
+    assert abs(error).max() < 0.1
+    assert np.sqrt(np.mean(error**2)) < 0.04
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_reports_do_for_a_guess(count):
+    time = BEGAN + np.linspace(0.5, 1.5, count)
+    track = Track([BEGAN, *time], [0.0, *PLAN.place(time - BEGAN)], PLAN)
+    assert track.at([BEGAN + 1.0])[0] == pytest.approx(float(PLAN.place(1.0)), abs=0.01)
+
+
+def test_a_move_too_short_for_any_report_is_made_when_it_was_told():
+    track = Track([BEGAN, BEGAN + 5], [0.0, LENGTH], PLAN)
+    assert track.began == BEGAN
+    np.testing.assert_array_equal(track.at([BEGAN - 1, BEGAN + 5]), [0, LENGTH])
+
+
+def live(time, way, frames, began=BEGAN):
+    """Tell the live ways at some times, each with the reports that were there 20 ms later."""
+    track = LiveTrack(PLAN, began)
+    given, found = 0, []
+    for frame in frames:
+        while given < len(time) and time[given] < frame + 0.02:
+            track.add(time[given], way[given])
+            given += 1
+        found.append(float(track.at([frame])[0]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_live_way_is_near_and_never_runs_back(seed):
+    time, way = reports(seed)
+    frames = np.linspace(BEGAN, BEGAN + 3, 600)
+    found = live(time, way, frames)
+    error = found - TRUE.place(frames - BEGAN - 0.07)
+    assert np.all(np.diff(found) >= 0)
+    assert found[0] == 0
+    assert found[-1] == LENGTH
+    assert abs(error).max() < 0.12  # before the first report of the move nothing tells that it began late
+    assert np.sqrt(np.mean(error[frames > BEGAN + 0.5] ** 2)) < 0.006
+
+
+def test_the_live_way_goes_on_between_reports():
+    track = LiveTrack(PLAN, BEGAN)
+    for time in np.arange(BEGAN + 0.3, BEGAN + 1.0, 0.1):
+        track.add(time, float(PLAN.place(time - BEGAN)))
+    assert track.at([BEGAN + 1.2])[0] == pytest.approx(float(PLAN.place(1.2)), abs=1e-9)
+
+
+def test_the_live_way_of_nothing_is_nothing():
+    assert LiveTrack(PLAN, BEGAN).at([]).shape == (0,)
+
+
+def test_the_progress_of_a_press_is_its_travel_from_the_start():
+    progress = Progress(VerticalPlan(0.5, 1.5, speed=1))
+    ways = [progress(Report(k, Position(travel), "run")) for k, travel in enumerate([0.4, 0.5, 0.9, 1.6])]
+    assert ways == pytest.approx([0, 0, 0.4, 1])
+
+
+def test_the_progress_of_a_rotation_counts_whole_turns():
+    plan = AxialPlan(1.0, 0.05, turns=3, rate=2.0)
+    progress = Progress(plan)
+    time = np.arange(0, plan.path.duration + 0.3, 0.1)
+    way = plan.path.place(time - 0.15)  # begins late
+    found = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, way, strict=True)]
+    np.testing.assert_allclose(found, way, atol=1e-9)
+
+
+def test_the_phase_of_an_upright_body_is_the_beginning():
+    progress = Progress(AxialPlan(1.0, 0.05, rate=1.0))
+    assert progress(Report(0.0, Position(1.0, 0.0, 0.0), "idle")) == 0
+
+
+@pytest.mark.parametrize("window", [5, 25])
+def test_times_become_even_and_keep_what_was_lost(window):
+    random = np.random.default_rng(1)
+    number = np.delete(np.arange(400), slice(100, 117))
+    true = 5.0 + number / 60 * (1 + 1e-4)
+    found = even_times(number, np.maximum.accumulate(true + 0.004 * random.standard_normal(383)), window)
+    assert np.all(np.diff(found) > 0)
+    error = found - true
+    assert error.std() < 0.004 / math.sqrt(window)
+
+
+@pytest.mark.parametrize("jitter", [0.0005, 0.004])
+def test_frames_that_were_lost_unnoticed_are_noticed(jitter):
+    random = np.random.default_rng(2)
+    shown = np.delete(np.arange(300), [80, 150, 151, 220])
+    arrival = np.maximum.accumulate(shown / 30 + jitter * random.standard_normal(len(shown)))
+    error = even_times(np.arange(len(shown)), arrival) - shown / 30
+    assert abs(error).max() < 0.6 * jitter
+
+
+def test_a_frame_that_is_late_by_itself_is_no_gap():
+    arrival = np.arange(100) / 30
+    arrival[50] += 0.03
+    error = even_times(np.arange(100), arrival) - np.arange(100) / 30
+    assert abs(error).max() < 0.002
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_times_stay_as_they_are(count):
+    times = np.array([3.0, 4.5])[:count]
+    np.testing.assert_array_equal(even_times(np.arange(count), times), times)

@@ -1,0 +1,191 @@
+"""A stage and a camera that do what they are told, in real time, with neither threads nor a twin."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mirrorskin.hw.camera import Counts, Frames
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.plans import Trapezoid
+from mirrorskin.hw.rig.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.stage import Limits, Position, Report
+
+LIMITS = Limits((-5.0, 3.0), 0.1, 2.0)
+PERIOD = 0.05  # seconds between reports
+
+
+def settings(shape=(8, 8), **camera):
+    axis = Axis("Z", 1, 0.0, -5.0, 3.0, 20.0, "mm")
+    lean = Axis("A", 1, 0.0, -0.1, 0.1, 2.0, "deg")
+    stage = StageSettings("none", 115200, False, 1.0, 20.0, axis, lean, lean, 2.0, (0.0, 0.0, 0.0))
+    return RigSettings(
+        Path("rig.toml"), "fake", stage, CameraSettings(0, shape, np.dtype(np.uint8), **camera)
+    )
+
+
+class FakeStage:
+    """Goes along trapezoids, exactly; what it reports is rounded as GRBL does."""
+
+    name = "fake stage"
+
+    def __init__(self, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
+        self.limits = limits
+        self.error = None
+        self.stops, self.closed = [], False
+        self.moves = []
+        self._acceleration = acceleration
+        self._late, self._random = late, np.random.default_rng(seed)
+        self._start = time.monotonic()
+        self._reports = []
+        self._lock = threading.Lock()
+        self._legs = [(self._start, None, lambda way: Position(-1.0, 0.0, 0.0))]
+
+    def position(self, at=None):
+        at = time.monotonic() if at is None else at
+        if self.stops:
+            at = min(at, self.stops[0])
+        began, path, place = [leg for leg in self._legs if leg[0] <= at or leg is self._legs[0]][-1]
+        return place(0.0 if path is None else float(path.place(at - began)))
+
+    def moving(self):
+        began, path, _ = self._legs[-1]
+        return not self.stops and path is not None and time.monotonic() < began + path.duration
+
+    def move(self, place, speed=None):
+        self.limits.check(place, self.name)
+        self.moves.append(place)
+        here = self.position(math.inf)
+        gap = np.array([place.travel - here.travel, place.pitch - here.pitch, place.roll - here.roll])
+        length = abs(gap[0]) if gap[0] else float(np.hypot(gap[1], gap[2]))
+        if length == 0:
+            return
+        start = np.array([here.travel, here.pitch, here.roll])
+        self._add(length, speed or 100.0, lambda way: Position(*(start + gap * way / length)))
+
+    def precess(self, tilt, turns, rate, start=0.0):
+        travel = self.position(math.inf).travel
+
+        def place(way):
+            return Position(travel, tilt * math.cos(start + way), tilt * math.sin(start + way))
+
+        self._add(math.tau * turns, math.tau * rate, place)
+
+    def wait(self, timeout=None):
+        began, path, _ = self._legs[-1]
+        while path is not None and time.monotonic() < began + path.duration + PERIOD / 2:
+            time.sleep(0.002)
+            if self.error is not None:
+                raise self.error
+            if self.stops:
+                raise HardwareError("fake stage was stopped")
+        return Report(time.monotonic(), self.position(), "idle")
+
+    def report(self):
+        if self.error is not None:
+            raise self.error
+        return Report(time.monotonic(), self.position(), "run" if self.moving() else "idle")
+
+    def history(self, since=-math.inf):
+        with self._lock:
+            while (due := self._start + len(self._reports) * PERIOD) < time.monotonic() - 0.002:
+                place = self.position(due)
+                told = due + float(
+                    np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3)
+                )
+                rounded = Position(round(place.travel, 3), round(place.pitch, 6), round(place.roll, 6))
+                self._reports.append(Report(told, rounded, "run"))
+            return [report for report in self._reports if since < report.time]
+
+    def stop(self):
+        self.stops.append(time.monotonic())
+
+    def close(self):
+        self.closed = True
+
+    def _add(self, length, speed, place):
+        path = Trapezoid(length, speed, self._acceleration * speed)
+        self._legs = [*self._legs, (time.monotonic() + 0.01, path, place)]
+
+
+class FakeCamera:
+    """Shows `picture(position)` at the time of each exposure; its frames come late, and unevenly."""
+
+    name = "fake camera"
+    dtype = np.dtype(np.uint8)
+
+    def __init__(
+        self,
+        where: Callable[[float], Position],
+        picture: Callable[[Position], np.ndarray],
+        rate=200.0,
+        delay=0.0,
+        jitter=0.0,
+        seed=0,
+    ):
+        self._where, self._picture = where, picture
+        self.shape = picture(Position()).shape
+        self._rate, self._delay, self._jitter = rate, delay, jitter
+        self._random = np.random.default_rng(seed)
+        self._start = time.monotonic()
+        self._next, self._last, self._dropped = 0, -math.inf, 0
+        self._silent = math.inf
+        self.error = None
+        self.closed = False
+
+    @property
+    def counts(self):
+        return Counts(self._next, 0, 0, self._rate, 0)
+
+    @property
+    def latest(self):
+        now = min(time.monotonic(), self._silent)
+        return self._start + math.floor((now - self._start) * self._rate) / self._rate
+
+    def stall(self):
+        self._silent = time.monotonic()
+
+    def lose(self):
+        self.error = HardwareError("fake camera was lost: look at its cable")
+        self.stall()
+
+    def flush(self):
+        self._next = max(self._next, math.ceil((time.monotonic() - self._start - self._delay) * self._rate))
+
+    def take(self, most, timeout):
+        if self.error is not None:
+            raise self.error
+        until = time.monotonic() + timeout
+        due = self._start + self._next / self._rate + self._delay
+        while time.monotonic() < min(due + 4 * self._jitter, until):
+            time.sleep(0.001)
+        count = math.floor((min(time.monotonic(), self._silent) - due) * self._rate) + 1
+        if count < 1:
+            raise HardwareError("fake camera: no frame")
+        number = np.arange(self._next, self._next + min(most, count))
+        self._next += len(number)
+        exposed = self._start + number / self._rate
+        arrival = exposed + self._delay + self._jitter * self._random.standard_normal(len(number))
+        arrival = np.maximum.accumulate(np.maximum(arrival, self._last))
+        self._last = arrival[-1]
+        pixels = np.stack([self._picture(self._where(float(one))) for one in exposed])
+        return Frames(pixels, number, arrival, 0)
+
+    def close(self):
+        self.closed = True
+
+
+def spreading(shape=(32, 32), steepness=0.05):
+    """Return a picture of light that spreads with travel, and moves with the lean."""
+    y, x = np.mgrid[: shape[0], : shape[1]] / shape[0]
+
+    def picture(place):
+        edge = np.hypot(x - 0.5 - 2 * place.pitch, y - 0.5 - 2 * place.roll) - 0.5 * place.travel
+        return (255 / (1 + np.exp(np.clip(edge / steepness, -50, 50)))).astype(np.uint8)
+
+    return picture
