@@ -108,6 +108,12 @@ class Limits:
         self._check_travel(travel, name)
         self._check_tilt(tilt, name)
 
+    def excess(self, position: Position) -> float:
+        """Return how far a place lies beyond the limits: mm or degrees, whichever are more; 0 within."""
+        low, high = self.travel
+        lean = math.degrees(position.tilt - self.tilt)
+        return max(0.0, low - position.travel, position.travel - min(high, self.press), lean)
+
     def _check_travel(self, travel: float, name: str) -> None:
         low, high = self.travel
         if not math.isfinite(travel):
@@ -116,12 +122,12 @@ class Limits:
             )
         if not low - _ROUNDING <= travel <= high + _ROUNDING:
             raise InputError(
-                f"{name}: a travel of {travel:.6g} mm is beyond the axis, which goes from {low:.6g} to "
-                f"{high:.6g} mm; stay within, or correct the rig file's limits"
+                f"{name}: a travel of {travel:.9g} mm is beyond the axis, which goes from {low:.9g} to "
+                f"{high:.9g} mm; stay within, or correct the rig file's limits"
             )
         if travel > self.press + _ROUNDING:
             raise InputError(
-                f"{name}: a travel of {travel:.6g} mm presses deeper than the {self.press:.6g} mm that "
+                f"{name}: a travel of {travel:.9g} mm presses deeper than the {self.press:.9g} mm that "
                 "the rig file allows; press less, or raise its press"
             )
 
@@ -130,8 +136,8 @@ class Limits:
             raise InputError(f"{name}: a tilt of {tilt} is no angle; give a finite one")
         if abs(tilt) > self.tilt + _ROUNDING:
             raise InputError(
-                f"{name}: a tilt of {math.degrees(abs(tilt)):.6g} degrees is beyond the greatest, "
-                f"{math.degrees(self.tilt):.6g}; tilt less, or correct the rig file's pitch and roll"
+                f"{name}: a tilt of {math.degrees(abs(tilt)):.9g} degrees is beyond the greatest, "
+                f"{math.degrees(self.tilt):.9g}; tilt less, or correct the rig file's pitch and roll"
             )
 
 

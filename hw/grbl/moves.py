@@ -1,0 +1,220 @@
+"""From where the body shall stand to the words of G-code, and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from mirrorskin.hw.rig.settings import Axis, StageSettings
+from mirrorskin.hw.stage import Position
+from mirrorskin.io import InputError
+
+SLOWEST = 1.0
+"""Machine units a minute: GRBL goes no slower, whatever it is told."""
+
+_STRAIGHT = "G53G1"  # in the machine's coordinates
+_PLANES = {("X", "Y"): "G17", ("Z", "X"): "G18", ("Y", "Z"): "G19"}
+_CENTRES = {"X": "I", "Y": "J", "Z": "K"}
+_NO_TRAVEL = 1e-3  # mm that count as none where the body leans as well
+_SHORT = math.radians(1)  # of an arc that is as good as straight
+_EVEN = 1e-9  # of a half turn
+_MOST = 10_000  # turns at a time, since all their lines are made beforehand
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A line of G-code, and the seconds that it takes at the speed it names."""
+
+    line: str
+    duration: float
+
+
+class Axes:
+    """The axes of a stage: which letter moves what.
+
+    Parameters
+    ----------
+    settings : StageSettings
+        Letters, directions, zeros, units and greatest speeds.
+    name : str
+        What to call the stage in messages.
+    """
+
+    def __init__(self, settings: StageSettings, name: str) -> None:
+        self._axes = settings.axes
+        self._name = name
+        self.speeds = {motion: axis.speed for motion, axis in self._axes.items()}
+
+    @property
+    def letters(self) -> dict[str, str]:
+        """The letter of each motion."""
+        return {motion: axis.letter for motion, axis in self._axes.items()}
+
+    def machine(self, place: Position) -> dict[str, float]:
+        """Return the machine's coordinates of a place, by letter: zero + direction * value."""
+        return {
+            axis.letter: axis.zero + axis.direction * float(getattr(place, motion)) * _scale(axis)
+            for motion, axis in self._axes.items()
+        }
+
+    def place(self, machine: Mapping[str, float]) -> Position:
+        """Return the place of machine coordinates; KeyError if they lack an axis."""
+        return Position(
+            **{
+                motion: axis.direction * (machine[axis.letter] - axis.zero) / _scale(axis) + 0.0
+                for motion, axis in self._axes.items()
+            }
+        )
+
+    def limit(self, motion: str, rate: float) -> None:
+        """Lower the greatest speed of a motion to what the controller allows, machine units a second."""
+        self.speeds[motion] = min(self.speeds[motion], rate / _scale(self._axes[motion]))
+
+    def apart(self, one: Position, other: Position) -> float:
+        """Return by how much two places differ in the axis where they differ most, machine units."""
+        a, b = self.machine(one), self.machine(other)
+        return max(abs(a[letter] - b[letter]) for letter in a)
+
+    def straight(self, start: Position, place: Position, speed: float | None) -> Command | None:
+        """Return the straight move from one place to another, None if it is none.
+
+        It names the machine's coordinates, whatever the work coordinates are.
+
+        Parameters
+        ----------
+        start, place : Position
+            From where to where.
+        speed : float or None
+            mm/s, or rad/s if only the lean changes; None for the greatest.
+
+        Raises
+        ------
+        InputError
+            It would be faster than an axis goes, or slower than GRBL does.
+        """
+        before, after = self.machine(start), self.machine(place)
+        length = math.dist(list(before.values()), list(after.values()))
+        if length < 1e-6:
+            return None
+        duration = self._duration(start, place, speed)
+        return Command(f"{_STRAIGHT}{_words(after)}{self._feed(length / duration)}", duration)
+
+    def arcs(
+        self, tilt: float, turns: float, rate: float, start: float, offset: Mapping[str, float]
+    ) -> list[Command]:
+        """Return the arcs of a precession: pieces of half a turn at most, after the choice of their plane.
+
+        Parameters
+        ----------
+        tilt, start : float
+            Half-angle and the phase to begin at, radians.
+        turns : float
+            Counter-clockwise if positive.
+        rate : float
+            Turns a second.
+        offset : mapping
+            Where the work coordinates begin, machine units.
+
+        Raises
+        ------
+        InputError
+            The axes span no plane of arcs, or it would be too fast or too slow.
+        """
+        plane, sense = self._plane()
+        self._check_rate(tilt, turns, rate)
+        radius = tilt * _scale(self._axes["pitch"])
+        feed = self._feed(math.tau * rate * radius)
+        count = max(1, math.ceil(2 * abs(turns) - _EVEN))
+        step = math.tau * turns / count
+        word = "G3" if step * sense > 0 else "G2"
+        commands = [Command(plane, 0.0)]
+        for k in range(count):
+            ends = [self._lean(tilt, start + step * number) for number in (k, k + 1)]
+            if abs(step) < _SHORT:
+                line = f"{_STRAIGHT}{_words(ends[1])}{feed}"
+            else:
+                line = f"{word}{self._arc(ends[0], ends[1], offset)}{feed}"
+            commands.append(Command(line, abs(turns) / rate / count))
+        return commands
+
+    def _arc(self, begin: Mapping[str, float], end: Mapping[str, float], offset: Mapping[str, float]) -> str:
+        """Return the words of an arc about the upright body: GRBL takes its end in work coordinates only."""
+        centre = self._lean(0.0, 0.0)
+        return _words({x: end[x] - offset[x] for x in end}) + _words(
+            {_CENTRES[x]: centre[x] - begin[x] for x in centre}
+        )
+
+    def _lean(self, tilt: float, phase: float) -> dict[str, float]:
+        """Return the machine's coordinates of pitch and roll alone."""
+        machine = self.machine(Position(0.0, tilt * math.cos(phase), tilt * math.sin(phase)))
+        return {letter: machine[letter] for letter in (self._axes["pitch"].letter, self._axes["roll"].letter)}
+
+    def _plane(self) -> tuple[str, int]:
+        """Return the plane's word, and 1 if pitch to roll turns as a G3 does in it, -1 as a G2."""
+        pitch, roll = self._axes.get("pitch"), self._axes.get("roll")
+        if pitch is None or roll is None:
+            raise InputError(f"{self._name}: it cannot lean; name the axes of pitch and roll in the rig file")
+        if pitch.unit != roll.unit:
+            raise InputError(f"{self._name}: arcs need pitch and roll in the same unit; go in steps")
+        sense = pitch.direction * roll.direction
+        for letters, way in (((pitch.letter, roll.letter), sense), ((roll.letter, pitch.letter), -sense)):
+            if letters in _PLANES:
+                return _PLANES[letters], way
+        raise InputError(
+            f"{self._name}: GRBL has no arcs in the axes {pitch.letter} and {roll.letter}; put pitch and "
+            "roll on two of X, Y and Z, or go in steps"
+        )
+
+    def _check_rate(self, tilt: float, turns: float, rate: float) -> None:
+        if not (math.isfinite(rate) and rate > 0 and math.isfinite(turns) and turns != 0 and tilt > 0):
+            raise InputError(
+                f"{self._name}: {turns:g} turns at {rate:g} a second with a tilt of {math.degrees(tilt):g} "
+                "degrees are no precession; tilt and rate must be positive, and the turns not 0"
+            )
+        if abs(turns) > _MOST:
+            raise InputError(f"{self._name}: {turns:g} turns are too many; go round {_MOST} times at most")
+        greatest = min(self.speeds["pitch"], self.speeds["roll"]) / (math.tau * tilt)
+        if rate > greatest * (1 + _EVEN):
+            raise InputError(
+                f"{self._name}: {rate:.4g} turns a second at {math.degrees(tilt):.4g} degrees are more than "
+                f"pitch and roll go; at most {greatest:.4g}"
+            )
+
+    def _duration(self, start: Position, place: Position, speed: float | None) -> float:
+        changes: dict[str, float] = {
+            motion: abs(getattr(place, motion) - getattr(start, motion)) for motion in self._axes
+        }
+        times = {motion: change / self.speeds[motion] for motion, change in changes.items()}
+        slowest = max(times, key=lambda motion: times[motion])
+        if speed is None:
+            return times[slowest]
+        if not (math.isfinite(speed) and speed > 0):
+            raise InputError(f"{self._name}: a speed of {speed:g} is none; give a positive one")
+        lean = math.hypot(changes.get("pitch", 0.0), changes.get("roll", 0.0))
+        path = lean if lean > 0 and changes["travel"] < _NO_TRAVEL else changes["travel"]
+        if path / speed < times[slowest] * (1 - _EVEN):
+            unit = "mm/s" if path != lean else "rad/s"
+            raise InputError(
+                f"{self._name}: at {speed:.4g} {unit} the axis of {slowest} is too fast; at most "
+                f"{path / times[slowest]:.4g} {unit}"
+            )
+        return path / speed
+
+    def _feed(self, speed: float) -> str:
+        """Return the feed word of a speed in machine units a second."""
+        if speed * 60 < SLOWEST:
+            raise InputError(
+                f"{self._name}: GRBL goes no slower than {SLOWEST:g} mm (or degree) a minute, and "
+                f"{speed * 60:.4g} was asked for; go faster, or in steps"
+            )
+        return f"F{speed * 60:.4f}"
+
+
+def _scale(axis: Axis) -> float:
+    """Return the machine's units in one mm or rad."""
+    return math.degrees(1.0) if axis.unit == "deg" else 1.0
+
+
+def _words(values: Mapping[str, float]) -> str:
+    return "".join(f"{letter}{value:.5f}" for letter, value in values.items())

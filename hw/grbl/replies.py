@@ -1,0 +1,210 @@
+"""What a GRBL 1.1 or grblHAL controller says, line by line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+LONGEST = 512
+"""Bytes that a reply can have; longer ones are noise."""
+
+_LETTERS = "XYZABCUV"  # the order in which a report gives its coordinates
+_BANNER = re.compile(r"(grblHAL|Grbl) +v?(\d+)\.(\d+)(\w*)", re.IGNORECASE)
+_SETTING = re.compile(r"\$(\d+)=(.*)")
+_CODE = re.compile(r"(error|ALARM):(\d+)")
+_STATE = re.compile(r"([A-Z][a-z]+)(?::(\d+))?")
+_LAST = re.compile(rb"(<[^<]*>|ok|(error|ALARM):\d+)\s*$")
+_STATES = {"Idle", "Run", "Hold", "Jog", "Alarm", "Home", "Door", "Check", "Sleep", "Tool"}
+
+_ERRORS = {
+    1: "a word without a letter",
+    2: "a number that cannot be read",
+    3: "an unknown $ command",
+    5: "homing is switched off ($22)",
+    8: "it takes this only at rest",
+    9: "it is locked after an alarm or a reset: home it",
+    11: "the line is too long",
+    15: "the target is beyond the machine's travel ($130 to $132)",
+    20: "it does not know this command",
+    21: "two commands exclude each other",
+    22: "no feed was set",
+    24: "two commands want the axis words",
+    26: "no axis word was given",
+    33: "the arc or the target cannot be",
+    34: "the arc's radius does not fit its ends",
+    35: "the arc has no centre in its plane",
+    60: "the target is beyond the machine's travel ($130 to $132)",
+}
+_ALARMS = {
+    1: "a limit switch was hit; home it before anything else",
+    2: "the target is beyond the machine's travel ($130 to $132)",
+    3: "it was reset in motion, so that it has lost its place; home it",
+    6: "homing was interrupted",
+    7: "the door opened while homing",
+    8: "homing found a switch that stays pressed; look at its wiring and at $27",
+    9: "homing did not reach a switch; look at its wiring and at $130 to $132",
+    10: "the emergency stop is pressed",
+    11: "it must be homed first",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Banner:
+    """What a controller says when it starts: its name and version, such as (1, 1)."""
+
+    text: str
+    version: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Ok:
+    """A line was taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A line was not taken: ``error:N``."""
+
+    code: int
+
+    def __str__(self) -> str:
+        return f"error:{self.code} ({_ERRORS.get(self.code, 'see the list of its error codes')})"
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """The controller locked itself: ``ALARM:N``."""
+
+    code: int
+
+    def __str__(self) -> str:
+        return f"ALARM:{self.code} ({_ALARMS.get(self.code, 'see the list of its alarm codes')})"
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The answer to ``?``.
+
+    Attributes
+    ----------
+    state : str
+        Lower case: idle, run, hold, jog, alarm, home, door, check, sleep, tool.
+    detail : int or None
+        The number behind the state: Hold:0 has come to rest, Hold:1 has not.
+    machine, work, offset : mapping of a letter to a number, or None
+        Coordinates of the machine, of the work piece, and how far the first are ahead of the second, in the
+        machine's units. A report has some of them.
+    """
+
+    state: str
+    detail: int | None = None
+    machine: Mapping[str, float] | None = None
+    work: Mapping[str, float] | None = None
+    offset: Mapping[str, float] | None = None
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves: not in these states, nor while a hold or an open door slows it down."""
+        if self.state == "hold":
+            return self.detail != 1
+        if self.state == "door":
+            return self.detail in (0, 1)
+        return self.state not in ("run", "jog", "home", "tool")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One of the ``$`` settings."""
+
+    number: int
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """Anything in brackets, without them, and the start-up lines."""
+
+    text: str
+
+
+Reply = Banner | Ok | Refusal | Alarm | Status | Setting | Message
+
+
+def parse(line: bytes) -> Reply | None:
+    """Read one reply.
+
+    Parameters
+    ----------
+    line : bytes
+        Without the line's end.
+
+    Returns
+    -------
+    Reply or None
+        None if this is nothing that a controller says.
+    """
+    try:
+        text = line.decode("ascii").strip()
+    except UnicodeDecodeError:
+        return None
+    if text == "ok":
+        return Ok()
+    if text.startswith("<"):
+        return _status(text)
+    if match := _CODE.fullmatch(text):
+        return (Alarm if match[1] == "ALARM" else Refusal)(int(match[2]))
+    if match := _SETTING.fullmatch(text):
+        return Setting(int(match[1]), match[2].partition(" (")[0].strip())
+    if match := _BANNER.match(text):
+        return Banner(text, (int(match[2]), int(match[3])))
+    if re.fullmatch(r"\[[ -~]*\]|>[ -~]*", text):
+        return Message(text.strip("[]"))
+    return None
+
+
+def salvage(line: bytes) -> tuple[Reply | None, int]:
+    """Read the reply that ends a line which began as something else: the half of another reply, or noise.
+
+    Returns
+    -------
+    Reply or None
+        None if there is none.
+    int
+        How many bytes are noise.
+    """
+    match = _LAST.search(line)
+    reply = parse(match[0]) if match else None
+    return reply, match.start() if match and reply else len(line)
+
+
+def _status(text: str) -> Status | None:
+    """Read ``<Idle|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>``."""
+    if not text.endswith(">") or "<" in text[1:]:
+        return None
+    first, *fields = text[1:-1].split("|")
+    state = _STATE.fullmatch(first)
+    if state is None or state[1] not in _STATES:
+        return None
+    places: dict[str, Mapping[str, float] | None] = {}
+    for field in fields:
+        name, _, value = field.partition(":")
+        if name in ("MPos", "WPos", "WCO"):
+            places[name] = _coordinates(value)
+            if places[name] is None:
+                return None
+    if ("MPos" in places) == ("WPos" in places):
+        return None
+    detail = int(state[2]) if state[2] else None
+    return Status(state[1].lower(), detail, places.get("MPos"), places.get("WPos"), places.get("WCO"))
+
+
+def _coordinates(text: str) -> Mapping[str, float] | None:
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        return None
+    if not 3 <= len(numbers) <= len(_LETTERS) or not all(map(math.isfinite, numbers)):
+        return None
+    return dict(zip(_LETTERS, numbers, strict=False))

@@ -1,0 +1,302 @@
+"""A stage behind a GRBL 1.1 or grblHAL controller."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.greeting import PREPARE, Controller, greet, offset_known, unlock
+from mirrorskin.hw.grbl.link import Link, Seen
+from mirrorskin.hw.grbl.moves import Axes, Command
+from mirrorskin.hw.grbl.port import Port, open_port
+from mirrorskin.hw.grbl.replies import Status
+from mirrorskin.hw.rig.settings import StageSettings
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io import InputError
+from mirrorskin.io.types import Closing
+
+_KEPT = 1 << 17  # reports: an hour of motion
+_THERE = 0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
+_RESTS = 3  # reports of rest elsewhere, until that is where it stays
+_MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
+_HOMING = 60.0  # seconds, where the settings do not tell how long it takes
+_LETTERS = "XYZABC"
+
+
+class GrblStage(Closing):
+    """A stage that a GRBL controller moves; see `hw.stage.Stage`.
+
+    A stage that was stopped, or that failed, says so in `error` and to every call; open it again to go on.
+
+    Parameters
+    ----------
+    settings : StageSettings
+        Where it is plugged in, its axes and limits.
+    port : Port, optional
+        What to speak through instead of opening ``settings.port``; it is closed with the stage.
+
+    Attributes
+    ----------
+    name : str
+        What to call it in messages.
+    limits : Limits
+        What may be asked of it.
+
+    Raises
+    ------
+    InputError
+        No such port, one in use, or one behind which there is no GRBL 1.1.
+    """
+
+    def __init__(self, settings: StageSettings, port: Port | None = None) -> None:
+        self.name = f"stage {settings.port}"
+        self.limits = settings.limits
+        self._settings = settings
+        self._axes = Axes(settings, self.name)
+        self._offset: Mapping[str, float] | None = None
+        self._reports: deque[Report] = deque(maxlen=_KEPT)
+        self._latest: Report | None = None
+        self._target: Position | None = None
+        self._excess = math.inf  # how far beyond the limits it was at the least, since it works
+        self._rounding = 0.0  # half a step of the coarsest axis
+        self._due = 0.0
+        self._ramp = 0.0  # seconds that a move takes longer because it speeds up and slows down
+        opened = open_port(settings.port, settings.baud, self.name) if port is None else port
+        self._link = Link(opened, self.name, settings.timeout, 1 / settings.report_rate, self._hear)
+        try:
+            self._controller = self._open()
+        except BaseException:
+            self._link.close()
+            raise
+
+    @property
+    def error(self) -> HardwareError | None:
+        """What is wrong with the stage; None while all is well."""
+        return self._link.error
+
+    @property
+    def firmware(self) -> str:
+        """The controller's name and version."""
+        return self._controller.firmware
+
+    @property
+    def parameters(self) -> Mapping[int, float]:
+        """The controller's ``$`` settings, by their numbers."""
+        return self._controller.settings
+
+    @property
+    def round_trip(self) -> float:
+        """Seconds from a question for a report to its answer, of late; NaN before the first."""
+        return self._link.round_trip
+
+    def home(self) -> None:
+        """Find the axes' switches; see `Stage.home`."""
+        if not self._controller.on(22):
+            raise InputError(
+                f"{self.name}: homing is switched off; set $22=1, or home = false in the rig file"
+            )
+        timeout = self._homing_time()
+        with self._guarded():
+            self._link.patience = timeout
+            self._link.ask("$H", timeout)
+            with self._link.lock:
+                self._excess = math.inf  # the switches may be beyond the limits
+                self._link.patience = None  # not after a failure: what stops homing is told by it
+                self._link.locked = False
+            self._link.ask(PREPARE, self._settings.timeout)
+            self._target = None
+            self._target = self.wait().position
+
+    def move(self, place: Position, speed: float | None = None) -> None:
+        """Begin to go to `place` in a straight line; see `Stage.move`."""
+        self.limits.check(place, self.name)
+        command = self._axes.straight(self._stand(), place, speed)
+        if command is None:
+            self._target = place
+        else:
+            self._send([command], place)
+
+    def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
+        """Begin to go round; see `Stage.precess`."""
+        before = self._stand()
+        self.limits.check_precession(before.travel, tilt, self.name)
+        commands = self._axes.arcs(tilt, turns, rate, start, self._work())
+        begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
+        if self._axes.apart(before, begin) > _THERE:
+            raise InputError(
+                f"{self.name}: a precession begins where the body leans by {math.degrees(tilt):.4g} degrees "
+                f"at the phase {math.degrees(start):.4g} degrees; move there first"
+            )
+        self._send(commands, end)
+
+    def wait(self, timeout: float | None = None) -> Report:
+        """Wait until the body rests and every command is done; see `Stage.wait`."""
+        self._stand()
+        if timeout is None:
+            timeout = 1.25 * max(0.0, self._due - time.monotonic()) + self._settings.timeout
+        with self._guarded():
+            return self._link.until(self._arrived, timeout, "come to rest")
+
+    def report(self) -> Report:
+        """Return what the stage said last; see `Stage.report`."""
+        if self._link.error is not None:
+            raise self._link.error.with_traceback(None)
+        if self._latest is None:  # cannot be: it is open only after a report
+            raise HardwareError(f"{self.name}: it has not reported yet")
+        return self._latest
+
+    def history(self, since: float = -math.inf) -> list[Report]:
+        """Return the reports later than `since`; see `Stage.history`."""
+        found = []
+        with self._link.lock:
+            for report in reversed(self._reports):
+                if report.time <= since:
+                    break
+                found.append(report)
+        return found[::-1]
+
+    def stop(self) -> None:
+        """Stop the body at once; see `Stage.stop`."""
+        self._link.halt("the stage was stopped; open it again to go on")
+
+    def close(self) -> None:
+        """Stop the body if it moves, and let the port go."""
+        self._link.close()
+
+    def _open(self) -> Controller:
+        link, timeout = self._link, self._settings.timeout
+        try:
+            controller = greet(link, self.name, timeout)
+            self._check(controller)
+            if not self._settings.home:
+                unlock(link, self.name, timeout)
+            link.locked = link.seen is not None and link.seen.status.state == "alarm"
+            offset_known(link, self.name, timeout, lambda: self._offset is not None)
+            if not link.locked:
+                link.ask(PREPARE, timeout)
+            link.until(lambda: link.rests or link.locked or None, timeout, "report")
+        except HardwareError as error:
+            raise InputError(str(error)) from error
+        link.begin()
+        return controller
+
+    def _check(self, controller: Controller) -> None:
+        """Refuse a controller that lacks an axis; go no faster than it does, and learn how soon."""
+        told = (self._link.seen.status.machine or self._link.seen.status.work) if self._link.seen else None
+        for motion, letter in self._axes.letters.items():
+            if told is not None and letter not in told:
+                raise InputError(f"{self.name}: the controller has no axis {letter}; correct the rig file")
+            steps, rate, acceleration = (
+                controller.settings.get(number + _LETTERS.index(letter), 0.0) for number in (100, 110, 120)
+            )
+            rate /= 60
+            if steps > 0:
+                self._rounding = max(self._rounding, 0.5 / steps)
+            if rate > 0:
+                self._axes.limit(motion, rate)
+            if acceleration > 0:
+                self._ramp = max(self._ramp, rate / acceleration)
+
+    def _hear(self, seen: Seen) -> None:
+        """Take a report; the link's lock is held."""
+        if seen.status.offset is not None:
+            self._take_offset(seen.status.offset, seen.working)
+        place = self._place(seen.status)
+        if place is None:
+            return
+        self._look(place, seen.working)
+        self._latest = Report(seen.answer.time, place, seen.status.state)
+        if seen.answer.sure:
+            self._reports.append(self._latest)
+
+    def _take_offset(self, offset: Mapping[str, float], working: bool) -> None:
+        """Take where the work coordinates begin; while it works, these stay where they were."""
+        if working and offset != self._offset:
+            self._link.halt("its work offset was changed; leave G54 and G92 alone, and look at the cable")
+        else:
+            self._offset = offset
+
+    def _place(self, status: Status) -> Position | None:
+        machine = status.machine
+        if machine is None and status.work is not None and self._offset is not None:
+            machine = {letter: value + self._offset[letter] for letter, value in status.work.items()}
+        try:
+            return None if machine is None else self._axes.place(machine)
+        except KeyError:  # fewer axes than asked for; told when the stage is opened
+            return None
+
+    def _look(self, place: Position, working: bool) -> None:
+        """Stop it beyond its limits; one that begins there may come back, and go no farther."""
+        excess = self.limits.excess(place)
+        self._excess = min(self._excess, excess) if working else excess
+        if excess > self._excess + _MARGIN:
+            self._link.halt(
+                f"it says that it is {excess:.3g} mm or degrees beyond its limits, where nobody sent it; "
+                "look at its cable and its switches, and home it"
+            )
+
+    def _stand(self) -> Position:
+        """Return where the body is once all that was asked is done."""
+        if self._link.error is not None:
+            raise self._link.error.with_traceback(None)
+        if self._link.locked:
+            raise HardwareError(f"{self.name}: it is locked until it is homed; home it first")
+        return self.report().position if self._target is None else self._target
+
+    def _work(self) -> Mapping[str, float]:
+        if self._offset is None:  # cannot be: it is open only when this is known
+            raise HardwareError(f"{self.name}: its work offset is not known")
+        return self._offset
+
+    def _send(self, commands: list[Command], target: Position) -> None:
+        """Send lines that end at a target, and wait until the controller took the first that moves."""
+        duration = sum(command.duration for command in commands) + self._ramp
+        with self._guarded():
+            with self._link.lock:
+                number = self._link.enqueue(*(command.line for command in commands)) + len(commands[:-1][:1])
+                self._target = target
+            self._due = max(self._due, time.monotonic()) + duration
+            left = self._due - time.monotonic()
+            self._link.until(
+                lambda: self._link.window.done >= number or None,
+                1.25 * left + self._settings.timeout,
+                "take a move",
+            )
+
+    def _arrived(self) -> Report | None:
+        """Return the report that tells of rest, at the target if there is one; the link's lock is held."""
+        link, latest = self._link, self._latest
+        if link.window.busy or not link.rests or latest is None:
+            return None
+        if self._target is None:
+            return latest if link.rests > 1 else None
+        off = self._axes.apart(latest.position, self._target)
+        if off <= _THERE + self._rounding:
+            return latest
+        if link.rests >= _RESTS:
+            link.halt(f"it rests {off:.3g} mm or degrees from where it was sent; look at its cable")
+        return None
+
+    def _homing_time(self) -> float:
+        """Return the longest that homing takes: each axis there and back, and once more."""
+        settings = self._controller.settings
+        seek = settings.get(25, 0.0)
+        lengths = sum(settings.get(130 + number, 0.0) for number in range(len(_LETTERS)))
+        return (3 * lengths / seek * 60 if seek > 0 and lengths > 0 else _HOMING) + self._settings.timeout
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Stop the body on whatever goes wrong inside, Ctrl-C too."""
+        try:
+            yield
+        except BaseException:
+            self.stop()
+            raise
+
+
+def _leaning(travel: float, tilt: float, phase: float) -> Position:
+    return Position(travel, tilt * math.cos(phase), tilt * math.sin(phase))

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import pytest
+from scripted_grbl import stage_settings
+
+from mirrorskin.hw.emulator.machine import GrblMachine
+from mirrorskin.hw.emulator.pty import GrblPort
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.stage import Position
+
+LEAN = math.radians(2.5)
+QUICK = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 2000)
+
+
+@pytest.fixture
+def stage():
+    """A stage on an emulated controller whose axes begin at 0."""
+    machine = GrblMachine(QUICK)
+    with GrblPort(machine) as port:
+        axes = {name: replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
+        with GrblStage(stage_settings(port=port.url, timeout=2.0, **axes)) as opened:
+            yield opened, machine, port
+
+
+def _rests(machine, seconds=3.0):
+    end = time.monotonic() + seconds
+    while machine.moving():
+        assert time.monotonic() < end, "the stage moves on"
+        time.sleep(0.002)
+
+
+def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(stage):
+    opened, machine, _ = stage
+    opened.move(Position(1.0, LEAN))
+    opened.wait()
+    opened.precess(LEAN, -1.25, 2.0)
+    begun = time.monotonic()
+    report = opened.wait()
+    assert report.position.travel == pytest.approx(1, abs=2e-3)
+    assert report.position.phase == pytest.approx(-math.pi / 2, abs=2e-3)
+    truth = machine.position()
+    assert (truth["X"], truth["Y"], truth["Z"]) == pytest.approx((0, -2.5, -1), abs=2e-3)
+    tilts = [at.position.tilt for at in opened.history(begun)]
+    assert len(tilts) > 5
+    assert tilts == pytest.approx([LEAN] * len(tilts), abs=math.radians(5e-3))
+    assert time.monotonic() - begun > 1.25 / 2
+
+
+def test_reports_tell_where_the_machine_was(stage):
+    opened, machine, _ = stage
+    begun = time.monotonic()
+    opened.move(Position(2.0), 4.0)
+    opened.wait()
+    off = sorted(abs(-machine.position(at.time)["Z"] - at.position.travel) for at in opened.history(begun))
+    assert len(off) > 5
+    assert off[len(off) // 2] < 4.0 * 0.01
+
+
+@pytest.mark.parametrize("fault", ["silence", "garble"])
+def test_whatever_fails_the_machine_is_stopped(stage, fault):
+    opened, machine, port = stage
+    opened.move(Position(-4.5), 0.5)
+    assert machine.moving()
+    {"silence": port.silence, "garble": lambda: port.garble(100_000)}[fault]()
+    with pytest.raises(HardwareError):
+        opened.wait()
+    _rests(machine)
+    assert machine.position()["Z"] < 4
+
+
+def test_a_stop_keeps_the_place(stage):
+    opened, machine, _ = stage
+    opened.move(Position(-4.5), 5.0)
+    time.sleep(0.1)
+    opened.stop()
+    opened.close()
+    assert machine.state == "Idle"
+    assert 0.1 < machine.position()["Z"] < 4

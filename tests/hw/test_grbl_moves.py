@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scripted_grbl import stage_settings
+
+from mirrorskin.hw.grbl.moves import Axes
+from mirrorskin.hw.rig.settings import Axis
+from mirrorskin.hw.stage import Position
+from mirrorskin.io import InputError
+
+OFFSET = {"X": 1.0, "Y": -2.0, "Z": 3.0, "A": 7.0, "B": 11.0}
+NONE = dict.fromkeys("XYZAB", 0.0)
+LEAN = math.radians(2.5)
+
+
+def axis(letter, direction=1, zero=0.0, unit="deg"):
+    return Axis(letter, direction, zero, -1.0, 1.0, 10.0, unit)
+
+
+def axes(**changes):
+    return Axes(stage_settings(**changes), "rig")
+
+
+def words(line):
+    return {word[0]: float(word[1:]) for word in re.findall(r"[A-Z]-?[\d.]+", line)}
+
+
+def swept(line, start, plane):
+    """The points of an arc as G-code means it: G3 turns from the plane's first axis to its second."""
+    one, two = {"G17": "XY", "G18": "ZX", "G19": "YZ"}[plane]
+    said = words(line)
+    centre = [start[x] + said[{"X": "I", "Y": "J", "Z": "K"}[x]] for x in (one, two)]
+    begin = math.atan2(start[two] - centre[1], start[one] - centre[0])
+    end = math.atan2(said[two] - centre[1], said[one] - centre[0])
+    radius = math.hypot(start[one] - centre[0], start[two] - centre[1])
+    assert radius == pytest.approx(math.hypot(said[one] - centre[0], said[two] - centre[1]), abs=3e-5)
+    turn = (end - begin) % math.tau if line.startswith("G3") else -((begin - end) % math.tau)
+    angles = begin + np.linspace(0, turn, 25)
+    return [{one: centre[0] + radius * np.cos(t), two: centre[1] + radius * np.sin(t)} for t in angles]
+
+
+def path(commands, start, plane):
+    points, at = [start], dict(start)
+    for command in commands[1:]:
+        assert command.line.startswith(("G2", "G3"))
+        points += swept(command.line, at, plane)
+        at = {x: words(command.line)[x] for x in at}
+    return points
+
+
+def test_the_machines_coordinate_is_zero_plus_direction_times_value():
+    machine = axes().machine(Position(2.0, math.radians(1), math.radians(-3)))
+    assert machine == pytest.approx({"Z": 8.0, "X": 31.0, "Y": 37.0})
+
+
+def test_a_place_comes_back_from_its_coordinates():
+    rig, place = axes(), Position(1.25, 0.01, -0.02)
+    back = rig.place(rig.machine(place))
+    assert (back.travel, back.pitch, back.roll) == pytest.approx((1.25, 0.01, -0.02))
+
+
+def test_a_straight_move_names_the_machines_coordinates():
+    command = axes().straight(Position(), Position(2.0), 4.0)
+    assert command.line.startswith("G53G1")
+    assert words(command.line) == pytest.approx({"G": 1, "Z": 8.0, "X": 30.0, "Y": 40.0, "F": 240.0})
+    assert command.duration == pytest.approx(0.5)
+
+
+def test_a_lean_alone_goes_by_radians_a_second():
+    command = axes().straight(Position(1), Position(1, 0.03, 0.04), 0.1)
+    assert command.duration == pytest.approx(0.5)
+    assert words(command.line)["F"] == pytest.approx(math.degrees(0.05) / 0.5 * 60, rel=1e-4)
+
+
+def test_travel_and_lean_together_take_as_long_as_the_travel():
+    command = axes().straight(Position(), Position(2.0, 0.03, 0.04), 4.0)
+    assert command.duration == pytest.approx(0.5)
+    assert words(command.line)["F"] == pytest.approx(math.hypot(2.0, math.degrees(0.05)) * 120, rel=1e-4)
+
+
+def test_without_a_speed_the_slowest_axis_sets_the_time():
+    rig = axes()
+    assert rig.straight(Position(), Position(2.0), None).duration == pytest.approx(0.1)
+    tilted = rig.straight(Position(), Position(0.1, math.radians(5)), None)
+    assert tilted.duration == pytest.approx(0.05)
+    rig.limit("pitch", 50.0)
+    assert rig.straight(Position(), Position(0.1, math.radians(5)), None).duration == pytest.approx(0.1)
+
+
+def test_no_move_needs_no_words():
+    assert axes().straight(Position(1, 0.01), Position(1, 0.01), 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("place", "speed", "told"),
+    [
+        (Position(1), 20.1, "axis of travel is too fast; at most 20 mm/s"),
+        (Position(1, 0.05), 19.0, r"axis of pitch is too fast"),
+        (Position(0, 0.05), 1.8, "too fast; at most 1.745 rad/s"),
+        (Position(1), 0.016, "no slower than 1 mm"),
+        (Position(1), 0.0, "positive"),
+        (Position(1), -1.0, "positive"),
+        (Position(1), math.nan, "positive"),
+        (Position(1), math.inf, "positive"),
+    ],
+)
+def test_a_speed_that_cannot_be_is_refused(place, speed, told):
+    rig = axes()
+    rig.limit("pitch", math.degrees(0.1) if place.travel else 1e9)
+    with pytest.raises(InputError, match=f"^rig: .*{told}"):
+        rig.straight(Position(), place, speed)
+
+
+@pytest.mark.parametrize(("turns", "start"), [(1.0, 0.0), (-1.0, 1.0), (0.25, 3.0), (-2.6, -2.0)])
+@pytest.mark.parametrize("directions", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+@pytest.mark.parametrize(
+    ("letters", "plane"),
+    [("XY", "G17"), ("YX", "G17"), ("ZX", "G18"), ("XZ", "G18"), ("YZ", "G19"), ("ZY", "G19")],
+)
+def test_arcs_go_round_the_circle_as_often_and_the_way_they_should(letters, plane, directions, start, turns):
+    third = (set("XYZ") - set(letters)).pop()
+    rig = axes(
+        travel=axis(third, 1, 5.0, "mm"),
+        pitch=axis(letters[0], directions[0], 30.0),
+        roll=axis(letters[1], directions[1], -40.0),
+    )
+    commands = rig.arcs(LEAN, turns, 0.5, start, OFFSET)
+    assert commands[0].line == plane
+    assert sum(command.duration for command in commands) == pytest.approx(abs(turns) / 0.5)
+    machine = rig.machine(Position(0, LEAN * math.cos(start), LEAN * math.sin(start)))
+    points = path(commands, {x: machine[x] - OFFSET[x] for x in letters}, plane)
+    places = [rig.place({third: 0.0} | {x: p[x] + OFFSET[x] for x in letters}) for p in points]
+    np.testing.assert_allclose([place.tilt for place in places], LEAN, atol=1e-6)
+    phase = np.unwrap([place.phase for place in places])
+    assert np.all(np.diff(phase) * np.sign(turns) >= -1e-5)
+    assert phase[-1] - phase[0] == pytest.approx(math.tau * turns, abs=1e-4)
+    assert places[0].phase == pytest.approx(math.remainder(start, math.tau))
+
+
+def test_an_arcs_feed_takes_it_round_at_the_rate():
+    commands = axes().arcs(LEAN, 1.0, 0.5, 0.0, NONE)
+    assert words(commands[1].line)["F"] == pytest.approx(math.tau * 2.5 * 0.5 * 60)
+
+
+def test_every_line_of_a_precession_fits_a_line_of_the_controller():
+    far = axes(pitch=axis("X", 1, -1234.56789), roll=axis("Y", -1, -1234.56789))
+    assert max(len(command.line) for command in far.arcs(0.9, 100.0, 1.0, 1.234, NONE)) < 70
+
+
+def test_a_hundredth_of_a_degree_is_no_full_circle():
+    commands = axes().arcs(LEAN, math.radians(0.01) / math.tau, 0.01, 0.0, OFFSET)
+    assert [command.line[:5] for command in commands[1:]] == ["G53G1"]
+    assert words(commands[1].line)["X"] == pytest.approx(32.5), "the machine's, as of all straight lines"
+
+
+@pytest.mark.parametrize(
+    ("tilt", "turns", "rate", "told"),
+    [
+        (LEAN, 1.0, 0.0, "no precession"),
+        (LEAN, 1.0, -1.0, "no precession"),
+        (LEAN, 0.0, 1.0, "no precession"),
+        (0.0, 1.0, 1.0, "no precession"),
+        (LEAN, math.inf, 1.0, "no precession"),
+        (LEAN, 1e300, 1.0, "too many"),
+        (LEAN, -10_001.0, 1.0, "too many"),
+        (LEAN, 1.0, math.nan, "no precession"),
+        (LEAN, 1.0, 6.4, "at most 6.366"),
+        (math.radians(0.01), 1.0, 0.1, "no slower than"),
+    ],
+)
+def test_a_precession_that_cannot_be_is_refused(tilt, turns, rate, told):
+    with pytest.raises(InputError, match=f"^rig: .*{told}"):
+        axes().arcs(tilt, turns, rate, 0.0, NONE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"pitch": axis("A"), "roll": axis("B")}, "no arcs in the axes A and B"),
+        ({"pitch": axis("X"), "roll": axis("A")}, "no arcs in the axes X and A"),
+        ({"pitch": None, "roll": None}, "cannot lean"),
+        ({"pitch": axis("X", unit="mm"), "roll": axis("Y")}, "same unit"),
+    ],
+)
+def test_axes_that_span_no_plane_are_refused(changes, told):
+    with pytest.raises(InputError, match=told):
+        axes(**changes).arcs(LEAN, 1.0, 0.5, 0.0, NONE)
+
+
+def test_rotary_axes_still_go_straight():
+    rig = axes(pitch=axis("A"), roll=axis("B"))
+    line = rig.straight(Position(), Position(1.0, LEAN), None).line
+    assert words(line)["A"] == pytest.approx(2.5)
+
+
+def test_two_places_are_as_far_apart_as_the_axis_where_they_differ_most():
+    rig, place = axes(), Position(1, 0.01, 0.02)
+    assert rig.apart(place, place) == 0
+    assert rig.apart(place, replace(place, travel=1.25)) == pytest.approx(0.25)
+    assert rig.apart(place, Position(0.9, 0.01, 0.02 - math.radians(0.3))) == pytest.approx(0.3)

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import math
+import re
+import threading
+import time
+
+import pytest
+from scripted_grbl import ScriptedGrbl, stage_settings
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.rig.settings import Axis
+from mirrorskin.hw.stage import Position
+from mirrorskin.io import InputError
+
+LEAN = math.radians(2.5)
+HOMED = stage_settings(home=True)
+
+
+@pytest.fixture
+def opened():
+    """Open a stage on a scripted port, and close it in the end; no thread is left."""
+    stages, before = [], threading.active_count()
+
+    def open_stage(port=None, **changes):
+        port = ScriptedGrbl() if port is None else port
+        stages.append(GrblStage(stage_settings(**changes), port))
+        return stages[-1], port
+
+    yield open_stage
+    for stage in stages:
+        stage.close()
+    assert threading.active_count() == before
+
+
+def test_it_tells_where_it_is_and_who_it_is(opened):
+    stage, _ = opened(ScriptedGrbl(place=(31.0, 40.0, 9.0)))
+    report = stage.report()
+    assert report.state == "idle"
+    assert abs(report.time - time.monotonic()) < 5
+    assert report.position.travel == pytest.approx(1)
+    assert report.position.pitch == pytest.approx(math.radians(1))
+    assert stage.error is None
+    assert "1.1h" in stage.firmware
+    assert stage.parameters[110] == 6000
+    assert 0 < stage.round_trip < 5
+
+
+def test_reports_of_work_coordinates_are_turned_into_the_machines(opened):
+    stage, _ = opened(ScriptedGrbl(place=(31.0, 40.0, 9.0), work=True))
+    assert stage.report().position.travel == pytest.approx(1)
+    stage.move(Position(2.0))
+    assert stage.wait().position.travel == pytest.approx(2)
+
+
+def test_it_goes_where_it_is_sent_in_the_machines_coordinates(opened):
+    stage, port = opened()
+    stage.move(Position(1.0), 20.0)
+    assert stage.wait().position.travel == pytest.approx(1, abs=1e-3)
+    assert port.place == pytest.approx([30, 40, 9])
+    assert port.lines[-1] == "G53G1Z9.00000X30.00000Y40.00000F1200.0000"
+    stage.move(Position(1.0), 20.0)
+    stage.wait()
+    assert port.lines[-1].startswith("G53G1Z9"), "a move to where it stands needs no line"
+
+
+def test_a_precession_ends_where_it_began_and_streams_within_the_buffer(opened):
+    stage, port = opened()
+    stage.move(Position(1.0, LEAN))
+    stage.wait()
+    stage.precess(LEAN, 3.0, 5.0)
+    assert stage.report().state in ("run", "idle")
+    report = stage.wait()
+    assert report.state == "idle"
+    assert report.position.pitch == pytest.approx(LEAN, abs=1e-4)
+    assert sum(line.startswith("G3") for line in port.lines) == 6
+    assert 0 < port.fill <= 128
+
+
+def test_a_smaller_buffer_is_heeded(opened):
+    stage, port = opened(ScriptedGrbl(size=64))
+    stage.move(Position(1.0, LEAN))
+    stage.wait()
+    stage.precess(LEAN, 2.0, 6.0)
+    stage.wait()
+    assert 0 < port.fill <= 64
+
+
+def test_a_precession_begins_where_the_body_stands(opened):
+    stage, port = opened()
+    sent = len(port.lines)
+    with pytest.raises(InputError, match="move there first"):
+        stage.precess(LEAN, 1.0, 1.0)
+    stage.move(Position(0, LEAN * math.cos(1), LEAN * math.sin(1)))
+    stage.wait()
+    with pytest.raises(InputError, match="move there first"):
+        stage.precess(LEAN, 1.0, 1.0, 1.1)
+    stage.precess(LEAN, -0.5, 5.0, 1.0)
+    assert stage.wait().position.phase == pytest.approx(1 - math.pi, abs=1e-3)
+    assert len(port.lines) == sent + 3
+
+
+def test_what_is_beyond_the_limits_is_refused_before_anything_is_sent(opened):
+    stage, port = opened()
+    sent = list(port.lines)
+    for beyond in (3.1,), (-6,), (0, 0.2), (math.nan,), (0, 0.07, 0.07):
+        with pytest.raises(InputError, match="stage in memory"):
+            stage.move(Position(*beyond))
+    with pytest.raises(InputError, match="stage in memory"):
+        stage.precess(0.1, 1.0, 1.0)
+    with pytest.raises(InputError, match="too fast"):
+        stage.move(Position(1.0), 100.0)
+    time.sleep(0.05)
+    assert port.lines == sent
+    assert stage.error is None
+
+
+def test_it_goes_no_faster_than_the_controller_does(opened):
+    stage, _ = opened(ScriptedGrbl(settings={112: 300}))
+    with pytest.raises(InputError, match="at most 5 mm/s"):
+        stage.move(Position(1.0), 5.1)
+
+
+def test_the_history_is_in_order_and_can_be_cut(opened):
+    stage, _ = opened()
+    stage.move(Position(1.0), 10.0)
+    stage.wait()
+    reports = stage.history()
+    times = [report.time for report in reports]
+    assert len(reports) >= 3
+    assert times == sorted(times)
+    assert stage.history(times[1])[: len(times) - 2] == reports[2:]
+    assert stage.history(time.monotonic() + 1) == []
+
+
+def test_reports_tell_of_the_time_when_they_were_so(opened):
+    stage, _ = opened()
+    begun = time.monotonic()
+    stage.move(Position(2.0), 5.0)
+    stage.wait()
+    under_way = [report for report in stage.history(begun) if 0.1 < report.position.travel < 1.9]
+    late = [report.time - begun - report.position.travel / 5 for report in under_way]
+    assert len(under_way) >= 3
+    assert max(late) - min(late) < 0.1
+
+
+def test_a_locked_stage_without_switches_is_unlocked(opened):
+    stage, port = opened(ScriptedGrbl(state="Alarm"))
+    assert "$X" in port.lines
+    stage.move(Position(0.1))
+    stage.wait()
+
+
+def test_a_locked_stage_with_switches_waits_to_be_homed(opened):
+    stage, port = opened(ScriptedGrbl(state="Alarm", settings={22: 1}), home=True)
+    assert "$X" not in port.lines
+    assert stage.report().state == "alarm"
+    for ask in (lambda: stage.move(Position(0.1)), stage.wait):
+        with pytest.raises(HardwareError, match="home it first"):
+            ask()
+    stage.home()
+    assert port.lines[-2:] == ["$H", "G21G90G94"]
+    stage.move(Position(0.1))
+    stage.wait()
+
+
+def test_homing_that_fails_is_an_alarm(opened):
+    stage, _ = opened(ScriptedGrbl(state="Alarm", settings={22: 1}, answers={"$H": "ALARM:9"}), home=True)
+    with pytest.raises(HardwareError, match="did not reach a switch"):
+        stage.home()
+
+
+def test_homing_that_is_switched_off_is_refused(opened):
+    stage, _ = opened()
+    with pytest.raises(InputError, match=re.escape("$22=1")):
+        stage.home()
+
+
+def test_a_stage_left_moving_by_others_is_held_and_reset(opened):
+    port = ScriptedGrbl()
+    port._plan.append(([30.0, 40.0, 0.0], 60.0))
+    port.state = "Run"
+    stage, _ = opened(port)
+    assert stage.report().state == "idle"
+    assert port.bytes.index(b"!") < port.bytes.index(b"\x18")
+
+
+@pytest.mark.parametrize(
+    ("port", "told"),
+    [
+        (ScriptedGrbl(version="0.9j"), "version 0.9j"),
+        (ScriptedGrbl(settings={13: 1}), re.escape("$13=0")),
+        (ScriptedGrbl(answers={"$$": "error:8"}), "error:8"),
+    ],
+)
+def test_a_controller_that_cannot_be_worked_with_is_refused(port, told):
+    with pytest.raises(InputError, match=f"^stage in memory: .*{told}"):
+        GrblStage(stage_settings(), port)
+    assert port.closed
+
+
+def test_an_axis_that_the_controller_has_not_is_refused():
+    port = ScriptedGrbl()
+    with pytest.raises(InputError, match="no axis A"):
+        GrblStage(stage_settings(pitch=Axis("A", 1, 0.0, -1, 1, 1, "deg")), port)
+    assert port.closed
+
+
+def test_two_threads_may_wait(opened):
+    stage, _ = opened()
+    stage.move(Position(1.0), 10.0)
+    found = []
+    others = [threading.Thread(target=lambda: found.append(stage.wait())) for _ in range(2)]
+    for other in others:
+        other.start()
+    for other in others:
+        other.join(5)
+    assert [report.state for report in found] == ["idle", "idle"]
+
+
+def test_closing_twice_and_stopping_after_is_no_error():
+    stage = GrblStage(stage_settings(), ScriptedGrbl())
+    stage.close()
+    stage.close()
+    stage.stop()
+    with pytest.raises(HardwareError, match="closed"):
+        stage.move(Position(1))
+    with pytest.raises(HardwareError, match="closed"):
+        stage.report()
+
+
+def test_leaving_it_in_motion_stops_it():
+    port = ScriptedGrbl()
+    with GrblStage(stage_settings(), port) as stage:
+        stage.move(Position(-4), 1.0)
+    assert port.held_at is not None
+    assert port.reset_at is not None
+    assert port.closed

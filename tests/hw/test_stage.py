@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mirrorskin.hw.stage import Limits, Position
+from mirrorskin.io import InputError
+
+LIMITS = Limits(travel=(-2.0, 10.0), tilt=math.radians(3), press=4.0)
+
+
+def test_a_lean_has_a_half_angle_and_a_phase():
+    place = Position(pitch=0.03 * math.cos(2), roll=0.03 * math.sin(2))
+    assert place.tilt == pytest.approx(0.03)
+    assert place.phase == pytest.approx(2)
+    assert Position().phase == 0
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        Position(-2),
+        Position(4),
+        Position(0, math.radians(3)),
+        Position(0, math.radians(-3)),
+        Position(1, math.radians(3) * math.cos(1), math.radians(3) * math.sin(1)),
+    ],
+)
+def test_what_lies_on_a_limit_is_within(place):
+    LIMITS.check(place, "it")
+
+
+@pytest.mark.parametrize(
+    ("place", "limit"),
+    [
+        (Position(-2.001), "from -2 to 10 mm"),
+        (Position(11), "from -2 to 10 mm"),
+        (Position(4.001), "deeper than the 4 mm"),
+        (Position(math.nan), "finite"),
+        (Position(math.inf), "finite"),
+        (Position(0, math.radians(3.01)), "greatest, 3;"),
+        (Position(0, math.radians(2.5), math.radians(2.5)), "greatest, 3;"),
+        (Position(0, math.nan), "finite"),
+    ],
+)
+def test_what_lies_beyond_a_limit_is_refused_by_its_name(place, limit):
+    with pytest.raises(InputError, match=f"^rig: .*{limit}"):
+        LIMITS.check(place, "rig")
+
+
+@pytest.mark.parametrize(("travel", "tilt"), [(5, 0.01), (1, 0.06), (1, -0.06), (-3, 0), (1, math.nan)])
+def test_a_precession_beyond_a_limit_is_refused(travel, tilt):
+    LIMITS.check_precession(1, 0.01, "rig")
+    with pytest.raises(InputError, match=r"^rig: "):
+        LIMITS.check_precession(travel, tilt, "rig")
+
+
+@pytest.mark.parametrize(
+    ("place", "excess"),
+    [
+        (Position(-2), 0),
+        (Position(4, math.radians(3)), 0),
+        (Position(-2.5), 0.5),
+        (Position(4.25), 0.25),
+        (Position(11), 7),
+        (Position(5, math.radians(3.5)), 1),
+        (Position(4.25, 0, math.radians(-3.5)), 0.5),
+    ],
+)
+def test_how_far_a_place_is_beyond_the_limits_is_known(place, excess):
+    assert LIMITS.excess(place) == pytest.approx(excess)
+
+
+def test_a_refusal_shows_by_how_little_it_is_beyond():
+    with pytest.raises(InputError, match=r"a travel of 4\.0000001 mm"):
+        LIMITS.check(Position(4 + 1e-7), "rig")
+
+
+def test_a_stage_that_cannot_lean_stands_upright():
+    upright = Limits((0.0, 1.0), 0.0, 1.0)
+    upright.check(Position(0.5), "rig")
+    with pytest.raises(InputError, match="tilt"):
+        upright.check(Position(0.5, 0.001), "rig")
