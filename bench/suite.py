@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from mirrorskin.bench import accuracy, paths, scaling, sweep
+from mirrorskin.bench import accuracy, live, paths, scaling, sweep
 from mirrorskin.bench.accuracy import InaccurateError
 from mirrorskin.bench.correlation import CorrelationCase, run_correlation, run_sliding
 from mirrorskin.bench.integration import IntegrationCase, run_frames, run_mask, run_rectangle
@@ -132,6 +132,7 @@ _RUNS: dict[str, _Run] = {
     **{case.name: _integration(case, run) for case, run in _INTEGRATION.items()},
     **sweep.CASES,
     **paths.CASES,
+    **live.CASES,
     **scaling.CASES,
     **accuracy.CASES,
 }

@@ -15,7 +15,7 @@ from mirrorskin.cli.quantity import angle, per_angle
 from mirrorskin.engine import EVENTS
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.press.vertical import METHODS
-from mirrorskin.engine.rotation.normals import NORMAL_METHODS
+from mirrorskin.engine.rotation.launch import NORMAL_METHODS
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError
 

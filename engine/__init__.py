@@ -14,7 +14,8 @@ from mirrorskin.engine.reconstruct import reconstruct
 from mirrorskin.engine.rotation.axial import correlate_source, reconstruct_rotation
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
 from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.normals import NormalEstimator, NormalMethod, Normals, estimate_normals
+from mirrorskin.engine.rotation.launch import NormalMethod
+from mirrorskin.engine.rotation.normals import NormalEstimator, Normals, estimate_normals
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.score import AngleScore, ContactScore, EdgeScore, HeightScore, Score, score
 from mirrorskin.engine.summary import Summary, summarise

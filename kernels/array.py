@@ -120,6 +120,28 @@ class Array:
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
         return self.host
 
+    def see(self, kernel: cl.Event | None) -> NDArray[Any]:
+        """Wait for one kernel, while others that only read may run, and return a copy of what it wrote."""
+        queue, after = self._device.copies, [] if kernel is None else [kernel]
+        self._device.queue.flush()
+        if not self._shared:
+            event = cl.enqueue_copy(queue, self.host, self.buffer, wait_for=after)
+            self._device.profile.wait("download", self.name, event, self.host.nbytes)
+            return self.host.copy()
+        view, _ = cl.enqueue_map_buffer(
+            queue,
+            self.buffer,
+            cl.map_flags.READ,
+            0,
+            self.host.shape,
+            self.host.dtype,
+            wait_for=after,
+            is_blocking=True,
+        )
+        seen: NDArray[Any] = view.copy()
+        view.base.release(queue)
+        return seen
+
     def hand_over(self) -> NDArray[Any]:
         """Wait for the device and give away what it wrote, without a copy; the array is no more of use."""
         host = self.download()

@@ -115,3 +115,18 @@ __kernel void components_settle(
         height[p] = chosen(ANSWERED(p), RISEN(p, column) + offsets[LABEL(p)], NAN);
     }
 }
+
+// What brings the mean of each piece to 0.
+__kernel void components_level(
+    const int strips, const int count, __global const float *restrict sums, __global const float *restrict totals,
+    __global float *restrict offsets)
+{
+    const int piece = get_global_id(0);
+    if (piece >= count) return;
+    float sum = 0.0f, total = 0.0f;
+    for (int strip = 0; strip < strips; ++strip) {
+        sum += sums[strip * count + piece];
+        total += totals[strip * count + piece];
+    }
+    offsets[piece] = total > 0.0f ? -sum / total : 0.0f;
+}

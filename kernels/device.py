@@ -258,7 +258,7 @@ class Kernel:
         self._kernel = kernel
         self._group = group
 
-    def __call__(self, items: int, *args: Operand | np.generic, moved: int) -> None:
+    def __call__(self, items: int, *args: Operand | np.generic, moved: int, first: int = 0) -> None:
         """Put one run on the device's queue.
 
         Parameters
@@ -269,6 +269,8 @@ class Kernel:
             The kernel's arguments in order; arrays belong to the device by now.
         moved : int
             Bytes that it must read and write, for the profile.
+        first : int
+            Number of the first item, for work that is done in parts.
         """
         group = self._group
         size = -(-items // group) * group
@@ -276,7 +278,9 @@ class Kernel:
         arrays = [arg for arg in args if isinstance(arg, Operand)]
         copies = [array.arrived for array in arrays if array.arrived is not None]
         try:
-            event = self._kernel(self._device.queue, (size,), (group,), *values, wait_for=copies)
+            event = self._kernel(
+                self._device.queue, (size,), (group,), *values, global_offset=(first,), wait_for=copies
+            )
         except cl.Error as error:
             raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
         for array in arrays:

@@ -748,6 +748,59 @@ __kernel void multigrid_advance(
     TELL_PART
 }
 
+// Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,
+// z A p, p A p and b p.
+#define STEP(i) AT(p + (i))
+#define CORRECTION(i) AT(z + (i))
+__kernel void multigrid_curve(
+    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST z, CONST p,
+    const int count, __global float *restrict parts)
+{
+    const int begin = base + stride + (int)get_global_id(0) * PART;
+    const int end = LESSER(begin + PART, base + stride * (rows + 1));
+    reals zz = 0, zp = 0, pp = 0, bp = 0;
+    EACH_NODE {
+        LINKS
+        const reals along = -FLOWING(STEP);
+        zz -= CORRECTION(i) * FLOWING(CORRECTION);
+        zp += CORRECTION(i) * along;
+        pp += STEP(i) * along;
+        bp += AT(b + i) * STEP(i);
+    }
+    if (begin >= end) return;
+    __global float *part = parts + get_global_id(0);
+    part[0] = WHOLE(zz);
+    part[count] = WHOLE(zp);
+    part[2 * count] = WHOLE(pp);
+    part[3 * count] = WHOLE(bp);
+}
+
+// The best step in the plane of both, by the parts of these products and of that of b and z. No sum goes to the host.
+#define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
+__kernel void multigrid_follow(
+    const int base, const int rows, const int stride, const int products, CONST product, const int count, CONST parts,
+    CONST z, __global float *restrict p, __global float *restrict x)
+{
+    ITEMS_NODES
+    float bz = 0, zz = 0, zp = 0, pp = 0, bp = 0;
+    for (int k = 0; k < products; ++k) bz += product[k];
+    for (int k = 0; k < count; ++k) {
+        zz += parts[k];
+        zp += parts[count + k];
+        pp += parts[2 * count + k];
+        bp += parts[3 * count + k];
+    }
+    const float whole = zz * pp, determinant = whole - zp * zp;
+    const int both = whole > 0 && determinant > INDEPENDENT * whole;
+    const float along = both ? (bz * pp - bp * zp) / determinant : zz > 0 ? bz / zz : 0;
+    const float again = both ? (bp * zz - bz * zp) / determinant : 0;
+    EACH_NODE {
+        const reals step = along * CORRECTION(i) + again * STEP(i);
+        PUT(p + i) = step;
+        PUT(x + i) = AT(x + i) + step;
+    }
+}
+
 // The product of two.
 __kernel void multigrid_dot(
     const int base, const int rows, const int stride, CONST one,

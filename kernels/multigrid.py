@@ -30,6 +30,7 @@ Doubles = NDArray[np.float64]
 Array = NDArray[Any]
 Table = tuple[Array, Array, Array, Array]
 
+INDEPENDENT = 1e-4  # share of the products' determinant from which on two directions are two
 STRENGTH = 0.25  # a link is strong from this share of the geometric mean of its nodes' greatest ones on
 
 
@@ -459,6 +460,51 @@ def multigrid_advance(
     b[part] = _double(b, part) - alpha * image[part]
     parts[...] = 0
     parts[0] = np.sum(_double(b, part) ** 2)
+
+
+def multigrid_curve(
+    base: int,
+    rows: int,
+    stride: int,
+    right: Array,
+    down: Array,
+    anchor: Array,
+    b: Array,
+    z: Array,
+    p: Array,
+    count: int,
+    parts: Array,
+) -> None:
+    """Write, of two directions, z A z, z A p, p A p and b p, each in the first of its parts."""
+    part = _picture(base, rows, stride)
+    z_image, p_image = (-_flow(part, stride, right, down, anchor, one) for one in (z, p))
+    products = _double(z, part) * z_image, _double(z, part) * p_image, _double(p, part) * p_image
+    parts[...] = 0
+    parts[::count] = [np.sum(one) for one in (*products, _double(b, part) * _double(p, part))]
+
+
+def multigrid_follow(
+    base: int,
+    rows: int,
+    stride: int,
+    products: int,
+    product: Array,
+    count: int,
+    parts: Array,
+    z: Array,
+    p: Array,
+    x: Array,
+) -> None:
+    """Take the best step in the plane of z and p, or along z where both are nearly one; p becomes it."""
+    part = _picture(base, rows, stride)
+    bz = np.sum(_double(product, slice(products)))
+    zz, zp, pp, bp = _double(parts, slice(None)).reshape(4, count).sum(axis=1)
+    along, again = bz / zz if zz > 0 else 0.0, 0.0
+    if zz * pp > 0 and zz * pp - zp**2 > INDEPENDENT * zz * pp:
+        along, again = np.linalg.solve([[zz, zp], [zp, pp]], [bz, bp])
+    step = along * _double(z, part) + again * _double(p, part)
+    p[part] = step
+    x[part] = _double(x, part) + step
 
 
 def multigrid_dot(base: int, rows: int, stride: int, one: Array, other: Array, parts: Array) -> None:

@@ -10,6 +10,8 @@
 // WEIGHTED 1 where frames have weights of their own
 // MAPS     1 where each pixel has a scale of its own, 0 where `scale` holds one for all
 // ENDS     1 where brightness is linear between some zeniths only
+// RING     1 where the stack is a ring of COUNT frames, each of `stride` samples, in which the turn goes round
+// BARE     1 where the wave's maps are not wanted
 // MORE     Gauss-Newton steps after the first two, for pixels of which a sample is clipped, missing or out of range
 //
 // Angles are radians. Maps lie in planes of `stride` pixels, whole vectors, of which the first `pixels` are the
@@ -34,7 +36,14 @@ typedef JOIN(uchar, LANES) B;
 
 // A frame begins anywhere, so its vectors are not aligned.
 typedef struct __attribute__((packed)) { Raw samples; } Stored;
-#define LOAD(k) JOIN(convert_float, LANES)(((__global const Stored *)(frames + (size_t)(k) * pixels + p))->samples)
+#define LOAD(k) JOIN(convert_float, LANES)(((__global const Stored *)(frames + PLACE(k) + p))->samples)
+#if RING
+#define PLACE(k) (size_t)(begins + (k) - (begins + (k) < COUNT ? 0 : COUNT)) * each
+#define FRAMES const int begins = start, each = stride; __global const FRAME *frames = stack
+#else
+#define PLACE(k) (size_t)(k) * each
+#define FRAMES const int begins = 0, each = pixels; __global const FRAME *frames = stack + (size_t)start * pixels
+#endif
 #define READ(map, at) (*(__global const F *)((map) + (at)))
 #define STORE(map, at, values) (*(__global F *)((map) + (at)) = (values))
 #if MAPS
@@ -201,8 +210,8 @@ F mills(const F z)
 
 // The same of any samples. A clipped one tells only on which side of its bound it was (a Tobit model); one that is
 // expected out of range tells nothing of the direction, and a missing one nothing at all.
-Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *frames, const int pixels, const int p,
-                  __global const float *turn, const float cos_tilt, const float sin_tilt,
+Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *frames, const int begins,
+                  const int each, const int p, __global const float *turn, const float cos_tilt, const float sin_tilt,
                   const F offset, const F per_count, const F low, const F high, const F error_of_one)
 {
     Sums sums = NOTHING;
@@ -305,6 +314,9 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 #define JOINED(old, now) (now != now ? old : old != old ? now : old + (1.0f / turns) * (now - old))
 
 // What all methods tell beside their normals, in counts; of several turns the mean, and the root mean square.
+#if BARE
+#define KEEP_WAVE(square)
+#else
 #define KEEP_WAVE(square)                                                                        \
     {                                                                                            \
         const F gain = 1.0f / per_count, left = (square) * gain * gain;                          \
@@ -322,6 +334,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
         STORE(sines, p, now_sine);                                                               \
         STORE(residual, p, root(now_left));                                                      \
     }
+#endif
 
 #if LANES == 8
 #define KEEP_VECTORS(x, y, z)                                                                    \
@@ -393,7 +406,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     __global float *restrict residual
 
 #define EACH_VECTOR                                                                              \
-    __global const FRAME *frames = stack + (size_t)start * pixels;                               \
+    FRAMES;                                                                                      \
     __global const float *restrict turn = tables + (size_t)table * 6 * ROOM;                     \
     const int first = (int)get_global_id(0) * WORDS * LANES;                                     \
     for (int p = first; p < LESSER(first + WORDS * LANES, pixels); p += LANES)
@@ -447,7 +460,7 @@ __kernel void normals_exact(ARGUMENTS)
         if (ANY(odd)) {
             Direction at = begin;
             for (int more = 0; more < MORE; ++more) {
-                const Sums closer = look_closely(at, zeniths, frames, pixels, p, turn, cos_tilt, sin_tilt,
+                const Sums closer = look_closely(at, zeniths, frames, begins, each, p, turn, cos_tilt, sin_tilt,
                                                  offset, per_count, low, high, error_of_one);
                 sums = blend_sums(sums, closer, odd);
                 at = step(at, closer);

@@ -118,22 +118,50 @@ class Settler:
                 offsets.host[some] = level - self._means(relief, plane, maps)[some]
         offsets.upload()
         height = self._device.array("settled", self._room.shape, np.float32)
-        rows, columns = self._room.shape
-        items = rows * -(-columns // min(self._device.shape.tile, _CHUNK))
-        self._run("components_settle", items, relief, plane, [offsets, height])
+        self._settle(relief, plane, offsets, height)
         settled: NDArray[np.float32] = height.hand_over()
         return settled
+
+    def launch(self, relief: Array, plane: Plane) -> Array:
+        """Put on the queue what ``settle`` does where no height is known.
+
+        Returns
+        -------
+        Array, (H, W), float32
+            Heights, until the next launch.
+        """
+        count, rows = self._pieces.count, self._room.shape[0]
+        strip = self._strip(count)
+        strips = -(-rows // strip)
+        sums = [self._grow(name, strips * count) for name in ("live sums", "live totals")]
+        self._run("components_sum", strips, relief, plane, [np.int32(strip), np.int32(count), *sums])
+        offsets = self._grow("live offsets", count)
+        kernel = self._device.kernel("components", "components_level")
+        kernel(count, np.int32(strips), np.int32(count), *sums, offsets, moved=8 * strips * count)
+        height = self._make("live heights", self._room.shape)
+        self._settle(relief, plane, offsets, height)
+        return height
 
     def _means(self, relief: Array, plane: Plane, maps: list[Array]) -> NDArray[np.float64]:
         """Return by how much each piece is above 0, or above what is known of it, (components,), mm."""
         count, rows = self._pieces.count, self._room.shape[0]
-        strip = max(-(-rows // _STRIPS), -(-rows * count // _MOST_SUMS))
+        strip = self._strip(count)
         strips = -(-rows // strip)
         sums = [self._make(name, (strips, count)) for name in ("sums", "totals")]
         numbers = np.int32(strip), np.int32(count)
         self._run("components_sum", strips, relief, plane, [*maps, *numbers, *sums], HEIGHTS=len(maps))
         sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in sums)
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
+
+    def _strip(self, count: int) -> int:
+        """Return the rows of a piece of the picture that is summed alone, for so many components."""
+        rows = self._room.shape[0]
+        return max(-(-rows // _STRIPS), -(-rows * count // _MOST_SUMS))
+
+    def _settle(self, relief: Array, plane: Plane, offsets: Array, height: Array) -> None:
+        rows, columns = self._room.shape
+        items = rows * -(-columns // min(self._device.shape.tile, _CHUNK))
+        self._run("components_settle", items, relief, plane, [offsets, height])
 
     @property
     def labels(self) -> Labels:
@@ -151,6 +179,13 @@ class Settler:
             self._arrays[name] = self._device.array(name, shape, np.float32)
             self._arrays[name].upload()
         return self._arrays[name]
+
+    def _grow(self, name: str, size: int) -> Array:
+        """Return room for so many numbers or more: pieces come and go from frame to frame."""
+        known = self._arrays.get(name)
+        if known is None or known.host.size < size:
+            return self._make(name, (2 * size,))
+        return known
 
     def _run(
         self,

@@ -139,32 +139,44 @@ class Cycle:
         float
             Of the finest level the product of both; of others 0.
         """
+        self._go(number)
+        return self._sum() if number == 0 else 0.0
+
+    def launch(self) -> tuple[np.int32, Array]:
+        """Put a cycle from the finest level on the queue; return how many parts its product has, and them."""
+        self._go(0)
+        return np.int32(self._told), self._parts
+
+    def _go(self, number: int) -> None:
+        """Do a cycle from a level on; parts of the product are then told, of the finest level."""
         if number >= self._tail:
             self._run_tail("tail_cycle")
-            return self._product() if number == 0 else 0.0
-        told = self._go_through(number)
+            if number == 0:
+                self._multiply()
+            return
+        self._go_through(number)
         if self.twice and number in _TWICE:
             self._leave(number, False, self.b, self.x, self._t)
             self._each("keep", number, self._t, self.x, self.b, self._kept)
             self._go_through(number)
             self._each("add", number, self._kept, self.x)
-        return told
 
-    def _go_through(self, number: int) -> float:
+    def _go_through(self, number: int) -> None:
         """Go from a level down and up again."""
         if self._one_pass and not self._h.odd[number].graph.count:
             self._descend(number)
-            self.run(number + 1)
+            self._go(number + 1)
             self._ascend(number)
-            return self._sum() if number == 0 else 0.0
+            return
         self._begin(number)
         self._leave(number, True, self.b, self._t, self.x)
         self._restrict(number, self.x, self.b)
-        self.run(number + 1)
+        self._go(number + 1)
         self._prolong(number, 1.0, self._t, self.x)
         self._smooth(number, _STEPS[1], self.x, self._t)
         self._smooth(number, _STEPS[0], self._t, self.x)
-        return self._product() if number == 0 else 0.0
+        if number == 0:
+            self._multiply()
 
     def _descend(self, number: int) -> None:
         """Go down by one level in one pass."""
@@ -245,13 +257,12 @@ class Cycle:
         moved = 400 * h.levels[self._tail].nodes
         h.kernel(name)(1, *ends, *graph, *cycle, *vectors, moved=moved)
 
-    def _product(self) -> float:
-        """Return the product of what is asked for and the answer."""
+    def _multiply(self) -> None:
+        """Tell parts of the product of what is asked for and the answer."""
         level = self._h.levels[0]
         self._told = -(-level.nodes // part_of(self._h.device))
         arguments = *place(level), self.b, self.x, self._parts
         self._h.kernel("dot")(self._told, *arguments, moved=8 * level.nodes)
-        return self._sum()
 
     def _sum(self) -> float:
         return float(self._parts.download()[: self._told].sum(dtype=np.float64))

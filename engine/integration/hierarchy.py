@@ -105,20 +105,31 @@ class Hierarchy:
         self._nothing = self._table([])
         self.odd: list[OddRows] = []
 
-    def build(self, links: Links) -> None:
-        """Take a graph of this shape."""
+    def build(self, links: Links, *, plain: bool = False) -> None:
+        """Take a graph of this shape; a plain one joins all that a block of pixels has."""
         finest = self.levels[0]
-        self.admit(links.right, self.right)
-        self.admit(links.down, self.down)
-        if links.anchor is not None:
-            self.admit(links.anchor, self.anchor)
+        self._admit_graph(links)
         self._coarsen(range(1, len(self.levels)))
         self.odd, self.table = [OddRows() for _ in self.levels], self._nothing
-        split = self._split.download()
-        odd = self._put_right(split) if split[finest.end :].any() else nothing_odd()
-        self._split.upload()
+        odd = nothing_odd()
+        if not plain:
+            split = self._split.download()
+            odd = self._put_right(split) if split[finest.end :].any() else odd
+            self._split.upload()
         self._invert()
         self.bottom = self._solve_bottom(odd)
+
+    def follow(self, links: Links, *, deep: bool) -> None:
+        """Take a graph that is nearly the one before, a plain one; nothing goes to the host.
+
+        The coarsest level stays as it is; unless ``deep``, so do all but the finest.
+        """
+        self._admit_graph(links)
+        if deep:
+            self._coarsen(range(1, len(self.levels)))
+            self._invert()
+        else:
+            self._invert_level(self.levels[0])
 
     def kernel(self, name: str) -> Kernel:
         """Return a pass."""
@@ -148,6 +159,13 @@ class Hierarchy:
         self.anchor.upload()
         self.inverse.upload()
 
+    def _admit_graph(self, links: Links) -> None:
+        """Copy links and anchors to the finest level."""
+        self.admit(links.right, self.right)
+        self.admit(links.down, self.down)
+        if links.anchor is not None:
+            self.admit(links.anchor, self.anchor)
+
     def _coarsen(self, numbers: Iterable[int]) -> None:
         kernel = self.kernel("coarsen")
         for number in numbers:
@@ -157,11 +175,15 @@ class Hierarchy:
             )
 
     def _invert(self) -> None:
-        kernel, tile = self.kernel("invert"), self.device.shape.tile
         for level in self.levels:
-            kernel(-(-level.nodes // tile), *place(level), *self.graph, self.inverse, moved=12 * level.nodes)
+            self._invert_level(level)
         for rows in self.odd:
             self.run_odd("invert", rows.graph, self.anchor, self.inverse)
+
+    def _invert_level(self, level: Level) -> None:
+        items = -(-level.nodes // self.device.shape.tile)
+        moved = 12 * level.nodes
+        self.kernel("invert")(items, *place(level), *self.graph, self.inverse, moved=moved)
 
     def over_odd(self, name: str, odd: Rows, *args: Array) -> None:
         """Run a pass over odd nodes, a multiple of `WIDTH`, as if they were rows of a picture."""

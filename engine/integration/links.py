@@ -112,13 +112,38 @@ class LinkRoom:
             "KEEP": 0,
         }
         edges = self._put_some(edges=inputs.edges)
+        self._flag(mask, edges)
+        flags: Flags = self.flags.download()
+        return flags
+
+    def adopt(self, inputs: Inputs, *maps: str) -> None:
+        """Take maps that are on the device already, in arrays of this room: slopes, and weights.
+
+        Parameters
+        ----------
+        inputs : Inputs
+            Whose maps, slopes and two of weights, are not looked at.
+        *maps : str
+            Names of the arrays, in that order.
+        """
+        self._inputs = inputs
+        self.scale = inputs.pixel_size[0] * inputs.pixel_size[1] / inputs.typical
+        dz_dx, dz_dy, *self._weights = (self._make(name, np.float32) for name in maps)
+        self._slopes, self.heights = (dz_dx, dz_dy), []
+        self._macros = {"MASK": 0, "WEIGHTS": len(self._weights), "HEIGHTS": 0, "KEEP": 0}
+        self._flag([], [])
+
+    def array(self, name: str) -> Array:
+        """Return one of the room's arrays of floats, (H, W)."""
+        return self._make(name, np.float32)
+
+    def _flag(self, mask: list[Array], edges: list[Array]) -> None:
+        """Tell what the pixels are."""
         self.flags = self._make("flags", np.uint8)
         uncut = self._make("uncut", np.uint8) if edges else self.flags
         self._run("links_flags", *self._slopes, *mask, *self._weights, *self.heights, uncut)
         if edges:
             self._run("links_cut", *self._slopes, *edges, uncut, self.flags)
-        flags: Flags = self.flags.download()
-        return flags
 
     def lean(self) -> Plane:
         """Return a plane that leans with the slopes, 0 in the middle: above it, heights have more digits."""

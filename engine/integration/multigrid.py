@@ -56,9 +56,11 @@ class Multigrid:
     Parameters
     ----------
     links : Links
+    plain : bool
+        See `rebuild`.
     """
 
-    def __init__(self, links: Links) -> None:
+    def __init__(self, links: Links, *, plain: bool = False) -> None:
         self._device = links.device
         self._height = self._device.array("height", links.shape, np.float32)
         self._hierarchy = Hierarchy(links.shape, links.anchor is not None, links.device)
@@ -72,15 +74,19 @@ class Multigrid:
         for array in (self._height, self._x, self._p, self._before, self._image, self._parts):
             array.upload()
         self._cycle = Cycle(self._hierarchy)
-        self.rebuild(links)
+        self._plane: Array | None = None
+        self.rebuild(links, plain=plain)
 
-    def rebuild(self, links: Links) -> None:
-        """Take another graph of the same shape; what was allocated is used again."""
+    def rebuild(self, links: Links, *, plain: bool = False) -> None:
+        """Take another graph of the same shape; what was allocated is used again.
+
+        A plain one takes no care of what hangs together badly: solutions take more cycles.
+        """
         if (links.anchor is not None) != self._hierarchy.anchored:
             self._hierarchy = Hierarchy(links.shape, links.anchor is not None, links.device)
             self._cycle = Cycle(self._hierarchy)
         self._links = links
-        self._hierarchy.build(links)
+        self._hierarchy.build(links, plain=plain)
         self._cycle.prepare()
 
     def solve(
@@ -117,6 +123,53 @@ class Multigrid:
             done += more
         h.kernel("release")(*h.picture, self._x, self._height, moved=8 * h.levels[0].nodes)
         return Solution(self._height, done, residual, residual <= enough)
+
+    def follow(self, links: Links, *, deep: bool) -> Array:
+        """Go one step from the last heights towards those of a graph that is nearly the last one.
+
+        The step is the best one in the plane of what a cycle makes of what is left over, and of the step
+        before: conjugate gradients, as far as the graph is the same, and heights cannot become worse in any
+        case. All of it is on the device's queue when this returns.
+
+        Parameters
+        ----------
+        links : Links
+        deep : bool
+            Whether to look at all levels of the graph anew, but the coarsest, or at the finest alone.
+
+        Returns
+        -------
+        Array, (H, W), float32
+            Heights, until the next solution or step.
+        """
+        h, cycle, level = self._hierarchy, self._cycle, self._hierarchy.levels[0]
+        h.follow(links, deep=deep)
+        h.admit(links.source, cycle.full_b)
+        items = -(-level.nodes // self._device.shape.tile)
+        rest = cycle.full_b, self._x, cycle.b
+        h.kernel("residual")(items, *place(level), *h.graph, *rest, moved=20 * level.nodes)
+        self._products = cycle.launch()
+        count = len(self._parts.host)
+        if self._plane is None:
+            self._plane = self._device.array("parts", (4 * count,), np.float32)
+            self._plane.upload()
+        vectors = cycle.b, cycle.x, self._p
+        arguments = *place(level), *h.graph, *vectors, np.int32(count), self._plane
+        h.kernel("curve")(count, *arguments, moved=20 * level.nodes)
+        sums = *self._products, np.int32(count), self._plane
+        vectors = cycle.x, self._p, self._x
+        h.kernel("follow")(items, *place(level), *sums, *vectors, moved=20 * level.nodes)
+        h.kernel("release")(*h.picture, self._x, self._height, moved=8 * level.nodes)
+        return self._height
+
+    def tell_gap(self) -> float:
+        """Return how far heights were from the solution before the last step; see ``Solution.residual``."""
+        count, parts = self._products
+        product = float(parts.download()[:count].sum(dtype=np.float64))
+        if product == 0:
+            return 0.0
+        energy = self._energy()
+        return math.sqrt(product / energy) if product > 0 and energy > 0 else math.inf
 
     def _try(self, start: Array | None, goal: float, limit: int, deadline: float | None) -> tuple[int, float]:
         """Solve from a start; return how many steps were done, and the residual."""

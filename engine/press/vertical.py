@@ -120,24 +120,37 @@ def reconstruct_press(
     result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
     process["fill"] = "none: not asked"
     if fill:
-        result, process["fill"] = _fill(result, source, frames, event)
+        travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+        used = None if travel is None else travel[frames.start : frames.stop]
+        result, process["fill"] = fill_press(result, source, used, event)
     return sign(result, source, search.device, process)
 
 
-def _fill(result: Result, source: Source, frames: range, event: Event) -> tuple[Result, str]:
-    """Fill the holes of a height map, where it is known how wide they are, and say what was done."""
+def fill_press(
+    result: Result, source: Source, travel: NDArray[np.float64] | None, event: Event
+) -> tuple[Result, str]:
+    """Fill the holes of a height map, where it is known how wide they are, and say what was done.
+
+    Parameters
+    ----------
+    result : Result
+        With height, its sigma and status.
+    source : Source
+        Which tells the pixels' size.
+    travel : ndarray, (T,), or None
+        Of the frames that it was made of, mm; None where that is not known.
+    event : {"onset", "release"}
+    """
     assert result.height is not None
     assert result.height_sigma is not None
     pixel_size = source.header.pixel_size
     if pixel_size is None:
         return result, _NO_PIXEL_SIZE
-    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
     above = deepest = None
     if travel is not None:
-        used = travel[frames.start : frames.stop]
-        deepest = -float(np.max(used))
+        deepest = -float(np.max(travel))
         if event == "onset":  # what is light at start was touched before
-            above = np.where(result.status == _LIGHT_AT_START, -used[0], np.nan)
+            above = np.where(result.status == _LIGHT_AT_START, -travel[0], np.nan)
     height, filled = fill_holes(result.height, result.height_sigma, pixel_size, above=above, deepest=deepest)
     return replace(result, height=height, filled=filled), "holes"
 

@@ -15,7 +15,8 @@ from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.provenance import naming, sign, told
 from mirrorskin.engine.rotation.correlation import Correlator
 from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.normals import NORMAL_METHODS, NormalEstimator, NormalMethod, Normals
+from mirrorskin.engine.rotation.launch import NORMAL_METHODS, NormalMethod
+from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.rotation.relief import find_relief
 from mirrorskin.engine.rotation.turns import LONGEST, longest_turn

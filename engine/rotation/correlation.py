@@ -133,7 +133,7 @@ class Correlator:
         self._sums = (
             TurnSums(opened, shape, dtype, length)
             if window is None
-            else WindowSums(opened, shape, dtype, length, window)
+            else WindowSums(opened, shape, dtype, length, window, {})
         )
 
     @property
@@ -170,12 +170,17 @@ class Correlator:
         mirrorskin.io.InputError
             Their phases do not determine a fit yet.
         """
-        phase, weight = self._sums.seen()
-        used = weight > 0
-        check_phases(phase[used], weight[used])
-        mean, cosine, sine, residual = self._sums.solve()
-        return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
+        return tell_wave(self._sums)
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._sums.reset()
+
+
+def tell_wave(sums: TurnSums | WindowSums) -> Correlation:
+    """Return the fit that sums tell; see ``Correlator.result``."""
+    phase, weight = sums.seen()
+    used = weight > 0
+    check_phases(phase[used], weight[used])
+    mean, cosine, sine, residual = sums.solve()
+    return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ LIMITS = Limits(
 )
 """What the device and its reference are told."""
 
+_SHORTER = 4  # by how much other kernels are shorter than the longest one
 _FLAGS = ("clean", "lines", "more", "ways")
 
 
@@ -65,45 +67,72 @@ def find_edges(
     if contact.ndim != 2 or vectors.shape != (*shape, 3) or sigma.shape != shape or 0 in shape:
         told = f"vectors {vectors.shape}, sigma {sigma.shape} and contact {shape}"
         raise InputError(f"{told} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
-    return _Drawing(open_device(device), vectors, sigma, contact).draw()
+    drawing = EdgeDrawing(open_device(device), shape)
+    drawing.take(vectors, sigma, contact)
+    for _ in drawing.steps():
+        pass
+    return drawing.lines()
 
 
-class _Drawing:
-    """The maps of one picture on a device, and the kernels over them."""
+class EdgeDrawing:
+    """The maps of one picture on a device, and the kernels over them, which may be run in parts.
 
-    def __init__(
-        self,
-        device: Device,
-        vectors: NDArray[np.float32],
-        sigma: NDArray[np.float32],
-        contact: NDArray[np.uint8],
-    ) -> None:
-        rows, columns = contact.shape
+    Parameters
+    ----------
+    device : Device
+    shape : (int, int)
+        Rows and columns.
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        rows, columns = shape
         self._device, self._shape = device, (rows, columns)
         cells = (6, rows + 2 * MARGIN, columns + 2 * MARGIN)
         self._maps = {
-            "vectors": self._device.given("vectors", vectors, np.float32),
-            "sigma": self._device.given("sigma", sigma, np.float32),
-            "contact": self._device.given("contact", contact != 0, np.uint8),
-            "doubt": self._device.given("doubt", np.ones(contact.shape), np.uint8),
-            **{name: self._room(name, contact.shape, np.uint8) for name in _FLAGS},
-            "strength": self._room("strength", contact.shape, np.float32),
+            "vectors": self._room("vectors", (rows, columns, 3), np.float32),
+            "sigma": self._room("sigma", shape, np.float32),
+            "contact": self._room("contact", shape, np.uint8),
+            "doubt": self._device.given("doubt", np.ones(shape), np.uint8),
+            **{name: self._room(name, shape, np.uint8) for name in _FLAGS},
+            "strength": self._room("strength", shape, np.float32),
             **{name: self._room(name, cells, np.float32) for name in ("cells", "joined")},
         }
+        self._tables = {chosen: self._place(chosen) for chosen in (NEAR, FINE, COARSE)}
 
-    def draw(self) -> NDArray[np.uint8]:
-        """Return the edges."""
-        rows = self._shape[0] + 2 * MARGIN
-        self._run("edges_clean", self._tiles, "contact", "clean")
-        self._run("edges_cells", rows, "vectors", "sigma", "contact", "clean", "cells")
-        self._look(NEAR, "cells", "lines", "more")
-        self._look(FINE, "cells", "more", "lines")
-        self._run("edges_join", rows, "cells", "lines", "joined")
-        self._look(COARSE, "joined", "lines", "more")
-        self._run("edges_bound", self._tiles, "clean", "more", "lines")
+    def take(
+        self, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
+    ) -> None:
+        """Take the maps of a picture; see ``find_edges``."""
+        for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact != 0)):
+            array = self._maps[name]
+            array.claim()
+            array.host[...] = values
+            array.upload()
+
+    def steps(self, parts: int = 1) -> Iterator[None]:
+        """Put the kernels on the queue, the longest in so many parts, and yield after each."""
+        rows, fewer = self._shape[0] + 2 * MARGIN, -(-parts // _SHORTER)
+        yield from self._run("edges_clean", fewer, self._tiles, "contact", "clean")
+        yield from self._run("edges_cells", fewer, rows, "vectors", "sigma", "contact", "clean", "cells")
+        yield from self._look(NEAR, parts, "cells", "lines", "more")
+        yield from self._look(FINE, parts, "cells", "more", "lines")
+        yield from self._run("edges_join", fewer, rows, "cells", "lines", "joined")
+        yield from self._look(COARSE, parts, "joined", "lines", "more")
+        yield from self._run("edges_bound", fewer, self._tiles, "clean", "more", "lines")
+
+    def lines(self) -> NDArray[np.uint8]:
+        """Return the edges, once all steps are done."""
         return self._maps["lines"].download().copy()
 
-    def _look(self, chosen: Pass, cells: str, before: str, after: str) -> None:
+    def _place(self, chosen: Pass) -> tuple[Array, Array]:
+        """Return the pairs of cells that a pass compares."""
+        places, distances = pairs(chosen)
+        return (
+            self._device.given("places", places, np.int32),
+            self._device.given("distances", distances, np.float32),
+        )
+
+    def _look(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
         """Add the lines of one pass."""
         macros: dict[str, str | int] = {
             "SPACING": chosen.spacing,
@@ -114,17 +143,15 @@ class _Drawing:
             "PART": f"{chosen.part}f",
             "LAST": int(chosen is COARSE),
         }
-        places, distances = pairs(chosen)
-        table = (
-            self._device.given("places", places, np.int32),
-            self._device.given("distances", distances, np.float32),
-        )
         limits = LIMITS.jump, LIMITS.bend, LIMITS.sure, LIMITS.quiet, LIMITS.floor, LIMITS.lowest
         rows, columns = self._shape
         run = min(self._device.shape.tile, 64)
         found = "doubt", "strength", "ways"
-        self._run("edges_jumps", rows * -(-columns // run), cells, *table, *limits, *found, **macros)
-        self._run("edges_thin", self._tiles, "strength", "ways", before, after, **macros)
+        items, fewer = rows * -(-columns // run), -(-parts // _SHORTER)
+        jumps = cells, *self._tables[chosen], *limits, *found
+        yield from self._run("edges_jumps", parts, items, *jumps, **macros)
+        thin = "strength", "ways", before, after
+        yield from self._run("edges_thin", fewer, self._tiles, *thin, **macros)
 
     @property
     def _tiles(self) -> int:
@@ -136,10 +163,16 @@ class _Drawing:
         array.upload()
         return array
 
-    def _run(self, name: str, items: int, *arguments: str | float | Array, **macros: str | int) -> None:
+    def _run(
+        self, name: str, parts: int, items: int, *arguments: str | float | Array, **macros: str | int
+    ) -> Iterator[None]:
         values: list[Array | np.generic] = [np.int32(size) for size in self._shape]
         for one in arguments:
             kept = self._maps[one] if isinstance(one, str) else one
             values.append(kept if isinstance(kept, Array) else np.float32(kept))
         moved = sum(one.host.nbytes for one in values if isinstance(one, Array))
-        self._device.kernel("edges", name, **macros)(items, *values, moved=moved)
+        kernel, part = self._device.kernel("edges", name, **macros), -(-items // parts)
+        for first in range(0, items, part):
+            count = min(part, items - first)
+            kernel(count, *values, moved=moved * count // items, first=first)
+            yield

@@ -2,37 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Planes, cut_into_bands
+from mirrorskin.engine.bands import MEMORY_LIMIT, Band, cut_into_bands
 from mirrorskin.engine.noise import thin_out, thinning
-from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
+from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.fits import TurnFit, fit_of
+from mirrorskin.engine.rotation.launch import (
+    MAPS,
+    NORMAL_METHODS,
+    NormalLaunch,
+    NormalMethod,
+    Samples,
+    settle,
+)
 from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
 from mirrorskin.engine.rotation.scale import make_scale
-from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave
+from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
 from mirrorskin.engine.samples import check_dtype, check_frames
 from mirrorskin.io import Block, InputError, check_phase
-from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.device import C_TYPES, Device, open_device
-from mirrorskin.kernels.normals import MORE, contact_limits
-
-NormalMethod = Literal["exact", "paper"]
-NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
-
-_LANES = 8  # pixels that are best worked on side by side, where a word has room for as many
-_MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
-_TOGETHER = 64  # turns whose tables the device has at once
-_TABLE_BYTES = 4 * 6 * LONGEST
-_ENOUGH = 500  # pixels to tell the noise from
-_MAP_BYTES = 33  # of a pixel, in all of them
+from mirrorskin.kernels.device import Device, open_device
 
 
 @dataclass(frozen=True)
@@ -207,33 +202,23 @@ class NormalEstimator:
         check_dtype(self._dtype)
         if method not in NORMAL_METHODS:
             raise InputError(f"unknown method {method!r}; known are {', '.join(NORMAL_METHODS)}")
-        if noise is not None and not 0 < noise < np.inf:
-            raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
         self._given_tilt = None if tilt is None else check_tilt(tilt)
         self._scale = make_scale(gain, offset, low, high, shape)
-        self._shape, self._method = shape, method
-        self._given_noise = None if noise is None else CountNoise(noise**2, 0.0, noise**2)
+        self._shape = shape
+        self._given_noise = None if noise is None else even_noise(noise)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn
         self.device = open_device(device)
+        self._launch = NormalLaunch(self.device, self._dtype, self._scale, method)
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(
-            self.device, shape, self._dtype, self._planes(), length, self._longest + 1
+            self.device, shape, self._dtype, self._launch.planes, length, self._longest + 1
         )
         self._buffer = self._bands[0].frames.host
         if len(self._bands) > 1:
             fits = min(len(band.frames.host) for band in self._bands)
             self._buffer = np.empty((fits, *shape), self._dtype)
-        if self._scale.per_pixel:
-            for band in self._bands:
-                for plane, values in enumerate(self._scale.planes):
-                    band.write("scale", values[band.rows], plane=plane)
-        else:
-            self._one_scale = self.device.array("scale", (4,), np.float32)
-            self._one_scale.host[:] = self._scale.planes
-            self._one_scale.upload()
-        self._together = max(1, min(_TOGETHER, self.device.max_allocation // _TABLE_BYTES))
-        self._tables = self.device.array("turns", (self._together, 6, LONGEST), np.float32)
-        self._places: dict[TurnFit, int] = {}
+        for band in self._bands:
+            self._launch.write_scale(band)
         self.reset()
 
     def reset(self) -> None:
@@ -290,7 +275,9 @@ class NormalEstimator:
             maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
         else:
             maps = self._maps()
-        normals = self._normals(maps)
+        assert self._noise is not None
+        assert self._tilt is not None
+        normals = tell_normals(maps, self._noise, self._tilt, self._turns, self._frames)
         self.reset()
         return normals
 
@@ -315,9 +302,9 @@ class NormalEstimator:
         alone = len(self._bands) == 1
         if alone and turns:
             self._bands[0].frames.upload(len(self._phase))
-        for start in range(0, len(told), self._together):
-            group = told[start : start + self._together]
-            self._write_tables([fit for _, fit in group])
+        for start in range(0, len(told), self._launch.together):
+            group = told[start : start + self._launch.together]
+            self._launch.write_tables([fit for _, fit in group])
             for turn, fit in group:
                 self._estimate(turn, fit)
         if alone:
@@ -349,6 +336,8 @@ class NormalEstimator:
         count = turn.stop - turn.start
         if self._noise is None or self._tilt is None:
             self._settle(turn, fit.matrix)
+        assert self._noise is not None
+        assert self._tilt is not None
         self._turns += 1
         self._frames += count
         for band in self._bands:
@@ -358,77 +347,18 @@ class NormalEstimator:
                 band.frames.host[:count] = self._buffer[turn, band.rows]
                 band.frames.upload(count)
                 start = 0
+            turns = 1 if self._per_turn else self._turns
+            samples = Samples(band.frames, start, count)
             with band.resident():
-                self._launch(band, start, count, fit)
+                self._launch.run(band, samples, fit, self._noise, self._tilt, turns)
         if self._per_turn:
             self._each.append(self._maps())
 
     def _settle(self, turn: slice, matrix: Doubles) -> None:
         """Tell from a turn what was not given: the noise, and the tilt."""
-        frames, phase, weights = self._buffer[turn], self._phase[turn], self._weights[turn]
-        step = thinning(self._shape)
-        samples, scale = frames.reshape(len(frames), -1)[:, ::step], self._scale.thinned(step)
-        if self._noise is None:
-            with np.errstate(invalid="ignore"):
-                steep = samples[:, one_wave(matrix @ samples, scale)]
-            self._noise = noise_of_fit(steep if steep.shape[1] >= _ENOUGH else samples, phase, weights)
-        if self._tilt is None:
-            self._tilt = estimate_tilt(samples, phase, weights, matrix, scale, self._noise)
-
-    def _write_tables(self, fits: list[TurnFit]) -> None:
-        """Hand the tables of some turns to the device; unless it has them, that waits for all before."""
-        if all(fit in self._places for fit in fits):
-            return
-        self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
-        self._tables.claim()
-        for fit, place in self._places.items():
-            self._tables.host[place, :, : fit.table.shape[1]] = fit.table
-        self._tables.upload()
-
-    def _launch(self, band: Band, start: int, count: int, fit: TurnFit) -> None:
-        """Run the kernel over a band's samples of one turn."""
-        assert self._tilt is not None
-        assert self._noise is not None
-        shape, tilt = self.device.shape, self._tilt
-        lanes = min(_LANES, shape.lanes)
-        integer = self._dtype.kind == "u"
-        kernel = self.device.kernel(
-            "normals",
-            f"normals_{self._method}",
-            FRAME=C_TYPES[self._dtype.name],
-            COUNTED=int(integer),
-            TOP=int(np.iinfo(self._dtype).max) if integer else 0,
-            LANES=lanes,
-            COUNT=count,
-            WEIGHTED=int(fit.weighted),
-            ROOM=LONGEST,
-            MAPS=int(self._scale.per_pixel),
-            ENDS=int(self._scale.ends),
-            MORE=MORE,
-        )
-        limits = contact_limits(count - 3, tilt)
-        apart = tilt if self._method == "exact" else 0.0  # what is told is how much more it is, or all
-        whole = np.array([self._places[fit], start, band.pixels, band.stride], np.int32)
-        turns = np.int32(1 if self._per_turn else self._turns)
-        noise = self._noise.base, self._noise.slope, self._noise.least
-        reals = (
-            math.cos(tilt),
-            math.sin(tilt),
-            *noise,
-            limits.noise,
-            limits.model,
-            limits.still - apart,
-            limits.most - apart,
-            limits.rest,
-        )
-        scale = band.maps["scale"] if self._scale.per_pixel else self._one_scale
-        arguments: list[Array | np.generic] = [band.frames, self._tables, scale, *whole, turns]
-        arguments += [*np.array(reals, np.float32), *(band.maps[name] for name in _MAPS)]
-        if self._method == "paper":
-            (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
-            arguments += [*np.array([mean, cosine, both, sine], np.float32)]
-        moved = band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + 16 * self._scale.per_pixel)
-        kernel(-(-band.pixels // (lanes * shape.words)), *arguments, moved=moved)
+        samples = self._buffer[turn].reshape(turn.stop - turn.start, -1)[:, :: thinning(self._shape)]
+        known = self._phase[turn], self._weights[turn], matrix, self._scale, self._noise, self._tilt
+        self._noise, self._tilt = settle(samples, self._shape, *known)
 
     def _maps(self) -> list[NDArray[Any]]:
         """Return the maps of all rows, as they are listed."""
@@ -436,40 +366,29 @@ class NormalEstimator:
             return self._download(self._bands[0])
         return [np.concatenate(parts) for parts in zip(*map(self._download, self._bands), strict=True)]
 
-    def _normals(self, maps: list[NDArray[Any]]) -> Normals:
-        assert self._tilt is not None
-        assert self._noise is not None
-        vectors, sigma, contact, mean, cosine, sine, residual = maps
-        some = thin_out(mean)
-        known = some[np.isfinite(some)]
-        noise = float(self._noise.at(np.median(known) if known.size else 0.0))
-        return Normals(
-            vectors,
-            sigma,
-            contact,
-            mean,
-            cosine,
-            sine,
-            residual,
-            noise,
-            self._noise.slope,
-            self._tilt,
-            self._turns,
-            self._frames,
-        )
-
     def _download(self, band: Band) -> list[NDArray[Any]]:
         """Return the maps of a band, as they are listed; it has new ones then."""
         rows = (-1, self._shape[1])
         with band.resident():
-            vectors, *others = (band.hand_over(name).reshape(-1) for name in _MAPS)
+            vectors, *others = (band.hand_over(name).reshape(-1) for name in MAPS)
         flat = [one[: band.pixels].reshape(rows) for one in others]
         return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
 
-    def _planes(self) -> dict[str, Planes]:
-        scale = {"scale": Planes(4, np.float32)} if self._scale.per_pixel else {}
-        maps = {
-            name: Planes(3 if name == "vectors" else 1, np.uint8 if name == "contact" else np.float32)
-            for name in _MAPS
-        }
-        return maps | scale
+
+def even_noise(noise: float) -> CountNoise:
+    """Return the noise of samples that all have the same, of a standard deviation in counts."""
+    if not 0 < noise < np.inf:
+        raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
+    return CountNoise(noise**2, 0.0, noise**2)
+
+
+def tell_normals(
+    maps: list[NDArray[Any]], noise: CountNoise, tilt: float, turns: int, frames: int
+) -> Normals:
+    """Put together what a kernel left, as ``mirrorskin.engine.rotation.launch.MAPS`` lists it."""
+    vectors, sigma, contact, mean, cosine, sine, residual = maps
+    some = thin_out(mean)
+    known = some[np.isfinite(some)]
+    level = np.median(known) if known.size else 0.0
+    told = float(noise.at(level)), noise.slope, tilt, turns, frames
+    return Normals(vectors, sigma, contact, mean, cosine, sine, residual, *told)

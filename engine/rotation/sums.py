@@ -20,7 +20,7 @@ _PIECE = 256  # frames that a kernel is told of at once
 _MOST = 2**23  # frames that an accumulator of counts can take
 _SUMS = ("total", "cosine_sum", "sine_sum", "square")
 _PAIRS = ("reference", *_SUMS)
-_ANSWERS = ("mean", "cosine", "sine", "residual")
+_ANSWERS = ("wave mean", "wave cosine", "wave sine", "wave residual")
 
 
 class Sums:
@@ -199,13 +199,30 @@ class WindowSums(Sums):
     """The last frames of an endless rotation: integer sums move on with it, anything else is summed anew."""
 
     def __init__(
-        self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int, window: int
+        self,
+        device: Device,
+        shape: tuple[int, int],
+        dtype: np.dtype[Any],
+        length: int,
+        window: int,
+        beside: Mapping[str, DTypeLike | Planes],
     ) -> None:
         self._window = window
         self._width = {1: 4, 2: 8}.get(dtype.itemsize, 0)  # bytes of an integer sum
         sums = dict.fromkeys(_SUMS if self._width else (), f"i{self._width}")
-        super().__init__(device, shape, dtype, {"ring": Planes(window, dtype), **sums}, length, wide=False)
+        maps = {"ring": Planes(window, dtype), **sums, **beside}
+        super().__init__(device, shape, dtype, maps, length, wide=False)
         self.reset()
+
+    @property
+    def bands(self) -> list[Band]:
+        """Where the frames are: map ``ring`` of each band holds its rows of them."""
+        return self._bands
+
+    @property
+    def oldest(self) -> int:
+        """Plane of the ring that the oldest frame of a full window is in; the next frame goes there."""
+        return self._next
 
     def reset(self) -> None:
         """Forget the frames so far."""

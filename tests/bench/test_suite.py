@@ -34,6 +34,7 @@ TWIN = ["mirrorskin, vertical", "mirrorskin, rotation", "NumPy, vertical"]
 FRAME = 48 * 64  # pixels of a quick run
 # What has tests of its own.
 ELSEWHERE = ("integrate", "file-", "batch-", "sweep-", "accuracy-", "scaling-", "cold-start")
+ELSEWHERE = (*ELSEWHERE, "live-vertical", "live-axial")
 
 
 def moved(name, row):

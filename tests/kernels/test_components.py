@@ -71,3 +71,17 @@ def test_a_piece_without_known_height_has_the_mean_nothing_and_others_meet_what_
     assert (total[1], share.tolist()) == (4 + 1120 - 1130, [0, 1])
     settled = components.components_settle(flags, labels, relief, plane, np.array([-1052.0, 6]))
     np.testing.assert_array_equal(settled, [[-51, np.nan, 1028], [51, np.nan, 1130]])
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 300])
+def test_offsets_bring_means_to_0(device, pieces):
+    random = np.random.default_rng(pieces)
+    sums, totals = random.normal(0, 5, (9, pieces)), random.integers(0, 4, (9, pieces))
+    totals[:, -1] = 0
+    offsets = device.given("offsets", np.full(pieces, 9.0))
+    given = [device.given(name, values) for name, values in (("sums", sums), ("totals", totals))]
+    kernel = device.kernel("components", "components_level", ONE=0, HEIGHTS=0)
+    kernel(pieces, np.int32(9), np.int32(pieces), *given, offsets, moved=0)
+    expected = components.components_level(sums, totals)
+    np.testing.assert_allclose(offsets.download(), expected, rtol=1e-5, atol=1e-6)
+    assert offsets.download()[-1] == 0

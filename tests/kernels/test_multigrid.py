@@ -10,6 +10,7 @@ COARSE = (15 * 32, 7, 16)
 ODD = COARSE[0] + 9 * 16  # the first node without a place in the picture
 NODES = ODD + 16
 ROWS = 9
+PARTS = -(-FINE[1] * FINE[2] // 64)
 STEPS = 1.3896, 0.5617
 PAIR = (FINE[0], FINE[2], *COARSE)
 
@@ -32,7 +33,11 @@ class Arrays:
         self.inverse = np.abs(self.inverse)
         self.smoother, self.direction, self.image, self.split = (np.zeros(NODES) for _ in range(4))
         self.weight_at = np.abs(rng.normal(size=NODES))
-        self.parts = np.zeros(-(-FINE[1] * FINE[2] // 64))
+        self.parts = np.zeros(PARTS)
+        self.curves = np.zeros(4 * PARTS)
+        ends = np.array([[0.5], [0.1], [0.3], [-0.5]])
+        self.plane = (ends + 0.1 * rng.random((4, PARTS))).ravel()
+        self.same = np.repeat([0.5, 0.5, 0.5, 0.3], PARTS)
         inside = FINE[2] + rng.choice(FINE[1] * FINE[2], ROWS - 3, replace=False)
         self.node = np.sort(np.concatenate([inside, ODD + np.arange(3)]))
         counts = rng.integers(1, 9, ROWS)
@@ -73,6 +78,9 @@ PASSES = {
     "solve": ((30,), "bottom", "matrix", "b", "x"),
     "direct": (FINE, 0.7, *GRAPH, "z", "before", "direction", "image", "parts"),
     "advance": (FINE, 0.3, "e", "before", "b", "x", "parts"),
+    "curve": (FINE, *GRAPH, "b", "z", "before", np.int32(PARTS), "curves"),
+    "follow": (FINE, np.int32(5), "weight_at", np.int32(PARTS), "plane", "z", "before", "x"),
+    "follow along one": (FINE, np.int32(5), "weight_at", np.int32(PARTS), "same", "z", "before", "x"),
     "dot": (FINE, "e", "x", "parts"),
     "weigh": (FINE, "weight_at", "x", "parts"),
     "admit": ((13, 21, 32), "map_", "level"),
@@ -91,7 +99,7 @@ def items_of(name, device):
     if name.endswith("odd"):
         return ROWS
     nodes = FINE[1] * FINE[2]
-    sums = "direct", "advance", "dot", "weigh"
+    sums = "direct", "advance", "curve", "dot", "weigh"
     return -(-nodes // (64 if name in sums else device.shape.tile))
 
 
@@ -99,6 +107,7 @@ def items_of(name, device):
 @pytest.mark.parametrize("name", PASSES)
 def test_a_pass_does_what_its_reference_says(device, name, anchored):
     sizes, *arguments = PASSES[name]
+    name = name.split()[0]
     arrays = Arrays(anchored).all()
     arrays = {key: value.astype(np.int32 if key in INTEGERS else np.float32) for key, value in arrays.items()}
     on_device = {}
@@ -122,8 +131,8 @@ def test_a_pass_does_what_its_reference_says(device, name, anchored):
     assert changed
     for key in arrays:
         found = on_device[key].download()
-        if key == "parts":
-            found, expected = found.astype(np.float64).sum(), arrays[key].astype(np.float64).sum()
+        if key in ("parts", "curves"):
+            found, expected = (one.reshape(-1, PARTS).sum(1, np.float64) for one in (found, arrays[key]))
             np.testing.assert_allclose(found, expected, rtol=1e-5)
         else:
             np.testing.assert_allclose(found, arrays[key], rtol=2e-5, atol=2e-5)

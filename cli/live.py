@@ -1,0 +1,251 @@
+"""``mirrorskin live``: reconstruct while the stage moves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mirrorskin.cli import options, scans
+
+if TYPE_CHECKING:
+    from mirrorskin.cli.status import Newest
+    from mirrorskin.engine.live import LivePress, LiveRotation, Loop
+    from mirrorskin.hw.rig.plans import Plan
+    from mirrorskin.hw.rig.settings import RigSettings
+    from mirrorskin.io import LiveSource, Result
+
+_LATENCY = "100ms"
+# How a result's process says that a map is missing, and why; and the key of the rig file that would bring it.
+_UNTOLD = "none: "
+_REMEDIES = {"zenith": "zenith_gain", "height": "pixel_size", "fill": "pixel_size"}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What is asked besides the plan."""
+
+    record: Path | None
+    settle: str | None
+    frames: int | None
+    window: int | None
+    latency: float
+    threshold: float
+    hold: int
+    noise: float | None
+    device: str | None
+
+
+def command(
+    motion: scans.Motion,
+    rig_file: scans.RigFile,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="RES.h5", help="Result to write at the end.")
+    ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(metavar="WHERE", help="Show pictures in a 'window', a 'browser', or write a FILE.rrd."),
+    ] = None,
+    window: Annotated[
+        int | None,
+        typer.Option(min=3, max=64, help="Axial: frames of a turn to use.", show_default="all, up to 64"),
+    ] = None,
+    latency: Annotated[
+        str, typer.Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
+    ] = _LATENCY,
+    threshold: Annotated[
+        float, typer.Option(help="Vertical: share of the way from dark to bright that is light.")
+    ] = 0.5,
+    hold: Annotated[int, typer.Option(help="Vertical: light frames in a row that make an onset.")] = 2,
+    noise: Annotated[
+        float | None,
+        typer.Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
+    ] = None,
+    start: scans.Start = None,
+    stop: scans.Stop = None,
+    step: scans.Step = None,
+    speed: scans.Speed = None,
+    press: scans.Press = None,
+    tilt: scans.Tilt = None,
+    turns: scans.Turns = None,
+    phase_step: scans.PhaseStep = None,
+    rate: scans.Rate = None,
+    settle: scans.Settle = None,
+    frames: scans.StepFrames = None,
+    device: options.Device = None,
+) -> None:
+    """Reconstruct while the stage moves; Ctrl-C stops it, and what was found and recorded is kept."""
+    from mirrorskin import io
+    from mirrorskin.cli.quantity import duration
+    from mirrorskin.hw.rig.file import load_rig
+
+    settings = load_rig(rig_file)
+    words: scans.Words = {
+        "start": start,
+        "stop": stop,
+        "step": step,
+        "speed": speed,
+        "press": press,
+        "tilt": tilt,
+        "turns": turns,
+        "phase_step": phase_step,
+        "rate": rate,
+    }
+    plan = scans.make_plan(motion, words)
+    scans.check_steps(plan, settle, frames)
+    plan.check(settings.stage.limits, settings.name)
+    for path, others in ((record, (rig_file,)), (output, (rig_file, record))):
+        if path is not None:
+            io.check_output(path, *others)
+    asked = _Wanted(
+        record, settle, frames, window, duration(latency, "--latency"), threshold, hold, noise, device
+    )
+    _run(settings, plan, asked, output, view)
+
+
+def _run(settings: RigSettings, plan: Plan, asked: _Wanted, output: Path | None, view: str | None) -> None:
+    """Do it, and keep what was found whatever ends it."""
+    from mirrorskin.cli.status import summary
+    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.io import InputError
+
+    live = _Live()
+    try:
+        live.run(settings, plan, asked, view)
+    except (HardwareError, InputError, KeyboardInterrupt, SystemExit):
+        if live.found:
+            typer.echo(f"{settings.name}: cut short: {summary(live.status)}", err=True)
+            try:
+                _save(live, output, settings, asked)
+            except InputError as lacking:  # why it ended matters more
+                typer.echo(f"no result: {lacking}", err=True)
+        raise
+    typer.echo(f"{settings.name}: {summary(live.status)}")
+    _save(live, output, settings, asked)
+
+
+class _Live:
+    """A run, of which more is left than what it returns."""
+
+    def __init__(self) -> None:
+        self._loop: Loop | None = None
+        self._estimator: LivePress | LiveRotation | None = None
+
+    @property
+    def found(self) -> bool:
+        """Whether there is anything to be kept."""
+        return self._loop is not None and self._loop.status.used > 0
+
+    @property
+    def status(self) -> Any:
+        """How well it kept up."""
+        assert self._loop is not None
+        return self._loop.status
+
+    def result(self) -> Result:
+        """Return the maps of what was pushed."""
+        assert self._estimator is not None
+        return self._estimator.result()
+
+    def run(self, settings: RigSettings, plan: Plan, asked: _Wanted, view: str | None) -> None:
+        """Open all, begin with the work when it is warm, and leave the stage at rest."""
+        from mirrorskin.cli.status import show_status
+        from mirrorskin.engine.live import Loop
+        from mirrorskin.hw.rig.rig import open_rig
+        from mirrorskin.io import StreamRecorder
+
+        with ExitStack() as stack:
+            rig = stack.enter_context(open_rig(settings))
+            scan = scans.make_scan(rig, plan, asked.settle, asked.frames)
+            shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
+            tell = stack.enter_context(show_status())
+            recorder = None if asked.record is None else StreamRecorder(scan, asked.record)
+            source: LiveSource = scan if recorder is None else recorder
+            stack.enter_context(source)
+            estimator = _estimator(source, plan, rig.rate, asked)
+            estimator.warm()
+
+            def on_update(update: Any, status: Any) -> None:
+                tell(status)
+                if shown is not None:
+                    shown.show(update, status)
+
+            mark = None if recorder is None else recorder.mark
+            self._estimator = estimator
+            self._loop = Loop(source, estimator, latency=asked.latency, on_update=on_update, mark=mark)
+            self._loop.run()
+
+
+@contextmanager
+def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterator[Newest]:
+    """Show pictures in a thread of its own, and say in the end if that failed."""
+    from mirrorskin.cli.status import Newest
+    from mirrorskin.view.live import LiveView
+
+    viewer = Newest(LiveView(where, shape, settings.camera.pixel_size))
+    try:
+        yield viewer
+    finally:
+        viewer.close()
+        if viewer.error is not None:
+            typer.echo(f"the pictures ended early: {viewer.error}", err=True)
+
+
+def _estimator(source: LiveSource, plan: Plan, rate: float, asked: _Wanted) -> LivePress | LiveRotation:
+    """Make what tells the maps; the source has its references."""
+    from mirrorskin.engine.live import LivePress, LiveRotation
+    from mirrorskin.hw.rig.plans import VerticalPlan
+
+    if isinstance(plan, VerticalPlan):
+        known: dict[str, Any] = {"noise": asked.noise, "device": asked.device}
+        return LivePress(source, threshold=asked.threshold, hold=asked.hold, **known)
+    window, every = _window(plan, rate, asked)
+    return LiveRotation(source, window=window, every=every, noise=asked.noise, device=asked.device)
+
+
+def _window(plan: Plan, rate: float, asked: _Wanted) -> tuple[int, int]:
+    """Return how many frames are a turn, and which so-manieth is to be used."""
+    import math
+
+    from mirrorskin.engine.live import choose_window
+    from mirrorskin.hw.rig.plans import VerticalPlan
+    from mirrorskin.io import InputError
+
+    assert not isinstance(plan, VerticalPlan)
+    if plan.phase_step is not None:
+        turn = math.tau / plan.phase_step * (asked.frames or 1)
+    else:
+        turn = rate / (plan.rate or math.inf)
+        if not math.isfinite(turn) or turn <= 0:
+            raise InputError(
+                "nobody knows how many frames a turn has: give the camera's rate in the rig file"
+            )
+    turn *= min(1.0, plan.turns)
+    window, every = choose_window(turn)
+    if asked.window is None:
+        return window, every
+    if asked.window > round(turn):
+        raise InputError(f"--window {asked.window}: a turn has {round(turn)} frames only: leave it out")
+    return asked.window, max(1, round(turn / asked.window))
+
+
+def _save(live: _Live, output: Path | None, settings: RigSettings, asked: _Wanted) -> None:
+    """Write the result, if that is asked for, and say what it lacks."""
+    if output is None:
+        return
+    from mirrorskin.cli.output import save_and_tell
+
+    result = live.result()
+    for name, remedy in _REMEDIES.items():
+        said = str(result.process.get(name))
+        if said.startswith(_UNTOLD):
+            why = said.removeprefix(_UNTOLD)
+            typer.echo(f"{settings.name}: no {name}: {why}; give {remedy} in the rig file", err=True)
+    save_and_tell(result, output, asked.device, as_json=False)

@@ -1,0 +1,149 @@
+"""What live work shows while it runs: its rates and latencies on a terminal, pictures in a viewer."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mirrorskin.engine.live import Status, Update
+
+_JOIN = 5.0  # seconds for a viewer to show the last picture
+_LOOK = 0.2  # seconds after which a waiting viewer looks whether it is over
+
+
+class Viewer(Protocol):
+    """What shows pictures."""
+
+    def show(self, update: Update, status: Status) -> None:
+        """Show what is known now."""
+
+    def close(self) -> None:
+        """Let go."""
+
+
+class Newest:
+    """Hands updates to a viewer in a thread of its own: one that is slow misses some, and holds up nobody.
+
+    Parameters
+    ----------
+    viewer : Viewer
+        Used and closed by that thread alone.
+    """
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer = viewer
+        self._change = threading.Condition()
+        self._next: tuple[Update, Status] | None = None
+        self._over = False
+        self.error: Exception | None = None
+        # One that hangs must not keep the program from ending.
+        self._thread = threading.Thread(target=self._show, name="viewer", daemon=True)
+        self._thread.start()
+
+    def show(self, update: Update, status: Status) -> None:
+        """Show this next, instead of what has not been shown yet."""
+        with self._change:
+            self._next = update, status
+            self._change.notify()
+
+    def close(self) -> None:
+        """Show the last update, and wait until that is done, for some seconds at most."""
+        with self._change:
+            self._over = True
+            self._change.notify()
+        self._thread.join(_JOIN)
+
+    def _show(self) -> None:
+        try:
+            while (coming := self._wait()) is not None:
+                self._viewer.show(*coming)
+        except Exception as error:  # told at the end: the run goes on without pictures
+            self.error = error
+        finally:
+            self._viewer.close()
+
+    def _wait(self) -> tuple[Update, Status] | None:
+        """Return what is to be shown next, or None at the end."""
+        with self._change:
+            while self._next is None and not self._over:
+                self._change.wait(_LOOK)
+            coming, self._next = self._next, None
+            return coming
+
+
+class Board:
+    """The status as a table."""
+
+    def __init__(self) -> None:
+        self._status: Status | None = None
+
+    def tell(self, status: Status) -> None:
+        """Take note, from any thread."""
+        self._status = status
+
+    def render(self) -> Table:
+        """Return the table."""
+        from rich.table import Table
+
+        table = Table(box=None, show_header=False, pad_edge=False)
+        if (status := self._status) is None:
+            table.add_row("waiting for the first frames")
+            return table
+        table.add_row("frames", f"{status.frames} at {status.rate:.1f} Hz, {status.used} used")
+        table.add_row("lost", f"{status.skipped} skipped, {status.dropped} dropped")
+        table.add_row("updates", f"{status.updates}, {_per_second(status):.1f} Hz")
+        for stage, latency in status.latency.items():
+            if not math.isnan(latency.median):
+                told = f"{1e3 * latency.median:.1f} ms, 99 % below {1e3 * latency.p99:.1f} ms"
+                table.add_row(stage, told)
+        return table
+
+
+@contextmanager
+def show_status() -> Iterator[Callable[[Status], None]]:
+    """Show a status on a terminal, and nothing in a pipe.
+
+    Yields
+    ------
+    callable
+        To be told each status.
+    """
+    board = Board()
+    if not sys.stderr.isatty():
+        yield board.tell
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True)
+    with Live(get_renderable=board.render, console=console, transient=True, refresh_per_second=4):
+        yield board.tell
+
+
+def summary(status: Status) -> str:
+    """Say in a line how well the work kept up."""
+    from mirrorskin.engine.live import SHOWN
+
+    told = (
+        f"{status.frames} frames at {_rate(status):.4g} Hz: {status.used} used, {status.skipped} skipped,"
+        f" {status.dropped} dropped; {status.updates} updates"
+    )
+    shown = status.latency.get(SHOWN)
+    if shown is None or math.isnan(shown.median):
+        return told
+    return f"{told}, {1e3 * shown.median:.1f} ms from frame to map (99 % below {1e3 * shown.p99:.1f} ms)"
+
+
+def _rate(status: Status) -> float:
+    return (status.frames - 1) / status.seconds if status.seconds > 0 else 0.0
+
+
+def _per_second(status: Status) -> float:
+    return status.updates / status.seconds if status.seconds > 0 else 0.0

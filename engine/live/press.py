@@ -1,0 +1,155 @@
+"""A press while it goes on: the height map grows as contact spreads."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.live.types import Update
+from mirrorskin.engine.press.onset import OnsetSearch
+from mirrorskin.engine.press.vertical import fill_press
+from mirrorskin.engine.provenance import sign, told
+from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
+from mirrorskin.kernels.device import Device
+
+_ROOM = 64  # frames that may wait to be taken at once
+_UPDATES = 15.0  # a second, as many as people follow; each costs as much as many frames
+_ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
+_RANGE = "range of the type"
+
+
+class LivePress:
+    """Tell the heights of a press so far; the accumulator is ``OnsetSearch``.
+
+    Parameters
+    ----------
+    source : LiveSource
+        Of vertical motion; its header's references are used.
+    threshold, hold, subframe, noise, device
+        As for ``find_onset``.
+    fill : bool
+        Whether to fill holes in the result; see ``reconstruct_press``.
+
+    Attributes
+    ----------
+    device : Device
+    every : int
+    most_updates : float
+        See ``LiveEstimator``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The source is of another motion, or parameters cannot be used.
+    """
+
+    every = 1
+    most_updates = _UPDATES
+
+    def __init__(
+        self,
+        source: LiveSource,
+        *,
+        threshold: float = 0.5,
+        hold: int = 2,
+        subframe: bool = True,
+        noise: float | None = None,
+        fill: bool = True,
+        device: str | Device | None = None,
+    ) -> None:
+        if source.motion != "vertical":
+            raise InputError(f"{source.name} is of {source.motion} motion: heights of a press are vertical")
+        self._source, self._fill = source, fill
+        self._process: dict[str, ProcessValue] = {
+            "event": "onset",
+            "method": "threshold",
+            "threshold": threshold,
+            "hold": hold,
+            "subframe": subframe,
+            "dark": told(None, source.header.dark, _RANGE),
+            "bright": told(None, source.header.bright, _RANGE),
+        }
+        shape = source.shape[1:]
+        self._search = OnsetSearch(
+            shape,
+            source.dtype,
+            dark=source.header.dark,
+            bright=source.header.bright,
+            threshold=threshold,
+            hold=hold,
+            subframe=subframe,
+            noise=noise,
+            device=device,
+            memory_limit=2 * _ROOM * math.prod(shape) * source.dtype.itemsize,
+        )
+        self.device = self._search.device
+        self._reset()
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W)."""
+        return self._search.room
+
+    def warm(self) -> None:
+        """Push frames of nothing, and forget them."""
+        frames = np.zeros((3, *self._source.shape[1:]), self._source.dtype)
+        for step in range(len(frames)):
+            self.push(Block(frames[step : step + 1], step, travel=np.array([float(step)])))
+            self.update()
+        self._search.reset()
+        self._reset()
+
+    def push(self, block: Block) -> None:
+        """Take in the next frames; see ``OnsetSearch.push``."""
+        self._search.push(block)
+        assert block.travel is not None
+        self._travel.append(block.travel)
+        self._frames += len(block.frames)
+        if block.time is not None:
+            self._time = float(block.time[-1])
+        self._latest = block.frames[-1]
+
+    def update(self) -> Update:
+        """Return the heights so far; none before the second frame."""
+        position = float(self._travel[-1][-1])
+        told = self._frames, self._time, self._source.motion, position, self._latest.copy()
+        if self._frames < 2:
+            return Update(*told)
+        onset = self._search.result()
+        contact = np.asarray((onset.status == _ONSET) | (onset.status == _LIGHT_AT_START), np.uint8)
+        return Update(
+            *told, height=onset.height, contact=contact, contact_area=area_of(contact, self._source)
+        )
+
+    def spare(self, seconds: float) -> None:
+        """Do nothing: nothing can wait."""
+
+    def result(self) -> Result:
+        """Return the heights, with holes filled if that was asked, and how they were found.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            There were fewer than two frames.
+        """
+        onset = self._search.result()
+        process = self._process | {"first_frame": 0, "frames": self._frames, "noise": onset.noise}
+        result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
+        process["fill"] = "none: not asked"
+        if self._fill:
+            travel = np.concatenate(self._travel)
+            result, process["fill"] = fill_press(result, self._source, travel, "onset")
+        return sign(result, self._source, self.device, process | {"live": True})
+
+    def _reset(self) -> None:
+        self._frames, self._time = 0, math.nan
+        self._travel: list[NDArray[np.float64]] = []
+
+
+def area_of(contact: ArrayLike, source: LiveSource) -> float | None:
+    """Return the area in contact, mm^2, if the pixels' size is known."""
+    size = source.header.pixel_size
+    return None if size is None else float(np.count_nonzero(contact)) * size[0] * size[1]

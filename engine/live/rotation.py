@@ -1,0 +1,287 @@
+"""A rotation while it goes on: normals of the turn that has just been, edges, and heights that follow."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.integration.follow import Follower
+from mirrorskin.engine.live.edges import SpareEdges
+from mirrorskin.engine.live.press import area_of
+from mirrorskin.engine.live.types import Update
+from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.engine.rotation.axial import Rotation, maps_of
+from mirrorskin.engine.rotation.correlation import Correlation, Correlator
+from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.launch import NormalMethod
+from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.relief import find_relief
+from mirrorskin.engine.rotation.relief_maps import SlopeMaps
+from mirrorskin.engine.rotation.turns import LONGEST
+from mirrorskin.engine.rotation.window import NormalWindow
+from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
+from mirrorskin.kernels.device import Device
+
+_FEWEST = 3  # frames that determine a wave
+_WARMING = 10  # updates after which every kernel has run
+_NO_GAIN = "none: the source has no zenith gain"
+_NO_PIXEL_SIZE = "none: the source has no pixel size"
+
+
+def choose_window(frames_a_turn: float) -> tuple[int, int]:
+    """Return how many frames a window should have for one turn, and which so-manieth frame should be used.
+
+    Parameters
+    ----------
+    frames_a_turn : float
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Fewer than three, from which no wave can be told.
+    """
+    if not _FEWEST <= frames_a_turn < math.inf:
+        raise InputError(f"{frames_a_turn:g} frames a turn: at least 3 are needed; turn more slowly")
+    every = math.ceil(round(frames_a_turn) / LONGEST)
+    return max(_FEWEST, round(frames_a_turn / every)), every
+
+
+class LiveRotation:
+    """Tell normals, edges and heights of the last frames; the accumulator is ``NormalWindow``.
+
+    Heights follow the normals by one step of a solver for each update: their error stays near what changes
+    from one update to the next. Edges are drawn in the time that is left. Without a zenith gain there are
+    correlations only, and without a pixel size no heights.
+
+    Parameters
+    ----------
+    source : LiveSource
+        Of axial motion; its header's tilt, zenith gain and references are used.
+    window : int
+        Frames that count, 3 to 64: best those of one turn; see `choose_window`.
+    every : int
+        Only frames whose number is a multiple of this are asked for.
+    method, noise, device
+        As for ``estimate_normals``. Noise is told from the first full window otherwise.
+    integrate, edges : bool
+        Whether to tell heights and edges.
+
+    Attributes
+    ----------
+    device : Device
+    every : int
+    most_updates : float
+        See ``LiveEstimator``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The source is of another motion, or parameters cannot be used.
+    """
+
+    most_updates = math.inf
+
+    def __init__(
+        self,
+        source: LiveSource,
+        *,
+        window: int,
+        every: int = 1,
+        method: NormalMethod = "exact",
+        noise: float | None = None,
+        integrate: bool = True,
+        edges: bool = True,
+        device: str | Device | None = None,
+    ) -> None:
+        if source.motion != "axial":
+            raise InputError(f"{source.name} is of {source.motion} motion: normals take an axial rotation")
+        if every < 1:
+            raise InputError(f"every {every}: a number of frames from 1 on is needed")
+        self._source, self.every, self._size = source, every, window
+        header, shape = source.header, source.shape[1:]
+        self._method, self._header = method, header
+        self._wave: Correlator | None = None
+        self._normals: NormalWindow | None = None
+        if header.zenith_gain is None:
+            self._wave = Correlator(shape, source.dtype, window=window, device=device)
+            self.device = self._wave.device
+        else:
+            self._normals = NormalWindow(
+                shape,
+                source.dtype,
+                window=window,
+                tilt=header.tilt,
+                gain=header.zenith_gain,
+                offset=0.0 if header.zenith_offset is None else header.zenith_offset,
+                method=method,
+                noise=noise,
+                low=header.dark,
+                high=header.bright,
+                device=device,
+            )
+            self.device = self._normals.device
+        known = self._normals is not None
+        self._edges = SpareEdges(self.device, shape) if edges and known else None
+        self._slopes = self._heights = None
+        if integrate and known and header.pixel_size is not None:
+            self._slopes = SlopeMaps(self.device, shape)
+            self._heights = Follower(self.device, shape, header.pixel_size)
+        self._reset()
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W)."""
+        return self._frames_to.room
+
+    def warm(self) -> None:
+        """Rotate a slanted plane for a while, and forget it."""
+        with suppress(InputError):  # what a plane does not tell
+            for number in range(self._size + _WARMING):
+                phase = 2 * np.pi * number / self._size
+                self.push(Block(self._plane(phase), number, phase=np.array([phase])))
+                if number >= self._size:
+                    self.update()
+            if self._edges is not None and self._normals is not None:
+                self._edges.finish(self._normals)
+        self._frames_to.reset()
+        self._reset()
+
+    def push(self, block: Block) -> None:
+        """Take in the next frames; see ``NormalWindow.push``."""
+        with naming(self._source):
+            self._frames_to.push(block)
+        assert block.phase is not None
+        self._frames += len(block.frames)
+        self._position = float(block.phase[-1])
+        if block.time is not None:
+            self._time = float(block.time[-1])
+        self._latest = block.frames[-1]
+
+    def update(self) -> Update:
+        """Return what the last window tells; the newest picture alone, until one is full."""
+        told = self._frames, self._time, self._source.motion, self._position, self._latest.copy()
+        normals = self._normals
+        if normals is None or not normals.is_full:
+            return Update(*told)
+        with naming(self._source):
+            normals.estimate()
+        self._follow(normals)
+        self._has_estimate = True
+        vectors, contact = normals.glance("vectors"), normals.glance("contact")  # while heights are found
+        height = None if self._heights is None else self._heights.end()
+        return Update(
+            *told,
+            height=height,
+            normals=vectors,
+            contact=contact,
+            edges=None if self._edges is None else self._edges.lines,
+            contact_area=area_of(contact, self._source),
+            offset_unknown=height is not None,
+        )
+
+    def spare(self, seconds: float) -> None:
+        """Go on with the edges."""
+        if self._edges is not None and self._normals is not None and self._has_estimate:
+            self._edges.work(self._normals, seconds)
+
+    def normals(self) -> Normals:
+        """Return the normals of the last window; see ``NormalWindow.normals``."""
+        if self._normals is None:
+            raise InputError(f"{self._source.name} has no zenith gain, so no normals")
+        with naming(self._source):
+            return self._normals.normals()
+
+    def correlation(self) -> Correlation:
+        """Return the fit of the frames in the last window; see ``Correlator.result``."""
+        with naming(self._source):
+            if self._normals is not None:
+                return self._normals.correlation()
+            assert self._wave is not None
+            return self._wave.result()
+
+    def result(self) -> Result:
+        """Return the maps of the last window, heights as near to their normals as ``integrate`` brings them.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            The window is not full.
+        """
+        wave = self.correlation()
+        maps: dict[str, Any] = {
+            name: getattr(wave, name) for name in ("mean", "cosine", "sine", "modulation", "residual")
+        }
+        process: dict[str, ProcessValue] = {"live": True, "window": self._size, "every": self.every}
+        if self._normals is None:
+            process |= {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
+            return sign(Result(azimuth=wave.azimuth, **maps), self._source, self.device, process)
+        normals = self.normals()
+        edges = find_edges(normals.vectors, normals.sigma, normals.contact, device=self.device)
+        result = maps_of(Rotation(normals, normals.sigma, edges, self.device, {}))
+        process |= self._tell(normals)
+        if self._header.pixel_size is None:
+            process["height"] = _NO_PIXEL_SIZE
+            return sign(replace(result, **maps), self._source, self.device, process)
+        with naming(self._source):
+            relief = find_relief(normals, normals.sigma, self._header.pixel_size, device=self.device)
+        maps |= {"height": relief.height, "height_sigma": relief.sigma, "component": relief.component}
+        maps["offset_unknown"] = relief.offset_unknown
+        return sign(replace(result, **maps), self._source, self.device, process | relief.process)
+
+    @property
+    def _frames_to(self) -> NormalWindow | Correlator:
+        """What frames are pushed into."""
+        found = self._normals if self._normals is not None else self._wave
+        assert found is not None
+        return found
+
+    def _follow(self, normals: NormalWindow) -> None:
+        """Begin a step towards the heights of the normals that are being estimated."""
+        if self._slopes is None or self._heights is None:
+            return
+        maps = {name: normals.whole(name) for name in ("vectors", "sigma", "contact")}
+        self._slopes.find(normals.tilt, maps, self._heights.maps)
+        self._heights.begin(self._slopes.typical)
+
+    def _plane(self, phase: float) -> NDArray[Any]:
+        """Return a frame of a plane whose zenith lies in the middle of what can be seen."""
+        header, (rows, columns), dtype = self._header, self._source.shape[1:], self._source.dtype
+        gain, offset = header.zenith_gain, header.zenith_offset
+        swing = 1.0 if gain is None or header.tilt is None else gain * header.tilt
+        known = [0.0 if offset is None else offset + (0.5 if gain is None else 0.5 * gain)]
+        ends = [one for one in (header.dark, header.bright) if one is not None]
+        level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0) if len(ends) == 2 else known[0]
+        most = np.iinfo(dtype).max if dtype.kind == "u" else np.inf
+        frame = np.clip(level + swing * math.cos(phase), 0, most)
+        return np.broadcast_to(np.nan_to_num(frame), (1, rows, columns)).astype(dtype)
+
+    def _tell(self, normals: Normals) -> dict[str, ProcessValue]:
+        """Say what the normals were made with."""
+        header = self._header
+        return {
+            "method": self._method,
+            "tilt": normals.tilt,
+            "tilt_from": "estimate" if header.tilt is None else "recording",
+            "zenith_gain": told(None, header.zenith_gain, "none"),
+            "zenith_offset": told(None, header.zenith_offset, "0"),
+            "low": told(None, header.dark, "range of the type"),
+            "high": told(None, header.bright, "range of the type"),
+            "noise": normals.noise,
+            "shot_noise": normals.shot,
+            "turns": normals.turns,
+            "frames": normals.frames,
+        }
+
+    def _reset(self) -> None:
+        self._frames, self._time, self._position = 0, math.nan, math.nan
+        self._has_estimate = False
+        if self._edges is not None:
+            self._edges.reset()
+        if self._slopes is not None and self._heights is not None:
+            self._slopes.typical = math.nan
+            self._heights.restart()

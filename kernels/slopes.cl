@@ -1,0 +1,146 @@
+// Slopes and their weights from normals. Specification: slopes.py.
+//
+// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// WIDTH    pixels side by side in a vector: 8, or 1 where an item is a lane
+//
+// Maps are as long as the picture, but whole vectors of them may be read and written.
+
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+
+#define STEEPEST 0.17364818f  // cosine of the zenith beyond which a slope would grow without bounds
+#define WIDEST 0.25f          // radians^2: variance of an azimuth beyond which its mean cosine is not made good
+#define AROUND 2              // pixels on each side, from which the meridian's direction is taken
+#define LEAST 1.1754944e-38f
+
+#if WIDTH == 8
+typedef float8 F;
+typedef int8 I;
+typedef float8 __attribute__((aligned(4))) Loose;  // somewhere in memory
+typedef uchar8 __attribute__((aligned(1))) Bytes;
+#define READ(map, p) (*(__global const Loose *)((map) + (p)))
+#define WRITE(map, p, values) (*(__global Loose *)((map) + (p)) = (values))
+#define GET(line, i) (*(const Loose *)((line) + (i)))
+#define PUT(line, i, values) (*(Loose *)((line) + (i)) = (values))
+#define FLAGS(map, p) convert_int8(*(__global const Bytes *)((map) + (p)))
+#define READ_VECTORS                                                                                   \
+    const F a = READ(vectors, 3 * p), b = READ(vectors, 3 * p + 8), c = READ(vectors, 3 * p + 16);      \
+    F x = (F)(a.s0, a.s3, a.s6, b.s1, b.s4, b.s7, c.s2, c.s5);                                         \
+    F y = (F)(a.s1, a.s4, a.s7, b.s2, b.s5, c.s0, c.s3, c.s6);                                         \
+    F z = (F)(a.s2, a.s5, b.s0, b.s3, b.s6, c.s1, c.s4, c.s7);
+#else
+typedef float F;
+typedef int I;
+#define READ(map, p) ((map)[p])
+#define WRITE(map, p, values) ((map)[p] = (values))
+#define GET(line, i) ((line)[i])
+#define PUT(line, i, values) ((line)[i] = (values))
+#define FLAGS(map, p) ((int)(map)[p])
+#define READ_VECTORS F x = vectors[3 * p], y = vectors[3 * p + 1], z = vectors[3 * p + 2];
+#endif
+
+// The exponential of numbers from 0 to 1/2, to 1e-7.
+#define EXPONENTIAL(x)                                                                                 \
+    (1.0f + (x) * (1.0f + (x) * (0.5f + (x) * (0.16666667f + (x) * (0.041666668f + (x) * (0.0083333338f \
+     + (x) * (0.0013888889f + (x) * 0.0001984127f)))))))
+
+// The variance of the azimuth, radians^2 within bounds, and the share of an angular error's that is along the meridian.
+#define UNSURE(flat, variance)                                                                         \
+    const F outside = GREATER(flat, (F)least), share = 0.5f * least / outside;                         \
+    const F wide = (1.0f - share) * (variance) / outside, turned = LESSER(wide, (F)WIDEST);
+
+// Slopes, and the squares of the normal's parts along x and y. Where nothing is known slopes are no numbers, and the
+// squares 0.
+__kernel void slopes_find(
+    const int pixels, const float least, __global const float *restrict vectors, __global const float *restrict sigma,
+    __global const uchar *restrict contact, __global float *restrict dz_dx, __global float *restrict dz_dy,
+    __global float *restrict squares_x, __global float *restrict squares_y)
+{
+    const int first = (int)get_global_id(0) * TILE;
+    for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
+        READ_VECTORS
+        const F s = READ(sigma, p);
+        const I known = (FLAGS(contact, p) != 0) & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
+        x = known ? x : (F)0.0f;
+        y = known ? y : (F)0.0f;
+        const F flat = x * x + y * y, slant = 1.0f / GREATER(z, (F)STEEPEST);
+        UNSURE(flat, s * s)
+        const F half_of = 0.5f * turned, longer = EXPONENTIAL(half_of);
+        WRITE(dz_dx, p, known ? -longer * x * slant : (F)NAN);
+        WRITE(dz_dy, p, known ? -longer * y * slant : (F)NAN);
+        WRITE(squares_x, p, x * x);
+        WRITE(squares_y, p, y * y);
+    }
+}
+
+#if TILE < 256
+#define CHUNK TILE
+#define ROWS 1
+#else
+#define CHUNK 256
+#define ROWS 16
+#endif
+
+// One of five rows around another: where it begins, less the columns on the left, and 0 where there is none.
+#define ROW(k, by)                                                                                     \
+    const int is_there_##k = row + by >= 0 && row + by < rows;                                         \
+    const int at_##k = (is_there_##k ? row + by : row) * columns + begin - AROUND;                     \
+    const float there_##k = is_there_##k ? 1.0f : 0.0f;
+
+#define FIVE(line) ((GET(line, i) + GET(line, i + 1)) + (GET(line, i + 2) + GET(line, i + 3)) + GET(line, i + 4))
+#define DOWN_FIVE(map)                                                                                 \
+    ((there_0 * READ(map, at_0 + i) + there_1 * READ(map, at_1 + i))                                   \
+     + (there_3 * READ(map, at_3 + i) + there_4 * READ(map, at_4 + i)) + READ(map, at_2 + i))
+
+// Inverse variances of slopes along x and y, within bounds; 0 where nothing is known.
+__kernel void slopes_weigh(
+    const int rows, const int columns, const float least, const float lowest, const float highest,
+    __global const float *restrict sigma, __global const float *restrict dz_dx,
+    __global const float *restrict squares_x, __global const float *restrict squares_y,
+    __global float *restrict weight_x, __global float *restrict weight_y)
+{
+    const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
+    const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);
+    if (top >= rows) return;
+    const int begin = item % across_all * CHUNK, end = LESSER(columns, begin + CHUNK);
+    const int width = end - begin;  // of lines that begin with the pixels on the left, as far as there are any
+    const int from = AROUND - LESSER(begin, AROUND), to = width + AROUND + LESSER(columns - end, AROUND);
+    float x[CHUNK + 2 * AROUND + WIDTH], y[CHUNK + 2 * AROUND + WIDTH];
+    for (int i = 0; i < from; ++i) x[i] = y[i] = 0.0f;
+    for (int row = top; row < bottom; ++row) {
+        ROW(0, -2) ROW(1, -1) ROW(2, 0) ROW(3, 1) ROW(4, 2)
+        for (int i = from; i < to; i += WIDTH) {
+            PUT(x, i, DOWN_FIVE(squares_x));
+            PUT(y, i, DOWN_FIVE(squares_y));
+        }
+        for (int i = to; i < width + 2 * AROUND + WIDTH; ++i) x[i] = y[i] = 0.0f;
+        for (int i = 0; i < width; i += WIDTH) {
+            const int p = row * columns + begin + i;
+            const F sum_x = FIVE(x), sum_y = FIVE(y), slope = READ(dz_dx, p), s = READ(sigma, p);
+            const I known = slope == slope;
+            const F variance = known ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
+            const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
+            UNSURE(flat, variance)
+            const F here = share * variance * steep * steep + 0.5f * flat * steep * turned * turned;
+            const F beside = (1.0f - share) * variance * steep, twice = 2.0f * turned;
+            const F east_of = (sum_x + LEAST) / (sum_x + sum_y + 2.0f * LEAST) - 0.5f;
+            const F told = 0.5f + east_of * EXPONENTIAL(twice);
+            const F high = LESSER(told, (F)1.0f), east = GREATER(high, (F)0.0f), north = 1.0f - east;
+            const F one = GREATER(1.0f / (east * here + north * beside), (F)lowest);
+            const F two = GREATER(1.0f / (north * here + east * beside), (F)lowest);
+            const F in_x = known ? LESSER(one, (F)highest) : (F)0.0f, in_y = known ? LESSER(two, (F)highest) : (F)0.0f;
+            if (i + WIDTH <= width) {
+                WRITE(weight_x, p, in_x);
+                WRITE(weight_y, p, in_y);
+            } else {  // the next pixels are another item's
+                PUT(x, 0, in_x);
+                PUT(y, 0, in_y);
+                for (int lane = 0; lane < width - i; ++lane) {
+                    weight_x[p + lane] = x[lane];
+                    weight_y[p + lane] = y[lane];
+                }
+                for (int lane = 0; lane < from; ++lane) x[lane] = y[lane] = 0.0f;
+            }
+        }
+    }
+}

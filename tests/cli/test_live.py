@@ -1,0 +1,251 @@
+"""``mirrorskin live`` on a rig of fakes, in real time."""
+
+import math
+import re
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+import typer
+from rig_fakes import FakeCamera, FakeStage, settings, spreading
+from typer.testing import CliRunner
+
+from mirrorskin import io
+from mirrorskin.cli import live
+from mirrorskin.cli.status import Board, Newest, summary
+from mirrorskin.engine.live import SHOWN, Latency, Status
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig import file, rig
+
+SHAPE = (24, 32)
+OFFSET, GAIN = 20.0, 200.0
+PRESS = ["vertical", "--stop", "1mm", "--speed", "2mm/s"]
+TURN = ["axial", "--press", "1mm", "--tilt", "2.5deg", "--rate", "2.5", "--turns", "2"]
+
+app = typer.Typer()
+app.command()(live.command)
+
+
+def slanted(shape=SHAPE):
+    """Return a picture of a plane of zenith 0.3, by eq. 10 to the first order, dark without contact."""
+    noise = np.random.default_rng(0).normal(0, 1.0, (16, *shape))
+
+    def picture(place):
+        if place.travel < 0.5:
+            return np.zeros(shape, np.uint8)
+        counts = OFFSET + GAIN * (0.3 + place.pitch)
+        return np.clip(np.rint(counts + noise[int(1e6 * abs(place.roll)) % 16]), 1, 254).astype(np.uint8)
+
+    return picture
+
+
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """A rig whose file is read and which is opened without hardware; its stage and camera."""
+
+    class Fake:
+        def __init__(self):
+            self.picture = spreading(SHAPE)
+            self.camera_settings = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0}
+            self.path = tmp_path / "rig.toml"
+
+        def open(self, told):
+            self.stage = FakeStage()
+            self.camera = FakeCamera(self.stage.position, self.picture, rate=60.0)
+            return rig.Rig(self.stage, self.camera, told)
+
+        def run(self, *words):
+            return CliRunner().invoke(app, [*words, "--rig", str(self.path)])
+
+    made = Fake()
+    made.path.touch()
+    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **made.camera_settings))
+    monkeypatch.setattr(rig, "open_rig", made.open)
+    return made
+
+
+def counted(text):
+    found = re.search(r"(\d+) frames at .* (\d+) used, (\d+) skipped, (\d+) dropped; (\d+) updates", text)
+    assert found is not None, text
+    return [int(number) for number in found.groups()]
+
+
+def test_a_press_is_told_recorded_and_kept(fake, tmp_path):
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    done = fake.run(*PRESS, "--record", str(record), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    frames, used, skipped, _, updates = counted(done.output)
+    assert used + skipped == frames > 10
+    assert updates > 1
+    result = io.open_result(output)
+    assert np.isfinite(result.height).sum() > 20
+    assert result.process["frames"] == used
+    with io.open_recording(record, live=True) as recording:
+        assert recording.shape[0] == used
+    assert fake.stage.closed
+    assert fake.camera.closed
+
+
+def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
+    from mirrorskin.engine import OnsetSearch
+
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    fake.run(*PRESS, "--record", str(record), "-o", str(output))
+    with io.open_recording(record, live=True) as recording:
+        header = recording.header
+        search = OnsetSearch(SHAPE, "uint8", dark=header.dark, bright=header.bright)
+        while (block := recording.read(np.empty((7, *SHAPE), np.uint8))) is not None:
+            search.push(block)
+    result = io.open_result(output)
+    measured = result.filled == 0
+    assert measured.sum() > 20
+    np.testing.assert_array_equal(search.result().status, result.status)
+    np.testing.assert_array_equal(search.result().height[measured], result.height[measured])
+
+
+def test_a_rotation_is_told_and_kept(fake, tmp_path):
+    fake.picture = slanted()
+    fake.camera_settings |= {"zenith_gain": GAIN, "zenith_offset": OFFSET}
+    output = tmp_path / "res.h5"
+    done = fake.run(*TURN, "-o", str(output), "--latency", "5s")
+    assert done.exit_code == 0, done.output
+    result = io.open_result(output)
+    assert result.process["window"] == 24
+    assert np.degrees(np.median(result.zenith)) == pytest.approx(math.degrees(0.3), abs=1.0)
+    assert result.height is not None
+
+
+def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, tmp_path):
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    sent = []
+
+    def interrupt():
+        deadline = time.monotonic() + 20
+        while time.monotonic() < deadline and not (hasattr(fake, "stage") and fake.stage.moving()):
+            time.sleep(0.005)
+        while time.monotonic() < deadline and fake.stage.position().travel < 0.3:
+            time.sleep(0.005)
+        sent.append(time.monotonic())
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    words = ["vertical", "--stop", "1.5mm", "--speed", "0.5mm/s", "--record", str(record), "-o", str(output)]
+    done = fake.run(*words)
+    thread.join()
+    assert done.exit_code != 0
+    assert "cut short" in done.output
+    assert fake.stage.stops[0] - sent[0] < 2.0
+    assert 0 < io.open_result(output).process["frames"] == counted(done.output)[1]
+    with io.open_recording(record) as recording:
+        assert recording.state.startswith("cut short")
+
+
+def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
+    output = tmp_path / "res.h5"
+    picture = fake.picture
+
+    def lost(place):
+        if place.travel > 0.5:
+            fake.camera.lose()
+        return picture(place)
+
+    fake.picture = lost
+    done = fake.run(*PRESS, "-o", str(output))
+    assert isinstance(done.exception, HardwareError)
+    assert fake.stage.stops
+    assert "cut short" in done.output
+    assert output.exists()
+
+
+def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
+    fake.picture = slanted()
+    fake.camera_settings |= {"zenith_gain": GAIN, "zenith_offset": OFFSET}
+    picture = fake.picture
+
+    def lost(place):
+        if place.roll > 0.03:
+            fake.camera.lose()
+        return picture(place)
+
+    fake.picture = lost
+    done = fake.run(*TURN, "-o", str(tmp_path / "res.h5"))
+    assert isinstance(done.exception, HardwareError)
+    assert "no result: " in done.output
+    assert not (tmp_path / "res.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([*PRESS, "--latency", "5mm"], "--latency"),
+        ([*TURN, "--window", "60"], "--window 60"),
+        (["vertical", "--stop", "9mm", "--speed", "1mm/s"], "9"),
+        ([*PRESS, "-o", "rig.toml"], "rig.toml"),
+        (["axial", "--press", "1mm", "--rate", "40"], "frames a turn"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_line(fake, monkeypatch, tmp_path, words, told):
+    monkeypatch.chdir(tmp_path)
+    done = fake.run(*words)
+    assert isinstance(done.exception, io.InputError)
+    assert told in str(done.exception)
+    assert "\n" not in str(done.exception)
+
+
+class Slow:
+    """A viewer that takes its time, or fails."""
+
+    def __init__(self, error=None):
+        self.shown, self.closed, self.error = [], False, error
+        self.go = threading.Event()
+
+    def show(self, update, status):
+        self.go.wait(10)
+        if self.error:
+            raise self.error
+        self.shown.append(update)
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_slow_viewer_misses_updates_but_not_the_last_and_holds_up_nobody():
+    viewer = Slow()
+    newest = Newest(viewer)
+    begun = time.monotonic()
+    for number in range(1000):
+        newest.show(number, Status())
+    assert time.monotonic() - begun < 5
+    viewer.go.set()
+    newest.close()
+    assert viewer.closed
+    assert viewer.shown[-1] == 999
+    assert len(viewer.shown) < 1000
+
+
+def test_a_viewer_that_fails_does_not_end_the_run():
+    viewer = Slow(RuntimeError("no window"))
+    viewer.go.set()
+    newest = Newest(viewer)
+    newest.show(1, Status())
+    newest.close()
+    newest.show(2, Status())
+    assert str(newest.error) == "no window"
+    assert viewer.closed
+
+
+def test_the_status_is_a_table_and_a_line():
+    from rich.console import Console
+
+    latency = {SHOWN: Latency(0.0123, 0.0234), "push": Latency(math.nan, math.nan)}
+    status = Status(101, 90, 11, 3, 50, 2.0, 49.9, latency)
+    board, console = Board(), Console(record=True, width=80, quiet=True)
+    console.print(board.render())
+    board.tell(status)
+    console.print(board.render())
+    assert "12.3 ms from frame to map (99 % below 23.4 ms)" in summary(status)
+    assert "101 frames at 50 Hz: 90 used, 11 skipped, 3 dropped; 50 updates" in summary(status)
+    assert summary(Status()).startswith("0 frames")

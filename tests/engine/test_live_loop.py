@@ -1,0 +1,178 @@
+"""The live loop's policy, on a clock that stands still unless someone works."""
+
+import math
+import signal
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from live_frames import Clock, paced, turn_header
+
+from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, Loop, Update, run
+from mirrorskin.engine.live.watch import Reservoir
+from mirrorskin.io import InputError
+
+COUNT, RATE = 40, 100.0
+FRAMES = np.arange(COUNT, dtype=np.uint8)[:, np.newaxis, np.newaxis] * np.ones((2, 3), np.uint8)
+PLACES = 0.1 * np.arange(COUNT)
+
+
+@dataclass
+class Slow:
+    """An estimator for which each push and update takes a time of its own."""
+
+    clock: Clock
+    push_time: float = 0.0
+    update_time: float = 0.0
+    every: int = 1
+    most_updates: float = math.inf
+    pushed: list[int] = field(default_factory=list)
+    updates: list[int] = field(default_factory=list)
+    spared: list[float] = field(default_factory=list)
+
+    room = np.empty((64, 2, 3), np.uint8)
+
+    def push(self, block):
+        assert np.array_equal(block.phase, PLACES[block.frames[:, 0, 0]])
+        assert block.index == block.frames[0, 0, 0]
+        self.pushed += block.frames[:, 0, 0].tolist()
+        self.clock.now += self.push_time
+
+    def update(self):
+        self.clock.now += self.update_time
+        self.updates.append(len(self.pushed))
+        height = np.zeros((2, 3), np.float32)
+        return Update(len(self.pushed), 0.0, "axial", 0.0, FRAMES[0], height=height)
+
+    def spare(self, seconds):
+        self.spared.append(seconds)
+
+    def warm(self): ...
+
+    def result(self): ...
+
+
+def make(slots=64, **how):
+    clock = Clock()
+    return paced(FRAMES, turn_header(), PLACES, RATE, clock, slots), Slow(clock, **how)
+
+
+def test_a_quick_estimator_gets_each_frame_at_once_and_updates_each_time():
+    source, slow = make(push_time=0.001, update_time=0.002)
+    status = run(source, slow)
+    assert slow.pushed == list(range(COUNT))
+    assert slow.updates == list(range(1, COUNT + 1))
+    counts = status.frames, status.used, status.skipped, status.dropped, status.updates
+    assert counts == (COUNT, COUNT, 0, 0, COUNT)
+    assert status.rate == pytest.approx(RATE)
+    assert status.latency[WAITED].median == pytest.approx(0, abs=1e-9)
+    assert status.latency[PUSHED].p99 == pytest.approx(0.001)
+    assert status.latency[UPDATED].p99 == pytest.approx(0.002)
+    assert status.latency[SHOWN].median == pytest.approx(0.003)
+
+
+def test_a_slow_one_gets_all_that_waited_together():
+    source, slow = make(update_time=0.035)
+    status = run(source, slow)
+    assert slow.pushed == list(range(COUNT))
+    assert np.all(np.diff(slow.updates)[:-1] >= 3)
+    assert status.skipped == 0
+
+
+def test_frames_that_are_too_old_are_skipped_counted_and_marked():
+    source, slow = make(update_time=0.095)
+    marks = np.full(COUNT, -1)
+
+    def mark(index, used):
+        assert np.all(marks[index : index + len(used)] == -1)
+        marks[index : index + len(used)] = used
+
+    status = run(source, slow, latency=0.05, mark=mark)
+    assert np.flatnonzero(marks).tolist() == slow.pushed
+    assert np.count_nonzero(marks == 0) == status.skipped == COUNT - status.used > 5
+    assert slow.pushed[-1] == COUNT - 1
+
+
+def test_of_frames_that_are_all_too_old_the_newest_is_used():
+    source, slow = make(update_time=0.5)
+    source_now = source.now
+    source.now = lambda: source_now() + 1.0
+    status = run(source, slow, latency=0.05)
+    assert status.used == status.updates == len(slow.pushed) > 0
+    assert status.skipped == COUNT - status.used
+
+
+def test_what_the_ring_lost_is_told_as_dropped():
+    source, slow = make(slots=4, update_time=0.1)
+    status = run(source, slow)
+    assert status.dropped > 0
+    assert status.frames + status.dropped == COUNT
+    assert len(slow.pushed) == status.used
+
+
+def test_updates_are_no_more_often_than_asked_and_the_last_frame_is_in_one():
+    source, slow = make()
+    status = run(source, slow, updates=10.0)
+    assert status.updates == pytest.approx(COUNT / RATE * 10, abs=2)
+    assert slow.updates[-1] == COUNT
+
+
+def test_an_estimator_that_asks_for_every_third_frame_gets_these():
+    source, slow = make(update_time=0.033, every=3)
+    status = run(source, slow)
+    assert slow.pushed == list(range(0, COUNT, 3))
+    assert status.used + status.skipped == COUNT
+
+
+def test_time_to_spare_is_what_is_left_until_the_next_frame():
+    source, slow = make(push_time=0.002, update_time=0.003)
+    run(source, slow)
+    assert slow.spared[0] == 0
+    np.testing.assert_allclose(slow.spared[1:], 1 / RATE - 0.005 - 0.001, atol=1e-9)
+
+
+def test_it_stops_when_asked():
+    source, slow = make()
+    status = run(source, slow, stop=lambda: len(slow.pushed) >= 7)
+    assert status.frames == 7
+    assert slow.updates[-1] == 7
+
+
+def test_each_update_is_told_with_the_status_so_far():
+    source, slow = make()
+    told = []
+    run(source, slow, on_update=lambda update, status: told.append((update.frames, status.used)))
+    assert told == [(n, n) for n in range(1, COUNT + 1)]
+
+
+def test_ctrl_c_during_a_push_comes_after_it():
+    source, slow = make()
+    push = slow.push
+
+    def interrupted(block):
+        signal.raise_signal(signal.SIGINT)
+        push(block)
+
+    slow.push = interrupted
+    loop = Loop(source, slow)
+    with pytest.raises(KeyboardInterrupt):
+        loop.run()
+    assert slow.pushed == [0]
+    assert loop.status.used == 1
+
+
+@pytest.mark.parametrize("wrong", [{"latency": 0.0}, {"updates": -1.0}, {"latency": math.nan}])
+def test_a_latency_or_rate_that_cannot_be_is_refused(wrong):
+    source, slow = make()
+    with pytest.raises(InputError, match="above 0"):
+        run(source, slow, **wrong)
+
+
+def test_a_reservoir_tells_of_the_last_few_thousand():
+    times = Reservoir()
+    assert math.isnan(times.latency().median)
+    times.add(np.full(10_000, 5.0))
+    times.add(np.arange(1, 4097) / 4096)
+    told = times.latency()
+    assert told.median == pytest.approx(0.5, abs=1e-3)
+    assert told.p99 == pytest.approx(0.99, abs=1e-3)

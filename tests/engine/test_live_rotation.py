@@ -1,0 +1,194 @@
+"""A rotation told while it goes on: normals of its last turn, heights that follow, edges now and then."""
+
+import math
+
+import numpy as np
+import pytest
+from live_frames import PIXEL, Clock, blocks, paced, phases, press_header, turn_frames, turn_header
+
+from mirrorskin.bench.turns import SCALES, TILT
+from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
+from mirrorskin.engine.live import LiveRotation, choose_window, run
+from mirrorskin.engine.rotation.slopes import find_slopes
+from mirrorskin.io import InputError, open_result, save_result
+
+SHAPE, WINDOW = (24, 40, 52), 8
+PHASE = phases(SHAPE[0])
+OFFSET, GAIN, NOISE = SCALES["uint8"]
+LAST = slice(-WINDOW, None)
+
+
+def make(device=None, frames=None, header=None, **options):
+    frames = turn_frames(SHAPE) if frames is None else frames
+    source = paced(frames, header or turn_header(), PHASE)
+    options = {"window": WINDOW, "noise": NOISE, **options}
+    return frames, LiveRotation(source, device=device, **options)
+
+
+def feed(live, frames, cuts):
+    updates = []
+    for block in blocks(frames, cuts, phase=PHASE):
+        live.push(block)
+        updates.append(live.update())
+        live.spare(0.0)
+    return updates
+
+
+def best_heights(normals):
+    slopes = find_slopes(normals.vectors, normals.sigma, normals.contact, normals.tilt)
+    weights = slopes.weights
+    return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, weights=weights).height
+
+
+def test_an_update_tells_the_last_turn(device):
+    frames, live = make(device)
+    live.warm()
+    updates = feed(live, frames, [1] * SHAPE[0])
+    assert all(update.normals is None and update.height is None for update in updates[: WINDOW - 1])
+    last = updates[-1]
+    exact = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
+    np.testing.assert_array_equal(last.normals, exact.vectors)
+    np.testing.assert_array_equal(last.contact, exact.contact)
+    np.testing.assert_array_equal(last.picture, frames[-1])
+    assert last.contact_area == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
+    assert last.offset_unknown
+    assert (last.frames, last.position, last.time) == (SHAPE[0], PHASE[-1], 0.01 * (SHAPE[0] - 1))
+
+
+def test_heights_follow_those_that_fit_best(device):
+    frames, live = make(device)
+    updates = feed(live, frames, [1] * SHAPE[0])
+    for update, stop in [(updates[WINDOW - 1], WINDOW), (updates[-1], SHAPE[0])]:
+        turn = slice(stop - WINDOW, stop)
+        normals = estimate_normals(frames[turn], PHASE[turn], TILT, GAIN, OFFSET, noise=NOISE)
+        best = best_heights(normals)
+        np.testing.assert_array_equal(np.isnan(update.height), np.isnan(best))
+        off = (update.height - best)[np.isfinite(best)]
+        assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[np.isfinite(best)])
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_a_replay_in_other_cuts_is_the_same_bit_by_bit(dtype):
+    results = []
+    for cuts in ([1] * SHAPE[0], [13, 2, 9], [SHAPE[0]]):
+        frames = turn_frames(SHAPE, dtype)
+        _, live = make(frames=frames, header=turn_header(dtype), noise=None)
+        feed(live, frames, cuts)
+        results.append(live.result())
+    first = results[0]
+    for other in results[1:]:
+        for name in ("normals", "normal_sigma", "contact", "mean", "cosine", "sine", "residual", "edges"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(other, name), err_msg=name)
+        span = np.nanmax(first.height) - np.nanmin(first.height)
+        np.testing.assert_allclose(first.height, other.height, atol=1e-3 * span)
+
+
+def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
+    frames, live = make()
+    feed(live, frames, [SHAPE[0]])
+    save_result(live.result(), tmp_path / "live.h5")
+    result = open_result(tmp_path / "live.h5")
+    correlator = Correlator(SHAPE[1:], "uint8", window=WINDOW)
+    correlator.push(blocks(frames, [SHAPE[0]], phase=PHASE)[0])
+    np.testing.assert_array_equal(result.cosine, correlator.result().cosine)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    np.testing.assert_array_equal(result.normals, normals.vectors)
+    np.testing.assert_array_equal(result.edges, find_edges(normals.vectors, normals.sigma, normals.contact))
+    np.testing.assert_allclose(result.height, best_heights(normals), atol=1e-6)
+    assert (result.process["window"], result.process["live"]) == (WINDOW, True)
+    assert result.process["tilt"] == pytest.approx(TILT)
+
+
+def test_edges_are_drawn_in_the_time_that_is_left(device):
+    frames, live = make(device, integrate=False)
+    feed(live, frames, [SHAPE[0]])
+    assert live.update().edges is None
+    for _ in range(400):
+        live.spare(0.05)
+        if live.update().edges is not None:
+            break
+    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
+    exact = find_edges(normals.vectors, normals.sigma, normals.contact, device=device)
+    np.testing.assert_array_equal(live.update().edges, exact)
+    assert exact.any()
+
+
+def test_a_sudden_change_is_followed_within_some_frames():
+    frames = turn_frames(SHAPE)
+    frames[: SHAPE[0] // 2] = frames[: SHAPE[0] // 2, :, ::-1]
+    _, live = make(frames=frames)
+    update = feed(live, frames, [1] * SHAPE[0])[-1]
+    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    best = best_heights(normals)
+    off = (update.height - best)[np.isfinite(best)]
+    assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
+
+
+def test_without_contact_there_are_no_heights_and_they_come_with_it():
+    frames = turn_frames(SHAPE)
+    frames[: WINDOW + 2] = round(OFFSET)
+    _, live = make(frames=frames)
+    updates = feed(live, frames, [1] * SHAPE[0])
+    assert np.isnan(updates[WINDOW].height).all()
+    assert updates[WINDOW].contact_area == 0
+    assert np.isfinite(updates[-1].height).mean() > 0.3
+
+
+def test_without_a_gain_there_is_the_wave_alone():
+    frames, live = make(header=turn_header(zenith_gain=None))
+    update = feed(live, frames, [SHAPE[0]])[-1]
+    assert update.normals is None
+    result = live.result()
+    assert result.normals is None
+    assert np.isfinite(result.azimuth).mean() > 0.9
+    assert str(result.process["zenith"]).startswith("none")
+
+
+def test_without_a_pixel_size_there_are_no_heights():
+    frames, live = make(header=turn_header(pixel_size=None))
+    update = feed(live, frames, [SHAPE[0]])[-1]
+    assert update.height is None
+    assert update.contact_area is None
+    assert live.result().height is None
+
+
+def test_what_warming_leaves_behind_is_nothing():
+    frames, live = make(noise=None)
+    live.warm()
+    with pytest.raises(InputError):
+        live.result()
+    feed(live, frames, [SHAPE[0]])
+    _, fresh = make(noise=None)
+    feed(fresh, frames, [SHAPE[0]])
+    np.testing.assert_array_equal(live.result().normals, fresh.result().normals)
+
+
+def test_a_whole_run_uses_each_frame():
+    frames = turn_frames(SHAPE)
+    source = paced(frames, turn_header(), PHASE, 100.0, Clock())
+    live = LiveRotation(source, window=WINDOW, noise=NOISE)
+    status = run(source, live)
+    assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
+    exact = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    np.testing.assert_array_equal(live.normals().vectors, exact.vectors)
+
+
+@pytest.mark.parametrize(
+    ("turn", "window", "every"), [(8, 8, 1), (64, 64, 1), (65, 32, 2), (400.3, 57, 7), (3.2, 3, 1)]
+)
+def test_a_window_is_a_turn_of_at_most_64_frames(turn, window, every):
+    assert choose_window(turn) == (window, every)
+    assert abs(window * every - turn) <= every
+
+
+@pytest.mark.parametrize("turn", [2.0, math.nan, math.inf])
+def test_a_turn_of_too_few_frames_is_refused(turn):
+    with pytest.raises(InputError, match="frames a turn"):
+        choose_window(turn)
+
+
+def test_a_press_and_a_step_of_none_are_refused():
+    with pytest.raises(InputError, match="axial"):
+        LiveRotation(paced(turn_frames(SHAPE), press_header(), PHASE), window=8)
+    with pytest.raises(InputError, match="every"):
+        make(every=0)

@@ -1,0 +1,75 @@
+"""The slopes' kernels do what their reference does, and that is what slopes from normals are offline."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mirrorskin.engine.rotation.relief_maps import SlopeMaps
+from mirrorskin.engine.rotation.slopes import find_slopes
+from mirrorskin.kernels import slopes
+
+SHAPES = [(1, 1), (1, 9), (9, 1), (7, 5), (23, 37), (40, 300), (33, 520), (19, 128)]
+TILT = 0.04
+MAPS = "dz_dx", "dz_dy", "weight_x", "weight_y"
+
+
+def normals(shape):
+    random = np.random.default_rng(shape[0])
+    vectors = random.normal(size=(*shape, 3)) * (0.7, 0.7, 1)
+    vectors[..., 2] = np.where(random.random(shape) < 0.9, np.abs(vectors[..., 2]), vectors[..., 2])
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    vectors[random.random(shape) < 0.05] = (0, 0, 1)
+    sigma = random.uniform(0.001, 0.1, shape)
+    sigma[random.random(shape) < 0.05] = np.nan
+    contact = random.random(shape) < 0.9
+    vectors[0, 0], sigma[0, 0], contact[0, 0] = (0.6, 0.0, 0.8), 0.01, True
+    return vectors.astype(np.float32), sigma.astype(np.float32), contact.astype(np.uint8)
+
+
+def on_device(device, vectors, sigma, contact):
+    maps = SlopeMaps(device, contact.shape)
+    given = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
+    to = {name: device.given(name, np.zeros(contact.shape)) for name in MAPS}
+    maps.find(TILT, {name: device.given(name, *one) for name, one in given.items()}, to)
+    return maps, {name: to[name].download().copy() for name in MAPS}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_kernels_do_what_the_reference_does(device, shape):
+    given = normals(shape)
+    maps, found = on_device(device, *given)
+    first = slopes.slopes_find(math.sin(TILT) ** 2, *given)
+    dz_dx, _, *squares = first
+    bounds = 1e-4 * maps.typical, 1e3 * maps.typical
+    weights = slopes.slopes_weigh(math.sin(TILT) ** 2, *bounds, given[1], dz_dx, *squares)
+    for name, exact in zip(MAPS, (*first[:2], *weights), strict=True):
+        np.testing.assert_allclose(found[name], exact, rtol=2e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("shape", SHAPES[3:6])
+def test_the_reference_does_what_find_slopes_does(shape):
+    given = normals(shape)
+    known = find_slopes(*given, TILT)
+    first = slopes.slopes_find(math.sin(TILT) ** 2, *given)
+    dz_dx, _, *squares = first
+    weights = slopes.slopes_weigh(math.sin(TILT) ** 2, 0.0, np.inf, given[1], dz_dx, *squares)
+    for one, other in zip((*first[:2], *weights), (known.dz_dx, known.dz_dy, *known.weights), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_the_typical_weight_is_told_once_and_bounds_the_others(device):
+    given = normals((30, 40))
+    given[1][3, 4] = 1e-9
+    maps, found = on_device(device, *given)
+    weights = find_slopes(*given, TILT).weights
+    assert maps.typical == pytest.approx(float(np.median(weights[weights > 0])), rel=0.05)
+    assert found["weight_x"].max() <= 1e3 * maps.typical * 1.0001
+
+
+def test_without_contact_nothing_is_typical(device):
+    vectors, sigma, contact = normals((5, 6))
+    maps, found = on_device(device, vectors, sigma, np.zeros_like(contact))
+    assert math.isnan(maps.typical)
+    assert not found["weight_x"].any()
+    assert np.isnan(found["dz_dx"]).all()

@@ -1,0 +1,93 @@
+"""Frames for live work, and a source of them on a clock that tests wind."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.bench import stacks, turns
+from mirrorskin.bench.live.paced import Paced
+from mirrorskin.io import Block, Header
+
+PIXEL = 0.05
+
+
+class Clock:
+    """Time that passes only when someone sleeps or works."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def press_frames(shape: tuple[int, int, int], dtype: str = "uint8") -> NDArray[Any]:
+    frames = np.empty(shape, dtype)
+    stacks.fill(frames, "press")
+    return frames
+
+
+def turn_frames(shape: tuple[int, int, int], dtype: str = "uint8") -> NDArray[Any]:
+    frames = np.empty(shape, dtype)
+    turns.fill(frames)
+    return frames
+
+
+def phases(count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Phases of eight frames a turn, as uneven as live ones are."""
+    even = np.arange(count) * (2 * np.pi / turns.STEPS)
+    return even + np.random.default_rng(seed).normal(0, 0.02, count)
+
+
+def press_header(**other: Any) -> Header:
+    return Header("vertical", **{"pixel_size": (PIXEL, PIXEL), **other})
+
+
+def turn_header(dtype: str = "uint8", **other: Any) -> Header:
+    offset, gain, _ = turns.SCALES[dtype]
+    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "tilt": turns.TILT}
+    return Header("axial", **{"pixel_size": (PIXEL, PIXEL), **known, **other})
+
+
+def paced(
+    frames: NDArray[Any],
+    header: Header,
+    places: NDArray[np.float64],
+    rate: float = 100.0,
+    clock: Clock | None = None,
+    slots: int = 64,
+) -> Paced:
+    ticks = clock or Clock()
+    return Paced(
+        frames,
+        lambda number: number,
+        header,
+        lambda number: places[number],
+        rate,
+        len(frames),
+        slots=slots,
+        clock=ticks,
+        sleep=ticks.sleep,
+    )
+
+
+def blocks(frames: NDArray[Any], cuts: list[int], **places: NDArray[np.float64]) -> list[Block]:
+    """Cut frames, and where the body was, into blocks of these lengths."""
+    ends = np.cumsum([0, *cuts])
+    assert ends[-1] == len(frames)
+    return [
+        Block(
+            frames[a:b],
+            a,
+            time=0.01 * np.arange(a, b),
+            **{name: values[a:b] for name, values in places.items()},
+        )
+        for a, b in pairwise(ends.tolist())
+    ]
