@@ -19,15 +19,19 @@ import typer
 from mirrorskin.cli import (
     batch,
     bench,
+    capture,
     correlate,
     demo,
     devices,
     fuse,
     import_,
     info,
+    live,
     reconstruct,
+    rig,
     score,
     simulate,
+    twin,
 )
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
@@ -51,8 +55,23 @@ def _common(
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
 
 
-for module in (demo, simulate, import_, reconstruct, correlate, fuse, batch, score, info, devices):
+for module in (
+    demo,
+    simulate,
+    import_,
+    capture,
+    live,
+    reconstruct,
+    correlate,
+    fuse,
+    batch,
+    score,
+    info,
+    devices,
+):
     app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
+app.add_typer(rig.app, name="rig")
+app.add_typer(twin.app, name="twin")
 app.add_typer(bench.app, name="bench")
 
 

@@ -46,7 +46,7 @@ def serve(
     optics: Annotated[
         OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")
     ] = OpticsName.ideal,
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 20.0,
     delay: Annotated[
         str, typer.Option(metavar="TIME", help="From a frame's exposure to its sending.")
     ] = "50ms",

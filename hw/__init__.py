@@ -1,5 +1,34 @@
-"""What moves and what sees: stage, camera, and the digital twin of both."""
+"""What moves and what sees: stage, camera, both as a rig, and the digital twin of it all."""
 
+from mirrorskin.hw.camera import Camera
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig.file import load_rig
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+from mirrorskin.hw.rig.rig import Rig, open_rig
+from mirrorskin.hw.rig.steps import StepScan
+from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.stage import Limits, Position, Stage
 from mirrorskin.hw.twin import Live, Twin
+from mirrorskin.hw.video import VideoCamera
 
-__all__ = ["Live", "Twin"]
+__all__ = [
+    "AxialPlan",
+    "Camera",
+    "EmulatedRig",
+    "GrblStage",
+    "HardwareError",
+    "Limits",
+    "Live",
+    "Position",
+    "Rig",
+    "Stage",
+    "StepScan",
+    "SweepScan",
+    "Twin",
+    "VerticalPlan",
+    "VideoCamera",
+    "load_rig",
+    "open_rig",
+]

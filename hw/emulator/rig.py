@@ -32,11 +32,11 @@ TILT = math.radians(9.0)
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
 _BAUD = 115200
-_SPEEDS = {"tilt": math.radians(40.0), "travel": 15.0}  # rad/s, mm/s
+_SPEEDS = {"tilt": math.radians(20.0), "travel": 10.0}  # rad/s, mm/s
 # What GRBL is told of homing, in units a minute, ms and units; and of its axes X, Y, Z, which are pitch, roll
 # (these count degrees) and travel: greatest speeds in units a minute, accelerations, lengths.
 _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
-_SPEED, _ACCELERATION, _LENGTH = (2400.0, 2400.0, 900.0), (400.0, 400.0, 200.0), (20.0, 20.0, 10.0)
+_SPEED, _ACCELERATION, _LENGTH = (1200.0, 1200.0, 600.0), (800.0, 800.0, 400.0), (20.0, 20.0, 10.0)
 _MACHINE = (
     _HOMING
     | dict(enumerate(_SPEED, 110))

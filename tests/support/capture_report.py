@@ -94,12 +94,13 @@ def watch(
     delay: float = 0.05,
     jitter: float = 0.005,
     seed: int = 0,
+    known: Mapping[str, float] = {},
 ) -> Watched:
-    """Capture a sphere on the emulated rig."""
+    """Capture a sphere on the emulated rig, whose file says of the camera what is known."""
     pattern = "uniform" if plan.motion == "vertical" else "linear"
     optics = {"shape": shape, "pixel_size": pixel_size, "pattern": pattern}
     with EmulatedRig("sphere", **optics, rate=rate, delay=delay, jitter=jitter, seed=seed) as emulated:
-        captured, scan = capture(emulated, plan)
+        captured, scan = capture(emulated, plan, known)
         return Watched(captured, scan, emulated.twin(_movement(plan, captured.places)))
 
 
@@ -117,9 +118,10 @@ def compare(watched: Watched) -> Compared:
     return Compared(len(frames), scan.dropped, height, normal, delay)
 
 
-def capture(emulated: EmulatedRig, plan: Plan) -> tuple[Kept, StepScan | SweepScan]:
+def capture(emulated: EmulatedRig, plan: Plan, known: Mapping[str, float]) -> tuple[Kept, StepScan | SweepScan]:
     """Return what a scan gave, and the scan."""
     settings = emulated.settings
+    settings = replace(settings, camera=replace(settings.camera, **known))
     with Rig(GrblStage(settings.stage), emulated.camera, settings) as rig:
         numbers = _note_numbers(rig)
         blocks = []
