@@ -456,7 +456,8 @@ __kernel void normals_exact(ARGUMENTS)
         sums = look(nearer, zeniths, wave, turn, cos_tilt, sin_tilt);
         const F waves = sums.waves;
         Direction found = step(nearer, sums);
-        const I odd = plain < COUNT;
+        // Where too few samples tell anything, there is no answer, however closely one looks.
+        const I odd = (plain < COUNT) & (plain >= LEAST);
         if (ANY(odd)) {
             Direction at = begin;
             for (int more = 0; more < MORE; ++more) {
