@@ -19,6 +19,7 @@ _TOGETHER = 64
 
 
 def command(
+    context: typer.Context,
     motion: scans.Motion,
     rig_file: scans.RigFile,
     output: options.NewRecording,
@@ -42,22 +43,7 @@ def command(
     from mirrorskin.kernels.correlation import WINDOW
 
     settings = load_rig(rig_file)
-    plan = scans.make_plan(
-        motion,
-        {
-            "start": start,
-            "stop": stop,
-            "step": step,
-            "speed": speed,
-            "press": press,
-            "tilt": tilt,
-            "turns": turns,
-            "phase_step": phase_step,
-            "rate": rate,
-        },
-    )
-    scans.check_steps(plan, settle, frames)
-    plan.check(settings.stage.limits, settings.name)
+    plan = scans.make_plan(context.params, settings)  # from the options above
     io.check_output(output, rig_file)
     with open_rig(settings) as rig:
         # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.

@@ -41,6 +41,7 @@ class _Wanted:
 
 
 def command(
+    context: typer.Context,
     motion: scans.Motion,
     rig_file: scans.RigFile,
     record: Annotated[
@@ -87,20 +88,7 @@ def command(
     from mirrorskin.hw.rig.file import load_rig
 
     settings = load_rig(rig_file)
-    words: scans.Words = {
-        "start": start,
-        "stop": stop,
-        "step": step,
-        "speed": speed,
-        "press": press,
-        "tilt": tilt,
-        "turns": turns,
-        "phase_step": phase_step,
-        "rate": rate,
-    }
-    plan = scans.make_plan(motion, words)
-    scans.check_steps(plan, settle, frames)
-    plan.check(settings.stage.limits, settings.name)
+    plan = scans.make_plan(context.params, settings)  # from the options above
     for path, others in ((record, (rig_file,)), (output, (rig_file, record))):
         if path is not None:
             io.check_output(path, *others)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
+    from mirrorskin.hw.rig.settings import RigSettings
     from mirrorskin.hw.rig.steps import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
 
@@ -49,43 +50,42 @@ Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first
 StepFrames = Annotated[int | None, typer.Option("--frames", min=1, help="In steps: at each place.")]
 
 
-class Words(TypedDict):
-    """The options as they were given; None where not."""
-
-    start: str | None
-    stop: str | None
-    step: str | None
-    speed: str | None
-    press: str | None
-    tilt: str | None
-    turns: float | None
-    phase_step: str | None
-    rate: float | None
-
-
 _OWN: Mapping[ScanName, tuple[str, ...]] = {
     ScanName.vertical: ("start", "stop", "step", "speed"),
     ScanName.axial: ("press", "tilt", "turns", "phase_step", "rate"),
 }
 
 
-def make_plan(motion: ScanName, words: Words) -> Plan:
-    """Turn the options into a plan.
+def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
+    """Turn a command's options into a plan that the rig can do.
+
+    Parameters
+    ----------
+    words : mapping
+        The command's parameters by their names, as of `typer.Context.params`; None where not given.
+    settings : RigSettings
+        What the rig file says.
 
     Raises
     ------
     InputError
-        An option belongs to the other motion, is missing, or cannot be.
+        An option belongs to the other motion, is missing, cannot be, or is more than the rig can do.
     """
+    from mirrorskin.hw.rig.possible import check_plan
     from mirrorskin.io import InputError
 
-    foreign = [name for name, value in words.items() if value is not None and name not in _OWN[motion]]
+    motion = ScanName(words["motion"])
+    others = [name for other in ScanName if other != motion for name in _OWN[other]]
+    foreign = [name for name in others if words[name] is not None]
     if foreign:
         raise InputError(
             f"{_spelled(foreign[0])} says nothing of a motion that is {motion.value}: leave it out, or choose"
             " the other"
         )
-    return _vertical(words) if motion == ScanName.vertical else _axial(words)
+    plan: Plan = _vertical(words) if motion == ScanName.vertical else _axial(words)
+    check_steps(plan, words["settle"], words["frames"])
+    check_plan(plan, settings.stage, settings.name)
+    return plan
 
 
 def make_scan(
@@ -120,7 +120,7 @@ def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
             raise InputError(f"{name} says nothing of a motion without a halt: leave it out, or give a step")
 
 
-def _vertical(words: Words) -> VerticalPlan:
+def _vertical(words: Mapping[str, Any]) -> VerticalPlan:
     from mirrorskin.cli.quantity import length
     from mirrorskin.hw.rig.plans import VerticalPlan
 
@@ -133,7 +133,7 @@ def _vertical(words: Words) -> VerticalPlan:
     )
 
 
-def _axial(words: Words) -> AxialPlan:
+def _axial(words: Mapping[str, Any]) -> AxialPlan:
     from mirrorskin.cli.quantity import angle, length
     from mirrorskin.hw.rig.plans import AxialPlan
 

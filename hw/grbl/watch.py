@@ -91,7 +91,7 @@ class Watch:
         if self._unsure or not asked:
             self._quiet = now
             if asked:
-                self._wider = _WIDER * (now - asked[0])
+                self._wider = min(_WIDER * (now - asked[0]), _SURELY)  # homing answers nothing for long
                 self._resume = asked[-1] + self._wider
             return Answer(-math.inf, now, False)
         trip = now - asked[0]

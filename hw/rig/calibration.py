@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.grbl.moves import SLOWEST
 from mirrorskin.hw.rig.delay import Delay, block_means, estimate_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig
+from mirrorskin.hw.rig.settings import Axis
+from mirrorskin.hw.rig.stage_check import unit_of
 from mirrorskin.hw.rig.track import Track, even_times
 from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Floats
@@ -23,7 +26,7 @@ _PRESSED = 0.5  # of a press, that comes before the calibration
 _LONGEST_DELAY = 0.6  # seconds that late frames are waited for
 _TOGETHER = 8  # frames
 _KEEPS_TIME = 1.3  # by which a whole line may be worse than lines near each frame
-_HURRY = 0.9  # of an axis's greatest speed
+_HURRY = 0.9  # of an axis's greatest speed; as much above its least
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +38,15 @@ class _Way:
     length: float
     along: Callable[[Position], float]
     fastest: float
+    slowest: float
 
 
 def measure_delay(rig: Rig, plan: Plan) -> Delay:
     """Move there and back in contact, and find out how late the camera's frames come.
 
     A press goes over the deeper half of its way; a rotation leans from phase 0 to the opposite one. Each way
-    takes 1.5 s or 60 frames, whichever is longer. The delay is that against the stage's reports: what these
-    are late by themselves is part of it, as it should be.
+    takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
+    against the stage's reports: what these are late by themselves is part of it, as it should be.
 
     Parameters
     ----------
@@ -57,8 +61,9 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     """
     way = _way(rig, plan)
     rests = rig.go(way.begin).time
-    seconds = max(_SECONDS, _FRAMES * rig.period, way.length / way.fastest)
-    speed = way.length / seconds
+    seconds = max(_SECONDS, _FRAMES * rig.period)
+    speed = min(max(way.length / seconds, way.slowest), way.fastest)
+    seconds = way.length / speed
     every = max(1, math.floor(seconds * rig.rate / _FRAMES_MOST))
     _Watched(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
     watched = _Watched(rig, every)
@@ -85,17 +90,18 @@ def _way(rig: Rig, plan: Plan) -> _Way:
     stage = rig.settings.stage
     if isinstance(plan, AxialPlan):
         begin, end = plan.place(0.0), plan.place(math.pi)
-        fastest = math.inf if stage.pitch is None else stage.pitch.speed
-        return _Way(begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, _HURRY * fastest)
+        return _Way(begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch))
     length = (1 - _PRESSED) * (plan.stop - plan.start)
-    first = plan.stop - length
-    return _Way(
-        Position(first),
-        Position(plan.stop),
-        length,
-        lambda place: place.travel - first,
-        _HURRY * stage.travel.speed,
-    )
+    first, end = plan.stop - length, Position(plan.stop)
+    return _Way(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
+
+
+def _speeds(axis: Axis | None) -> tuple[float, float]:
+    """Return how fast and how slowly an axis may go, mm/s or rad/s."""
+    if axis is None:  # cannot be: what does not lean does not go round
+        return math.inf, 0.0
+    _, scale = unit_of(axis)
+    return _HURRY * axis.speed, SLOWEST / 60 / scale / _HURRY
 
 
 def _track(

@@ -17,6 +17,7 @@ _RAMP = 0.1
 """Seconds in which a stage is taken to reach its speed, as long as nothing else is known."""
 
 _STEPS_MAX = 10**6
+_TURNS_MAX = 10_000
 _ROUNDING = 1e-9  # of a step
 
 
@@ -159,7 +160,7 @@ class AxialPlan:
     tilt : float
         Half-angle of the cone, radians, above 0.
     turns : float
-        How often it goes round, above 0.
+        How often it goes round, above 0, at most 10 000 times.
     phase_step : float or None
         From place to place, radians, where it goes in steps; the end of the turns is no place of its own.
     rate : float or None
@@ -181,6 +182,8 @@ class AxialPlan:
         _check_number(self.press, "press", "mm")
         _check_above_zero(self.tilt, "tilt", "radians")
         _check_above_zero(self.turns, "turns", "")
+        if self.turns > _TURNS_MAX:
+            raise InputError(f"{self.turns:g} turns are too many: go round {_TURNS_MAX} times at most")
         _check_one_of(("phase step", self.phase_step, "radians"), ("rate", self.rate, "turns/s"))
         if self.phase_step is not None:
             _check_steps(math.tau * self.turns / self.phase_step, 3)

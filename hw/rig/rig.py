@@ -8,12 +8,17 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.settings import RigSettings
 from mirrorskin.hw.stage import Position, Report, Stage
+from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.grbl import GrblStage
 
 _TICK = 0.02
 """Seconds from one look of the guard to the next."""
@@ -23,6 +28,7 @@ _STALL_PERIODS = 3
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
 _JOIN = 5.0
+_HOMING = 22  # the number of GRBL's setting
 
 
 class Move:
@@ -265,7 +271,8 @@ class Rig(Closing):
 def open_rig(settings: RigSettings) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
-    A stage that has switches, and does not know where it is, is homed.
+    A stage that has switches, and does not know where it is, is homed. One that the file says to have
+    switches, and that does not home, is refused: nobody would know where it is.
 
     Raises
     ------
@@ -283,7 +290,17 @@ def open_rig(settings: RigSettings) -> Rig:
         camera.take(1, _PATIENCE)
         stage = GrblStage(settings.stage)
         opening.callback(stage.close)
-        if settings.stage.home and stage.report().state == "alarm":
-            stage.home()
+        if settings.stage.home:
+            _check_homing(stage)
+            if stage.report().state == "alarm":
+                stage.home()
         opening.pop_all()
     return Rig(stage, camera, settings)
+
+
+def _check_homing(stage: GrblStage) -> None:
+    """Refuse a stage that is never where it says, because its homing is switched off."""
+    if not int(stage.parameters.get(_HOMING, 0)) & 1:
+        raise InputError(
+            f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or home = false"
+        )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.rig.plans import AxialPlan, Plan
+from mirrorskin.hw.rig.possible import check_plan
 from mirrorskin.hw.rig.references import given_reference, take_dark
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.stage import Position, Report
@@ -51,7 +52,7 @@ class Scan(Closing):
     Raises
     ------
     InputError
-        The plan goes beyond the stage's limits.
+        The plan goes beyond the stage's limits, or is too fast or too slow for it.
     """
 
     rewindable = False
@@ -64,7 +65,7 @@ class Scan(Closing):
         self._origin: float | None = None
         self._complete = False
         self._live: list[Floats] = []
-        plan.check(rig.stage.limits, rig.stage.name)
+        check_plan(plan, rig.settings.stage, rig.stage.name)
 
     @property
     def expected(self) -> int:

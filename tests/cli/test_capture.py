@@ -26,8 +26,8 @@ def emulated(tmp_path_factory):
         patch.setattr(rigs, "_STALL", 5.0)
         patch.setattr(Link, "_limit", lambda link: 5.0)
         file = rig.write(folder, server.url)
-        known = file.read_text().replace("[camera]", "[camera]\ndelay = 0.02\ndark = 16")
-        file.write_text(known)
+        text = file.read_text().replace("[camera]", "[camera]\ndelay = 0.02\ndark = 16")
+        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
         yield rig, file
 
 
@@ -52,14 +52,14 @@ def test_a_press_in_steps_becomes_a_recording(emulated, tmp_path):
 
 def test_a_rotation_without_a_halt_becomes_a_recording(emulated, tmp_path):
     path = tmp_path / "turn.h5"
-    ended = capture(emulated, "axial", "-o", path, "--press", "1mm", "--rate", "1", "--compression", "lzf")
+    ended = capture(emulated, "axial", "-o", path, "--press", "1mm", "--rate", "1.2", "--compression", "lzf")
     assert ended.code == 0, ended.said
     assert "late; frames 20.0 ms after their exposure" in ended.out
     with io.open_recording(path) as recording:
         assert recording.state == "complete"
         assert recording.header.press == 1
-        assert recording.phase[-1] == pytest.approx(6.28, abs=0.3)
-        assert recording.shape[0] > 15
+        assert recording.phase[-1] == pytest.approx(6.28, abs=0.6)
+        assert recording.shape[0] > 8
 
 
 def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monkeypatch):
@@ -88,6 +88,9 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
     [
         (["vertical", "--stop", "9mm", "--step", "1mm"], "beyond the axis"),
         (["axial", "--press", "1mm", "--tilt", "20deg", "--rate", "1"], "beyond"),
+        (["vertical", "--stop", "1mm", "--speed", "50mm/s"], "too fast"),
+        (["axial", "--press", "1mm", "--rate", "50"], "more than pitch and roll go"),
+        (["axial", "--press", "1mm", "--rate", "1", "--turns", "1e300"], "turns are too many"),
         (["vertical", "--step", "1mm"], "--stop is missing"),
         (["axial", "--rate", "1"], "--press is missing"),
         (["vertical", "--stop", "1mm"], "either a step"),
@@ -101,14 +104,14 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         (["horizontal", "--stop", "1mm"], "horizontal"),
     ],
 )
-def test_a_call_that_cannot_be_moves_nothing(emulated, tmp_path, words, said):
+def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, words, said):
+    monkeypatch.setattr(rigs, "open_rig", None)
     path = tmp_path / "none.h5"
     ended = capture(emulated, *words, "-o", path)
     assert ended.code == 2
     assert said in ended.said
     assert ended.said.count("\n") == 1
     assert not path.exists()
-    assert not emulated[0].machine.moving()
 
 
 def test_a_rig_file_that_is_missing_is_named(tmp_path):
@@ -136,3 +139,15 @@ def test_a_port_that_is_missing_is_one_line(emulated, tmp_path):
     assert ended.code == 2
     assert "none" in ended.said
     assert ended.said.count("\n") == 1
+
+
+def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path):
+    rig, file = emulated
+    other = file.with_name("home.toml")
+    other.write_text(file.read_text().replace("home = false", "home = true"))
+    words = ("--rig", other, "-o", tmp_path / "a.h5", "--stop", "1mm", "--step", "1mm")
+    ended = run("capture", "vertical", *words)
+    assert ended.code == 2
+    assert "set $22=1, or home = false" in ended.said
+    assert ended.said.count("\n") == 1
+    assert not rig.machine.moving()

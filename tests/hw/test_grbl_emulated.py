@@ -9,6 +9,7 @@ from scripted_grbl import stage_settings
 
 from mirrorskin.hw.emulator.machine import GrblMachine
 from mirrorskin.hw.emulator.pty import GrblPort
+from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl import GrblStage
 from mirrorskin.hw.stage import Position
@@ -49,6 +50,14 @@ def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(stage):
     assert len(tilts) > 5
     assert tilts == pytest.approx([LEAN] * len(tilts), abs=math.radians(5e-3))
     assert time.monotonic() - begun > 1.25 / 2
+
+
+def test_a_stage_that_was_homed_knows_its_place_at_once_and_goes_on():
+    with EmulatedRig(shape=(4, 6), rate=5, home=True) as rig, GrblStage(rig.settings.stage) as opened:
+        opened.home()  # in which nothing is answered
+        opened.move(Position())
+        assert opened.wait().position.travel == pytest.approx(0, abs=0.01)
+        assert rig.where(time.monotonic()).travel == pytest.approx(0, abs=0.01)
 
 
 def test_reports_tell_where_the_machine_was(stage):

@@ -11,13 +11,22 @@ from mirrorskin.hw.rig import calibration
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 
-DELAY, JITTER = 0.05, 0.005
+DELAY = 0.05
+OPTICS = {"shape": (48, 64), "pixel_size": 0.125}
+CAMERA = {"delay": DELAY, "jitter": 0.003}
 PLANS = {
-    "vertical, steps": VerticalPlan(0.0, 1.0, step=0.2),
+    "vertical, steps": VerticalPlan(0.0, 1.0, step=0.25),
     "vertical, continuous": VerticalPlan(0.0, 1.0, speed=1.0),
-    "axial, steps": AxialPlan(1.0, TILT, phase_step=math.radians(60)),
+    "axial, steps": AxialPlan(1.0, TILT, phase_step=math.radians(90)),
     "axial, continuous": AxialPlan(1.0, TILT, rate=0.7),
 }
+
+
+def rate_and_known(plan):
+    """Steps need few frames, and no delay that is measured."""
+    if plan.in_steps:
+        return {"rate": 10.0, "known": {"dark": 16.0, "delay": DELAY}}
+    return {"rate": 20.0, "known": {"dark": 16.0}}
 
 
 @pytest.fixture(scope="module")
@@ -26,15 +35,16 @@ def compared():
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(len(PLANS)) as pool:
         # Emulators are late where other programs have the processors; that is no fault here.
         patch.setattr(rigs, "_STALL", 3.0)
-        patch.setattr(calibration, "_SECONDS", 1.2)
-        patch.setattr(calibration, "_FRAMES", 24)
-        patch.setattr(calibration, "_LONGEST_DELAY", 0.2)
+        patch.setattr(calibration, "_SECONDS", 1.0)
+        patch.setattr(calibration, "_FRAMES", 20)
+        patch.setattr(calibration, "_LONGEST_DELAY", 0.1)
         patch.setattr(Link, "_limit", lambda link: 3.0)
         tasks = {
-            name: pool.submit(watch, plan, rate=20.0, delay=DELAY, jitter=JITTER, seed=number)
+            name: pool.submit(watch, plan, **OPTICS, **CAMERA, **rate_and_known(plan), seed=number)
             for number, (name, plan) in enumerate(PLANS.items())
         }
-        return {name: compare(task.result()) for name, task in tasks.items()}
+        watched = {name: task.result() for name, task in tasks.items()}
+    return {name: compare(one) for name, one in watched.items()}
 
 
 @pytest.mark.parametrize("name", PLANS)

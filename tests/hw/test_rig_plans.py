@@ -1,9 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from rig_fakes import settings
 
 from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan
+from mirrorskin.hw.rig.possible import check_plan
 from mirrorskin.hw.stage import Limits, Position
 from mirrorskin.io import InputError
 
@@ -122,6 +125,8 @@ def test_a_press_that_cannot_be_is_refused(values):
         (1, -0.04, 1, 1, None),
         (1, 0.04, 0, 1, None),
         (1, 0.04, INF, None, 1),
+        (1, 0.04, NAN, None, 1),
+        (1, 0.04, -1, None, 1),
         (1, 0.04, 1, None, None),
         (1, 0.04, 1, 1, 1),
         (1, 0.04, 1, None, -1),
@@ -132,3 +137,56 @@ def test_a_press_that_cannot_be_is_refused(values):
 def test_a_rotation_that_cannot_be_is_refused(values):
     with pytest.raises(InputError):
         AxialPlan(*values)
+
+
+def test_turns_that_would_take_for_ever_are_refused():
+    assert AxialPlan(1.0, 0.04, turns=10_000, rate=1.0).turns == 10_000
+    for turns in (10_001, 1e300):
+        with pytest.raises(InputError, match="10000 times at most"):
+            AxialPlan(1.0, 0.04, turns=turns, rate=1.0)
+
+
+STAGE = settings().stage  # 20 mm/s, 20 rad/s, pitch and roll on X and Y
+
+
+@pytest.mark.parametrize(
+    ("plan", "said"),
+    [
+        (VerticalPlan(0.0, 1.0, speed=20.1), "axis of travel is too fast"),
+        (VerticalPlan(0.0, 1.0, speed=0.016), "GRBL goes no slower"),
+        (AxialPlan(1.0, 0.04, rate=80.0), "more than pitch and roll go"),
+        (AxialPlan(1.0, 0.04, turns=1e4, rate=1e-4), "GRBL goes no slower"),
+        (AxialPlan(1.0, 0.11, rate=1.0), "beyond"),
+        (VerticalPlan(0.0, 2.5, speed=1.0), "deeper"),
+        (VerticalPlan(0.0, 2.5, step=1.0), "deeper"),
+    ],
+)
+def test_what_the_stage_cannot_do_is_refused(plan, said):
+    with pytest.raises(InputError, match=said):
+        check_plan(plan, STAGE, "stage")
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        VerticalPlan(0.0, 1.0, speed=20.0),
+        VerticalPlan(0.0, 1.0, speed=0.017),
+        AxialPlan(1.0, 0.04, turns=1e4, rate=79.0),
+        AxialPlan(1.0, 0.04, turns=0.1, rate=2e-3),
+    ],
+)
+def test_what_the_stage_can_just_do_is_not(plan):
+    check_plan(plan, STAGE, "stage")
+
+
+def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
+    stage = replace(STAGE, pitch=replace(STAGE.pitch, letter="A"))
+    with pytest.raises(InputError, match="no arcs in the axes A and Y"):
+        check_plan(AxialPlan(1.0, 0.04, rate=1.0), stage, "stage")
+    check_plan(AxialPlan(1.0, 0.04, phase_step=1.0), stage, "stage")
+
+
+@pytest.mark.parametrize("way", [{"rate": 1.0}, {"phase_step": 1.0}])
+def test_a_stage_that_does_not_lean_goes_round_in_no_way(way):
+    with pytest.raises(InputError, match="tilt"):
+        check_plan(AxialPlan(1.0, 0.04, **way), replace(STAGE, pitch=None, roll=None), "stage")

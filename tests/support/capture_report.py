@@ -118,7 +118,9 @@ def compare(watched: Watched) -> Compared:
     return Compared(len(frames), scan.dropped, height, normal, delay)
 
 
-def capture(emulated: EmulatedRig, plan: Plan, known: Mapping[str, float]) -> tuple[Kept, StepScan | SweepScan]:
+def capture(
+    emulated: EmulatedRig, plan: Plan, known: Mapping[str, float]
+) -> tuple[Kept, StepScan | SweepScan]:
     """Return what a scan gave, and the scan."""
     settings = emulated.settings
     settings = replace(settings, camera=replace(settings.camera, **known))

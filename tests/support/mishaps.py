@@ -29,7 +29,7 @@ SOON = 0.2
 """Seconds within which a stage must rest after a mishap."""
 
 PATIENCE = 7.0
-"""Seconds after which whatever waits must have given up: 5 of these for a camera's first frame, 2 for a stage."""
+"""Seconds after which whatever waits must have given up: 5 for a camera's first frame, and 2 for a stage."""
 
 FULL = 2_950_000
 """Bytes that a full disk takes: the maps, what is kept free to the end, and some tens of frames."""
@@ -154,6 +154,11 @@ class Child:
         return self.process.communicate(timeout=_START)[1]
 
 
+def starved(said: str) -> bool:
+    """Return whether a capture ended because this machine was too busy to emulate a rig in time."""
+    return "no longer answers" in said or "gave no frame" in said
+
+
 def state_of(path: Path) -> str | None:
     """Return the state of a recording, which must be readable; None if nothing was written, or too little."""
     if not path.exists():
@@ -185,13 +190,15 @@ def words(chance: random.Random) -> list[str]:
     return ["axial", "--press", "1mm", "--turns", "2", "--rate", "1"]
 
 
-def wait_for_frames(child: Child) -> None:
-    """Wait until a capture has some frames on disk."""
+def has_frames(child: Child) -> bool:
+    """Wait until a capture has some frames on disk; False if it ended before."""
     deadline = time.monotonic() + _START
     while state_of(child.recording) is None:
-        assert child.process.poll() is None, child.wait()
+        if child.process.poll() is not None:
+            return False
         assert time.monotonic() < deadline, "the capture does not come to work"
         time.sleep(0.02)
+    return True
 
 
 def rest(rig: EmulatedRig) -> None:

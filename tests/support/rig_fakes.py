@@ -22,7 +22,7 @@ PERIOD = 0.05  # seconds between reports
 
 def settings(shape=(8, 8), **camera):
     axis = Axis("Z", 1, 0.0, -5.0, 3.0, 20.0, "mm")
-    pitch, roll = (Axis(letter, 1, 0.0, -0.1, 0.1, 2.0, "deg") for letter in "XY")
+    pitch, roll = (Axis(letter, 1, 0.0, -0.1, 0.1, 20.0, "deg") for letter in "XY")
     stage = StageSettings("none", 115200, False, 1.0, 20.0, axis, pitch, roll, 2.0, (0.0, 0.0, 0.0))
     return RigSettings(
         Path("rig.toml"), "fake", stage, CameraSettings(0, shape, np.dtype(np.uint8), **camera)
