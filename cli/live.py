@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
     from mirrorskin.engine.live import LivePress, LiveRotation, Loop
     from mirrorskin.hw.rig.plans import Plan
-    from mirrorskin.hw.rig.settings import RigSettings
+    from mirrorskin.hw.settings import RigSettings
     from mirrorskin.io import LiveSource, Result
 
 _LATENCY = "100ms"

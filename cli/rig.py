@@ -14,7 +14,7 @@ from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.finding import Finding
-    from mirrorskin.hw.rig.settings import RigSettings
+    from mirrorskin.hw.settings import RigSettings
 
 app = typer.Typer(help="Look at a stage and a camera before they are used.", no_args_is_help=True)
 

@@ -12,9 +12,9 @@ import typer
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
-    from mirrorskin.hw.rig.settings import RigSettings
     from mirrorskin.hw.rig.steps import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
+    from mirrorskin.hw.settings import RigSettings
 
 SETTLE = "100ms"
 """From rest to the first exposure of a step."""

@@ -18,7 +18,7 @@ from mirrorskin.hw.emulator.machine import GrblMachine
 from mirrorskin.hw.emulator.pty import GrblPort
 from mirrorskin.hw.emulator.rig_file import write_rig
 from mirrorskin.hw.emulator.server import FrameServer
-from mirrorskin.hw.rig.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.settings import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Body, Camera, ContactName, Object, OpticsName, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement

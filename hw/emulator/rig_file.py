@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.rig.settings import Axis, RigSettings
+from mirrorskin.hw.settings import Axis, RigSettings
 from mirrorskin.io.types import InputError
 
 _FIRST = "# An emulated rig; it is there as long as the program that wrote this runs.\n"

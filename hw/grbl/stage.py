@@ -14,7 +14,7 @@ from mirrorskin.hw.grbl.link import Link, Seen
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.port import Port, open_port
 from mirrorskin.hw.grbl.replies import Status
-from mirrorskin.hw.rig.settings import StageSettings
+from mirrorskin.hw.settings import StageSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
 from mirrorskin.hw.rig.finding import Finding
-from mirrorskin.hw.rig.settings import CameraSettings
+from mirrorskin.hw.settings import CameraSettings
 
 _FIRST = 5.0  # seconds that a camera may take to its first frame
 _PERIOD = 1.0  # seconds that frames are counted for

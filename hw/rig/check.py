@@ -11,8 +11,8 @@ from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig.camera_check import check_camera
 from mirrorskin.hw.rig.finding import Finding
 from mirrorskin.hw.rig.move_check import check_moves
-from mirrorskin.hw.rig.settings import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.rig.stage_check import check_stage
+from mirrorskin.hw.settings import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.video import VideoCamera
 
 

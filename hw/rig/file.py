@@ -13,7 +13,7 @@ import numpy as np
 
 from mirrorskin.hw.rig.keys import Key, flag, number, one_of, read_table, several, text, whole
 from mirrorskin.hw.rig.reference_files import SUFFIXES, check_references
-from mirrorskin.hw.rig.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.settings import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.io import InputError
 from mirrorskin.io.types import FRAME_DTYPES
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from mirrorskin.hw.rig.finding import Finding
-from mirrorskin.hw.rig.settings import StageSettings
 from mirrorskin.hw.rig.stage_check import tell, unit_of
+from mirrorskin.hw.settings import StageSettings
 from mirrorskin.hw.stage import Limits, Position, Stage
 
 _FARTHEST = {"mm": 0.5, "deg": math.radians(0.5)}  # how far an axis is moved at most, mm and rad

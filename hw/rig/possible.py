@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mirrorskin.hw.rig.plans import AxialPlan, Plan
-from mirrorskin.hw.rig.settings import StageSettings
+from mirrorskin.hw.settings import StageSettings
 from mirrorskin.hw.stage import Position
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.rig.settings import CameraSettings
+from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.io import InputError
 from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.settings import RigSettings
+from mirrorskin.hw.settings import RigSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing

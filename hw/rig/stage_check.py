@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from mirrorskin.hw.rig.finding import Finding
-from mirrorskin.hw.rig.settings import Axis, StageSettings
+from mirrorskin.hw.settings import Axis, StageSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
 

@@ -9,8 +9,8 @@ import time as clock
 
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.settings import CameraSettings
 from mirrorskin.hw.running import RunningCamera
+from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.hw.video.capture import OPEN_TIMEOUT, READ_TIMEOUT, Capture
 from mirrorskin.hw.video.source import find_source
 from mirrorskin.io import InputError

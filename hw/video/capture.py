@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from mirrorskin.hw.rig.settings import CameraSettings
+from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.hw.video.grey import to_grey
 from mirrorskin.hw.video.source import VideoSource
 from mirrorskin.io import InputError

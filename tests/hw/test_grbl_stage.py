@@ -10,7 +10,7 @@ from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl import GrblStage
-from mirrorskin.hw.rig.settings import Axis
+from mirrorskin.hw.settings import Axis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 

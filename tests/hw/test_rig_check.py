@@ -13,8 +13,8 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.camera_check import check_camera
 from mirrorskin.hw.rig.check import check_rig
 from mirrorskin.hw.rig.move_check import check_moves
-from mirrorskin.hw.rig.settings import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.rig.stage_check import check_stage
+from mirrorskin.hw.settings import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 

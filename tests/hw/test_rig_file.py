@@ -12,8 +12,8 @@ import pytest
 from mirrorskin.hw.rig.file import KEYS, load_rig
 from mirrorskin.hw.rig.keys import REQUIRED
 from mirrorskin.hw.rig.reference_files import read_reference
-from mirrorskin.hw.rig.settings import Axis, CameraSettings, StageSettings
 from mirrorskin.hw.rig.template import TEMPLATE
+from mirrorskin.hw.settings import Axis, CameraSettings, StageSettings
 from mirrorskin.hw.stage import Limits
 from mirrorskin.io import InputError
 

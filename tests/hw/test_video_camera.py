@@ -22,7 +22,7 @@ import pytest
 
 from mirrorskin.hw.camera import Tally
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.settings import CameraSettings
+from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.hw.video import VideoCamera, camera, capture, source
 from mirrorskin.hw.video.grey import to_grey
 from mirrorskin.io import InputError

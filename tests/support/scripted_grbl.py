@@ -10,7 +10,7 @@ import time
 import serial
 
 from mirrorskin.hw.grbl.port import SLICE
-from mirrorskin.hw.rig.settings import Axis, StageSettings
+from mirrorskin.hw.settings import Axis, StageSettings
 
 SLOTS = 4
 SETTINGS = {
