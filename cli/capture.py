@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import typer
@@ -49,7 +47,7 @@ def command(
         # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
         scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
         recorder = io.StreamRecorder(scan, output, compression.value)
-        with _kept(recorder):
+        with scans.kept(recorder):
             _drain(recorder)
         typer.echo(f"{output}: {_summary(scan)}")
 
@@ -63,28 +61,6 @@ def _drain(recorder: StreamRecorder) -> None:
         room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
         while recorder.read(room) is not None:
             show(recorder.count)
-
-
-@contextmanager
-def _kept(recorder: StreamRecorder) -> Iterator[None]:
-    """Say of a capture that was cut short what was kept of it."""
-    from mirrorskin.hw.errors import HardwareError
-    from mirrorskin.io import InputError
-
-    try:
-        yield
-    except (HardwareError, InputError) as error:
-        if not recorder.count:
-            raise
-        raise HardwareError(f"{error}; {_remains(recorder)}") from error
-    except (KeyboardInterrupt, SystemExit):
-        if recorder.count:
-            typer.echo(_remains(recorder), err=True)
-        raise
-
-
-def _remains(recorder: StreamRecorder) -> str:
-    return f"{recorder.path} was cut short and holds {recorder.count} frames"
 
 
 def _summary(scan: Scan) -> str:

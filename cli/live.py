@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import LiveSource, Result
 
 _LATENCY = "100ms"
+_THRESHOLD, _HOLD = 0.5, 2
 # How a result's process says that a map is missing, and why; and the key of the rig file that would bring it.
 _UNTOLD = "none: "
 _REMEDIES = {"zenith": "zenith_gain", "height": "pixel_size", "fill": "pixel_size"}
@@ -34,8 +35,8 @@ class _Wanted:
     frames: int | None
     window: int | None
     latency: float
-    threshold: float
-    hold: int
+    threshold: float | None
+    hold: int | None
     noise: float | None
     device: str | None
 
@@ -62,9 +63,15 @@ def command(
         str, typer.Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
     ] = _LATENCY,
     threshold: Annotated[
-        float, typer.Option(help="Vertical: share of the way from dark to bright that is light.")
-    ] = 0.5,
-    hold: Annotated[int, typer.Option(help="Vertical: light frames in a row that make an onset.")] = 2,
+        float | None,
+        typer.Option(
+            help="Vertical: share of the way from dark to bright that is light.", show_default=str(_THRESHOLD)
+        ),
+    ] = None,
+    hold: Annotated[
+        int | None,
+        typer.Option(help="Vertical: light frames in a row that make an onset.", show_default=str(_HOLD)),
+    ] = None,
     noise: Annotated[
         float | None,
         typer.Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
@@ -156,6 +163,7 @@ class _Live:
             tell = stack.enter_context(show_status())
             recorder = None if asked.record is None else StreamRecorder(scan, asked.record)
             source: LiveSource = scan if recorder is None else recorder
+            stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
             estimator = _estimator(source, plan, rig.rate, asked)
             estimator.warm()
@@ -193,7 +201,10 @@ def _estimator(source: LiveSource, plan: Plan, rate: float, asked: _Wanted) -> L
 
     if isinstance(plan, VerticalPlan):
         known: dict[str, Any] = {"noise": asked.noise, "device": asked.device}
-        return LivePress(source, threshold=asked.threshold, hold=asked.hold, **known)
+        threshold = _THRESHOLD if asked.threshold is None else asked.threshold
+        return LivePress(
+            source, threshold=threshold, hold=_HOLD if asked.hold is None else asked.hold, **known
+        )
     window, every = _window(plan, rate, asked)
     return LiveRotation(source, window=window, every=every, noise=asked.noise, device=asked.device)
 
@@ -221,7 +232,7 @@ def _window(plan: Plan, rate: float, asked: _Wanted) -> tuple[int, int]:
         return window, every
     if asked.window > round(turn):
         raise InputError(f"--window {asked.window}: a turn has {round(turn)} frames only: leave it out")
-    return asked.window, max(1, round(turn / asked.window))
+    return asked.window, max(1, int(round(turn) // asked.window))  # within one turn
 
 
 def _save(live: _Live, output: Path | None, settings: RigSettings, asked: _Wanted) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig.steps import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
     from mirrorskin.hw.settings import RigSettings
+    from mirrorskin.io import StreamRecorder
 
 SETTLE = "100ms"
 """From rest to the first exposure of a step."""
@@ -50,9 +52,16 @@ Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first
 StepFrames = Annotated[int | None, typer.Option("--frames", min=1, help="In steps: at each place.")]
 
 
+# Those after the first line are live's.
 _OWN: Mapping[ScanName, tuple[str, ...]] = {
-    ScanName.vertical: ("start", "stop", "step", "speed"),
-    ScanName.axial: ("press", "tilt", "turns", "phase_step", "rate"),
+    ScanName.vertical: (
+        *("start", "stop", "step", "speed"),
+        *("threshold", "hold"),
+    ),
+    ScanName.axial: (
+        *("press", "tilt", "turns", "phase_step", "rate"),
+        *("window",),
+    ),
 }
 
 
@@ -76,7 +85,7 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
 
     motion = ScanName(words["motion"])
     others = [name for other in ScanName if other != motion for name in _OWN[other]]
-    foreign = [name for name in others if words[name] is not None]
+    foreign = [name for name in others if words.get(name) is not None]
     if foreign:
         raise InputError(
             f"{_spelled(foreign[0])} says nothing of a motion that is {motion.value}: leave it out, or choose"
@@ -118,6 +127,30 @@ def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
     for name, value in (("--settle", settle), ("--frames", frames)):
         if value is not None and not plan.in_steps:
             raise InputError(f"{name} says nothing of a motion without a halt: leave it out, or give a step")
+
+
+@contextmanager
+def kept(recorder: StreamRecorder | None) -> Iterator[None]:
+    """Say of a recording that was cut short what was kept of it, with exit code 1."""
+    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.io import InputError
+
+    try:
+        yield
+    except (HardwareError, InputError) as error:
+        if recorder is None or not recorder.count:
+            raise
+        raise HardwareError(f"{error}; {_remains(recorder)}") from error
+    except (KeyboardInterrupt, SystemExit):
+        if recorder is not None and recorder.count:
+            typer.echo(_remains(recorder), err=True)
+        raise
+
+
+def _remains(recorder: StreamRecorder) -> str:
+    if not recorder.written:
+        return f"of {recorder.path} nothing was written"
+    return f"{recorder.path} was cut short and holds {recorder.written} frames"
 
 
 def _vertical(words: Mapping[str, Any]) -> VerticalPlan:

@@ -80,8 +80,9 @@ def serve(
         scale = rig.settings.camera.zenith_gain
         typer.echo(_tell(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
         try:
-            while True:
+            while rig.camera.error is None:
                 time.sleep(_LOOK)
+            raise rig.camera.error
         except KeyboardInterrupt:
             typer.echo("the rig has ended")
 

@@ -67,8 +67,8 @@ class StreamRecorder:
     ----------
     name, header, shape, dtype, motion, rewindable
         The source's; what was recorded cannot be read again.
-    count : int
-        Frames that were taken.
+    count, written : int
+        Frames that were taken, and those of them that are in the file.
     """
 
     rewindable = False
@@ -84,7 +84,7 @@ class StreamRecorder:
         self.source = source
         self.path = Path(path)
         self.name, self.motion = source.name, source.motion
-        self.count = 0
+        self.count = self.written = 0
         self._compression: Compression = compression
         self._period = period
         self._queue: queue.SimpleQueue[Block | _Mark | _End] = queue.SimpleQueue()
@@ -130,9 +130,9 @@ class StreamRecorder:
         InputError
             The disk is full, or too slow by more than 256 MB; this may concern frames before.
         """
+        self._check()
         block = self.source.read(out)
-        if self._error is not None:
-            raise self._error
+        self._check()
         if block is not None:
             self._hand_over(block)
         return block
@@ -152,6 +152,10 @@ class StreamRecorder:
     def mark(self, index: int, used: NDArray[np.bool_]) -> None:
         """Say whether frames, from number ``index`` on, were used; unless marked, they were."""
         self._queue.put(_Mark(index, np.array(used, bool)))
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
 
     def _hand_over(self, block: Block) -> None:
         """Queue a block for the thread that writes, if there is room."""
@@ -253,6 +257,7 @@ class StreamRecorder:
 
     def _append(self, file: GrowingRecording, block: Block) -> None:
         file.append(block)
+        self.written = file.count
         with self._lock:
             self._backlog -= block.frames.nbytes
 

@@ -27,6 +27,7 @@ OnUpdate = Callable[[Update, Status], None]
 Mark = Callable[[int, NDArray[np.bool_]], None]
 
 _INTERVALS = 32  # between frames, that tell when the next one is due
+_ENDING = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 _MARGIN = 0.001  # seconds before that, in which nothing is begun any more
 
 
@@ -200,16 +201,18 @@ def _cut(block: Block, part: slice) -> Block:
 
 @contextmanager
 def _whole() -> Iterator[None]:
-    """Put Ctrl-C off until a step is done, so that an estimator's frames and its books agree."""
-    handler = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+    """Put signals off until a step is done, so that an estimator's frames and its books agree."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
+    handlers = {number: handler for number in _ENDING if callable(handler := signal.getsignal(number))}
     waiting: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, frame: waiting.append((number, frame)))
+    for number in handlers:
+        signal.signal(number, lambda number, frame: waiting.append((number, frame)))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     if waiting:
-        handler(*waiting[0])
+        handlers[signal.Signals(waiting[0][0])](*waiting[0])

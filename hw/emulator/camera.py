@@ -82,8 +82,8 @@ class TwinCamera(RunningCamera):
         self._sent = threading.Condition()
         self._stalled, self._ended = threading.Event(), threading.Event()
         self._threads = [
-            threading.Thread(target=work, name=f"{self.name}: {work.__name__.strip('_')}")
-            for work in (self._expose, self._deliver)
+            threading.Thread(target=self._tell_if_it_fails, args=(work,), name=f"{self.name}: {name}")
+            for name, work in (("exposes", self._expose), ("delivers", self._deliver))
         ]
         for thread in self._threads:
             thread.start()
@@ -109,6 +109,12 @@ class TwinCamera(RunningCamera):
         for thread in self._threads:
             thread.join()
         self._fail(f"{self.name} is closed")
+
+    def _tell_if_it_fails(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:  # readers are told, and the other thread ends when it is closed
+            self._fail(f"{self.name} failed: {error}")
 
     def _expose(self) -> None:
         """Render each frame when its exposure is over, or pass it over if it would come too late."""

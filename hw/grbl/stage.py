@@ -257,7 +257,7 @@ class GrblStage(Closing):
         duration = sum(command.duration for command in commands) + self._ramp
         with self._guarded():
             with self._link.lock:
-                number = self._link.enqueue(*(command.line for command in commands)) + len(commands[:-1][:1])
+                number = self._link.enqueue(*(command.line for command in commands)) + int(len(commands) > 1)
                 self._target = target
             self._due = max(self._due, time.monotonic()) + duration
             left = self._due - time.monotonic()

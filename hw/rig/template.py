@@ -11,7 +11,7 @@ port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://ho
 # baud = 115200
 home = true                     # the stage has switches, and must home before it moves
 # timeout = 2.0                 # s that an answer may take
-# report_rate = 20.0            # Hz: how often the position is asked for
+# report_rate = 20.0            # Hz: how often it is asked where it rests
 press = 2.0                     # mm: greatest travel, whatever the axis could do
 # pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: what the body turns about
 

@@ -258,13 +258,14 @@ def test_a_closed_camera_tells_readers_and_closes_twice() -> None:
 
 def test_frames_that_wait_can_be_forgotten() -> None:
     with running(still) as camera:
-        take(camera, 2)
-        time.sleep(0.05)
+        seen = camera.counts.frames
+        while camera.counts.frames < seen + 8:
+            time.sleep(0.005)
         forgotten = camera.latest
         camera.flush()
         frames = camera.take(1, PATIENCE)
         assert frames.time[0] >= forgotten
-        assert frames.dropped == 0
+        assert frames.dropped < 8  # not those that were forgotten; a busy machine may lose others
 
 
 @pytest.mark.parametrize(
