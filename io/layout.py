@@ -133,10 +133,8 @@ class Layout:
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
         )
 
-    def positions(
-        self, motion: Motion, travel: ArrayLike | None, phase: ArrayLike | None
-    ) -> dict[str, Floats | None]:
-        """Read where the body was in each frame, and when, if it is not given; check it.
+    def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
+        """Read where the body was in each frame, and when; travel or phase may be given; check it.
 
         Returns
         -------
@@ -146,9 +144,9 @@ class Layout:
         """
         found = {"time": self._cut_series("time", (self._count,))}
         if motion == "vertical":
-            found["travel"] = self._travel(travel)
+            found["travel"] = self._travel(given)
         elif motion == "axial":
-            found["phase"] = self._phase(phase)
+            found["phase"] = self._phase(given)
         elif motion == "horizontal":
             found["displacement"] = self._cut_series("displacement", (self._count, 2))
         else:

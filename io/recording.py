@@ -232,7 +232,8 @@ def open_recording(
             chosen = _used(str(path), told, travel, phase)
             told, positions = told.of(chosen), layout.live(header.motion, chosen)
         else:
-            positions = layout.positions(header.motion, _along(travel, shape[0]), _along(phase, shape[0]))
+            given = {"vertical": travel, "axial": phase}.get(header.motion)
+            positions = layout.positions(header.motion, _along(given, shape[0]))
         fetched = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
         if live:
             fetched = Picked(fetched, chosen)

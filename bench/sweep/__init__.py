@@ -17,6 +17,7 @@ FAMILIES = (
     rotation.CORRELATION,
     rotation.NORMALS,
     rotation.EDGES,
+    rotation.SLOPES,
     rotation.REGISTRATION,
     graph.LINKS,
     graph.COMPONENTS,

@@ -1,4 +1,4 @@
-"""What a rotation goes through: ``correlation.cl``, ``normals.cl``, ``edges.cl`` and ``registration.cl``."""
+"""What a rotation goes through: correlation, normals, edges, slopes and registration."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from mirrorskin.bench.normals import NormalsCase
 from mirrorskin.bench.peers.normals.odd import answer
 from mirrorskin.bench.sweep.sweep import FRAME_TYPES, MAPS_ONLY, Family, Job, Shape, agree, run_kernel
-from mirrorskin.bench.turns import STEPS, fill, phases
+from mirrorskin.bench.turns import STEPS, TILT, fill, phases
 from mirrorskin.engine import Correlator, NormalEstimator, find_edges
 from mirrorskin.engine.rotation.edges import LIMITS
 from mirrorskin.engine.rotation.phases import basis
+from mirrorskin.engine.rotation.relief_maps import SlopeMaps
 from mirrorskin.io import Block
-from mirrorskin.kernels import correlation, edges, registration
+from mirrorskin.kernels import correlation, edges, registration, slopes
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.edges import COARSE, PASSES, WAYS
@@ -27,6 +28,8 @@ _NORMAL = 21  # bytes of a pixel: normal, sigma, contact and mean
 _LOOKS, _LOOK, _START = 3, 37, 12  # looks at all samples; multiply-adds of a sample in each, and at first
 _PAIRS = 9 + 9 + 6  # of places, in each direction, over the three passes
 _PAIR = 14  # multiply-adds of a pair
+_SLOPE_BYTES = 12 + 4 + 1 + 4 * 4 + 2 * 4 * 2 + 4 + 4  # of a pixel
+_SLOPE = 90  # operations of a pixel
 _TAPS = 4 * 4 + 4 + 3 * 8 + 16  # multiply-adds of a resampled pixel: sums, weights, place, noise
 
 
@@ -143,6 +146,31 @@ def _make_edges(device: Device, shape: Shape, kind: str, _: int) -> dict[str, Jo
 
     moved, operations = pixels * (12 + 4 + 1 + 1), pixels * WAYS * _PAIRS * _PAIR
     return {"edges": Job(draw, moved, check, 0, operations)}
+
+
+def _make_slopes(device: Device, shape: Shape, kind: str, _: int) -> dict[str, Job]:
+    """Return the slopes of a roof's normals, and their weights."""
+    vectors, sigma, contact = _roof(shape)
+    given: dict[str, NDArray[Any]] = {"vectors": vectors, "sigma": sigma, "contact": contact}
+    normals = {name: device.given(name, values, values.dtype) for name, values in given.items()}
+    to = {name: device.array(name, shape, np.float32) for name in ("dz_dx", "dz_dy", "weight_x", "weight_y")}
+    for array in to.values():
+        array.upload()
+    maps = SlopeMaps(device, shape)
+    maps.find(TILT, normals, to)  # which finds the typical weight
+
+    def check() -> None:
+        maps.find(TILT, normals, to)
+        least = np.sin(TILT) ** 2
+        dz_dx, dz_dy, *squares = slopes.slopes_find(least, vectors, sigma, contact)
+        bounds = 1e-4 * maps.typical, 1e3 * maps.typical
+        weights = slopes.slopes_weigh(least, *bounds, sigma, dz_dx, *squares)
+        for (name, array), exact in zip(to.items(), (dz_dx, dz_dy, *weights), strict=True):
+            agree(f"slopes, {name}", array.download(), exact, 1e-4 * np.nanmax(np.abs(exact)))
+
+    pixels = shape[0] * shape[1]
+    work = run_kernel(device, lambda: maps.find(TILT, normals, to))
+    return {"slopes_find and slopes_weigh": Job(work, pixels * _SLOPE_BYTES, check, 0, pixels * _SLOPE)}
 
 
 def _roof(shape: Shape) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
@@ -283,6 +311,17 @@ EDGES = Family(
     f"bytes are those of normals, sigma and contact, and of the edges; multiply-adds: {_PAIRS} pairs of "
     f"places in {WAYS} directions, {_PAIR} each, where no pass is spared; the maps go to the device in each "
     "turn",
+)
+SLOPES = Family(
+    "sweep-slopes",
+    "slopes.cl: slopes and weights of a roof's normals",
+    _make_slopes,
+    MAPS_ONLY,
+    "triad",
+    110,
+    "bytes are those of normals, sigma and contact, of slopes, weights and two maps between, which are "
+    "written and read; operations a pixel: 40 for slopes with an exponential, 10 for the sums of two maps, 40 for "
+    "weights with another",
 )
 REGISTRATION = Family(
     "sweep-registration",

@@ -181,7 +181,7 @@ def test_an_unknown_case_is_refused_and_the_nearest_are_named():
 
 
 def test_cases_are_chosen_in_their_order_each_once():
-    assert choose(["live*", "full-uint?", "full-*", "live"]) == (
+    assert choose(["live-r*", "full-uint?", "full-*", "live"]) == (
         *(name for name in NAMES if name.startswith("full-")),
         "live",
         "live-random",

@@ -76,7 +76,10 @@ def test_the_table_fits_a_hundred_columns():
 def test_the_names_of_all_cases_are_told():
     assert ran(["--list"]).splitlines() == list(NAMES)
     assert json.loads(ran(["--list", "--json"])) == list(NAMES)
-    assert ran(["--list", "--case", "live*"]).splitlines() == ["live", "live-random"]
+    assert ran(["--list", "--case", "live-v*"]).splitlines() == [
+        "live-vertical-vga",
+        "live-vertical-1920x1200",
+    ]
 
 
 def test_cases_are_chosen_by_name_and_by_pattern(cases):
