@@ -320,8 +320,8 @@ SLOPES = Family(
     "triad",
     110,
     "bytes are those of normals, sigma and contact, of slopes, weights and two maps between, which are "
-    "written and read; operations a pixel: 40 for slopes with an exponential, 10 for the sums of two maps, 40 "
-    "for weights with another",
+    "written and read; operations a pixel: 40 for slopes with an exponential, 10 for the sums of two maps, "
+    "40 for weights with another",
 )
 REGISTRATION = Family(
     "sweep-registration",
