@@ -21,9 +21,12 @@ if TYPE_CHECKING:
 
 _LATENCY = "100ms"
 _THRESHOLD, _HOLD = 0.5, 2
-# How a result's process says that a map is missing, and why; and the key of the rig file that would bring it.
-_UNTOLD = "none: "
-_REMEDIES = {"zenith": "zenith_gain", "height": "pixel_size", "fill": "pixel_size"}
+# What would bring a map that is missing: keys of the rig file.
+_REMEDIES = {
+    "zenith": "zenith_gain in the rig file",
+    "height": "pixel_size in the rig file",
+    "fill": "pixel_size in the rig file",
+}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -239,12 +242,8 @@ def _save(live: _Live, output: Path | None, settings: RigSettings, asked: _Wante
     """Write the result, if that is asked for, and say what it lacks."""
     if output is None:
         return
-    from mirrorskin.cli.output import save_and_tell
+    from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
 
     result = live.result()
-    for name, remedy in _REMEDIES.items():
-        said = str(result.process.get(name))
-        if said.startswith(_UNTOLD):
-            why = said.removeprefix(_UNTOLD)
-            typer.echo(f"{settings.name}: no {name}: {why}; give {remedy} in the rig file", err=True)
+    tell_what_is_missing(settings.name, result.process, _REMEDIES)
     save_and_tell(result, output, asked.device, as_json=False)

@@ -14,6 +14,8 @@ import typer
 if TYPE_CHECKING:
     from mirrorskin.io import Result
 
+_UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
+
 
 def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool) -> None:
     """Write a result and say in a line what it holds, or in JSON how it came about as well."""
@@ -77,3 +79,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def tell_what_is_missing(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
+    """Say which maps a result's process says are missing, why, and what would bring them."""
+    for what, remedy in remedies.items():
+        said = str(process.get(what))
+        if said.startswith(_UNTOLD):
+            typer.echo(f"{name}: no {what}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)

@@ -38,8 +38,7 @@ _OWN = {
     },
 }
 _ESTIMATE = "estimate"
-# How a result's process says that a map is missing, and why; and the options that would bring it.
-_UNTOLD = "none: "
+# What would bring a map that is missing: options.
 _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}
 
 
@@ -115,7 +114,7 @@ def command(
 ) -> None:
     """Reconstruct heights from a press, or normals and heights from a rotation."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import save_and_tell
+    from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
     from mirrorskin.cli.positions import given
     from mirrorskin.cli.progress import progress
     from mirrorskin.cli.quantity import memory as bytes_of
@@ -154,10 +153,7 @@ def command(
                 device=device,
                 progress=show,
             )
-    for name, remedy in _REMEDIES.items():
-        said = str(result.process.get(name))
-        if said.startswith(_UNTOLD):
-            typer.echo(f"{recording}: no {name}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
+    tell_what_is_missing(str(recording), result.process, _REMEDIES)
     save_and_tell(result, target, device, as_json)
 
 

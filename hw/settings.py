@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,19 @@ class Axis:
     high: float
     speed: float
     unit: str
+
+    @property
+    def scale(self) -> float:
+        """The machine's units in one mm or rad."""
+        return math.degrees(1.0) if self.unit == "deg" else 1.0
+
+    def coordinate(self, value: float) -> float:
+        """Return the machine's coordinate at a value, mm or rad."""
+        return self.zero + self.direction * value * self.scale
+
+    def value(self, coordinate: float) -> float:
+        """Return the value, mm or rad, at a coordinate of the machine."""
+        return self.direction * (coordinate - self.zero) / self.scale + 0.0  # no minus zero
 
 
 @dataclass(frozen=True, slots=True)

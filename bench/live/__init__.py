@@ -15,8 +15,8 @@ __all__ = ["CASES", "run_live"]
 _QUICK, _SHORT = (48, 64), 0.3
 
 _PRESSES = (
-    LiveCase("live-vertical-vga", (480, 640), 1000.0, 60.0),
-    LiveCase("live-vertical-1920x1200", (1200, 1920), 165.0, 30.0),
+    LiveCase("live-vertical-vga", (480, 640), 1000.0, 60.0, least=1000.0),
+    LiveCase("live-vertical-1920x1200", (1200, 1920), 165.0, 30.0, least=150.0),
 )
 _ROTATION = LiveCase("live-axial-vga", (480, 640), 66.0, 60.0)
 

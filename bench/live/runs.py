@@ -46,12 +46,15 @@ class LiveCase:
         Frames a second that come.
     seconds : float
         For how long.
+    least : float
+        Frames a second that must be kept up with.
     """
 
     name: str
     shape: tuple[int, int]
     rate: float
     seconds: float
+    least: float = 0.0
 
     @property
     def count(self) -> int:
@@ -88,8 +91,7 @@ def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
         case.count,
     )
     ran = _run(source, LivePress(source, device=device))
-    least = {"live-vertical-vga": 1000.0}.get(case.name, 150.0)
-    targets = () if quick else (_judge_rate(ran, least), _judge_losses(ran))
+    targets = () if quick else (_judge_rate(ran, case.least), _judge_losses(ran))
     return Case(case.name, f"heights of a press while it goes on; {case.size}", [], {}, _notes(ran), targets)
 
 

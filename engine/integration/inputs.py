@@ -14,7 +14,9 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
 
-_LEAST, _MOST = 1e-4, 1e3  # of the median, between which weights of slopes count: float32 solves no more
+LEAST, MOST = 1e-4, 1e3
+"""Of the median, between which weights of slopes count: float32 solves no more."""
+
 _FIRMEST = 1e4  # of a link's weight, above which a known height does not count more
 _SAMPLES = 65536  # pixels that tell the median
 
@@ -103,7 +105,7 @@ def check_inputs(
         planes = [np.zeros(shape, np.float32)]
     size = check_pixel_size(pixel_size)
     typical = _typical(planes) if planes else weight
-    planes = [_bounded(plane, typical * _LEAST, typical * _MOST) for plane in planes]
+    planes = [_bounded(plane, typical * LEAST, typical * MOST) for plane in planes]
     firmest = _FIRMEST * typical / min(size) ** 2
     height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
     return Inputs(

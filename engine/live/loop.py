@@ -73,8 +73,8 @@ def run(
     mirrorskin.io.InputError
         A latency or rate that is not above 0, or what source and estimator raise.
     """
-    asked = {"on_update": on_update, "stop": stop, "mark": mark}
-    return Loop(source, estimator, latency=latency, updates=updates, **asked).run()  # type: ignore[arg-type]
+    known = latency, updates, on_update, stop, mark
+    return Loop(source, estimator, *known).run()
 
 
 class Loop:
@@ -90,7 +90,6 @@ class Loop:
         self,
         source: LiveSource,
         estimator: LiveEstimator,
-        *,
         latency: float = LATENCY,
         updates: float | None = None,
         on_update: OnUpdate | None = None,

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from mirrorskin.engine.integration.inputs import LEAST, MOST
 from mirrorskin.engine.noise import SAMPLES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
-_LOWEST, _HIGHEST = 1e-4, 1e3  # of the typical weight, between which weights count; as `integrate` has it
 _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see slopes.cl
 _PARTS = "squares_x", "squares_y"
 
@@ -62,7 +62,7 @@ class SlopeMaps:
         for _ in range(2 if math.isnan(self.typical) else 1):
             typical = 1.0 if math.isnan(self.typical) else self.typical
             free = math.isnan(self.typical)
-            bounds = (0.0, math.inf) if free else (_LOWEST * typical, _HIGHEST * typical)
+            bounds = (0.0, math.inf) if free else (LEAST * typical, MOST * typical)
             sizes = np.int32(rows), np.int32(columns), least, *map(np.float32, bounds)
             weigh(items, *sizes, given[1], slopes[0], *self._parts, *weights, moved=24 * pixels)
             if free:

@@ -153,7 +153,7 @@ class EmulatedRig:
     def where(self, at: float) -> Position:
         """Tell where the body truly is at a time of `time.monotonic`."""
         at_machine = self.machine.position(at)
-        return Position(**{name: _value(axis, at_machine[axis.letter]) for name, axis in self._axes.items()})
+        return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
 
     def twin(self, movement: Movement) -> Twin:
         """Make the same scene as a twin that is rendered directly; its references are `references`."""
@@ -217,9 +217,3 @@ def _axes(home: bool) -> dict[str, Axis]:
         "pitch": Axis("X", 1, middle, -TILT, TILT, _SPEEDS["tilt"], "deg"),
         "roll": Axis("Y", 1, middle, -TILT, TILT, _SPEEDS["tilt"], "deg"),
     }
-
-
-def _value(axis: Axis, coordinate: float) -> float:
-    """Return the travel or the angle at a coordinate of the machine."""
-    value = axis.direction * (coordinate - axis.zero)
-    return math.radians(value) if axis.unit == "deg" else value

@@ -87,7 +87,7 @@ def _text(settings: RigSettings) -> str:
 
 def _axis(axis: Axis) -> dict[str, object]:
     """Tell an axis in its own unit."""
-    scale = math.degrees(1.0) if axis.unit == "deg" else 1.0
+    scale = axis.scale
     return {
         "letter": axis.letter,
         "direction": axis.direction,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from mirrorskin.hw.settings import Axis, StageSettings
+from mirrorskin.hw.settings import StageSettings
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
@@ -54,22 +54,16 @@ class Axes:
     def machine(self, place: Position) -> dict[str, float]:
         """Return the machine's coordinates of a place, by letter: zero + direction * value."""
         return {
-            axis.letter: axis.zero + axis.direction * float(getattr(place, motion)) * _scale(axis)
-            for motion, axis in self._axes.items()
+            axis.letter: axis.coordinate(float(getattr(place, motion))) for motion, axis in self._axes.items()
         }
 
     def place(self, machine: Mapping[str, float]) -> Position:
         """Return the place of machine coordinates; KeyError if they lack an axis."""
-        return Position(
-            **{
-                motion: axis.direction * (machine[axis.letter] - axis.zero) / _scale(axis) + 0.0
-                for motion, axis in self._axes.items()
-            }
-        )
+        return Position(**{motion: axis.value(machine[axis.letter]) for motion, axis in self._axes.items()})
 
     def limit(self, motion: str, rate: float) -> None:
         """Lower the greatest speed of a motion to what the controller allows, machine units a second."""
-        self.speeds[motion] = min(self.speeds[motion], rate / _scale(self._axes[motion]))
+        self.speeds[motion] = min(self.speeds[motion], rate / self._axes[motion].scale)
 
     def apart(self, one: Position, other: Position) -> float:
         """Return by how much two places differ in the axis where they differ most, machine units."""
@@ -123,7 +117,7 @@ class Axes:
         """
         plane, sense = self._plane()
         self._check_rate(tilt, turns, rate)
-        radius = tilt * _scale(self._axes["pitch"])
+        radius = tilt * self._axes["pitch"].scale
         feed = self._feed(math.tau * rate * radius)
         count = max(1, math.ceil(2 * abs(turns) - _EVEN))
         step = math.tau * turns / count
@@ -209,11 +203,6 @@ class Axes:
                 f"{speed * 60:.4g} was asked for; go faster, or in steps"
             )
         return f"F{speed * 60:.4f}"
-
-
-def _scale(axis: Axis) -> float:
-    """Return the machine's units in one mm or rad."""
-    return math.degrees(1.0) if axis.unit == "deg" else 1.0
 
 
 def _words(values: Mapping[str, float]) -> str:

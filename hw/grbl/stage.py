@@ -89,13 +89,18 @@ class GrblStage(Closing):
         return self._controller.settings
 
     @property
+    def homes(self) -> bool:
+        """Whether the controller's homing is switched on."""
+        return self._controller.on(22)
+
+    @property
     def round_trip(self) -> float:
         """Seconds from a question for a report to its answer, of late; NaN before the first."""
         return self._link.round_trip
 
     def home(self) -> None:
         """Find the axes' switches; see `Stage.home`."""
-        if not self._controller.on(22):
+        if not self.homes:
             raise InputError(
                 f"{self.name}: homing is switched off; set $22=1, or home = false in the rig file"
             )

@@ -28,7 +28,6 @@ _STALL_PERIODS = 3
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
 _JOIN = 5.0
-_HOMING = 22  # the number of GRBL's setting
 
 
 class Move:
@@ -300,7 +299,7 @@ def open_rig(settings: RigSettings) -> Rig:
 
 def _check_homing(stage: GrblStage) -> None:
     """Refuse a stage that is never where it says, because its homing is switched off."""
-    if not int(stage.parameters.get(_HOMING, 0)) & 1:
+    if not stage.homes:
         raise InputError(
             f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or home = false"
         )

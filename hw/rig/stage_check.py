@@ -129,7 +129,7 @@ def _speed(name: str, axis: Axis, told: Mapping[int, float]) -> Finding:
 
 def unit_of(axis: Axis) -> tuple[str, float]:
     """Return an axis's unit in the file, and how many of it make one of ours (mm or rad)."""
-    return axis.unit, 1.0 if axis.unit == "mm" else math.degrees(1.0)
+    return axis.unit, axis.scale
 
 
 def _told(value: float | None, unit: str) -> str:
