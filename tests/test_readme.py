@@ -1,5 +1,6 @@
 """Every mirrorskin command of the README runs as it stands there; demo and rig with fewer pixels."""
 
+import contextlib
 import re
 import shlex
 import signal
@@ -21,6 +22,14 @@ PYTHON = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("mirrorskin ")]
 SUPPORT = Path(__file__).parent / "support"
 SERVERS = []
+OF_THEIR_OWN = (
+    "demo",
+    "batch",
+    "bench",
+    "rig",
+    "capture",
+    "live",
+)  # in processes, which they start or end
 TRIES = 3  # of what a machine may be too busy for to emulate in time
 RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); import commands; commands.main_with_a_small_demo()"
 
@@ -56,13 +65,18 @@ def test_a_command_of_the_readme_runs(desk, line):
     if words[-1] == "&":
         serve(desk, words[:-1])
         return
+    if words[0] not in OF_THEIR_OWN:
+        with contextlib.chdir(desk):
+            ended = run(*words)
+        assert ended.code == 0, ended.said
+        return
     for _ in range(TRIES):
-        run = subprocess.run(
+        done = subprocess.run(
             [sys.executable, "-c", RUN, str(SUPPORT), *words], cwd=desk, capture_output=True, text=True
         )
-        if run.returncode == 0 or not starved(run.stderr):
+        if done.returncode == 0 or not starved(done.stderr):
             break
-    assert run.returncode == 0, run.stderr
+    assert done.returncode == 0, done.stderr
 
 
 def serve(desk, words):

@@ -1,12 +1,11 @@
 """``mirrorskin reconstruct --method change-point``, as a user runs it."""
 
 import json
-import subprocess
-import sys
 
 import h5py
 import numpy as np
 import pytest
+from commands import run
 
 from mirrorskin import io
 
@@ -14,26 +13,31 @@ FRAMES = np.full((20, 5, 7), 20, np.uint8)
 FRAMES[8:, :, 1:] = 200
 
 
-def run(*words, cwd):
-    command = [sys.executable, "-m", "mirrorskin.cli.main", "reconstruct", "press.h5", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
-
-
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with h5py.File(tmp_path / "press.h5", "w") as file:
         file["frames"] = FRAMES
     return tmp_path
 
 
-GIVEN = ["--motion", "vertical", "--travel-step", "0.1mm", "--method", "change-point"]
+GIVEN = [
+    "reconstruct",
+    "press.h5",
+    "--motion",
+    "vertical",
+    "--travel-step",
+    "0.1mm",
+    "--method",
+    "change-point",
+]
 
 
 @pytest.mark.parametrize("levels", [["--dark", 20, "--bright", 200], ["--dark", 20], []])
 def test_the_method_reaches_the_engine(folder, levels):
-    done = run(*GIVEN, *levels, "--json", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+    done = run(*GIVEN, *levels, "--json")
+    assert done.code == 0, done.said
+    told = json.loads(done.out)
     assert told["process"]["method"] == "change-point"
     kernels = {record["name"] for record in told["profile"]}
     passes = {"changepoint_scan"} if len(levels) == 4 else {"changepoint_sum", "changepoint_split"}
@@ -53,7 +57,7 @@ def test_the_method_reaches_the_engine(folder, levels):
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(folder, words, said):
-    done = run(*GIVEN, *words, cwd=folder)
-    assert done.returncode == 2
-    assert said in done.stderr
+    done = run(*GIVEN, *words)
+    assert done.code == 2
+    assert said in done.said
     assert not (folder / "press-result.h5").exists()

@@ -1,5 +1,6 @@
 """The commands, run as a user runs them."""
 
+import contextlib
 import json
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from commands import run
 
 from mirrorskin import io
 
@@ -16,14 +18,10 @@ SMALL = ["--size", "70x60", "--pixel-size", "0.15mm"]
 
 
 def mirrorskin(*words, cwd=None):
-    run = subprocess.run(
-        [sys.executable, "-m", "mirrorskin.cli.main", *map(str, words)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-    )
-    assert run.returncode == 0, run.stderr
-    return run.stdout
+    with contextlib.chdir(cwd or "."):
+        ended = run(*words)
+    assert ended.code == 0, ended.said
+    return ended.out
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +46,9 @@ def help_of(*words):
         f"heavy = {HEAVY} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    return run.stdout
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_help_imports_nothing_heavy():
@@ -167,12 +165,11 @@ def test_what_is_given_is_used(folder, words, name, value):
     ],
 )
 def test_a_wrong_call_is_one_line(tmp_path, words, said):
-    run = subprocess.run(
-        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert run.returncode == 2
-    assert said in run.stderr
-    assert run.stderr.count("\n") == 1
+    with contextlib.chdir(tmp_path):
+        ended = run(*words)
+    assert ended.code == 2
+    assert said in ended.said
+    assert ended.said.count("\n") == 1
 
 
 def test_debug_shows_where_and_keeps_the_exit_code(tmp_path):
@@ -229,20 +226,18 @@ def test_an_import_does_not_overwrite_its_own_pictures(tmp_path):
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"frame{number}.png"), np.full((8, 9), 9, np.uint8))
     words = ["import", ".", "-o", "frame1.png", "--motion", "vertical", "--travel-step", "1mm"]
-    run = subprocess.run(
-        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert run.returncode == 2
-    assert "is the input" in run.stderr
+    with contextlib.chdir(tmp_path):
+        ended = run(*words)
+    assert ended.code == 2
+    assert "is the input" in ended.said
 
 
 def test_an_import_names_what_it_left_out(tmp_path):
     for name in ("frame0", "frame1", "ambient"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((8, 9), 9, np.uint8))
     words = ["import", ".", "-o", "press.h5", "--motion", "vertical", "--travel-step", "1mm"]
-    run = subprocess.run(
-        [sys.executable, "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert run.returncode == 0
-    assert run.stderr.splitlines() == ["left out: ambient.png"]
-    assert run.stdout == "press.h5: 2 frames of 9 x 8, uint8, vertical motion\n"
+    with contextlib.chdir(tmp_path):
+        ended = run(*words)
+    assert ended.code == 0
+    assert ended.said.splitlines() == ["left out: ambient.png"]
+    assert ended.out == "press.h5: 2 frames of 9 x 8, uint8, vertical motion\n"

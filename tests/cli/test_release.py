@@ -1,11 +1,11 @@
 """A press and its release, from the twin to the score, as a user runs them."""
 
+import contextlib
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from commands import run
 
 from mirrorskin import io
 
@@ -13,10 +13,10 @@ SMALL = ["--size", "70x60", "--pixel-size", "0.15mm"]
 
 
 def mirrorskin(*words, cwd):
-    command = [sys.executable, "-m", "mirrorskin.cli.main", *map(str, words)]
-    run = subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
-    assert run.returncode == 0, run.stderr
-    return run.stdout
+    with contextlib.chdir(cwd):
+        ended = run(*words)
+    assert ended.code == 0, ended.said
+    return ended.out
 
 
 @pytest.fixture(scope="module")
