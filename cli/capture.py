@@ -32,6 +32,7 @@ def command(
     rate: scans.Rate = None,
     settle: scans.Settle = None,
     frames: scans.StepFrames = None,
+    calibration: options.Calibration = None,
     compression: options.Compression = options.CompressionName.raw,
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
@@ -42,11 +43,12 @@ def command(
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context.params, settings)  # from the options above
-    io.check_output(output, rig_file)
+    io.check_output(output, rig_file, calibration)
+    known = scans.open_calibration(calibration, settings)
     with open_rig(settings) as rig:
         # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
         scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
-        recorder = io.StreamRecorder(scan, output, compression.value)
+        recorder = io.StreamRecorder(scan, output, compression.value, calibration=known)
         with scans.kept(recorder):
             _drain(recorder)
         typer.echo(f"{output}: {_summary(scan)}")

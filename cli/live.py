@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.live import LivePress, LiveRotation, Loop
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.settings import RigSettings
-    from mirrorskin.io import LiveSource, Result
+    from mirrorskin.io import Calibration, LiveSource, Result
 
 _LATENCY = "100ms"
 _THRESHOLD, _HOLD = 0.5, 2
@@ -42,6 +42,7 @@ class _Wanted:
     hold: int | None
     noise: float | None
     device: str | None
+    calibration: Calibration | None
 
 
 def command(
@@ -90,6 +91,7 @@ def command(
     rate: scans.Rate = None,
     settle: scans.Settle = None,
     frames: scans.StepFrames = None,
+    calibration: options.Calibration = None,
     device: options.Device = None,
 ) -> None:
     """Reconstruct while the stage moves; Ctrl-C stops it, and what was found and recorded is kept."""
@@ -99,11 +101,12 @@ def command(
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context.params, settings)  # from the options above
-    for path, others in ((record, (rig_file,)), (output, (rig_file, record))):
+    for path, others in ((record, ()), (output, (record,))):
         if path is not None:
-            io.check_output(path, *others)
+            io.check_output(path, rig_file, calibration, *others)
+    known = scans.open_calibration(calibration, settings)
     asked = _Wanted(
-        record, settle, frames, window, duration(latency, "--latency"), threshold, hold, noise, device
+        record, settle, frames, window, duration(latency, "--latency"), threshold, hold, noise, device, known
     )
     _run(settings, plan, asked, output, view)
 
@@ -157,15 +160,18 @@ class _Live:
         from mirrorskin.cli.status import show_status
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
-        from mirrorskin.io import StreamRecorder
+        from mirrorskin.io import Calibrated, StreamRecorder
 
         with ExitStack() as stack:
             rig = stack.enter_context(open_rig(settings))
             scan = scans.make_scan(rig, plan, asked.settle, asked.frames)
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())
-            recorder = None if asked.record is None else StreamRecorder(scan, asked.record)
+            known = asked.calibration
+            recorder = None if asked.record is None else StreamRecorder(scan, asked.record, calibration=known)
             source: LiveSource = scan if recorder is None else recorder
+            if known is not None:
+                source = Calibrated(source, known)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
             estimator = _estimator(source, plan, rig.rate, asked)

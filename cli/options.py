@@ -65,6 +65,10 @@ Frames = Annotated[
     str | None, typer.Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")
 ]
 Dataset = Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(metavar="CAL.h5", help="What is known of the sensor; see docs/calibration.md."),
+]
 Memory = Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]
 NewRecording = Annotated[Path, typer.Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]

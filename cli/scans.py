@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig.steps import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
     from mirrorskin.hw.settings import RigSettings
-    from mirrorskin.io import StreamRecorder
+    from mirrorskin.io import Calibration, StreamRecorder
 
 SETTLE = "100ms"
 """From rest to the first exposure of a step."""
@@ -127,6 +127,17 @@ def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
     for name, value in (("--settle", settle), ("--frames", frames)):
         if value is not None and not plan.in_steps:
             raise InputError(f"{name} says nothing of a motion without a halt: leave it out, or give a step")
+
+
+def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | None:
+    """Open a calibration, if there is one, and refuse that of another camera before anything moves."""
+    from mirrorskin import io
+
+    if path is None:
+        return None
+    calibration, camera = io.open_calibration(path), settings.camera
+    io.check_camera(calibration, io.CameraId(camera.name, camera.shape, camera.dtype), settings.name)
+    return calibration
 
 
 @contextmanager

@@ -137,6 +137,8 @@ class CameraSettings:
         Counts per radian of zenith.
     zenith_offset : float or None
         Counts at zenith 0.
+    name : str
+        What it is called in recordings, and by which calibrations know it.
     """
 
     source: int | str
@@ -152,6 +154,7 @@ class CameraSettings:
     bright: float | Path | None = None
     zenith_gain: float | None = None
     zenith_offset: float | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.calibration.file import open_calibration
+from mirrorskin.io.calibration.layout import MARK as CALIBRATION_MARK
+from mirrorskin.io.calibration.types import GROUPS, Calibration
+from mirrorskin.io.calibration.words import words_of
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, TRUTH_UNITS
 from mirrorskin.io.recording import Recording, open_recording
@@ -16,7 +20,7 @@ from mirrorskin.io.types import Result
 
 
 def describe(path: str | Path) -> dict[str, str]:
-    """Tell what an HDF5 file holds: a recording, a result, or someone else's stacks.
+    """Tell what an HDF5 file holds: a recording, a result, a calibration, or someone else's stacks.
 
     Returns
     -------
@@ -31,7 +35,10 @@ def describe(path: str | Path) -> dict[str, str]:
     path = Path(path)
     with Hdf5File(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
-        stacks = {} if ours or result else file.stacks()
+        calibration = file.marked(CALIBRATION_MARK)
+        stacks = {} if ours or result or calibration else file.stacks()
+    if calibration:
+        return {"kind": "calibration", **_calibration(open_calibration(path))}
     if ours:
         with open_recording(path) as recording:
             return _recording(recording)
@@ -71,6 +78,9 @@ def _recording(recording: Recording) -> dict[str, str]:
     if recording.motion == "axial":
         facts["zenith gain"] = _counts(header.zenith_gain, "counts/rad")
         facts["zenith offset"] = _counts(header.zenith_offset, "counts")
+    if header.camera:
+        facts["camera"] = header.camera
+    facts |= _carried(recording.carried)
     for name in ("dark", "bright"):
         facts[f"{name} reference"] = _counts(getattr(header, name), "counts")
     truth = recording.truth
@@ -104,4 +114,26 @@ def _result(result: Result) -> dict[str, str]:
     if result.offset_unknown is not None:
         count, unknown = result.offset_unknown.size, np.count_nonzero(result.offset_unknown)
         facts["components"] = f"{count}, of which {unknown} have an unknown offset"
-    return {**facts, **{name: str(value) for name, value in result.process.items()}}
+    facts |= {name: str(value) for name, value in result.process.items()}
+    return facts | _carried(result.calibration)
+
+
+def _carried(calibration: Calibration | None) -> dict[str, str]:
+    """Tell of a copy in a line."""
+    if calibration is None:
+        return {}
+    return {"carried calibration": f"{calibration.contents} of camera {calibration.camera}"}
+
+
+def _calibration(calibration: Calibration) -> dict[str, str]:
+    facts = {"camera": str(calibration.camera)}
+    for name in GROUPS:
+        part = calibration.parts().get(name)
+        if part is None:
+            facts[GROUPS[name]] = "none"
+        else:
+            facts |= {f"{GROUPS[name]}.{field}": said for field, said in words_of(part).items()}
+    return facts | {
+        name: f"{value:.4g}" if isinstance(value, float) else str(value)
+        for name, value in calibration.process.items()
+    }

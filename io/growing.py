@@ -14,6 +14,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.calibration.layout import CARRIED, size_of, write_calibration
+from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.columns import Column, Marks
 from mirrorskin.io.layout import DROPPED, LIVE, SERIES, STATE, UNDER_WAY, USED
 from mirrorskin.io.reserve import Reserve
@@ -42,6 +44,8 @@ class GrowingRecording(Closing):
         Frames that are expected, rows and columns.
     dtype : dtype
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
+    calibration : Calibration, optional
+        What it carries a copy of.
 
     Attributes
     ----------
@@ -62,6 +66,7 @@ class GrowingRecording(Closing):
         shape: tuple[int, int, int],
         dtype: np.dtype[Any],
         compression: Compression,
+        calibration: Calibration | None = None,
     ) -> None:
         self.count = 0
         self._raw = compression == "raw"
@@ -74,10 +79,13 @@ class GrowingRecording(Closing):
             opening.callback(os.close, self._descriptor)
             self._reserve = Reserve(path, self._descriptor, min(_STEP, shape[0] * self._frame))
             room = self._spare + 32 * math.prod(shape[1:])  # for the maps of the header, too
+            room += 0 if calibration is None else size_of(calibration)
             self._reserve.hold(room)
             self._file = opening.enter_context(_new_hdf5(self._descriptor, meta, self._frame))
             self._reserve.hold(room)  # once more: HDF5 has emptied the file
             write_header(self._file, header)
+            if calibration is not None:
+                write_calibration(self._file, calibration, CARRIED)
             self._make(shape, dtype, compression, POSITIONS[header.motion])
             write_plot(self._file, header.motion, {"time", POSITIONS[header.motion]})
             self._file.flush()  # all but the frames has its place now

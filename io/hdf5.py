@@ -90,11 +90,17 @@ class Hdf5File(Closing):
         with plainly(f"{self.path}: {group}"):
             return list(node) if isinstance(node, h5py.Group) else []
 
-    def marked(self, mark: str) -> bool:
-        """Tell whether a file is one of ours: whether its entry has a certain attribute."""
-        entry = self.find("/entry")
-        with plainly(f"{self.path}: /entry"):
+    def marked(self, mark: str, group: str = "/entry") -> bool:
+        """Tell whether a file is one of ours: whether its entry, or that group, has a certain attribute."""
+        entry = self.find(group)
+        with plainly(f"{self.path}: {group}"):
             return isinstance(entry, h5py.Group) and mark in entry.attrs
+
+    def attribute(self, name: str, attribute: str) -> Any:
+        """Return an attribute, a text or a number, of an object; None where it has none."""
+        node = self.find(name)
+        with plainly(f"{self.path}: {name}"):
+            return None if node is None else _first(node.attrs.get(attribute))
 
     def stacks(self) -> dict[str, str]:
         """Return the three-dimensional datasets that the file itself holds: their names, sizes and types."""
@@ -162,6 +168,13 @@ class Hdf5File(Closing):
                     f"{self.where(node)} does not hold one value: write one text or number there"
                 )
             return _first(_values(node.id))
+
+    def texts(self, node: Node, remedy: str) -> tuple[str, ...]:
+        """Read a list of texts."""
+        with plainly(lambda: self.where(node)):
+            if not isinstance(node, h5py.Dataset) or node.ndim != 1 or node.dtype.kind not in "SO":
+                raise InputError(f"{self.where(node)} holds no list of texts: {remedy}")
+            return tuple(str(_first(text)) for text in _values(node.id))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
         """Do what ``find`` does, from any object on and after so many links."""

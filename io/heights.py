@@ -12,7 +12,7 @@ from mirrorskin.io.layout import MARK
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result
-from mirrorskin.io.types import InputError, Result
+from mirrorskin.io.types import UNDISTORTED, InputError, Result
 
 
 def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[np.float32]:
@@ -42,6 +42,11 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
             height, part = None if recording.truth is None else recording.truth.height, None
     else:
         result = open_result(path)
+        if result.process.get(UNDISTORTED):
+            remedy = "give one that was made without a scale in its calibration"
+            raise InputError(
+                f"{path} holds undistorted heights, and frames are as the camera saw them: {remedy}"
+            )
         height = _absolute(result)
         part = part_of(result.process)
     if height is None:

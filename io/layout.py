@@ -131,6 +131,7 @@ class Layout:
             pivot=self._pivot(pixel_size),
             zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
+            camera=self._text(f"{DETECTOR}/local_name"),
         )
 
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
+from mirrorskin.io.calibration.layout import CARRIED, write_calibration
+from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import SERIES, TRUTH, TRUTH_UNITS
 from mirrorskin.io.types import Block, Floats, InputError, Source, Truth
 from mirrorskin.io.writing import (
@@ -43,6 +45,8 @@ class Recorder:
         Raw frames are stored in one piece, which is the fastest to read; the others in one chunk a frame.
     truth : Truth or callable, optional
         What a simulation knows; a callable is asked for it after the last frame.
+    calibration : Calibration, optional
+        What the recording is to carry a copy of; positions and references stay those of the source.
 
     Attributes
     ----------
@@ -58,6 +62,7 @@ class Recorder:
         path: str | Path,
         compression: Compression = "raw",
         truth: Truth | Callable[[], Truth] | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         check_compression(compression)
         self.source = source
@@ -66,6 +71,7 @@ class Recorder:
         self.shape, self.dtype = source.shape, source.dtype
         self._compression = compression
         self._truth = truth
+        self._calibration = calibration
         self._count = 0
         self._series: dict[str, Floats] = {}
         self._exit = ExitStack()
@@ -76,6 +82,8 @@ class Recorder:
             opening.push(self._finish)
             opening.enter_context(self.source)
             write_header(self._new.root, self.header)
+            if self._calibration is not None:
+                write_calibration(self._new.root, self._calibration, CARRIED)
             chunks = None if self._compression == "raw" else (1, *self.shape[1:])
             storage = {"chunks": chunks, **packing(self._compression)}
             self._frames = new_stack(self._new.root, self.shape, self.dtype, **storage)

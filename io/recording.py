@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.calibration.reading import carried_by
+from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, STACK, Layout, Taken, how_taken
@@ -154,6 +157,11 @@ class Recording(Closing):
             The file was changed, or another took its name, after it was opened.
         """
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
+
+    @functools.cached_property
+    def carried(self) -> Calibration | None:
+        """The calibration that it carries a copy of, of the whole picture; not applied to anything here."""
+        return carried_by(self._file)
 
     @property
     def how(self) -> str:

@@ -6,16 +6,19 @@ from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import MAKE_ROOM, new_file, new_hdf5
+from mirrorskin.io.calibration.layout import CARRIED, datasets_of, groups_of
+from mirrorskin.io.calibration.reading import carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.mould import Mould
-from mirrorskin.io.plain import legible, plainly
+from mirrorskin.io.parts import Part, parts_of_process, read_process, write_part
+from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"
@@ -35,14 +38,6 @@ _RESULT, _PROCESS = "/entry/result", "/entry/process"
 _AGAIN = "reconstruct it again"
 
 
-class _Part(NamedTuple):
-    """A dataset of a result: its name, what it holds, and how that is to be read."""
-
-    name: str
-    values: NDArray[Any]
-    attributes: Mapping[str, str]
-
-
 # Of the forms of results that were written last.
 _moulds: dict[Hashable, Mould] = {}
 _MOST_MOULDS = 8
@@ -57,7 +52,11 @@ def save_result(result: Result, path: str | Path) -> None:
         It cannot be written there.
     """
     path, maps = Path(path), result.maps()
-    parts = [*_parts_of_maps(result, maps), *_parts_of_process(result)]
+    parts = [*_parts_of_maps(result, maps), *parts_of_process(_PROCESS, result.process)]
+    carried = {}
+    if result.calibration is not None:
+        parts += datasets_of(result.calibration, CARRIED)
+        carried = groups_of(result.calibration, CARRIED)
     values = [part.values for part in parts]
     form = tuple((part.name, part.values.dtype.str, part.values.shape) for part in parts)
     mould = _moulds.get(form)
@@ -66,7 +65,7 @@ def save_result(result: Result, path: str | Path) -> None:
             mould.pour(descriptor, values)
         return
     with new_hdf5(path) as new:
-        _write(new.root, parts, _plot_of(result, maps))
+        _write(new.root, parts, _plot_of(result, maps), carried)
         places = [(new.root[part.name].id.get_offset() or 0, part.values.nbytes) for part in parts]
         new.close()
         new.check()
@@ -75,37 +74,33 @@ def save_result(result: Result, path: str | Path) -> None:
         _moulds[form] = Mould.of(new.descriptor, places)
 
 
-def _write(file: h5py.File, parts: Iterable[_Part], plot: Mapping[str, Any]) -> None:
-    """Write a result's parts, and what a viewer should plot of them unasked."""
+def _write(
+    file: h5py.File,
+    parts: Iterable[Part],
+    plot: Mapping[str, Any],
+    more: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Write a result's parts, what a viewer should plot of them unasked, and more groups for them."""
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = file.create_group("entry")
     entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
     entry.create_group("result").attrs.update(NX_class="NXdata", **plot)
     entry.create_group("process").attrs["NX_class"] = "NXprocess"
+    for name, attributes in more.items():
+        file.create_group(name).attrs.update(attributes)
     for part in parts:
-        # In a piece, so that it lies there as it is in memory.
-        file.create_dataset(part.name, data=part.values).attrs.update(part.attributes)
+        write_part(file, part)
 
 
-def _parts_of_maps(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[_Part]:
+def _parts_of_maps(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Part]:
     """Yield the maps, and what is known of a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
         said = {} if name == _VECTORS else {"interpretation": "image"}
-        yield _Part(f"{_RESULT}/{name}", values, said | ({"units": _UNITS[name]} if name in _UNITS else {}))
+        yield Part(f"{_RESULT}/{name}", values, said | ({"units": _UNITS[name]} if name in _UNITS else {}))
     if result.offset_unknown is not None:
-        yield _Part(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+        yield Part(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
     for name, positions in _axes_of(result, maps).items():
-        yield _Part(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
-
-
-def _parts_of_process(result: Result) -> Iterator[_Part]:
-    """Yield how it came about; texts as bytes, whose number is known."""
-    for name, value in result.process.items():
-        if isinstance(value, str):
-            text = legible(value).encode() or b"\0"
-            yield _Part(f"{_PROCESS}/{name}", np.array(text, h5py.string_dtype("utf-8", len(text))), {})
-        else:
-            yield _Part(f"{_PROCESS}/{name}", np.asarray(value), {})
+        yield Part(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 
 
 def _axes_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -150,7 +145,7 @@ def open_result(path: str | Path) -> Result:
             for name, (node, shape) in _find_maps(file).items()
         }
         maps |= _read_offsets(file, maps.get("component"))
-        return Result(**maps, process=_read_process(file, file.names(_PROCESS)))
+        return Result(**maps, process=read_process(file, _PROCESS), calibration=carried_by(file))
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
@@ -162,7 +157,7 @@ def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
         for node, shape in _find_maps(file).values():
             if getattr(node, "shape", None) != shape:
                 raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
-        return _read_process(file, names or file.names(_PROCESS))
+        return read_process(file, _PROCESS, names or None)
 
 
 @contextmanager
@@ -171,12 +166,6 @@ def _opened(path: Path) -> Iterator[Hdf5File]:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
         yield file
-
-
-def _read_process(file: Hdf5File, names: Iterable[str]) -> dict[str, ProcessValue]:
-    group = file.find(_PROCESS)
-    found = {} if group is None else {name: file.walk(group, name) for name in names}
-    return {name: file.value(node) for name, node in found.items() if node is not None}
 
 
 def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:

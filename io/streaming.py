@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import MAKE_ROOM, check_output, new_file
+from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.growing import GrowingRecording
 from mirrorskin.io.layout import COMPLETE, CUT_SHORT
 from mirrorskin.io.plain import plainly
@@ -62,6 +63,8 @@ class StreamRecorder:
         Frames are stored in one chunk each.
     period : float, optional
         Seconds.
+    calibration : Calibration, optional
+        What the recording is to carry a copy of; positions and references stay those of the source.
 
     Attributes
     ----------
@@ -79,6 +82,7 @@ class StreamRecorder:
         path: str | Path,
         compression: Compression = "raw",
         period: float = 0.5,
+        calibration: Calibration | None = None,
     ) -> None:
         check_compression(compression)
         self.source = source
@@ -87,6 +91,7 @@ class StreamRecorder:
         self.count = self.written = 0
         self._compression: Compression = compression
         self._period = period
+        self._calibration = calibration
         self._queue: queue.SimpleQueue[Block | _Mark | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
@@ -216,7 +221,7 @@ class StreamRecorder:
             return None
         with ExitStack() as opening:
             with new_file(self.path) as descriptor:
-                known = self.header, self.shape, self.dtype, self._compression
+                known = self.header, self.shape, self.dtype, self._compression, self._calibration
                 file = opening.enter_context(GrowingRecording(self.path, descriptor, *known))
                 self._append(file, block)
                 file.publish()

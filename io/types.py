@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mirrorskin.io.calibration.types import Calibration
 
 Motion = Literal["vertical", "axial", "horizontal", "twist"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
@@ -86,6 +89,8 @@ class Header:
         Point that the body turns about, mm, from the rest sheet's centre, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
+    camera : str
+        What the camera is called; empty where that is not told.
     """
 
     motion: Motion
@@ -99,6 +104,7 @@ class Header:
     pivot: tuple[float, float, float] | None = None
     zenith_gain: Floats | None = None
     zenith_offset: Floats | None = None
+    camera: str = ""
 
 
 class Closing:
@@ -242,6 +248,8 @@ class Result:
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
     process : mapping
         Program, version, date, every parameter, device, source and its hash.
+    calibration : Calibration or None
+        That with which it was made, of the camera's whole picture.
     """
 
     height: NDArray[np.float32] | None = None
@@ -264,6 +272,7 @@ class Result:
     x: Floats | None = None
     y: Floats | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
+    calibration: Calibration | None = None
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps that were computed, by name."""
@@ -271,8 +280,11 @@ class Result:
         return {name: value for name, value in values.items() if value is not None}
 
 
-NO_MAPS = ("offset_unknown", "x", "y", "process")
+NO_MAPS = ("offset_unknown", "x", "y", "process", "calibration")
 """What a result has besides maps."""
+
+UNDISTORTED = "undistorted"
+"""What the process of a result says once its maps lie on the sheet, and no longer in the camera's pixels."""
 
 
 def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:

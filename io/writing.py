@@ -52,6 +52,7 @@ def write_header(file: h5py.File, header: Header) -> None:
     detector = new_group(instrument, "detector", "NXdetector")
     stage = new_group(instrument, "stage", "NXpositioner")
     stage["motion"] = header.motion
+    put(detector, "local_name", None, legible(header.camera) or None)
     x, y = header.pixel_size or (None, None)
     put(detector, "x_pixel_size", "mm", x)
     put(detector, "y_pixel_size", "mm", y)

@@ -206,6 +206,7 @@ class EmulatedRig:
             bright=self._levels.bright,
             zenith_gain=gain,
             zenith_offset=offset,
+            name=header.camera,
         )
 
 

@@ -66,6 +66,7 @@ def _text(settings: RigSettings) -> str:
         },
         **{f"stage.{name}": _axis(axis) for name, axis in stage.axes.items()},
         "camera": {
+            "name": camera.name,
             "source": camera.source,
             "size": camera.shape[::-1],
             "dtype": camera.dtype.name,

@@ -19,6 +19,7 @@ from mirrorskin.io.types import FRAME_DTYPES
 
 _TILTS = ("pitch", "roll")
 _STEEPEST = 90.0  # degrees
+_USER = re.compile("//[^/]*@")
 
 
 def load_rig(path: Path | str) -> RigSettings:
@@ -136,6 +137,8 @@ def _camera(said: Any, path: Path) -> CameraSettings:
         if isinstance(values[name], str):
             values[name] = path.parent / values[name]
     source = values.pop("source")
+    if values["name"] is None:
+        values["name"] = _USER.sub("//", str(source))  # without the password of a stream
     if isinstance(source, str) and "://" not in source:
         source = _beside(path, source)
     return CameraSettings(source=source, shape=(rows, columns), **values)
@@ -225,6 +228,7 @@ KEYS: Mapping[str, Mapping[str, Key]] = {
     "camera": {
         "source": Key(_source, "0"),
         "size": Key(several(2, "columns and rows", whole("each", 1, 65535)), "[640, 480]"),
+        "name": Key(text("what the camera is called"), '"left"', None),
         "dtype": Key(_dtype, '"uint8"', np.dtype(np.uint8)),
         "fourcc": Key(_fourcc, '"GREY"', None),
         "exposure": Key(number("a time above 0, in seconds,", _is_positive), "0.004", None),

@@ -191,6 +191,7 @@ class Scan(Closing):
             pixel_size=camera.pixel_size,
             zenith_gain=_scalar(camera.zenith_gain),
             zenith_offset=_scalar(camera.zenith_offset),
+            camera=camera.name,
         )
         if isinstance(self.plan, AxialPlan):
             return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)

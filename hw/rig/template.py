@@ -42,6 +42,7 @@ speed = 20.0
 [camera]
 source = 0                      # a camera's number, or a file or URL in quotes
 size = [640, 480]               # columns, rows
+# name = "left"                 # what recordings and calibrations call it; without it, the source
 # dtype = "uint8"
 # fourcc = "GREY"
 # exposure = 0.004              # s

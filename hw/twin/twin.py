@@ -30,6 +30,7 @@ CONTACTS: tuple[ContactName, ...] = get_args(ContactName)
 OpticsName = Literal["ideal", "cylinder"]
 OPTICS: tuple[OpticsName, ...] = get_args(OpticsName)
 
+_CAMERA = "twin"
 _PIXELS_MAX = 200_000_000
 _MEMORY = 512_000_000  # bytes of light that a movement may keep
 _REACH_POSES = 16  # that tell how far an object reaches
@@ -151,6 +152,7 @@ class Twin(Closing):
             bright=bright,
             zenith_gain=gain,
             zenith_offset=offset,
+            camera=_CAMERA,
         )
 
     @functools.cached_property

@@ -58,6 +58,7 @@ speed = 45
 [camera]
 source = "http://localhost:8000/video"
 size = [64, 48]
+name = "left"
 dtype = "uint16"
 fourcc = "Y16"
 exposure = 0.004
@@ -144,6 +145,7 @@ def test_every_key_arrives_in_millimetres_radians_and_seconds(rig):
         bright=4000.5,
         zenith_gain=pytest.approx(5.7 / degree),
         zenith_offset=10.0,
+        name="left",
     )
 
 
@@ -162,7 +164,20 @@ def test_what_is_not_said_has_its_default(rig):
         press=2.0,
         pivot=None,
     )
-    assert found.camera == CameraSettings(source=0, shape=(3, 4), dtype=np.dtype(np.uint8))
+    assert found.camera == CameraSettings(source=0, shape=(3, 4), dtype=np.dtype(np.uint8), name="0")
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ('"/dev/video2"', "/dev/video2"),
+        ('"rtsp://me:a:secret@10.0.0.7/left"', "rtsp://10.0.0.7/left"),
+        ('"rtsp://10.0.0.7/left@2"', "rtsp://10.0.0.7/left@2"),
+    ],
+)
+def test_a_camera_without_a_name_is_called_as_its_source_without_a_password(rig, source, name):
+    found = rig(LEAST.replace("source = 0", f"source = {source}")).camera
+    assert (found.source, found.name) == (source.strip('"'), name)
 
 
 def test_one_pixel_size_is_of_both_sides(rig):

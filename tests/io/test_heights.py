@@ -48,6 +48,10 @@ def stack(path):
             "holds no heights: give a result of a",
         ),
         (lambda path: record(sphere(), path), "holds no heights: give a result of a press, or a simulation"),
+        (
+            lambda path: io.save_result(io.Result(height=heights(), process={io.UNDISTORTED: True}), path),
+            "holds undistorted heights, and frames are as the camera saw them",
+        ),
         (stack, "is no result: 'mirrorskin reconstruct' makes one from a recording"),
         (nothing, "no such file"),
         (lambda path: path.write_text("-0.1 -0.2"), "is not an HDF5 file"),

@@ -33,6 +33,7 @@ def full_header():
         pivot=(0.1, -0.2, 40.0),
         zenith_gain=np.linspace(50, 60, 35).reshape(5, 7),
         zenith_offset=np.asarray(12.5),
+        camera="left",
     )
 
 
@@ -73,6 +74,7 @@ def test_a_vertical_recording_has_the_layout_of_the_design(tmp_path):
         instrument: {"NX_class": "NXinstrument"},
         f"{instrument}/detector": {"NX_class": "NXdetector"},
         f"{instrument}/detector/data": ((8, 5, 7), "u2", image),
+        f"{instrument}/detector/local_name": ((), "text", {}),
         f"{instrument}/detector/x_pixel_size": ((), "f8", mm),
         f"{instrument}/detector/y_pixel_size": ((), "f8", mm),
         f"{instrument}/detector/frame_time": ((8,), "f8", {"units": "s"}),

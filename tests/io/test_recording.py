@@ -376,6 +376,7 @@ def test_a_recording_is_described(press):
         "storage": "in one piece",
         "pixel size": "0.5 x 0.6 mm, field 3.5 x 3 mm",
         "travel": "0 to 2.1 mm",
+        "camera": "twin",
         "dark reference": "16 counts (median)",
         "bright reference": "224 counts (median)",
         "truth": "height, zenith, azimuth, contact",

@@ -1,0 +1,169 @@
+"""A source as it is with a calibration."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.calibration.fit import check_camera, cropped
+from mirrorskin.io.calibration.sizes import check_sizes
+from mirrorskin.io.calibration.types import Calibration, CameraId, Precession
+from mirrorskin.io.region import Region
+from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, Source
+
+_SAME_TILT = 1.25
+"""By what factor a rotation's half-angle may differ from the one that was calibrated."""
+
+_MEASURED: Mapping[str, tuple[str, ...]] = {"axial": ("zenith", "precession"), "vertical": ("gel",)}
+"""The parts with lengths that a motion is read with."""
+
+
+class Calibrated:
+    """A source with the header and the phases that a calibration tells; frames are passed on untouched.
+
+    What else the source has (``travel``, ``region``, ``fingerprint`` ...) this has as well. A live source is
+    not asked for its header before someone asks this, because that moves the stage.
+
+    Parameters
+    ----------
+    source : Source
+        A recording, also of a part of the picture, or a live source.
+    calibration : Calibration
+        Of the camera's whole picture.
+
+    Attributes
+    ----------
+    source : Source
+    whole : Calibration
+        As given.
+    name, motion, rewindable
+        Those of the source.
+
+    Raises
+    ------
+    InputError
+        The calibration is of another camera or half-angle, or a part of it was made with another pixel size.
+    """
+
+    def __init__(self, source: Source, calibration: Calibration) -> None:
+        self.source, self.whole = source, calibration
+        self.name, self.motion, self.rewindable = source.name, source.motion, source.rewindable
+        if hasattr(source, "now"):
+            self._check("")
+            self._check_sizes(None)
+        else:
+            _ = self.header
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "source" not in self.__dict__:  # one that is being copied
+            raise AttributeError(name)
+        return getattr(self.source, name)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns."""
+        return self.source.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a sample."""
+        return self.source.dtype
+
+    @property
+    def region(self) -> Region:
+        """Which part of the camera's picture it gives."""
+        return getattr(self.source, "region", None) or Region.whole(self.source.shape[1:])
+
+    @functools.cached_property
+    def calibration(self) -> Calibration:
+        """The calibration of the part of the picture that is given: maps cut, places from its centre."""
+        if self.region == Region.whole(self.whole.camera.shape):
+            return self.whole
+        lens = self.whole.lens
+        pixel_size = self.source.header.pixel_size if lens is None else lens.pixel_size
+        return cropped(self.whole, self.region, pixel_size)
+
+    @functools.cached_property
+    def header(self) -> Header:
+        """The source's, with references, the lens's pixel size, tilt and pivot of the calibration."""
+        own = self.source.header
+        self._check(own.camera)
+        calibration = self.calibration
+        known: dict[str, Any] = {}
+        if calibration.references is not None:
+            known |= {"dark": calibration.references.dark, "bright": calibration.references.bright}
+        if calibration.lens is not None:
+            known["pixel_size"] = calibration.lens.pixel_size
+        if self.motion == "axial" and calibration.precession is not None:
+            known |= self._movement(own, calibration.precession)
+        header = replace(own, **known)
+        self._check_sizes(header.pixel_size)
+        return header
+
+    @property
+    def phase(self) -> Floats | None:
+        """The phases of all frames, radians, if they are known beforehand."""
+        return self._turned(getattr(self.source, "phase", None))
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the source's next frames, and tell their phases better; see ``Source.read``."""
+        block = self.source.read(out)
+        if block is None or block.phase is None:
+            return block
+        return replace(block, phase=self._turned(block.phase))
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self.source.rewind()
+
+    def now(self) -> float:
+        """Return the time of a live source."""
+        return cast(LiveSource, self.source).now()
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return the positions of a live source, its phases told better."""
+        told = dict(cast(LiveSource, self.source).positions())
+        if "phase" in told:
+            told["phase"] = cast(Floats, self._turned(told["phase"]))
+        return told
+
+    def __enter__(self) -> Self:
+        self.source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.source.__exit__(kind, error, trace)
+
+    def _turned(self, phase: Floats | None) -> Floats | None:
+        precession = self.whole.precession
+        return phase if phase is None or precession is None else precession.phase(phase)
+
+    def _check(self, camera: str) -> None:
+        shape: tuple[int, ...] = getattr(self.source, "full_shape", self.source.shape)
+        check_camera(self.whole, CameraId(camera, (shape[1], shape[2]), self.source.dtype), self.name)
+
+    def _check_sizes(self, told: tuple[float, float] | None) -> None:
+        size = told if self.whole.lens is None else self.whole.lens.pixel_size
+        check_sizes(self.whole, size, self.name, _MEASURED[self.motion])
+
+    def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
+        """Return tilt and pivot of the precession; what it does not know is the source's own."""
+        tilt = precession.tilt
+        unknown = own.pivot or (np.nan,) * 3
+        places = zip(precession.pivot, unknown, strict=True)
+        pivot = tuple(there if np.isfinite(there) else otherwise for there, otherwise in places)
+        if own.tilt and not 1 / _SAME_TILT < tilt / own.tilt < _SAME_TILT:
+            learned, said = np.degrees([tilt, own.tilt])
+            raise InputError(
+                f"{self.whole.name or 'the calibration'} is of a tilt of {learned:.2f} deg, {self.name} of "
+                f"{said:.2f} deg: calibrate the tilt again with this one"
+            )
+        return {"tilt": tilt, "pivot": pivot if np.isfinite(pivot).all() else None}

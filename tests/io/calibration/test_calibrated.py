@@ -1,0 +1,369 @@
+"""A source with a calibration: what its header and its phases become, and which calibration is refused."""
+
+from dataclasses import fields, replace
+
+import h5py
+import numpy as np
+import pytest
+from calibrations import a_calibration, a_lens, a_map, a_precession, assert_same, some_references
+from growing import Feed, frames_of, stream
+from stacks import SHAPE, MadeUp, random_stack, read_all, record
+
+from mirrorskin import io
+from mirrorskin.io.atomic import new_file
+from mirrorskin.io.growing import GrowingRecording
+
+PICTURE = SHAPE[1:]
+PHASE = np.linspace(0.1, 7.0, 8)
+OWN = io.Header(
+    "axial",
+    title="mine",
+    pixel_size=(0.1, 0.2),
+    dark=a_map(20),
+    bright=a_map(21),
+    press=1.0,
+    tilt=0.042,
+    pivot=(1.0, 2.0, 3.0),
+    zenith_gain=np.asarray(50.0),
+    camera="left",
+)
+
+
+def a_source(dtype="uint8", **changes):
+    return MadeUp(random_stack(dtype), replace(OWN, **changes), phase=PHASE)
+
+
+def calibrated(only=None, source=None, **known):
+    return io.Calibrated(source or a_source(), a_calibration(only=only, **known))
+
+
+def differing(header, own=OWN):
+    """Name what two headers say differently; equal maps are the same object."""
+    names = [one.name for one in fields(own)]
+    return {name for name in names if getattr(header, name) is not getattr(own, name)}
+
+
+@pytest.mark.parametrize(
+    ("only", "changed"),
+    [
+        ([], set()),
+        (["references"], {"dark", "bright"}),
+        (["lens"], {"pixel_size"}),
+        (["zenith"], set()),
+        (["precession"], {"tilt", "pivot"}),
+        (["gel"], set()),
+        (None, {"dark", "bright", "pixel_size", "tilt", "pivot"}),
+    ],
+)
+def test_each_part_tells_what_it_knows_and_the_rest_is_the_source_s(only, changed):
+    with_calibration = calibrated(only)
+    header, calibration = with_calibration.header, with_calibration.calibration
+    assert differing(header) == changed
+    told = {
+        "dark": lambda: calibration.references.dark,
+        "bright": lambda: calibration.references.bright,
+        "pixel_size": lambda: calibration.lens.pixel_size,
+        "tilt": lambda: calibration.precession.tilt,
+        "pivot": lambda: calibration.precession.pivot,
+    }
+    for name in changed:
+        np.testing.assert_array_equal(getattr(header, name), told[name]())
+    assert (with_calibration.whole, with_calibration.calibration) == (calibration, calibration)
+
+
+def test_a_press_has_neither_tilt_nor_pivot():
+    source = MadeUp(random_stack(), io.Header("vertical"), travel=PHASE)
+    header = calibrated(["precession"], source).header
+    assert (header.tilt, header.pivot) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("found", "own", "told"),
+    [
+        ((0.5, -0.5, np.nan), (1.0, 2.0, 3.0), (0.5, -0.5, 3.0)),
+        ((np.nan, np.nan, np.nan), (1.0, 2.0, 3.0), (1.0, 2.0, 3.0)),
+        ((0.5, -0.5, 9.0), None, (0.5, -0.5, 9.0)),
+        ((0.5, -0.5, np.nan), None, None),
+    ],
+)
+def test_what_was_not_found_of_the_pivot_is_the_source_s(found, own, told):
+    calibration = replace(a_calibration(only=[]), precession=a_precession(pivot=found))
+    assert io.Calibrated(a_source(pivot=own), calibration).header.pivot == told
+
+
+def test_phases_are_those_of_the_precession_however_blocks_are_cut():
+    found = read_all(calibrated(["precession"]), 3)
+    np.testing.assert_array_equal(found.phase, a_precession().phase(PHASE))
+    np.testing.assert_array_equal(found.frames, random_stack())
+    np.testing.assert_array_equal(read_all(calibrated(["references"]), 3).phase, PHASE)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_frames_are_the_source_s_own_and_stay_lent(dtype):
+    feed = Feed(8, (3,), "axial", dtype=dtype)
+    handed = []
+    read = feed.read
+    feed.read = lambda out=None: handed.append(read(out)) or handed[-1]
+    source = calibrated(["references", "precession"], feed, dtype=dtype)
+    while (block := source.read()) is not None:
+        assert block.frames is handed[-1].frames
+        assert block.lent
+        assert block.dropped == handed[-1].dropped
+        np.testing.assert_array_equal(block.phase, a_precession().phase(handed[-1].phase))
+    assert handed[-1] is None
+    assert len(handed) == 4
+
+
+def test_a_live_source_is_left_alone_until_its_header_is_asked_for():
+    class Live(Feed):
+        asked = 0
+
+        @property
+        def header(self):
+            Live.asked += 1
+            return io.Header("axial", tilt=0.04, camera="right")
+
+        @header.setter
+        def header(self, value):
+            pass
+
+    live = Live(8, motion="axial")
+    source = calibrated(None, live)
+    assert source.read() is not None
+    assert Live.asked == 0
+    with pytest.raises(io.InputError, match="the camera 'left', feed of 'right'"):
+        _ = source.header
+
+
+def test_a_live_source_tells_time_and_corrected_positions_and_can_be_left():
+    feed = Feed(8, (3,), "axial")
+    with calibrated(["precession"], feed) as source:
+        while source.read() is not None:
+            pass
+        assert source.now() == feed.now()
+        told, positions = feed.positions()["phase"], source.positions()
+    np.testing.assert_array_equal(positions["phase"], a_precession().phase(told))
+    assert list(positions) == ["phase"]
+    assert feed.left
+
+
+def test_travel_is_told_as_it_is():
+    feed = Feed(8, (3,))
+    source = calibrated(None, feed)
+    while source.read() is not None:
+        pass
+    np.testing.assert_array_equal(source.positions()["travel"], feed.positions()["travel"])
+
+
+def test_what_else_a_recording_has_is_there_and_what_it_has_not_is_not(tmp_path):
+    path = record(a_source(), tmp_path / "turn.h5")
+    with io.open_recording(path) as recording:
+        source = calibrated(None, recording)
+        assert (source.name, source.shape, source.dtype) == (str(path), SHAPE, np.dtype("uint8"))
+        assert (source.motion, source.rewindable) == ("axial", True)
+        assert source.fingerprint() == recording.fingerprint()
+        assert source.origin == (0, 0)
+        np.testing.assert_array_equal(source.phase, a_precession().phase(PHASE))
+        first = read_all(source, 3)
+        source.rewind()
+        np.testing.assert_array_equal(read_all(source, 5).phase, first.phase)
+        assert not hasattr(source, "nothing")
+    assert calibrated().phase is None
+
+
+# Parts of the picture.
+
+
+def test_a_part_of_the_picture_has_its_part_of_every_map(tmp_path):
+    path = record(a_source(), tmp_path / "turn.h5")
+    region = io.Region((1, 4), (2, 7))
+    whole = a_calibration()
+    with io.open_recording(path, region=region) as recording:
+        source = io.Calibrated(recording, whole)
+        cut = source.calibration
+        np.testing.assert_array_equal(source.header.dark, whole.references.dark[1:4, 2:7])
+    np.testing.assert_array_equal(cut.references.defects, whole.references.defects[1:4, 2:7])
+    np.testing.assert_array_equal(cut.zenith.azimuth_sigma, whole.zenith.azimuth_sigma[1:4, 2:7])
+    assert cut.zenith.zenith_sigma.flags.c_contiguous
+    assert cut.camera.shape == (3, 5)
+    assert source.whole is whole
+
+
+@pytest.mark.parametrize(("lens", "pixel"), [(None, (0.1, 0.2)), (a_lens(), (0.5, 0.6))])
+def test_places_are_told_from_the_centre_of_a_part(tmp_path, lens, pixel):
+    """The same point of the sheet is the same pixel, of the whole picture and of a part."""
+    path = record(a_source(), tmp_path / "turn.h5")
+    region = io.Region((1, 4), (2, 7))
+    whole = replace(a_calibration(), lens=lens)
+    with io.open_recording(path, region=region) as recording:
+        cut = io.Calibrated(recording, whole).calibration
+    (x, y), (part_x, part_y) = (io.pixel_axes(shape, pixel) for shape in (PICTURE, (3, 5)))
+    for there, here in (
+        (whole.zenith.axis, cut.zenith.axis),
+        (whole.precession.pivot, cut.precession.pivot),
+        (whole.gel.axis, cut.gel.axis),
+    ):
+        assert here[0] - part_x[0] == pytest.approx(there[0] - x[2])
+        assert here[1] - part_y[0] == pytest.approx(there[1] - y[1])
+        assert here[2:] == there[2:]
+
+
+def test_all_of_the_picture_is_the_calibration_itself(tmp_path):
+    path = record(a_source(), tmp_path / "turn.h5")
+    with io.open_recording(path, region=io.Region.whole(PICTURE)) as recording:
+        source = calibrated(None, recording)
+        assert source.calibration is source.whole
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({"name": "right"}, "the camera 'right', made up of 'left': calibrate again"),
+        ({"shape": (7, 5)}, "5 x 7 pixels, made up of 7 x 5: calibrate again"),
+        ({"dtype": "uint16"}, "uint16 samples, made up of uint8: calibrate again"),
+        (
+            {"name": "b", "shape": (1, 1)},
+            "the camera 'b' and 1 x 1 pixels, made up of 'left' and 7 x 5: calibrate again",
+        ),
+    ],
+)
+def test_the_calibration_of_another_camera_is_refused_in_a_line(known, said):
+    calibration = replace(a_calibration(**known), name="cal.h5")
+    with pytest.raises(io.InputError, match=rf"^cal\.h5 is of {said}") as told:
+        io.Calibrated(a_source(), calibration)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(("mine", "its"), [("", "left"), ("left", ""), ("", "")])
+def test_a_camera_without_a_name_may_be_any(mine, its):
+    io.Calibrated(a_source(camera=its), a_calibration(name=mine))
+
+
+def test_the_part_of_a_picture_of_another_size_is_refused(tmp_path):
+    path = record(a_source(), tmp_path / "turn.h5")
+    with (
+        io.open_recording(path, region=io.Region((0, 3), (0, 4))) as recording,
+        pytest.raises(io.InputError, match=r"is of 4 x 3 pixels, .* of 7 x 5"),
+    ):
+        io.Calibrated(recording, a_calibration((3, 4)))
+
+
+@pytest.mark.parametrize(("tilt", "fits"), [(0.033, True), (0.049, True), (0.031, False), (0.051, False)])
+def test_a_rotation_by_another_tilt_is_refused(tilt, fits):
+    source = a_source(tilt=tilt)
+    if fits:
+        assert calibrated(["precession"], source).header.tilt == 0.04
+        return
+    with pytest.raises(io.InputError, match=r"of a tilt of 2.29 deg, made up of .* calibrate the tilt again"):
+        calibrated(["precession"], source)
+
+
+# What carries a copy.
+
+
+def test_a_recording_carries_a_copy_and_stays_what_the_source_said(tmp_path):
+    path = tmp_path / "turn.h5"
+    source, calibration = a_source(), a_calibration()
+    with io.Recorder(source, path, calibration=calibration) as recorder:
+        while recorder.read(np.empty((3, *PICTURE), np.uint8)) is not None:
+            pass
+    with io.open_recording(path) as recording:
+        assert_same(recording.carried, calibration)
+        assert recording.carried.name == f"the calibration in {path}"
+        np.testing.assert_array_equal(recording.phase, PHASE)
+        np.testing.assert_array_equal(recording.header.dark, OWN.dark)
+        assert recording.header.tilt == OWN.tilt
+    assert io.describe(path)["carried calibration"] == (
+        "references, scale, zenith, tilt, elastic of camera 'left', 7 x 5, uint8"
+    )
+    assert io.describe(path)["camera"] == "left"
+    assert_same(io.open_calibration(path), calibration)
+
+
+def test_a_part_of_a_recording_carries_the_copy_of_the_whole(tmp_path):
+    path = tmp_path / "turn.h5"
+    with io.Recorder(a_source(), path, calibration=a_calibration()) as recorder:
+        recorder.drain(lambda count: None)
+    with io.open_recording(path, region=io.Region((1, 4), (2, 7)), frames=(1, 5)) as recording:
+        assert_same(recording.carried, a_calibration())
+        assert io.Calibrated(recording, recording.carried).header.dark.shape == (3, 5)
+
+
+@pytest.mark.parametrize("compression", ["raw", "lzf"])
+def test_a_recording_that_is_written_while_frames_come_carries_a_copy(tmp_path, compression):
+    path = tmp_path / "live.h5"
+    feed = Feed(20, (3,), "axial")
+    recorder = io.StreamRecorder(feed, path, compression, calibration=a_calibration())
+    with recorder:
+        while recorder.read() is not None:
+            pass
+    with io.open_recording(path) as recording:
+        assert_same(recording.carried, a_calibration())
+        assert recording.state == "complete"
+        assert (recording.how == "mapped") == (compression == "raw")
+        np.testing.assert_array_equal(read_all(recording, 7).frames, frames_of(np.arange(20)))
+        np.testing.assert_array_equal(recording.phase, feed.positions()["phase"])
+
+
+def test_others_see_the_copy_while_frames_come(tmp_path):
+    path, feed = tmp_path / "live.h5", Feed(8, (4,))
+    with new_file(path) as descriptor:
+        known = feed.header, feed.shape, feed.dtype, "raw", a_calibration()
+        growing = GrowingRecording(path, descriptor, *known)
+    with growing:
+        growing.append(feed.read())
+        growing.publish()
+        assert_same(io.open_calibration(path), a_calibration())
+        growing.append(feed.read())
+        growing.finish({}, "complete")
+    assert_same(io.open_calibration(path), a_calibration())
+
+
+def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path):
+    height = np.zeros(PICTURE, np.float32)
+    for number, calibration in enumerate((a_calibration(), a_calibration(name="east", dtype="uint16"), None)):
+        path = tmp_path / f"result-{number}.h5"
+        for _ in range(2):
+            io.save_result(io.Result(height=height, process={"hold": 2}, calibration=calibration), path)
+        found = io.open_result(path)
+        assert found.process == {"hold": 2}
+        assert list(found.maps()) == ["height"]
+        if calibration is None:
+            assert found.calibration is None
+            assert "carried calibration" not in io.describe(path)
+        else:
+            assert_same(found.calibration, calibration)
+            assert_same(io.open_calibration(path), calibration)
+            assert io.describe(path)["carried calibration"].startswith("references, scale")
+
+
+def test_recordings_and_results_of_before_carry_nothing_and_name_no_camera(tmp_path):
+    path = record(a_source(camera=""), tmp_path / "old.h5")
+    with io.open_recording(path) as recording:
+        assert recording.carried is None
+        assert recording.header.camera == ""
+    assert not {"camera", "carried calibration"} & set(io.describe(path))
+    stream(Feed(4), tmp_path / "live.h5")
+    with io.open_recording(tmp_path / "live.h5") as recording:
+        assert recording.carried is None
+
+
+def test_a_copy_that_is_damaged_is_told_when_it_is_asked_for_and_only_then(tmp_path):
+    path = tmp_path / "turn.h5"
+    with io.Recorder(a_source(), path, calibration=a_calibration()) as recorder:
+        recorder.drain(lambda count: None)
+    with h5py.File(path, "r+") as file:
+        file["entry/calibration"].attrs["mirrorskin_calibration"] = 7
+    with io.open_recording(path) as recording:
+        assert recording.shape == SHAPE
+        with pytest.raises(io.InputError, match="newer layout, 7"):
+            _ = recording.carried
+
+
+def test_references_know_which_pixels_are_defect():
+    references = some_references()
+    source = calibrated(["references"])
+    np.testing.assert_array_equal(np.isnan(source.header.dark), references.defects > 0)

@@ -1,0 +1,324 @@
+"""Calibration files: everything comes back, one part is replaced, what cannot be used is told in a line."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from calibrations import (
+    SHAPE,
+    a_calibration,
+    a_lens,
+    a_precession,
+    assert_same,
+    some_references,
+)
+from stacks import plot_of, record, sphere
+
+from mirrorskin import io
+
+PARTS = ("references", "lens", "zenith", "precession", "gel")
+CAMERA = io.CameraId("left", SHAPE, np.dtype("uint8"))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cal.h5"
+
+
+@pytest.fixture
+def saved(path):
+    io.save_calibration(a_calibration(), path)
+    return path
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("shape", [SHAPE, (1, 1), (1, 9), (13, 1)])
+def test_a_calibration_comes_back_as_it_was(path, shape, dtype):
+    calibration = a_calibration(shape, dtype, "münze 五")
+    io.save_calibration(calibration, path)
+    found = io.open_calibration(path)
+    assert_same(found, calibration)
+    assert found.name == str(path)
+
+
+@pytest.mark.parametrize("part", [*PARTS, None])
+def test_parts_may_be_missing(path, part):
+    calibration = a_calibration(only=[part])
+    io.save_calibration(calibration, path)
+    found = io.open_calibration(path)
+    assert_same(found, calibration)
+    assert list(found.parts()) == ([] if part is None else [part])
+
+
+def test_a_camera_may_have_no_name(path):
+    io.save_calibration(a_calibration(name=""), path)
+    assert io.open_calibration(path).camera.name == ""
+
+
+def test_what_nobody_knows_may_be_no_number(path):
+    calibration = a_calibration(only=["precession"])
+    unknown = replace(calibration.precession, pivot=(np.nan,) * 3, sigma={})
+    io.save_calibration(replace(calibration, precession=unknown), path)
+    found = io.open_calibration(path).precession
+    assert np.isnan(found.pivot).all()
+    assert found.sigma == {}
+
+
+def test_it_has_the_layout_that_is_documented(saved):
+    found = {}
+    with h5py.File(saved) as file:
+        assert dict(file.attrs) == {"NX_class": "NXroot", "default": "entry"}
+        file["entry"].visititems(lambda name, node: found.update({name: dict(node.attrs)}))
+        assert dict(file["entry"].attrs) == {
+            "NX_class": "NXentry",
+            "default": "references",
+            "mirrorskin_calibration": 1,
+        }
+        nodes = {name: file["entry"][name] for name in found}
+        shapes = {name: node.shape for name, node in nodes.items() if isinstance(node, h5py.Dataset)}
+        assert file["entry/camera/dtype"].asstr()[()] == "uint8"
+        assert file["entry/zenith/parameters"].asstr()[()].tolist() == ["radius", "k0"]
+    groups = {name: attrs["NX_class"] for name, attrs in found.items() if "NX_class" in attrs}
+    assert groups == {
+        "camera": "NXcollection",
+        "references": "NXdata",
+        "scale": "NXcollection",
+        "zenith": "NXdata",
+        "tilt": "NXcollection",
+        "elastic": "NXcollection",
+        "process": "NXprocess",
+    }
+    assert (found["references"]["signal"], found["zenith"]["signal"]) == ("bright", "zenith_sigma")
+    assert found["references/dark"] == {"interpretation": "image", "units": "counts"}
+    assert found["scale/pixel_size"] == found["tilt/pivot"] == found["tilt/sigma/pivot_z"] == {"units": "mm"}
+    assert found["tilt/tilt"] == found["tilt/sigma/tilt"] == {"units": "rad"}
+    assert shapes["references/defects"] == shapes["zenith/azimuth_sigma"] == SHAPE
+    assert (shapes["camera/name"], shapes["camera/shape"], shapes["zenith/curve"]) == ((), (2,), (3,))
+    assert shapes["process/tilt.frames"] == ()
+
+
+@pytest.mark.parametrize(("only", "shown"), [(PARTS, "bright"), (["zenith"], "zenith_sigma")])
+def test_viewers_show_a_map_unasked(path, only, shown):
+    calibration = a_calibration(only=only)
+    io.save_calibration(calibration, path)
+    _, signal, _ = plot_of(path)
+    part = calibration.references if shown == "bright" else calibration.zenith
+    np.testing.assert_array_equal(signal, getattr(part, shown))
+
+
+def test_units_are_obeyed(saved):
+    with h5py.File(saved, "r+") as file:
+        file["entry/tilt/tilt"][()] = 2.5
+        file["entry/tilt/tilt"].attrs["units"] = "deg"
+    assert io.open_calibration(saved).precession.tilt == pytest.approx(np.radians(2.5))
+
+
+def test_a_field_that_came_later_may_be_missing(saved):
+    with h5py.File(saved, "r+") as file:
+        del file["entry/elastic/travel_zero"], file["entry/elastic/sigma"]
+    gel = io.open_calibration(saved).gel
+    assert (gel.travel_zero, gel.sigma) == (0.0, {})
+
+
+# One part at a time.
+
+
+def test_parts_are_added_one_by_one(path):
+    told = {"program": "mirrorskin", "frames": 8}
+    io.update_calibration(path, some_references(), CAMERA, told)
+    found = io.update_calibration(path, a_precession(), CAMERA, {"tilt.frames": 9})
+    assert_same(found, io.open_calibration(path))
+    assert list(found.parts()) == ["references", "precession"]
+    assert found.process == {"references.program": "mirrorskin", "references.frames": 8, "tilt.frames": 9}
+
+
+def test_a_part_is_replaced_with_what_is_told_of_it_and_others_stay(saved):
+    before = io.open_calibration(saved)
+    io.update_calibration(saved, a_precession(tilt=0.05), CAMERA, {"turns": 2})
+    after = io.open_calibration(saved)
+    assert after.precession.tilt == 0.05
+    assert_same(after.zenith, before.zenith)
+    assert "tilt.frames" not in after.process
+    assert after.process["tilt.turns"] == 2
+    assert after.process["zenith.weight"] == 0.5
+
+
+@pytest.mark.parametrize(("first", "then", "kept"), [("", "left", "left"), ("left", "", "left")])
+def test_a_camera_gets_the_name_that_is_told_once(path, first, then, kept):
+    io.update_calibration(path, a_precession(), replace(CAMERA, name=first))
+    io.update_calibration(path, a_lens(), replace(CAMERA, name=then))
+    assert io.open_calibration(path).camera.name == kept
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"name": "right"}, "'left', this of 'right'"),
+        ({"shape": (7, 5)}, "7 x 5 pixels, this of 5 x 7"),
+        ({"dtype": np.dtype("uint16")}, "uint8 samples, this of uint16"),
+    ],
+)
+def test_a_part_of_another_camera_is_refused(saved, changes, said):
+    before = saved.read_bytes()
+    with pytest.raises(io.InputError, match=f"cal.h5 is of .*{said}: name another file with -o"):
+        io.update_calibration(saved, a_precession(), replace(CAMERA, **changes))
+    assert saved.read_bytes() == before
+
+
+def test_a_recording_is_not_taken_for_a_calibration_to_be_updated(path):
+    record(sphere(), path)
+    before = path.read_bytes()
+    with pytest.raises(io.InputError, match="no calibration: name another file with -o"):
+        io.update_calibration(path, a_precession(), CAMERA)
+    assert path.read_bytes() == before
+
+
+def test_a_part_that_does_not_fit_leaves_the_file_as_it_was(saved):
+    before = saved.read_bytes()
+    with pytest.raises(ValueError, match=r"references/dark is of shape \(3, 3\)"):
+        io.update_calibration(saved, some_references((3, 3)), CAMERA)
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_calibration_that_cannot_be_written_is_told(tmp_path):
+    with pytest.raises(io.InputError, match="make it first"):
+        io.save_calibration(a_calibration(), tmp_path / "none" / "cal.h5")
+
+
+# What cannot be used.
+
+
+def a_version(number):
+    def change(file):
+        file["entry"].attrs["mirrorskin_calibration"] = number
+
+    return change
+
+
+def a_value(name, value):
+    def change(file):
+        del file[f"entry/{name}"]
+        file[f"entry/{name}"] = value
+
+    return change
+
+
+def without(name):
+    def change(file):
+        del file[f"entry/{name}"]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (a_version(0), "older layout, 0, where 1 is read: calibrate again"),
+        (a_version("one"), "older layout, one, where 1 is read: calibrate again"),
+        (a_version(2), "newer layout, 2, where 1 is read: update the program, or calibrate again"),
+        (without("camera"), "there is no /entry/camera/name: calibrate again"),
+        (without("camera/shape"), "there is no /entry/camera/shape: calibrate again"),
+        (a_value("camera/shape", [5, 0]), "which no picture has: calibrate again"),
+        (a_value("camera/shape", [5.5, 7]), "which no picture has: calibrate again"),
+        (a_value("camera/shape", [5, 8]), r"\(5, 7\) where \(5, 8\) is needed: calibrate again"),
+        (a_value("camera/dtype", "int64"), "'int64', which no camera here gives: calibrate again"),
+        (without("references/dark"), "references has no dark: calibrate again"),
+        (a_value("references/dark", np.zeros(35)), r"\(35,\) where \(5, 7\) is needed: calibrate again"),
+        (a_value("references/dark", "grey"), "holds no numbers: calibrate again"),
+        (a_value("references", 1.0), "/entry/references has no dark: calibrate again"),
+        (a_value("scale/pixel_size", [0.1, 0.0]), r"\(0.1, 0.0\), which cannot be: calibrate again"),
+        (a_value("scale/pixel_size", [0.1, np.nan]), "which cannot be: calibrate again"),
+        (a_value("scale/shape", [5.0, np.inf]), "whole numbers are needed: calibrate again"),
+        (a_value("scale/camera", np.eye(2)), r"\(2, 2\) where \(3, 3\) is needed: calibrate again"),
+        (a_value("zenith/radius", -1.0), "which cannot be: calibrate again"),
+        (a_value("zenith/pattern", "striped"), "striped, which cannot be: calibrate again"),
+        (a_value("zenith/pattern", [1, 2]), "does not hold one value"),
+        (a_value("zenith/curve", 1.0), r"\(\) where \(0,\) is needed: calibrate again"),
+        (a_value("zenith/curve", [0.9, np.nan]), "curve has numbers that are not finite: calibrate again"),
+        (a_value("scale/camera", np.full((3, 3), np.inf)), "numbers that are not finite: calibrate again"),
+        (a_value("zenith/parameters", [1.0, 2.0]), "no list of texts: calibrate again"),
+        (a_value("zenith/parameters", ["radius"]), r"\(2, 2\) where \(1, 1\) is needed: calibrate again"),
+        (a_value("tilt/tilt", np.nan), "is nan, which cannot be: calibrate again"),
+        (a_value("tilt/direction", 2), "is 2, which cannot be: calibrate again"),
+        (a_value("tilt/direction", np.nan), "whole numbers are needed: calibrate again"),
+        (a_value("tilt/sigma/tilt", "much"), "holds no numbers: calibrate again"),
+    ],
+)
+def test_a_file_that_is_damaged_or_of_another_version_is_told_in_a_line(saved, change, said):
+    with h5py.File(saved, "r+") as file:
+        change(file)
+    with pytest.raises(io.InputError, match=said) as told:
+        io.open_calibration(saved)
+    assert str(told.value).startswith(str(saved))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("length", [0, 100, 5000])
+def test_a_truncated_file_is_told(saved, length):
+    saved.write_bytes(saved.read_bytes()[:length])
+    with pytest.raises(io.InputError, match=r"cal\.h5"):
+        io.open_calibration(saved)
+
+
+def test_what_is_no_calibration_is_told(path, tmp_path):
+    with pytest.raises(io.InputError, match="no such file"):
+        io.open_calibration(path)
+    record(sphere(), path)
+    with pytest.raises(io.InputError, match="is no calibration: 'mirrorskin calibrate' makes one"):
+        io.open_calibration(path)
+    path.write_text("dark = 12")
+    with pytest.raises(io.InputError, match="not an HDF5 file"):
+        io.open_calibration(path)
+
+
+# In words.
+
+
+def test_a_calibration_is_described(saved):
+    facts = io.describe(saved)
+    assert facts["kind"] == "calibration"
+    assert facts["camera"] == "'left', 7 x 5, uint8"
+    assert facts["references.dark"].endswith("counts (median; 1 pixels unknown)")
+    assert facts["references.defects"] == "0 hot, 1 dead, 0 saturated"
+    assert facts["scale.pixel_size"] == "0.5, 0.6 mm"
+    assert facts["tilt.tilt"] == "2.2918 deg"
+    assert facts["tilt.sigma"] == "pivot_z 0.3 mm, tilt 0.0057296 deg"
+    assert facts["tilt.frames"] == "8"
+
+
+def test_numbers_of_how_it_came_about_are_told_with_four_digits(path):
+    process = {"references.dark_sigma": 0.19073192774615977, "references.frames": 12345678}
+    io.save_calibration(replace(a_calibration(), process=process), path)
+    facts = io.describe(path)
+    assert facts["references.dark_sigma"] == "0.1907"
+    assert facts["references.frames"] == "12345678"
+    assert io.open_calibration(path).process == process
+
+
+def test_parts_that_are_missing_are_described_as_such(path):
+    io.save_calibration(a_calibration(name="", only=["gel"]), path)
+    facts = io.describe(path)
+    assert facts["camera"] == "7 x 5, uint8"
+    assert {facts[name] for name in ("references", "scale", "zenith", "tilt")} == {"none"}
+
+
+def test_every_dataset_is_documented(saved):
+    said = (Path(__file__).parents[3] / "docs" / "calibration.md").read_text(encoding="utf-8")
+    names = []
+    with h5py.File(saved) as file:
+        file["entry"].visititems(
+            lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None
+        )
+    wanted = {
+        "process/PART.NAME"
+        if name.startswith("process/")
+        else f"{name.partition('/sigma/')[0]}/sigma/NAME"
+        if "/sigma/" in name
+        else name
+        for name in names
+    }
+    assert len(wanted) > 30
+    assert [name for name in sorted(wanted) if f"`{name}`" not in said] == []
