@@ -1,4 +1,4 @@
-// Surface normals from the samples of one turn of axial rotation. Specification: normals.py.
+// Surface normals from the samples of one turn of axial rotation. Specification: normals.py, normals_wall.py.
 //
 // FRAME    type of a sample
 // COUNTED  1 where samples are whole counts, clipped at 0 and at TOP; 0 where they are floats, of which NaN is missing
@@ -13,6 +13,11 @@
 // RING     1 where the stack is a ring of COUNT frames, each of `stride` samples, in which the turn goes round
 // BARE     1 where the wave's maps are not wanted
 // MORE     Gauss-Newton steps after the first two, for pixels of which a sample is clipped, missing or out of range
+// WALL     1 where samples are lights that come from a cylindrical wall, not zeniths; unset otherwise. Then there are
+// STEPS    Gauss-Newton steps of all pixels
+// CURVE    numbers of the light's curve
+// INVERSE  numbers of its inverse
+// FOLLOWS  1 where a pixel keeps seeing one point of the object
 //
 // Angles are radians. Maps lie in planes of `stride` pixels, whole vectors, of which the first `pixels` are the
 // picture's:
@@ -20,7 +25,8 @@
 // stack    `pixels` samples of each frame, one frame after the other; the turn begins with frame `start`
 // tables   of several turns, of which `table` is this one's: planes of ROOM frames: cosine and sine of the phase, root of
 //          the weight, shares in mean, cosine and sine
-// scale    counts at zenith 0; radians per count; the zeniths between which brightness is linear
+// scale    counts at zenith 0; radians per count; the zeniths between which brightness is linear. Under a wall: counts
+//          without light; light per count; x and y from the wall's axis, and z
 // vectors  x, y and z of each pixel side by side
 //
 // All maps but those are answers; of the second turn on they are joined with those of the `turns` - 1 before.
@@ -52,6 +58,16 @@ typedef struct __attribute__((packed)) { Raw samples; } Stored;
 #define SCALE(plane) ((F)scale[plane])
 #endif
 
+#if COUNTED
+#define WHOLE(raw) ((raw > 0.0f) & (raw < TOP))
+#define PRESENT(raw) raw
+#define PRESENT_COUNT ((float)COUNT)
+#else
+#define WHOLE(raw) (raw == raw)
+#define PRESENT(raw) (raw == raw ? raw : (F)0.0f)
+#define PRESENT_COUNT JOIN(convert_float, LANES)(whole)
+#endif
+
 #define COSINE(k) turn[k]
 #define SINE(k) turn[ROOM + (k)]
 #if WEIGHTED
@@ -74,15 +90,29 @@ typedef struct __attribute__((packed)) { Raw samples; } Stored;
 #define REACH 0.25f     // longest step, radians
 #define NO_ANSWER 1.0f  // a standard error, radians, from which on nothing is known
 #define STEADY 1e-6f    // amplitude, radians, up to which rounding makes the azimuth
+#define SETTLED 1e-12f  // square of a step, radians, after which the next ones are none
 #define LEAST 3         // samples that must be there and within their range
 #define MARGIN 3.0f     // standard deviations that a sample must be from the ends of a range to be within it
 
 typedef struct { F ct, st, cp, sp; } Direction;  // cosine and sine of zenith and azimuth
 typedef struct { F mean, cosine, sine; } Wave;   // of a pixel's zeniths over the turn
+#if WALL
+// The point that a pixel sees in the mean pose, by how much its line of sight moves for each mm of z, and that for each mm
+// from the axis.
+typedef struct { F x, y, z, slope_x, slope_y, bend; } Place;
+#define SCENE , const Place place, __global const float *wall
+#define HERE , place, wall
+#else
+#define SCENE
+#define HERE
+#endif
 typedef struct {
     F m11, m12, m22, b1, b2;  // normal equations of the direction: along the meridian, and across
     F m13, m23, m33, b3;      // and of the tilt
     F square, waves;          // sums of the squares of what the direction leaves, and of what the wave leaves
+#if WALL
+    I within;                 // samples that are whole, and expected within range
+#endif
 } Sums;
 
 #if defined(__AVX__) && defined(__has_builtin)
@@ -155,6 +185,90 @@ Direction direction_of(const F x, const F y, const F z)
     return found;
 }
 
+#if WALL
+#define RADIUS wall[0]
+#define RIM wall[1]
+#define SCATTER wall[2]  // square of the sine of its half-angle
+#define BEND wall[3]
+#define BEND_SQUARE wall[4]
+#define LAMP_X wall[5]   // by the radius, as LAMP_Y
+#define LAMP_Y wall[6]
+#define NEAREST wall[7]  // the q between which the curve holds
+#define FURTHEST wall[8]
+#define DARKEST wall[9]  // and the lights
+#define LIGHTEST wall[10]
+#define SENSE wall[11]   // 1 where steeper is brighter, -1 where it is darker
+#define PIVOT_X wall[12]
+#define PIVOT_Y wall[13]
+#define PIVOT_Z wall[14]
+#define MIDDLE wall[15]  // what q is counted from in the curve, and how often
+#define PER_Q wall[16]
+#define OF_INVERSE(i) wall[17 + (i)]
+#define OF_CURVE(i) wall[17 + INVERSE + (i)]
+
+// The light of each sample and its derivatives; see response.py. The normal and the point turn with the body first: along
+// the phase's direction and up only. The line of sight need not be a unit vector.
+#define PREPARE const F nx = at.st * at.cp, ny = at.st * at.sp, nz = at.ct;
+#define SEE(k)                                                                                   \
+    const float c = COSINE(k), s = SINE(k);                                                      \
+    const F flat_n = nx * c + ny * s, out_n = flat_n * cos_tilt + nz * sin_tilt;                 \
+    const F bz = nz * cos_tilt - flat_n * sin_tilt, bx = nx + c * (out_n - flat_n), by = ny + s * (out_n - flat_n); \
+    const F out_p = (place.x - PIVOT_X) * c + (place.y - PIVOT_Y) * s, up_p = place.z - PIVOT_Z; \
+    const F pz = PIVOT_Z + up_p * cos_tilt - out_p * sin_tilt;
+#if FOLLOWS
+#define STAND                                                                                    \
+    const F shift = out_p * (cos_tilt - 1.0f) + up_p * sin_tilt;                                 \
+    const F px = place.x + c * shift, sx = place.slope_x - place.bend * c * shift;               \
+    const F py = place.y + s * shift, sy = place.slope_y - place.bend * s * shift;
+#else
+#define STAND                                                                                    \
+    const F sx = place.slope_x, px = place.x + (pz - place.z) * sx;                               \
+    const F sy = place.slope_y, py = place.y + (pz - place.z) * sy;
+#endif
+#define MIRROR                                                                                   \
+    const F facing = sx * bx + sy * by + bz, twice = facing + facing;                            \
+    const F rx = twice * bx - sx, ry = twice * by - sy, rz = twice * bz - 1.0f, flat = rx * rx + ry * ry; \
+    const F room = RADIUS * RADIUS - px * px - py * py, along = px * rx + py * ry;               \
+    const F square = along * along + flat * room, per_leave = inverse_root(square);              \
+    const F way = room / (along + square * per_leave);                                           \
+    const F mx = px + way * rx, my = py + way * ry, h = pz + way * rz;                            \
+    const F far = h * h + RADIUS * RADIUS, per_far = inverse_root(far), per_both = 1.0f / (far * per_far + RADIUS); \
+    const F q = h * per_both, least_q = GREATER(q, (F)NEAREST), held = LESSER(least_q, (F)FURTHEST); \
+    F level = OF_CURVE(CURVE - 1), steep = 0.0f;                                                 \
+    const F place_q = (held - MIDDLE) * PER_Q;                                                   \
+    for (int i = CURVE - 2; i >= 0; --i) {                                                       \
+        steep = steep * place_q + level;                                                         \
+        level = level * place_q + OF_CURVE(i);                                                   \
+    }                                                                                            \
+    steep *= PER_Q;                                                                              \
+    level += steep * (q - held);
+#define DERIVE(k)                                                                                \
+    const F lamp = 1.0f + LAMP_X * mx + LAMP_Y * my, zenith = lamp * level;                      \
+    const F by_height = lamp * steep * (RADIUS * per_far * per_both);                            \
+    const F further = (level * (LAMP_X * rx + LAMP_Y * ry) + by_height * rz) * per_leave;        \
+    const F gx = way * (level * LAMP_X - further * mx), gy = way * (level * LAMP_Y - further * my), gz = way * by_height; \
+    const F pull_n = gx * bx + gy * by + gz * bz;                                                \
+    const F vx = 2.0f * (facing * gx + pull_n * sx), vy = 2.0f * (facing * gy + pull_n * sy);    \
+    const F vz = 2.0f * (facing * gz + pull_n), flat_v = vx * c + vy * s;                        \
+    const F back = flat_v * cos_tilt - vz * sin_tilt - flat_v;                                   \
+    const F wx = vx + c * back, wy = vy + s * back, wz = flat_v * sin_tilt + vz * cos_tilt;      \
+    const F u1 = WEIGH(at.ct * (at.cp * wx + at.sp * wy) - at.st * wz, k);                       \
+    const F u2 = WEIGH(at.cp * wy - at.sp * wx, k), u3 = WEIGH(flat_v * bz - vz * out_n, k);
+// Whether the rays that are turned up and down by the scatter meet the wall, too: by the sines of the angles to its edges.
+#define EXPECT                                                                                   \
+    const F below = RIM - h, over = RIM - pz, apart = way * way * flat;                           \
+    const F turned = SCATTER * (sx * sx + sy * sy + 1.0f);                                       \
+    const I inside = (q == held) & (below >= 0.0f) & (h >= 0.0f)                                 \
+        & (flat * below * below >= turned * (apart + over * over)) & (flat * h * h >= turned * (apart + pz * pz));
+#define PREDICT(k) SEE(k) STAND MIRROR DERIVE(k) EXPECT
+#define COUNT_INSIDE(flags) sums.within -= (flags);
+#define COUNT_LAST if (last) COUNT_INSIDE(inside)
+#define LAST , const int last
+#else
+#define COUNT_INSIDE(flags)
+#define COUNT_LAST
+#define LAST
+
 // Half the sine of a zenith is root(x - x^2), of x = sin^2(zenith / 2); and x is base + lean cos(azimuth - phase), which
 // loses no digits that matter. By u1, u2 and u3 a zenith grows along the meridian, across it and with the tilt; all are
 // divided by the standard deviation of a sample of its weight, in those of weight 1.
@@ -170,6 +284,8 @@ Direction direction_of(const F x, const F y, const F z)
     const F zenith = rest * inverse * angle_by_half_sine(x), by_sine = WEIGH(inverse, k); \
     const F u1 = (low_part * near + high_part) * by_sine, u2 = beside * by_sine;                 \
     const F u3 = (high_part * near + low_part) * by_sine;
+#endif
+
 #define ADD_DERIVATIVES(v1, v2, v3)                                                              \
     sums.m11 += v1 * u1; sums.m12 += v1 * u2; sums.m22 += v2 * u2;                               \
     sums.m13 += v1 * u3; sums.m23 += v2 * u3; sums.m33 += v3 * u3;
@@ -184,7 +300,7 @@ F off_wave(const F zenith, const Wave wave, const float cosine, const float sine
 
 // The normal equations at a direction, of samples that are all there and all within range.
 Sums look(const Direction at, const F *zeniths, const Wave wave, __global const float *turn,
-          const float cos_tilt, const float sin_tilt)
+          const float cos_tilt, const float sin_tilt SCENE LAST)
 {
     Sums sums = NOTHING;
     PREPARE
@@ -192,6 +308,7 @@ Sums look(const Direction at, const F *zeniths, const Wave wave, __global const 
         PREDICT(k)
         const F error = WEIGH(zeniths[k] - zenith, k);
         const F off = WEIGH(off_wave(zeniths[k], wave, COSINE(k), SINE(k)), k);
+        COUNT_LAST
         ADD_DERIVATIVES(u1, u2, u3)
         ADD_RESIDUAL(error)
         sums.square += error * error;
@@ -212,14 +329,19 @@ F mills(const F z)
 // expected out of range tells nothing of the direction, and a missing one nothing at all.
 Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *frames, const int begins,
                   const int each, const int p, __global const float *turn, const float cos_tilt, const float sin_tilt,
-                  const F offset, const F per_count, const F low, const F high, const F error_of_one)
+                  const F offset, const F per_count, const F low, const F high, const F error_of_one SCENE)
 {
     Sums sums = NOTHING;
     PREPARE
     for (int k = 0; k < COUNT; ++k) {
         PREDICT(k)
+#if WALL
+        const F seen = zenith, error = zeniths[k] - seen, raw = LOAD(k);
+        COUNT_INSIDE(inside & WHOLE(raw))
+#else
         const F least = GREATER(zenith, low), seen = LESSER(least, high), error = zeniths[k] - seen, raw = LOAD(k);
         const I inside = (zenith > low) & (zenith < high);
+#endif
         F share = 1.0f, pull = error, misfit = error * error;
 #if COUNTED
         const I under = raw <= 0.0f, clipped = under | (raw >= TOP);
@@ -235,6 +357,9 @@ Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *fr
         share = known ? share : (F)0.0f;
         pull = known ? pull : (F)0.0f;
         misfit = known ? misfit : (F)0.0f;
+#endif
+#if WALL
+        misfit = inside ? misfit : (F)0.0f;
 #endif
         share = inside ? share : (F)0.0f;
         pull = WEIGH(inside ? pull : (F)0.0f, k);
@@ -264,6 +389,9 @@ Direction step(const Direction at, const Sums sums)
 Sums blend_sums(Sums mine, const Sums other, const I chosen)
 {
     TAKE(m11) TAKE(m12) TAKE(m22) TAKE(b1) TAKE(b2) TAKE(m13) TAKE(m23) TAKE(m33) TAKE(b3) TAKE(square)
+#if WALL
+    TAKE(within)
+#endif
     return mine;
 }
 
@@ -272,6 +400,34 @@ Direction blend(Direction mine, const Direction other, const I chosen)
     TAKE(ct) TAKE(st) TAKE(cp) TAKE(sp)
     return mine;
 }
+
+#if WALL
+// The mean light is that of a place on the wall; the wave tells its azimuth, and so how far it is from here.
+Direction begin_at_wall(const F *lights, const F mean, __global const float *turn SCENE)
+{
+    F x = 0.0f, y = 0.0f, q = OF_INVERSE(INVERSE - 1);
+    for (int k = 0; k < COUNT; ++k) {
+        const F apart = lights[k] == lights[k] ? lights[k] - mean : (F)0.0f;
+        x += IN_COSINE(k) * apart;
+        y += IN_SINE(k) * apart;
+    }
+    const F most = LESSER(mean, (F)LIGHTEST), light = GREATER(most, (F)DARKEST);
+    for (int i = INVERSE - 2; i >= 0; --i) q = q * light + OF_INVERSE(i);
+    q = q < NEAREST ? (F)NEAREST : q;
+    q = q > FURTHEST ? (F)FURTHEST : q;
+    const F swing = x * x + y * y;
+    const I swings = swing > 0.0f;
+    const F inverse = SENSE * inverse_root(swings ? swing : (F)1.0f);
+    x = swings ? x * inverse : (F)1.0f;
+    y = swings ? y * inverse : (F)0.0f;
+    const F along = place.x * x + place.y * y;
+    const F out = root(along * along + RADIUS * RADIUS - place.x * place.x - place.y * place.y) - along;
+    const F rise = 2.0f * RADIUS * q / (1.0f - q * q) - place.z, per_ray = inverse_root(out * out + rise * rise);
+    const F per_sight = inverse_root(place.slope_x * place.slope_x + place.slope_y * place.slope_y + 1.0f);
+    return direction_of(out * x * per_ray + place.slope_x * per_sight, out * y * per_ray + place.slope_y * per_sight,
+                        rise * per_ray + per_sight);
+}
+#endif
 
 // Eq. 10 is linear in the normal once the cosine of the zenith is taken: its wave is the normal. A missing sample is
 // taken for the mean of the others.
@@ -390,14 +546,19 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     }
 
 // Whether a sum of squares is that of noise and of what the model leaves out.
-#define LIKE_NOISE(square) (FREEDOM > 0 ? (square) <= noise_limit * error_of_one * error_of_one + limit : (I)-1)
+#define LIKE_NOISE(square, model) (FREEDOM > 0 ? (square) <= noise_limit * error_of_one * error_of_one + (model) : (I)-1)
 
 // A sheet at rest shows the zenith 0 all the time; one in contact a mean of the tilt or more.
 #define AT_REST (wave.mean < rest_below)
 
+#if WALL
+#define WALL_ARGUMENT __global const float *restrict wall,
+#else
+#define WALL_ARGUMENT
+#endif
 #define ARGUMENTS                                                                                \
     __global const FRAME *restrict stack, __global const float *restrict tables,                 \
-    __global const float *restrict scale, const int table, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
+    __global const float *restrict scale, WALL_ARGUMENT const int table, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
     const float sin_tilt, const float noise_base, const float noise_slope, const float noise_least, \
     const float noise_limit, const float limit, const float still_below, const float wild_above, const float rest_below,                         \
     __global float *restrict vectors, __global float *restrict sigma,                            \
@@ -411,16 +572,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     const int first = (int)get_global_id(0) * WORDS * LANES;                                     \
     for (int p = first; p < LESSER(first + WORDS * LANES, pixels); p += LANES)
 
-#if COUNTED
-#define WHOLE(raw) ((raw > 0.0f) & (raw < TOP))
-#define PRESENT(raw) raw
-#define PRESENT_COUNT ((float)COUNT)
-#else
-#define WHOLE(raw) (raw == raw)
-#define PRESENT(raw) (raw == raw ? raw : (F)0.0f)
-#define PRESENT_COUNT JOIN(convert_float, LANES)(whole)
-#endif
-#if ENDS
+#if ENDS || WALL
 #define COUNT_WITHIN                                                                             \
     I plain = 0;                                                                                 \
     for (int k = 0; k < COUNT; ++k) {                                                            \
@@ -430,8 +582,17 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 #else
 #define COUNT_WITHIN const I plain = whole;
 #endif
+#if WALL
+#define READ_ENDS                                                                                \
+    const F pixel_x = SCALE(2), pixel_y = SCALE(3), z = SCALE(4), low = DARKEST, high = LIGHTEST; \
+    const F bend = BEND + BEND_SQUARE * (pixel_x * pixel_x + pixel_y * pixel_y);                 \
+    const Place place = {pixel_x * (1.0f - z * bend), pixel_y * (1.0f - z * bend), z, -bend * pixel_x, -bend * pixel_y, bend};
+#else
+#define READ_ENDS const F low = SCALE(2), high = SCALE(3);
+#endif
 #define READ_ZENITHS                                                                             \
-    const F offset = SCALE(0), per_count = SCALE(1), low = SCALE(2), high = SCALE(3);            \
+    const F offset = SCALE(0), per_count = SCALE(1);                                             \
+    READ_ENDS                                                                                    \
     F zeniths[COUNT], sum = 0.0f;                                                                 \
     I whole = 0;                                                                                 \
     for (int k = 0; k < COUNT; ++k) {                                                            \
@@ -446,6 +607,56 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     COUNT_WITHIN                                                                                 \
     const Wave wave = fit_wave(zeniths, turn);
 
+// With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
+#define CONCLUDE(plain, at_rest, model)                                                          \
+    const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;                \
+    const F error = error_of_one * root((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));       \
+    const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f); \
+    const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;                             \
+    const F d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scaled;                             \
+    const F w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) * scaled;                           \
+    const F w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) * scaled;                           \
+    const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);                 \
+    const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;             \
+    const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;                 \
+    const F doubt = 3.0f * error_of_one * inverse_root(told);                                    \
+    const I apart = at_rest | (more_tilt + doubt < still_below) | (more_tilt - doubt > wild_above); \
+    KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left, model) & ~apart)
+
+#if WALL
+// Where too few samples tell anything, there is no answer, however closely one looks.
+__kernel void normals_wall(ARGUMENTS)
+{
+    EACH_VECTOR {
+        READ_ZENITHS
+        const Direction begin = begin_at_wall(zeniths, (level - offset) * per_count, turn HERE);
+        Direction found = begin;
+        for (int number = 1; number < STEPS; ++number)
+            found = step(found, look(found, zeniths, wave, turn, cos_tilt, sin_tilt HERE, 0));
+        Sums sums = look(found, zeniths, wave, turn, cos_tilt, sin_tilt HERE, 1);
+        const F waves = sums.waves;
+        found = step(found, sums);
+        const I odd = ((plain < COUNT) | (sums.within < COUNT)) & (plain >= LEAST);
+        if (ANY(odd)) {
+            Direction at = begin;
+            for (int more = 0; more < MORE; ++more) {
+                const Sums closer = look_closely(at, zeniths, frames, begins, each, p, turn, cos_tilt, sin_tilt,
+                                                 offset, per_count, low, high, error_of_one HERE);
+                sums = blend_sums(sums, closer, odd);
+                const Direction before = at;
+                at = step(at, closer);
+                const F along = at.ct - before.ct, x = at.st * at.cp - before.st * before.cp;
+                const F y = at.st * at.sp - before.st * before.sp;
+                if (!ANY(odd & (along * along + x * x + y * y > SETTLED))) break;
+            }
+            found = blend(found, at, odd);
+        }
+        const I telling = LESSER(plain, sums.within);
+        CONCLUDE(telling, (found.st < rest_below), limit * (1.0f / COUNT) * sums.m11)
+        KEEP_WAVE(waves)
+    }
+}
+#else
 __kernel void normals_exact(ARGUMENTS)
 {
     EACH_VECTOR {
@@ -468,21 +679,7 @@ __kernel void normals_exact(ARGUMENTS)
             }
             found = blend(found, at, odd);
         }
-        const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;
-        const F error = error_of_one * root((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));
-        const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f);
-
-        // With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
-        const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;
-        const F d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scaled;
-        const F w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) * scaled;
-        const F w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) * scaled;
-        const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);
-        const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;
-        const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;
-        const F doubt = 3.0f * error_of_one * inverse_root(told);
-        const I apart = AT_REST | (more_tilt + doubt < still_below) | (more_tilt - doubt > wild_above);
-        KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left) & ~apart)
+        CONCLUDE(plain, AT_REST, limit)
         KEEP_WAVE(waves)
     }
 }
@@ -510,7 +707,8 @@ __kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosin
         const I answered = swings & (ct > 0.0f);
         const F swung = swing * inverse, doubt = 3.0f * error_of_one * root(along);
         const I apart = AT_REST | (swung + doubt < still_below) | (swung - doubt > wild_above);
-        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves) & ~apart)
+        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves, limit) & ~apart)
         KEEP_WAVE(waves)
     }
 }
+#endif

@@ -142,7 +142,7 @@ def normals_exact(
     -------
     Answer
     """
-    samples = _Samples(frames, turn, scale, noise)
+    samples = Samples(frames, turn, scale, noise)
     normal = _start(samples, turn, tilt)
     sums = None
     for number in range(2 + MORE):
@@ -154,17 +154,11 @@ def normals_exact(
             break
         latest = _look(normal, samples, turn, tilt, closely=number >= 2)
         sums = latest if sums is None or number < 2 else latest.where(moves, sums)
-        normal = np.where(moves[:, np.newaxis], _step(normal, latest), normal)
+        normal = np.where(moves[:, np.newaxis], step(normal, latest), normal)
     assert sums is not None
-    det = sums.m11 * sums.m22 - sums.m12**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
-        more_tilt, told, left = _free_tilt(sums, det)
-        doubt = 3 * samples.error / np.sqrt(told)
-        apart = (tilt + more_tilt + doubt < limits.still) | (tilt + more_tilt - doubt > limits.most)
-        touching = _like_noise(left, samples, limits) & ~apart & ~(samples.mean < limits.rest)
-    unknown = (samples.plain < _LEAST) | ~(sigma < _NO_ANSWER)
-    return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
+    with np.errstate(invalid="ignore"):
+        rest = samples.mean < limits.rest
+    return conclude(normal, sums, samples, samples.plain, tilt, limits, limits.model, rest)
 
 
 def normals_paper(
@@ -190,7 +184,7 @@ def normals_paper(
     Answer
         The standard errors are those by noise; the approximation's own error comes on top.
     """
-    samples = _Samples(frames, turn, scale, noise)
+    samples = Samples(frames, turn, scale, noise)
     zenith, c, s = samples.mean, samples.cosine, samples.sine
     swing = np.hypot(c, s)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -201,7 +195,11 @@ def normals_paper(
         sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / swing) ** 2 * across)
         doubt = 3 * samples.error * np.sqrt(along)
         apart = (swing + doubt < limits.still) | (swing - doubt > limits.most)
-        touching = _like_noise(samples.square, samples, limits) & ~apart & ~(zenith < limits.rest)
+        touching = (
+            _like_noise(samples.square, samples, limits.noise, limits.model)
+            & ~apart
+            & ~(zenith < limits.rest)
+        )
     normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
     return _answer(normal, np.where(swing > _STEADY, sigma, np.nan), touching, samples)
 
@@ -228,7 +226,7 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
     with np.errstate(divide="ignore"):
         sigma = 1 / np.sqrt(own + theirs)
     return Answer(
-        vectors=_unit(sums),
+        vectors=normalise(sums),
         sigma=np.where(np.isinf(sigma), np.nan, sigma),
         contact=before.contact & now.contact,
         mean=mean(before.mean, now.mean),
@@ -238,14 +236,14 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
     )
 
 
-class _Samples:
+class Samples:
     """Samples as zeniths, and their fit with one wave a turn."""
 
     def __init__(self, frames: NDArray[Any], turn: Doubles, scale: Doubles, noise: Variance) -> None:
         count, pixels = frames.shape
         self.offset, per_count, self.low, self.high = np.broadcast_to(scale.reshape(4, -1), (4, pixels))
         self.per_count = per_count
-        self.freedom = count - 3
+        self.turn, self.freedom = turn, count - 3
         raw = frames.astype(np.float64)
         self.zenith = (raw - self.offset) * per_count
         self.missing = np.isnan(raw)
@@ -267,8 +265,47 @@ class _Samples:
         self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
 
+def conclude(
+    normal: Doubles,
+    sums: Sums,
+    samples: Samples,
+    plain: NDArray[np.int_],
+    tilt: float,
+    limits: Limits,
+    model: float | Doubles,
+    rest: NDArray[np.bool_],
+) -> Answer:
+    """Say how sure a direction is, and whether it is one of a lasting contact.
+
+    Parameters
+    ----------
+    normal : ndarray, (n, 3), float64
+    sums : Sums
+        At the direction, or next to it.
+    samples : Samples
+    plain : ndarray, (n,), int
+        How many samples are whole and within their range.
+    tilt : float
+        Radians.
+    limits : Limits
+    model : float or ndarray, (n,), float64
+        Sum of squares that the model may leave out, in the unit of the samples, squared.
+    rest : ndarray, (n,), bool
+        Where the sheet is at rest.
+    """
+    det = sums.m11 * sums.m22 - sums.m12**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
+        more_tilt, told, left = _free_tilt(sums, det)
+        doubt = 3 * samples.error / np.sqrt(told)
+        apart = (tilt + more_tilt + doubt < limits.still) | (tilt + more_tilt - doubt > limits.most)
+        touching = _like_noise(left, samples, limits.noise, model) & ~apart & ~rest
+    unknown = (plain < _LEAST) | ~(sigma < _NO_ANSWER)
+    return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
+
+
 @dataclass(frozen=True, slots=True)
-class _Sums:
+class Sums:
     """Normal equations of the direction (along the meridian 1, across it 2) and of the tilt (3)."""
 
     m11: Doubles
@@ -282,25 +319,46 @@ class _Sums:
     b3: Doubles
     square: Doubles
 
-    def where(self, chosen: NDArray[np.bool_], other: _Sums) -> _Sums:
-        return _Sums(*(np.where(chosen, getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
+    @classmethod
+    def of(
+        cls, u1: Doubles, u2: Doubles, u3: Doubles, share: Doubles, pull: Doubles, squares: Doubles
+    ) -> Sums:
+        """Sum over the samples, (N, n): derivatives, shares of information, pulls and squared misfits."""
+        return cls(
+            m11=(share * u1 * u1).sum(axis=0),
+            m12=(share * u1 * u2).sum(axis=0),
+            m22=(share * u2 * u2).sum(axis=0),
+            m13=(share * u1 * u3).sum(axis=0),
+            m23=(share * u2 * u3).sum(axis=0),
+            m33=(share * u3 * u3).sum(axis=0),
+            b1=(u1 * pull).sum(axis=0),
+            b2=(u2 * pull).sum(axis=0),
+            b3=(u3 * pull).sum(axis=0),
+            square=squares.sum(axis=0),
+        )
+
+    def where(self, chosen: NDArray[np.bool_], other: Sums) -> Sums:
+        """Take the pixels that are chosen from here, the others from there."""
+        return Sums(*(np.where(chosen, getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
 
 
-def _start(samples: _Samples, turn: Doubles, tilt: float) -> Doubles:
+def _start(samples: Samples, turn: Doubles, tilt: float) -> Doubles:
     level = np.cos(samples.zenith)
     if samples.missing.any():
         known = np.maximum((~samples.missing).sum(axis=0), 1)
         level = np.where(samples.missing, np.where(samples.missing, 0.0, level).sum(axis=0) / known, level)
     mean, cosine, sine = turn[3:] @ level
-    return _unit(np.stack([-cosine * math.cos(tilt), -sine * math.cos(tilt), mean * math.sin(tilt)], axis=1))
+    return normalise(
+        np.stack([-cosine * math.cos(tilt), -sine * math.cos(tilt), mean * math.sin(tilt)], axis=1)
+    )
 
 
-def _look(normal: Doubles, samples: _Samples, turn: Doubles, tilt: float, closely: bool) -> _Sums:
+def _look(normal: Doubles, samples: Samples, turn: Doubles, tilt: float, closely: bool) -> Sums:
     """Form the normal equations at a direction; closely, as clipped or missing samples demand."""
     axes, tilting = _axes(turn, tilt)
     chord = np.linalg.norm(normal[np.newaxis] - axes[:, np.newaxis], axis=2)
     zenith = 2 * np.arcsin(np.clip(chord / 2, 1e-6, math.sqrt(0.5)))
-    along, across = _tangents(normal)
+    along, across = tangents(normal)
     root = turn[2][:, np.newaxis]
     # d zenith = -d(n . a) / sin(zenith)
     by_sine = -root / np.sin(zenith)
@@ -308,31 +366,20 @@ def _look(normal: Doubles, samples: _Samples, turn: Doubles, tilt: float, closel
     error = samples.zenith - zenith
     share, pull, misfit = np.ones_like(error), error, error**2
     if closely:
-        share, pull, misfit = _tell(samples, zenith)
-    pull = root * pull
-    return _Sums(
-        m11=(share * u1 * u1).sum(axis=0),
-        m12=(share * u1 * u2).sum(axis=0),
-        m22=(share * u2 * u2).sum(axis=0),
-        m13=(share * u1 * u3).sum(axis=0),
-        m23=(share * u2 * u3).sum(axis=0),
-        m33=(share * u3 * u3).sum(axis=0),
-        b1=(u1 * pull).sum(axis=0),
-        b2=(u2 * pull).sum(axis=0),
-        b3=(u3 * pull).sum(axis=0),
-        square=(root**2 * misfit).sum(axis=0),
-    )
+        inside = (zenith > samples.low) & (zenith < samples.high)
+        share, pull, misfit = tell(samples, np.clip(zenith, samples.low, samples.high), inside)
+    return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit)
 
 
-def _tell(samples: _Samples, zenith: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+def tell(samples: Samples, seen: Doubles, inside: NDArray[np.bool_]) -> tuple[Doubles, Doubles, Doubles]:
     """Return what each sample tells: its share of information, its pull on the zenith, its squared misfit.
+
+    Expected is ``seen``; where that is not inside the range, a sample tells nothing.
 
     A clipped sample has the likelihood of being beyond its bound (Tobin 1958): with z the bound's distance
     in standard deviations and m the ratio of the normal distribution's density to its integral there, its
     pull is m and its information m (m + z).
     """
-    seen = np.clip(zenith, samples.low, samples.high)
-    inside = (zenith > samples.low) & (zenith < samples.high)
     error = samples.zenith - seen
     clipped = samples.under | samples.over
     bound = (np.where(samples.under, 0.5, samples.top - 0.5) - samples.offset) * samples.per_count
@@ -359,7 +406,7 @@ def _axes(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
     return axes, tilting
 
 
-def _tangents(normal: Doubles) -> tuple[Doubles, Doubles]:
+def tangents(normal: Doubles) -> tuple[Doubles, Doubles]:
     """Return unit vectors along the meridian, away from the pole, and across it, (n, 3) each."""
     x, y, z = normal.T
     st = np.hypot(x, y)
@@ -368,19 +415,19 @@ def _tangents(normal: Doubles) -> tuple[Doubles, Doubles]:
     return np.stack([z * cp, z * sp, -st], axis=1), np.stack([-sp, cp, np.zeros_like(sp)], axis=1)
 
 
-def _step(normal: Doubles, sums: _Sums) -> Doubles:
+def step(normal: Doubles, sums: Sums) -> Doubles:
     """Take a Gauss-Newton step."""
-    along, across = _tangents(normal)
+    along, across = tangents(normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         det = sums.m11 * sums.m22 - sums.m12**2
         d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det
         d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
         shorter = _REACH**2 / np.maximum(d1**2 + d2**2, _REACH**2)
         moved = normal + (shorter * d1)[:, np.newaxis] * along + (shorter * d2)[:, np.newaxis] * across
-    return _unit(moved)
+    return normalise(moved)
 
 
-def _free_tilt(sums: _Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+def _free_tilt(sums: Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Return the step of the tilt were it free, its information, and the sum of squares then left."""
     d1, d2 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det, (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
     w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) / det
@@ -390,15 +437,15 @@ def _free_tilt(sums: _Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     return pull / told, told, sums.square - sums.b1 * d1 - sums.b2 * d2 - pull**2 / told
 
 
-def _like_noise(square: Doubles, samples: _Samples, limits: Limits) -> NDArray[np.bool_]:
+def _like_noise(square: Doubles, samples: Samples, noise: float, model: float | Doubles) -> NDArray[np.bool_]:
     """Tell where a sum of squares is that of noise and of what the model leaves out; all, of three frames."""
     if samples.freedom == 0:
         return np.ones(len(square), bool)
-    found: NDArray[np.bool_] = square <= limits.noise * samples.error**2 + limits.model
+    found: NDArray[np.bool_] = square <= noise * samples.error**2 + model
     return found
 
 
-def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], samples: _Samples) -> Answer:
+def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], samples: Samples) -> Answer:
     with np.errstate(divide="ignore", invalid="ignore"):
         answered = np.isfinite(sigma) & (normal[:, 2] > 0)  # a sheet does not face away
         gain = 1 / samples.per_count
@@ -415,6 +462,7 @@ def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], sample
     )
 
 
-def _unit(vectors: Doubles) -> Doubles:
+def normalise(vectors: Doubles) -> Doubles:
+    """Return vectors, (n, 3), of length 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -4,6 +4,7 @@
 // FRAME   type of a sample
 // TOP     largest count of an integer type; it is not set for floats
 // LEVELS  1 where each pixel has its own counts for the same light, 0 where all are alike
+// CURVED  1 where shifts go by the squares of column and row, and their product, as well; unset otherwise
 // TILE    pixels of one work-item, all in one row; 1 where an item is a lane, many where it is a core's loop
 //
 // A missing sample is a NaN, and so is the border round a padded frame: whatever is made of one is a NaN as
@@ -56,6 +57,17 @@ __kernel void registration_admit(
     }
 }
 
+// Each place has five numbers: where it lies in the padded frame, and the four samples of which it is the mean.
+__kernel void registration_mend(const int count, __global const int *restrict places, __global float *restrict padded)
+{
+    const int first = get_global_id(0) * TILE, end = min(first + TILE, count);
+    for (int i = first; i < end; ++i) {
+        __global const int *place = places + 5 * i;
+        const float beside = padded[place[1]] + padded[place[2]], above = padded[place[3]] + padded[place[4]];
+        padded[place[0]] = 0.25f * (beside + above);
+    }
+}
+
 __kernel void registration_resample(
     const int rows, const int columns, __global const float *restrict padded, __global const float *restrict height,
     __global const float *restrict shift, __global const float *restrict offset, __global const float *restrict gain,
@@ -65,8 +77,14 @@ __kernel void registration_resample(
     if (row >= rows) return;
     const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, columns);
     const int pixels = rows * columns, stride = columns + 2 * BORDER;
+#if CURVED
+    const float right = shift[0] + (shift[2] + shift[6] * row) * row, right_column = shift[1] + shift[5] * row;
+    const float down = shift[7] + (shift[9] + shift[13] * row) * row, down_column = shift[8] + shift[12] * row;
+    const float right_curve = shift[4], right_height = shift[3], down_curve = shift[11], down_height = shift[10];
+#else
     const float right = shift[0] + shift[2] * row, right_column = shift[1], right_height = shift[3];
     const float down = shift[4] + shift[6] * row, down_column = shift[5], down_height = shift[7];
+#endif
 
     for (int base = first; base < end; base += CHUNK) {
         const int width = min(CHUNK, end - base), start = row * columns + base;
@@ -75,8 +93,13 @@ __kernel void registration_resample(
 
         for (int i = 0; i < width; ++i) {
             const int column = base + i;
+#if CURVED
+            float x = right + (right_column + right_curve * column) * column + right_height * height[start + i];
+            float y = down + (down_column + down_curve * column) * column + down_height * height[start + i];
+#else
             float x = right + right_column * column + right_height * height[start + i];
             float y = down + down_column * column + down_height * height[start + i];
+#endif
             HOLD(x, -1 - column, columns - 1 - column)
             HOLD(y, -1 - row, rows - 1 - row)
             int west = (int)x, north = (int)y;

@@ -51,6 +51,21 @@ def registration_admit(
     padded[BORDER:-BORDER, BORDER:-BORDER] = np.where(usable, value, np.nan)
 
 
+def registration_mend(places: NDArray[np.int32], padded: NDArray[np.float32]) -> None:
+    """Put the mean of samples round them in the places of those that tell nothing in any frame.
+
+    Parameters
+    ----------
+    places : ndarray, (n, 5), int32
+        Where in the padded frame, row by row, and the four samples of which it is made. None of these is
+        mended itself.
+    padded : ndarray, (H + 4, W + 4), float32
+        See ``registration_admit``.
+    """
+    flat = padded.reshape(-1)
+    flat[places[:, 0]] = flat[places[:, 1:]].astype(np.float64).mean(axis=1)
+
+
 def weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the weights, (4, ...), of the samples at -1, 0, 1 and 2 for a place from 0 to 1."""
     before, behind, beyond = part + 1, part - 1, part - 2
@@ -81,9 +96,10 @@ def registration_resample(
         See ``registration_admit``.
     height : ndarray, (H, W), float32
         Of the object's points, mm; NaN where unknown.
-    shift : ndarray, (2, 4), float32
+    shift : ndarray, (2, 4) or (2, 7), float32
         How many pixels to the right, and how many down, the point of a pixel is to be found: a number, and
-        what is added for each column, row and millimetre of height.
+        what is added for each column, row and millimetre of height; perhaps also for the column's square,
+        the column times the row, and the row's square.
     offset, gain : ndarray, (H, W) or (1, 1), float32
         See ``registration_admit``.
     registered : ndarray, (H, W), float32
@@ -95,7 +111,8 @@ def registration_resample(
     """
     rows, columns = height.shape
     column, row = np.meshgrid(np.arange(float(columns)), np.arange(float(rows)))
-    place = np.stack([np.ones(height.shape), column, row, height])
+    place = np.stack([np.ones(height.shape), column, row, height, column**2, column * row, row**2])
+    place = place[: shift.shape[1]]
     right, down = np.tensordot(shift.astype(np.float64), place, 1)
     west, part_x = _split(column, right, columns)
     north, part_y = _split(row, down, rows)

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from mirrorskin.engine.calibrated import on_the_sheet
 from mirrorskin.engine.integration.follow import Follower
 from mirrorskin.engine.live.edges import SpareEdges
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.types import Update
-from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.engine.provenance import naming, sign, told, told_level
 from mirrorskin.engine.rotation.axial import Rotation, maps_of
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator
 from mirrorskin.engine.rotation.edges import find_edges
@@ -22,12 +24,15 @@ from mirrorskin.engine.rotation.launch import NormalMethod
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.relief import find_relief
 from mirrorskin.engine.rotation.relief_maps import SlopeMaps
+from mirrorskin.engine.rotation.response import first_response, response_of
+from mirrorskin.engine.rotation.standing import standing_heights
 from mirrorskin.engine.rotation.turns import LONGEST
 from mirrorskin.engine.rotation.window import NormalWindow
 from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _FEWEST = 3  # frames that determine a wave
+_PLACED = 8  # updates after which it is told anew how high the object stands
 _WARMING = 10  # updates after which every kernel has run
 _NO_GAIN = "none: the source has no zenith gain"
 _NO_PIXEL_SIZE = "none: the source has no pixel size"
@@ -53,6 +58,9 @@ def choose_window(frames_a_turn: float) -> tuple[int, int]:
 
 class LiveRotation:
     """Tell normals, edges and heights of the last frames; the accumulator is ``NormalWindow``.
+
+    Where the source's calibration says how bright a wall makes pixels look, that is used; how high the object
+    stands is then told from the heights so far, now and then.
 
     Heights follow the normals by one step of a solver for each update: their error stays near what changes
     from one update to the next. Edges are drawn in the time that is left. Without a zenith gain there are
@@ -107,7 +115,9 @@ class LiveRotation:
         self._method, self._header = method, header
         self._wave: Correlator | None = None
         self._normals: NormalWindow | None = None
-        if header.zenith_gain is None:
+        wall = response_of(source)
+        self._response = None if wall is None else first_response(wall, source, header)
+        if header.zenith_gain is None and wall is None:
             self._wave = Correlator(shape, source.dtype, window=window, device=device)
             self.device = self._wave.device
         else:
@@ -122,6 +132,7 @@ class LiveRotation:
                 noise=noise,
                 low=header.dark,
                 high=header.bright,
+                response=self._response,
                 device=device,
             )
             self.device = self._normals.device
@@ -174,6 +185,9 @@ class LiveRotation:
         self._has_estimate = True
         vectors, contact = normals.glance("vectors"), normals.glance("contact")  # while heights are found
         height = None if self._heights is None else self._heights.end()
+        self._updates += 1
+        if height is not None and self._updates % _PLACED == 1:
+            self._place(height)
         return Update(
             *told,
             height=height,
@@ -219,19 +233,23 @@ class LiveRotation:
         process: dict[str, ProcessValue] = {"live": True, "window": self._size, "every": self.every}
         if self._normals is None:
             process |= {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
-            return sign(Result(azimuth=wave.azimuth, **maps), self._source, self.device, process)
-        normals = self.normals()
+            return self._signed(Result(azimuth=wave.azimuth, **maps), process)
+        normals = self._settled()
         edges = find_edges(normals.vectors, normals.sigma, normals.contact, device=self.device)
-        result = maps_of(Rotation(normals, normals.sigma, edges, self.device, {}))
+        systematic = None if self._response is None else self._response.sigma
+        result = maps_of(Rotation(normals, normals.sigma, edges, self.device, {}, systematic))
         process |= self._tell(normals)
         if self._header.pixel_size is None:
             process["height"] = _NO_PIXEL_SIZE
-            return sign(replace(result, **maps), self._source, self.device, process)
+            return self._signed(replace(result, **maps), process)
         with naming(self._source):
             relief = find_relief(normals, normals.sigma, self._header.pixel_size, device=self.device)
         maps |= {"height": relief.height, "height_sigma": relief.sigma, "component": relief.component}
         maps["offset_unknown"] = relief.offset_unknown
-        return sign(replace(result, **maps), self._source, self.device, process | relief.process)
+        return self._signed(replace(result, **maps), process | relief.process)
+
+    def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
+        return on_the_sheet(sign(result, self._source, self.device, process), self._source)
 
     @property
     def _frames_to(self) -> NormalWindow | Correlator:
@@ -239,6 +257,27 @@ class LiveRotation:
         found = self._normals if self._normals is not None else self._wave
         assert found is not None
         return found
+
+    def _place(self, height: NDArray[np.float32]) -> None:
+        """Tell the window where the object is, if that counts: its pieces' tops as high as the press."""
+        response, normals, press = self._response, self._normals, self._header.press
+        if response is None or normals is None or press is None:
+            return
+        piece, count = ndimage.label(np.isfinite(height), np.ones((3, 3)))
+        tops = np.concatenate([[0.0], ndimage.maximum(height, piece, np.arange(1, count + 1))])
+        normals.place(
+            np.where(piece > 0, np.clip(press + height - tops[piece], 0, press), response.planes[4])
+        )
+
+    def _settled(self) -> Normals:
+        """Return the normals of the last window, the object placed as well as they tell."""
+        normals, response, header = self.normals(), self._response, self._header
+        if response is None or header.pixel_size is None or header.press is None:
+            return normals
+        assert self._normals is not None
+        maps = normals.vectors, normals.contact, response.level(normals.mean)
+        self._normals.place(standing_heights(*maps, header.pixel_size, header.press, self.device))
+        return self.normals()
 
     def _follow(self, normals: NormalWindow) -> None:
         """Begin a step towards the heights of the normals that are being estimated."""
@@ -263,14 +302,19 @@ class LiveRotation:
     def _tell(self, normals: Normals) -> dict[str, ProcessValue]:
         """Say what the normals were made with."""
         header = self._header
+        scale: dict[str, ProcessValue] = {
+            "zenith_gain": told(None, header.zenith_gain, "none"),
+            "zenith_offset": told(None, header.zenith_offset, "0"),
+            "low": told_level(self._source, "dark"),
+            "high": told_level(self._source, "bright"),
+        }
+        if self._response is not None:
+            scale = {"zenith": "calibrated"}
         return {
             "method": self._method,
             "tilt": normals.tilt,
             "tilt_from": "estimate" if header.tilt is None else "recording",
-            "zenith_gain": told(None, header.zenith_gain, "none"),
-            "zenith_offset": told(None, header.zenith_offset, "0"),
-            "low": told(None, header.dark, "range of the type"),
-            "high": told(None, header.bright, "range of the type"),
+            **scale,
             "noise": normals.noise,
             "shot_noise": normals.shot,
             "turns": normals.turns,
@@ -279,7 +323,9 @@ class LiveRotation:
 
     def _reset(self) -> None:
         self._frames, self._time, self._position = 0, math.nan, math.nan
-        self._has_estimate = False
+        self._has_estimate, self._updates = False, 0
+        if self._response is not None and self._normals is not None:
+            self._normals.place(self._response.planes[4])
         if self._edges is not None:
             self._edges.reset()
         if self._slopes is not None and self._heights is not None:

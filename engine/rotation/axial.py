@@ -8,25 +8,21 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.feed import Progress, feed
-from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.engine.provenance import naming, sign, told, told_level
 from mirrorskin.engine.rotation.correlation import Correlator
-from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.launch import NORMAL_METHODS, NormalMethod
-from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
-from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.relief import find_relief
-from mirrorskin.engine.rotation.turns import LONGEST, longest_turn
+from mirrorskin.engine.rotation.response import response_of
+from mirrorskin.engine.rotation.run import Run
 from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
-
-_REACH = 5  # pixels across, of which a registered sample may be made
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +39,8 @@ class Rotation:
     device : Device
     process : dict
         What it was made with.
+    systematic : ndarray, (H, W), float32, or None
+        Standard errors, radians, that a calibration adds to the normals', alike for neighbours.
     """
 
     normals: Normals
@@ -50,6 +48,7 @@ class Rotation:
     edges: NDArray[np.uint8]
     device: Device
     process: dict[str, ProcessValue]
+    systematic: NDArray[np.float32] | None = None
 
 
 def reconstruct_rotation(
@@ -69,8 +68,9 @@ def reconstruct_rotation(
 ) -> Result:
     """Reconstruct normals from an axial rotation of one turn or more, and the heights that fit them.
 
-    Brightness is taken to be linear in the zenith between the source's dark and bright references, where it
-    has them. Without a zenith gain, there are azimuth, mean, modulation and residual only; without a pixel
+    Brightness is what the zenith response of the source's calibration says (see `mirrorskin.io.Calibrated`).
+    Without one, it is taken to be linear in the zenith between the source's dark and bright references, where
+    it has them. Without a zenith gain, there are azimuth, mean, modulation and residual only; without a pixel
     size, no heights. Heights are relative: the mean of each connected piece is 0.
 
     Parameters
@@ -83,15 +83,16 @@ def reconstruct_rotation(
         Half-angle of the precession, radians; by default the source's own. It is estimated from the first
         turn on request only: where the pivot is far from the object's surface, that is wrong.
     gain, offset : array_like, scalar or (H, W), optional
-        Counts per radian of zenith, and counts at zenith 0, instead of the source's own; an offset that
-        nobody knows is 0.
+        Counts per radian of zenith, and counts at zenith 0, instead of the source's own and of a calibrated
+        response; an offset that nobody knows is 0.
     noise : float, optional
         Standard deviation of a sample, counts; by default told from the first turn.
     per_turn : bool
         Whether to tell each turn alone, in maps with a leading axis, instead of the mean over turns.
     heights : array_like, (H, W), optional
         Millimetres of the surface: frames are registered for the pivot's shift with them first; see
-        ``Registered``.
+        ``Registered``. A calibrated response needs them in any case: where they are not given, they are found
+        in a first pass over the source.
     robust : bool
         Whether the surface may break, at discontinuities that are found in it; see
         `mirrorskin.engine.integrate`. Edges are drawn there, too.
@@ -113,7 +114,7 @@ def reconstruct_rotation(
     mirrorskin.engine.NotConverged
         The heights that fit the normals were not found.
     """
-    if gain is None and source.header.zenith_gain is None:
+    if gain is None and source.header.zenith_gain is None and response_of(source) is None:
         check_method(source, method)
         _need_no_gain(source, per_turn, heights)
         return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
@@ -165,53 +166,34 @@ def estimate_rotation(
     """Find the normals of a rotation whose zenith gain is known; see ``reconstruct_rotation``."""
     check_method(source, method)
     header = _believe(source, tilt, gain, offset)
-    opened = open_device(device)
-    frames: Source = source
-    if heights is not None:
-        if tilt == "estimate":
-            raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
-        frames = Registered(source, heights, opened, header)
-    assert header.zenith_gain is not None
-    assert header.zenith_offset is not None
-    with naming(source):
-        estimator = NormalEstimator(
-            frames.shape[1:],
-            frames.dtype,
-            tilt=header.tilt,
-            gain=header.zenith_gain,
-            offset=header.zenith_offset,
-            method=method,
-            noise=noise,
-            low=header.dark,
-            high=header.bright,
-            longest=_longest_turn(source),
-            per_turn=per_turn,
-            device=opened,
-            memory_limit=min(memory_limit, 2 * math.prod(frames.shape) * frames.dtype.itemsize),
-        )
-        feed(frames, estimator, range(frames.shape[0]), progress)
-        normals = estimator.result()
-    edges = _edges(normals, opened)  # where contact ends, before that is moved inwards
-    white = normals.sigma
-    if isinstance(frames, Registered):
-        white = white if noise is not None else white / frames.noise_gain
-        normals = _mend(normals, frames.noise_gain, given=noise is not None)
-    process: dict[str, ProcessValue] = {
+    wall = response_of(source) if gain is None else None
+    run = Run(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
+    if heights is not None and tilt == "estimate":
+        raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
+    if wall is None:
+        found = run.linear(heights)
+        process: dict[str, ProcessValue] = {
+            "zenith_gain": told(gain, source.header.zenith_gain, "none"),
+            "zenith_offset": told(offset, source.header.zenith_offset, "0"),
+            "low": told_level(source, "dark"),
+            "high": told_level(source, "bright"),
+            "heights": "none" if heights is None else "given",
+        }
+    else:
+        found, process = run.calibrated(wall, heights)
+    normals = found.normals
+    process = {
         "method": method,
         "tilt": normals.tilt,
         "tilt_from": "estimate" if tilt == "estimate" else "given" if tilt is not None else "recording",
-        "zenith_gain": told(gain, source.header.zenith_gain, "none"),
-        "zenith_offset": told(offset, source.header.zenith_offset, "0"),
-        "low": told(None, header.dark, "range of the type"),
-        "high": told(None, header.bright, "range of the type"),
         "noise": normals.noise,
         "shot_noise": normals.shot,
         "turns": normals.turns,
         "frames": normals.frames,
         "per_turn": per_turn,
-        "heights": "none" if heights is None else "given",
+        **process,
     }
-    return Rotation(normals, white, edges, opened, process)
+    return Rotation(normals, found.white, found.edges, run.device, process, found.systematic)
 
 
 def correlate_source(
@@ -266,7 +248,7 @@ def maps_of(rotation: Rotation) -> Result:
         normals=normals.vectors,
         zenith=normals.zenith,
         azimuth=normals.azimuth,
-        normal_sigma=normals.sigma,
+        normal_sigma=_with_systematic(normals.sigma, rotation.systematic),
         mean=normals.mean,
         modulation=normals.modulation,
         residual=normals.residual,
@@ -282,12 +264,10 @@ def check_method(source: Source, method: str) -> None:
         raise InputError(f"{source.name} is a rotation, which method {method!r} cannot do: take {known}")
 
 
-def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
-    """Find the edges of each turn, or of their mean."""
-    maps = normals.vectors, normals.sigma, normals.contact
-    if normals.contact.ndim == 2:
-        return find_edges(*maps, device=device)
-    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
+def _with_systematic(
+    sigma: NDArray[np.float32], systematic: NDArray[np.float32] | None
+) -> NDArray[np.float32]:
+    return sigma if systematic is None else np.hypot(sigma, systematic)
 
 
 def _believe(
@@ -315,22 +295,3 @@ def _need_no_gain(source: Source, per_turn: bool, heights: ArrayLike | None) -> 
     if per_turn or heights is not None:
         asked = "turns of their own" if per_turn else "use for heights"
         raise InputError(f"{source.name} has no zenith gain, so no normals, and no {asked}: give the gain")
-
-
-def _longest_turn(source: Source) -> int:
-    """Return how many frames a turn may have: as many as they have, where that is known beforehand."""
-    phase: NDArray[np.float64] | None = getattr(source, "phase", None)
-    return LONGEST if phase is None else longest_turn(phase)
-
-
-def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Normals:
-    """Account for what interpolation did to a pixel's noise, and where it reached beyond the contact.
-
-    Noise that was told from the frames themselves knows of the former. Samples are made of 4 x 4, of which
-    two on either side may have lost contact.
-    """
-    reach = np.ones((1,) * (normals.contact.ndim - 2) + (_REACH, _REACH), bool)
-    lost = np.isfinite(normals.sigma) & (normals.contact == 0)
-    inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
-    sigma = normals.sigma * noise_gain if given else normals.sigma
-    return replace(normals, sigma=sigma, contact=inside)

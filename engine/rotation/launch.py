@@ -15,12 +15,15 @@ from mirrorskin.engine.noise import thinning
 from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
 from mirrorskin.engine.rotation.fits import TurnFit
 from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import Scale
-from mirrorskin.engine.rotation.tilt import estimate_tilt, one_wave
+from mirrorskin.engine.rotation.tilt import estimate_tilt
 from mirrorskin.engine.rotation.turns import LONGEST
+from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.normals import MORE, contact_limits
+from mirrorskin.kernels.normals_wall import STEPS
 
 NormalMethod = Literal["exact", "paper"]
 NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
@@ -64,8 +67,13 @@ class NormalLaunch:
     device : Device
     dtype : dtype
         Of a sample.
-    scale : Scale
+    scale : Scale or Response
     method : {"exact", "paper"}
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The paper's equations, with a response.
 
     Attributes
     ----------
@@ -73,10 +81,19 @@ class NormalLaunch:
         Turns whose tables the device has at once, at most.
     """
 
-    def __init__(self, device: Device, dtype: np.dtype[Any], scale: Scale, method: NormalMethod) -> None:
+    def __init__(
+        self, device: Device, dtype: np.dtype[Any], scale: Scale | Response, method: NormalMethod
+    ) -> None:
         self._device, self._dtype, self._scale, self._method = device, dtype, scale, method
         if not scale.per_pixel:
             self._one_scale = device.given("scale", scale.planes)
+        if isinstance(scale, Response):
+            if method != "exact":
+                raise InputError(
+                    f"method {method!r} takes brightness for linear in the zenith, not as it was calibrated:"
+                    " take exact, or leave the calibration out"
+                )
+            self._wall = device.given("wall", scale.table)
         self.together = max(1, min(_TOGETHER, device.max_allocation // _TABLE_BYTES))
         self._tables = device.array("turns", (self.together, 6, LONGEST), np.float32)
         self._places: dict[TurnFit, int] = {}
@@ -84,7 +101,8 @@ class NormalLaunch:
     @property
     def planes(self) -> dict[str, Planes]:
         """The maps that a band needs."""
-        scale = {"scale": Planes(4, np.float32)} if self._scale.per_pixel else {}
+        per_pixel = {"scale": Planes(len(self._scale.planes), np.float32)}
+        scale = per_pixel if self._scale.per_pixel else {}
         maps = {
             name: Planes(3 if name == "vectors" else 1, np.uint8 if name == "contact" else np.float32)
             for name in MAPS
@@ -138,7 +156,7 @@ class NormalLaunch:
         integer = self._dtype.kind == "u"
         kernel = self._device.kernel(
             "normals",
-            f"normals_{self._method}",
+            "normals_wall" if isinstance(self._scale, Response) else f"normals_{self._method}",
             FRAME=C_TYPES[self._dtype.name],
             COUNTED=int(integer),
             TOP=int(np.iinfo(self._dtype).max) if integer else 0,
@@ -151,6 +169,7 @@ class NormalLaunch:
             MORE=MORE,
             RING=int(samples.ring),
             BARE=int(bare),
+            **self._wall_macros,
         )
         limits = contact_limits(count - 3, tilt)
         apart = tilt if self._method == "exact" else 0.0  # what is told is how much more it is, or all
@@ -166,13 +185,25 @@ class NormalLaunch:
             limits.rest,
         )
         scale = band.maps["scale"] if self._scale.per_pixel else self._one_scale
-        arguments: list[Operand | np.generic] = [samples.stack, self._tables, scale, *whole, np.int32(turns)]
+        arguments: list[Operand | np.generic] = [samples.stack, self._tables, scale]
+        arguments += [self._wall] if isinstance(self._scale, Response) else []
+        arguments += [*whole, np.int32(turns)]
         arguments += [*np.array(reals, np.float32), *(band.maps[name] for name in MAPS)]
         if self._method == "paper":
             (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             arguments += [*np.array([mean, cosine, both, sine], np.float32)]
-        moved = band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + 16 * self._scale.per_pixel)
+        planes = 4 * len(self._scale.planes) * self._scale.per_pixel
+        moved = band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + planes)
         kernel(-(-band.pixels // (lanes * shape.words)), *arguments, moved=moved)
+
+    @property
+    def _wall_macros(self) -> dict[str, int]:
+        """What a kernel under a wall is compiled with besides; nothing without one."""
+        if not isinstance(self._scale, Response):
+            return {}
+        wall = self._scale.wall
+        sizes = {"CURVE": len(wall.curve), "INVERSE": len(wall.inverse)}
+        return {"WALL": 1, "STEPS": STEPS, "FOLLOWS": int(wall.follows), **sizes}
 
 
 def settle(
@@ -181,7 +212,7 @@ def settle(
     phase: Doubles,
     weights: Doubles,
     matrix: Doubles,
-    scale: Scale,
+    scale: Scale | Response,
     noise: CountNoise | None,
     tilt: float | None,
 ) -> tuple[CountNoise, float]:
@@ -195,7 +226,7 @@ def settle(
         Rows and columns of a frame.
     phase, weights, matrix
         Of its frames; see ``mirrorskin.engine.rotation.fits``.
-    scale : Scale
+    scale : Scale or Response
     noise : CountNoise or None
     tilt : float or None
         Radians.
@@ -205,11 +236,17 @@ def settle(
     mirrorskin.io.InputError
         The turn does not tell it.
     """
-    thin = scale.thinned(thinning(shape))
+    step = thinning(shape)
     if noise is None:
         with np.errstate(invalid="ignore"):
-            steep = samples[:, one_wave(matrix @ samples, thin)]
+            wave = matrix @ samples
+            clear = scale.telling(wave, step)
+        steep = samples[:, clear]
         noise = noise_of_fit(steep if steep.shape[1] >= _ENOUGH else samples, phase, weights)
     if tilt is None:
-        tilt = estimate_tilt(samples, phase, weights, matrix, thin, noise)
+        if isinstance(scale, Response):
+            raise InputError(
+                "a calibrated response does not tell the tilt: calibrate that, or give it, such as 2.5deg"
+            )
+        tilt = estimate_tilt(samples, phase, weights, matrix, scale.thinned(step), noise)
     return noise, tilt

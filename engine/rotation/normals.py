@@ -22,6 +22,7 @@ from mirrorskin.engine.rotation.launch import (
     settle,
 )
 from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
+from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
@@ -92,13 +93,14 @@ def estimate_normals(
     frames: NDArray[Any],
     phase: ArrayLike,
     tilt: float | None,
-    gain: ArrayLike,
+    gain: ArrayLike | None = None,
     offset: ArrayLike = 0.0,
     *,
     method: NormalMethod = "exact",
     noise: float | None = None,
     low: ArrayLike | None = None,
     high: ArrayLike | None = None,
+    response: Response | None = None,
     weights: ArrayLike | None = None,
     device: str | Device | None = None,
 ) -> Normals:
@@ -121,6 +123,9 @@ def estimate_normals(
         shot noise.
     low, high : array_like, scalar or (H, W), optional
         Counts between which brightness is linear in the zenith; what is expected beyond tells nothing.
+    response : Response, optional
+        What is known of a sensor that is not linear, instead of gain, offset, low and high; see
+        ``mirrorskin.engine.rotation.response``.
     weights : array_like, (T,), optional
         Inverse variances of the frames, in those of ``noise``; 0 for a missing one.
     device : str or Device, optional
@@ -150,6 +155,7 @@ def estimate_normals(
         noise=noise,
         low=low,
         high=high,
+        response=response,
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
@@ -166,7 +172,7 @@ class NormalEstimator:
         Rows and columns of a frame.
     dtype : dtype
         uint8, uint16 or float32.
-    tilt, gain, offset, method, noise, low, high, device
+    tilt, gain, offset, method, noise, low, high, response, device
         As for ``estimate_normals``.
     longest : int
         Frames of a turn at most.
@@ -187,12 +193,13 @@ class NormalEstimator:
         dtype: DTypeLike,
         *,
         tilt: float | None,
-        gain: ArrayLike,
+        gain: ArrayLike | None = None,
         offset: ArrayLike = 0.0,
         method: NormalMethod = "exact",
         noise: float | None = None,
         low: ArrayLike | None = None,
         high: ArrayLike | None = None,
+        response: Response | None = None,
         longest: int = LONGEST,
         per_turn: bool = False,
         device: str | Device | None = None,
@@ -203,7 +210,7 @@ class NormalEstimator:
         if method not in NORMAL_METHODS:
             raise InputError(f"unknown method {method!r}; known are {', '.join(NORMAL_METHODS)}")
         self._given_tilt = None if tilt is None else check_tilt(tilt)
-        self._scale = make_scale(gain, offset, low, high, shape)
+        self._scale = response or make_scale(gain, offset, low, high, shape)
         self._shape = shape
         self._given_noise = None if noise is None else even_noise(noise)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn

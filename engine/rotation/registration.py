@@ -20,6 +20,22 @@ _BLOCK = 16_000_000  # bytes of the source's frames that are read at a time
 _FRAME: np.dtype[Any] = np.dtype(np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """How a camera's lines of sight lean.
+
+    Attributes
+    ----------
+    lean : float
+        By how much towards the axis, for each millimetre up and each millimetre from it: 1/mm.
+    axis : (float, float)
+        Millimetres.
+    """
+
+    lean: float
+    axis: tuple[float, float]
+
+
 class Registered:
     """A source's frames, resampled so that each pixel keeps seeing one point of the object.
 
@@ -37,10 +53,17 @@ class Registered:
     with u = (x - q.x) cos(alpha) + (y - q.y) sin(alpha). There, eq. 10 of the paper holds for the normal of
     the mean pose.
 
+    A camera whose lines of sight lean towards an axis, by k for each millimetre from it, sees the point p at
+    the pixel of X where (p.x, p.y) = X - k p.z (X - axis). To the first order in k, that adds to the way of
+    the pixel ::
+
+        k (p'.z - p.z) (X - axis) + k p.z (p' - p)
+
     A sample between the pixels is made of the 16 round it; see `mirrorskin.kernels.registration`. It is NaN
     where any of them is outside the picture, clipped (at either end of an integer type) or not a finite
     number, and where the height is unknown. Where each pixel has its own ``zenith_gain`` and
-    ``zenith_offset``, counts are brought to the scale of the pixel that they come to.
+    ``zenith_offset``, counts are brought to the scale of the pixel that they come to; one that has none, as
+    a defect, counts as the mean of those on opposite sides of it.
 
     Whether the sheet touches a point in every pose is not asked: frames show what is seen there. Nor is it
     whether a point is hidden by others: a mirror skin takes the object's shape, and a camera that looks along
@@ -58,6 +81,8 @@ class Registered:
 
     header : Header, optional
         What to believe instead of the source's own.
+    sight : Sight, optional
+        Of a camera that does not look along the body's axis everywhere.
 
     Attributes
     ----------
@@ -84,18 +109,20 @@ class Registered:
         heights: ArrayLike,
         device: str | Device | None = None,
         header: Header | None = None,
+        sight: Sight | None = None,
     ) -> None:
         check_dtype(source.dtype)
         header = source.header if header is None else header
-        self._geometry = _Geometry.of(source, header)
-        heights = _check_heights(heights, source.shape[1:])
+        self._geometry = _Geometry.of(source, header, sight)
+        heights = check_heights(heights, source.shape[1:])
         self.name, self.header, self.shape = source.name, header, source.shape
         self.motion: Motion = source.motion
         self.rewindable = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
         self.device = open_device(device)
         self._source = source
-        self._maps = _Maps(self.device, heights, *_levels(self.header, source.shape[1:]), source.dtype)
+        levels = _levels(self.header, source.shape[1:])
+        self._maps = _Maps(self.device, heights, *levels, source.dtype, curved=sight is not None)
         length = _BLOCK // (math.prod(self.shape[1:]) * source.dtype.itemsize)
         self._room = np.empty((min(max(1, length), self.shape[0]), *self.shape[1:]), source.dtype)
 
@@ -162,6 +189,7 @@ class _Geometry:
         Millimetres.
     pivot : (float, float, float)
         Millimetres.
+    sight : Sight or None
     """
 
     corner: tuple[float, float]
@@ -169,9 +197,10 @@ class _Geometry:
     tilt: float
     press: float
     pivot: tuple[float, float, float]
+    sight: Sight | None
 
     @classmethod
-    def of(cls, source: Source, header: Header) -> Self:
+    def of(cls, source: Source, header: Header, sight: Sight | None) -> Self:
         """Take what a header says of a source, or raise InputError."""
         if source.motion != "axial":
             raise InputError(f"{source.name} is of {source.motion} motion: only axial ones can be registered")
@@ -179,10 +208,10 @@ class _Geometry:
             _known(source, header, name) for name in ("pixel_size", "tilt", "press", "pivot")
         )
         x, y = pixel_axes(source.shape[1:], pixel_size)
-        return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot)
+        return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot, sight)
 
     def shift(self, phase: float) -> NDArray[np.float32]:
-        """Return where the points are found at a phase, (2, 4), as ``registration_resample`` takes it."""
+        """Return where the points are found at a phase, as ``registration_resample`` takes it."""
         cosine, sine = math.cos(phase), math.sin(phase)
         along_x, along_y = self.pixel_size
         rise, drop = math.sin(self.tilt), 2 * math.sin(self.tilt / 2) ** 2
@@ -194,7 +223,28 @@ class _Geometry:
             drop * along_y * sine,
             rise,
         ]
-        return np.outer([cosine / along_x, -sine / along_y], moved).astype(np.float32)
+        if self.sight is None:
+            return np.outer([cosine / along_x, -sine / along_y], moved).astype(np.float32)
+        lean = self.sight.lean
+        moved[0] += lean * rise * self.press * (self.press - self.pivot[2])
+        moved[3] += lean * rise * (2 * self.press - self.pivot[2])
+        # By how much the point rises; times the lean, so far the pixel goes for each mm from the axis.
+        up = -rise * outwards - drop * (self.press - self.pivot[2])
+        ways = self._radial(lean * up, -lean * rise * along_x * cosine, lean * rise * along_y * sine)
+        ways[:, :4] += np.outer([cosine, sine], moved)
+        return np.asarray(ways / [[along_x], [-along_y]], np.float32)
+
+    def _radial(self, number: float, column: float, row: float) -> NDArray[np.float64]:
+        """Return the way, mm, of pixels that go so far for each millimetre from the axis, (2, 7)."""
+        assert self.sight is not None
+        x, y = (corner - axis for corner, axis in zip(self.corner, self.sight.axis, strict=True))
+        along_x, along_y = self.pixel_size
+        return np.array(
+            [
+                [x * number, x * column + along_x * number, x * row, 0, along_x * column, along_x * row, 0],
+                [y * number, y * column, y * row - along_y * number, 0, 0, -along_y * column, -along_y * row],
+            ]
+        )
 
 
 class _Maps:
@@ -209,6 +259,8 @@ class _Maps:
         See ``registration_admit``.
     dtype : dtype
         Of a sample of the source.
+    curved : bool
+        Whether shifts have 7 numbers, not 4.
     """
 
     def __init__(
@@ -218,17 +270,21 @@ class _Maps:
         offset: NDArray[np.float32],
         gain: NDArray[np.float32],
         dtype: np.dtype[Any],
+        curved: bool,
     ) -> None:
         rows, columns = height.shape
         self._device, self._macros = device, _macros(dtype, levels=offset.size > 1)
+        self._macros |= {"CURVED": 1} if curved else {}
         self._sizes = np.int32(rows), np.int32(columns)
         self._items = rows * -(-columns // device.shape.tile)
         padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
         self._padded = device.given("padded", padding)
         self._height, self._offset = device.given("height", height), device.given("offset", offset)
         self._gain = device.given("gain", gain)
+        places = _mendable(offset, gain)
+        self._places = device.given("places", places, np.int32) if len(places) else None
         self._noise = device.given("noise", np.zeros((2, rows, columns), np.float32))
-        self._shift = device.array("shift", (2, 4), np.float32)
+        self._shift = device.array("shift", (2, 7 if curved else 4), np.float32)
         self._frame = device.array("frame", (rows, columns), dtype)
         self._registered = device.array("registered", (rows, columns), np.float32)
 
@@ -239,6 +295,16 @@ class _Maps:
         levels = self._offset, self._gain
         counts, samples = self._frame.host.nbytes, self._registered.host.nbytes
         self._run("registration_admit", self._frame, *levels, self._padded, moved=counts + samples)
+        if self._places is not None:
+            kernel = self._device.kernel("registration", "registration_mend", **self._macros)
+            count = len(self._places.host)
+            kernel(
+                -(-count // self._device.shape.tile),
+                np.int32(count),
+                self._places,
+                self._padded,
+                moved=9 * 4 * count,
+            )
         self._run(
             "registration_resample",
             *(self._padded, self._height, self._shift, *levels, self._registered, self._noise),
@@ -266,6 +332,25 @@ class _Maps:
         kernel(self._items, *self._sizes, *arrays, moved=moved)
 
 
+def _mendable(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:
+    """List the pixels without a scale between two that have one, as ``registration_mend`` takes them, (n, 5).
+
+    Opposite ones, so that a slope between them does no harm: beside and above, else those at the corners.
+    """
+    sound = np.pad(np.isfinite(offset) & np.isfinite(gain) & (gain != 0), BORDER)
+    stride = sound.shape[1]
+    flat = sound.reshape(-1)
+    lost = np.flatnonzero(~flat)
+    lost = lost[(lost > stride) & (lost < flat.size - stride - 1)]
+    chosen = np.zeros((2, len(lost)), np.intp)
+    for step in (stride + 1, stride - 1, stride, 1):  # the later, the better
+        both = flat[lost - step] & flat[lost + step]
+        chosen = np.where(both, [np.full(len(lost), step), np.where(chosen[0] > 0, chosen[0], step)], chosen)
+    known = chosen[0] > 0
+    lost, (one, other) = lost[known], chosen[:, known]
+    return np.stack([lost, lost - one, lost + one, lost - other, lost + other], axis=1).astype(np.int32)
+
+
 def _macros(dtype: np.dtype[Any], levels: bool) -> dict[str, str | int]:
     top = {"TOP": int(np.iinfo(dtype).max)} if dtype.kind == "u" else {}
     return {"FRAME": C_TYPES[dtype.name], "LEVELS": int(levels), **top}
@@ -285,7 +370,7 @@ def _known(source: Source, header: Header, name: str) -> Any:
     return value
 
 
-def _check_heights(heights: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
+def check_heights(heights: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return a map of the frames' size, float32, or raise InputError."""
     values = np.asarray(heights)
     if values.dtype.kind not in "iuf":

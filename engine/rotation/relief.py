@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.integrate import integrate
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
 from mirrorskin.io import ProcessValue
 from mirrorskin.kernels.device import Device
+
+_ENOUGH = 1e-4  # residual that will do where the solver's own tolerance is not met
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +104,8 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
     """Return the surface of one picture; one of no pixels, where there is no normal to begin with."""
     if not slopes.known.any():
         return _nothing(slopes.known.shape)
-    return integrate(
+    solve = functools.partial(
+        integrate,
         slopes.dz_dx,
         slopes.dz_dy,
         pixel_size,
@@ -109,6 +114,10 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         robust=robust,
         device=device,
     )
+    try:
+        return solve()
+    except NotConverged:  # of many small facets, by a little; the normals' noise is far more
+        return solve(tolerance=_ENOUGH)
 
 
 def _nothing(shape: tuple[int, ...]) -> Surface:

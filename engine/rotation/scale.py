@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.tilt import one_wave
 from mirrorskin.io import InputError
 
 _OPEN = {"low": -np.inf, "high": np.inf}
@@ -41,9 +42,13 @@ class Scale:
         """Return the scale of each so-manieth pixel, (4,) or (4, n)."""
         return self.planes.reshape(4, -1)[:, ::step] if self.per_pixel else self.planes
 
+    def telling(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
+        """Tell which of so many pixels show little but one wave a turn; see ``one_wave``."""
+        return one_wave(wave, self.thinned(step))
+
 
 def make_scale(
-    gain: ArrayLike,
+    gain: ArrayLike | None,
     offset: ArrayLike,
     low: ArrayLike | None,
     high: ArrayLike | None,
@@ -67,6 +72,8 @@ def make_scale(
     InputError
         A shape that does not fit, no gain but 0 or NaN, no offset that is a number, or a low above its high.
     """
+    if gain is None:
+        raise InputError("a zenith gain is needed: counts per radian, such as 206, or a calibration")
     given = {"zenith gain": gain, "zenith offset": offset, "low": low, "high": high}
     known = {name: _as_map(name, value, shape) for name, value in given.items() if value is not None}
     rate, zero = known["zenith gain"], known["zenith offset"]

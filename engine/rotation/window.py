@@ -16,6 +16,7 @@ from mirrorskin.engine.rotation.fits import TurnFit, fit_of
 from mirrorskin.engine.rotation.launch import MAPS, NormalLaunch, NormalMethod, Samples, settle
 from mirrorskin.engine.rotation.normals import Normals, even_noise, tell_normals
 from mirrorskin.engine.rotation.phases import check_phases
+from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.sums import WindowSums
 from mirrorskin.engine.rotation.tilt import check_tilt
@@ -43,7 +44,7 @@ class NormalWindow:
         uint8, uint16 or float32.
     window : int
         Frames, 3 to 64.
-    tilt, gain, offset, method, noise, low, high, device
+    tilt, gain, offset, method, noise, low, high, response, device
         As for ``estimate_normals``.
 
     Attributes
@@ -65,12 +66,13 @@ class NormalWindow:
         *,
         window: int,
         tilt: float | None,
-        gain: ArrayLike,
+        gain: ArrayLike | None = None,
         offset: ArrayLike = 0.0,
         method: NormalMethod = "exact",
         noise: float | None = None,
         low: ArrayLike | None = None,
         high: ArrayLike | None = None,
+        response: Response | None = None,
         device: str | Device | None = None,
     ) -> None:
         self._shape, self._dtype = shape, np.dtype(dtype)
@@ -80,7 +82,7 @@ class NormalWindow:
         self._window = window
         self._tilt = self._given_tilt = None if tilt is None else check_tilt(tilt)
         self._noise = self._given_noise = None if noise is None else even_noise(noise)
-        self._scale = make_scale(gain, offset, low, high, shape)
+        self._scale = response or make_scale(gain, offset, low, high, shape)
         self.device = open_device(device)
         self._launch = NormalLaunch(self.device, self._dtype, self._scale, method)
         beside = self._launch.planes
@@ -159,6 +161,11 @@ class NormalWindow:
                 known = fit, self._noise, self.tilt
                 self._launch.run(band, Samples(ring, *samples), *known, turns=1, bare=bare)
                 self._estimated = ring.used
+
+    def place(self, heights: NDArray[np.floating]) -> None:
+        """Say where the object is from now on, (H, W), mm above the rest plane; under a calibrated wall."""
+        for band in self.bands:
+            band.write("scale", heights[band.rows], plane=4)
 
     def normals(self) -> Normals:
         """Estimate the window's normals, and bring them to the host; more frames may follow.

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels import registration
 from mirrorskin.kernels.device import C_TYPES, Device
-from mirrorskin.kernels.registration import BORDER, registration_admit, registration_resample, weights
+from mirrorskin.kernels.registration import (
+    BORDER,
+    registration_admit,
+    registration_mend,
+    registration_resample,
+    weights,
+)
 
 DTYPES = ["uint8", "uint16", "float32"]
 ALIKE = np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32)
@@ -181,3 +187,19 @@ def test_noise_is_summed_over_frames(device: Device) -> None:
     once = device_frame(device, **case)
     np.testing.assert_allclose(room.noise, 3 * once.noise, rtol=1e-5)
     assert once.noise[1].sum() > 20
+
+
+@pytest.mark.parametrize("count", [1, 3, 200])
+def test_mended_places_are_the_means_of_those_round_them(device: Device, count: int) -> None:
+    rng = np.random.default_rng(count)
+    frame = rng.normal(size=(40, 30)).astype(np.float32)
+    order = rng.permutation(frame.size)
+    places = np.column_stack([order[:count], rng.choice(order[count:], (count, 4))]).astype(np.int32)
+    given = {"places": places, "padded": frame}
+    arrays = {name: device.given(name, values, values.dtype) for name, values in given.items()}
+    kernel = device.kernel("registration", "registration_mend", FRAME="uchar", LEVELS=1, TOP=255)
+    kernel(-(-count // device.shape.tile), np.int32(count), arrays["places"], arrays["padded"], moved=count)
+    wanted = frame.copy()
+    registration_mend(places, wanted)
+    assert (wanted != frame).sum() == count
+    np.testing.assert_allclose(arrays["padded"].download(), wanted, atol=1e-6)

@@ -150,9 +150,27 @@ def test_counts_come_on_the_scale_of_the_pixel_that_they_come_to(device):
             (found - offset) / gain, np.where(np.isnan(found), np.nan, alike), rtol=1e-5
         )
     lost = np.isfinite(alike) & np.isnan(found)
-    assert 0 < lost.sum() <= 2 * 17 * 6
+    assert set(zip(*np.nonzero(lost)[1:], strict=True)) == {(3, 4), (20, 20)}
     constant = replace(HEADER, zenith_offset=np.full(SHAPE, 16.0), zenith_gain=np.full(SHAPE, 250.0))
     np.testing.assert_array_equal(register(made_up(ramp(), constant), heights, device), alike)
+
+
+LONE, CORNER = [(4, 20), (10, 12)], [(15, 5), (16, 5), (15, 6)]
+BLOCK = [(row, column) for row in (8, 9, 10) for column in (21, 22, 23)]
+
+
+@pytest.mark.parametrize(("places", "mended"), [([*LONE, *CORNER], True), (BLOCK, False)])
+def test_a_pixel_without_a_scale_counts_as_those_on_opposite_sides_of_it(device, places, mended):
+    gain = np.full(SHAPE, 250.0)
+    gain[tuple(np.transpose(places))] = np.nan
+    header, heights = replace(HEADER, zenith_offset=np.full(SHAPE, 16.0), zenith_gain=gain), some_heights()
+    counts = 16 + np.float32(250) * ramp()
+    found = (register(made_up(counts, header), heights, device) - 16) / 250
+    alike = register(made_up(ramp()), heights, device)
+    np.testing.assert_allclose(found, np.where(np.isnan(found), np.nan, alike), rtol=1e-5)
+    lost = (np.isfinite(alike) & np.isnan(found)).any(axis=0)
+    assert lost[tuple(np.transpose(places))].all()
+    assert lost.sum() == len(places) if mended else lost.sum() > 2 * len(places)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])

@@ -1,0 +1,262 @@
+"""From counts to lights under a cylindrical wall: a calibration's response, at the places of the pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.provenance import naming
+from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.registration import Sight
+from mirrorskin.io import Calibrated, Header, InputError, Precession, Source, WallResponse, pixel_axes
+from mirrorskin.kernels.normals_wall import Wall
+
+_SAMPLES = 400  # of the curve, to tell its ends and its inverse from
+_INVERSE = 8  # numbers of the inverse, which is where to begin only
+_MOST = 12  # numbers of a curve
+_DARK = 0.05  # share of full light that is next to none
+
+HALF_WAY = 0.5
+"""Share of the press that an object is taken to stand at, before more is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """How light each pixel gets from which normal; it takes the place of a ``Scale``.
+
+    Attributes
+    ----------
+    planes : ndarray, (5, H, W), float32
+        Counts without light; light per count; x and y from the wall's axis, and height z of the object in the
+        mean pose above the rest plane, mm. NaN where a pixel tells nothing.
+    wall : Wall
+    sigma : ndarray, (H, W), float32
+        Standard error of the normals that the calibration makes, radians; NaN where it is unknown.
+    axis : (float, float)
+        Where the wall's axis is in the picture, mm from its centre.
+    """
+
+    planes: NDArray[np.float32]
+    wall: Wall
+    sigma: NDArray[np.float32]
+    axis: tuple[float, float]
+
+    @property
+    def per_pixel(self) -> bool:
+        """Whether each pixel has planes of its own: it has."""
+        return True
+
+    @property
+    def ends(self) -> bool:
+        """Whether there is a range out of which light tells nothing: there is."""
+        return True
+
+    @property
+    def sight(self) -> Sight:
+        """How the lines of sight lean, in the middle of the picture's distances from the axis."""
+        x, y = self.planes[2:4]
+        near, far = self.wall.sight
+        return Sight(near + far * float(np.mean(x**2 + y**2)), self.axis)
+
+    @property
+    def table(self) -> NDArray[np.float32]:
+        """What ``normals.cl`` is told of the wall: see the names there."""
+        wall = self.wall
+        radius, rim, scatter = wall.geometry
+        low, high = wall.reach
+        curve = np.polynomial.Polynomial(wall.curve).convert(
+            domain=[low, high], window=[-1, 1], kind=np.polynomial.Polynomial
+        )
+        known = [radius, rim, np.sin(scatter) ** 2, *wall.sight, *(lamp / radius for lamp in wall.lamps)]
+        known += [low, high, *wall.ends, wall.sense, *wall.pivot, (low + high) / 2, 2 / (high - low)]
+        numbers = np.zeros(len(wall.curve))
+        numbers[: len(curve.coef)] = curve.coef
+        return np.array([*known, *wall.inverse, *numbers], np.float32)
+
+    def thinned(self, step: int) -> Doubles:
+        """Return the planes of each so-manieth pixel, (5, n)."""
+        return self.planes.reshape(5, -1)[:, ::step].astype(np.float64)
+
+    def telling(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
+        """Tell which pixels, of each so-manieth, stay within the range of the light over a turn.
+
+        Parameters
+        ----------
+        wave : ndarray, (3, n), float64
+            Mean, cosine and sine of the samples, counts.
+        step : int
+        """
+        offset, per_count = self.thinned(step)[:2]
+        mean, swing = (wave[0] - offset) * per_count, np.hypot(*wave[1:]) * np.abs(per_count)
+        low, high = self.wall.ends
+        with np.errstate(invalid="ignore"):
+            return np.asarray((mean - swing > low) & (mean + swing < high))
+
+    def level(self, mean: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Tell where a surface is too level to be seen: it shows what lies over the rim of the wall.
+
+        Parameters
+        ----------
+        mean : ndarray, (H, W), float32
+            Of the samples, counts.
+        """
+        wall = self.wall
+        rim = float(np.polynomial.polynomial.polyval(wall.reach[1], wall.curve))
+        with np.errstate(invalid="ignore"):
+            return np.asarray((mean - self.planes[0]) * self.planes[1] < max(rim, _DARK) + _DARK)
+
+    def at(self, heights: ArrayLike, follows: bool = False) -> Response:
+        """Return the same with the object elsewhere.
+
+        Parameters
+        ----------
+        heights : array_like, scalar or (H, W)
+            Millimetres above the rest plane in the mean pose.
+        follows : bool
+            Whether each pixel keeps seeing one point of the object; see ``Registered``.
+        """
+        planes = self.planes.copy()
+        planes[4] = heights
+        return replace(self, planes=planes, wall=self.wall._replace(follows=follows))
+
+
+def response_of(source: Source) -> WallResponse | None:
+    """Return the response of a source's calibration, if it has one that tells zeniths."""
+    known = source.calibration if isinstance(source, Calibrated) else None
+    if known is None or known.zenith is None or known.zenith.pattern != "graded":
+        return None
+    return known.zenith if known.precession is None else _with_oval(known.zenith, known.precession)
+
+
+def _with_oval(wall: WallResponse, precession: Precession) -> WallResponse:
+    """Add to the azimuth's errors what comes of taking one half-angle d where the lean goes round an ellipse.
+
+    Of ellipticity e the half-angle is d (1 + e cos 2(a - m)) at azimuth a, m that of the greatest. A surface
+    inclined towards p so seems to change, beside the third harmonic, by d e/2 cos(a - 2m + p): as if p were
+    e/2 sin 2(p - m) off, root mean square e / (2 sqrt 2). As for the rest, the zenith is in mid range.
+    """
+    oval = abs(precession.ellipticity) / math.sqrt(8)
+    if not oval > 0:
+        return wall
+    zenith = math.pi / 4 - math.atan(sum(wall.reach) / 2)
+    sigma = np.hypot(wall.azimuth_sigma, np.float32(oval * math.sin(zenith)))
+    return replace(wall, azimuth_sigma=sigma)
+
+
+def first_response(wall: WallResponse, source: Source, header: Header) -> Response:
+    """Return the response for a source's pixels, the object taken to stand as high as half the press.
+
+    Parameters
+    ----------
+    wall : WallResponse
+        With maps of the source's pictures.
+    source : Source
+    header : Header
+        What to believe of it.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The header says too little, or what `make_response` raises.
+    """
+    if header.pixel_size is None or header.press is None:
+        missing = "pixel size" if header.pixel_size is None else "press"
+        raise InputError(
+            f"{source.name} does not say its {missing}, and the calibrated response goes by place: record it,"
+            " or give the zenith gain to do without the response"
+        )
+    axes = pixel_axes(source.shape[1:], header.pixel_size)
+    with naming(source):
+        return make_response(wall, header.dark, header.bright, axes, HALF_WAY * header.press, header.pivot)
+
+
+def make_response(
+    wall: WallResponse,
+    dark: ArrayLike | None,
+    bright: ArrayLike | None,
+    axes: tuple[Doubles, Doubles],
+    heights: ArrayLike,
+    pivot: tuple[float, float, float] | None = None,
+    follows: bool = False,
+) -> Response:
+    """Put a calibrated response together for the pixels of a picture.
+
+    Parameters
+    ----------
+    wall : WallResponse
+        With maps of the picture.
+    dark, bright : array_like, scalar or (H, W)
+        Counts without and with full light.
+    axes : (ndarray, ndarray)
+        x of the columns and y of the rows, mm.
+    heights, follows
+        As for `Response.at`.
+    pivot : (float, float, float), optional
+        What the body turns about, mm; by default the centre of the rest sheet.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        A response that tells no zenith, or no references to tell the light by.
+    """
+    if wall.pattern != "graded":
+        raise InputError(
+            "the calibration is of a uniform pattern, which tells no zenith: normals need a graded one"
+        )
+    if not 1 < len(wall.curve) <= _MOST:
+        raise InputError(
+            f"the calibration's curve has {len(wall.curve)} numbers, 2 to {_MOST} are needed: calibrate again"
+        )
+    if dark is None or bright is None:
+        raise InputError("the calibration's response needs dark and bright references: calibrate them, too")
+    shape = len(axes[1]), len(axes[0])
+    x, y = np.meshgrid(axes[0] - wall.axis[0], axes[1] - wall.axis[1])
+    base = np.broadcast_to(np.asarray(dark, np.float64), shape)
+    span = (np.asarray(bright, np.float64) - base) * shade(wall, x, y)
+    inside = x**2 + y**2 < wall.radius**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_count = np.where(inside & np.isfinite(span) & (span > 0), 1 / span, np.nan)
+    if not np.isfinite(per_count).any():
+        raise InputError("bright is not above dark at any pixel: are the references swapped?")
+    where = np.broadcast_to(np.asarray(heights, np.float64), shape)
+    return Response(
+        np.stack([base, per_count, x, y, where]).astype(np.float32),
+        _wall_of(wall, (0.0, 0.0, 0.0) if pivot is None else pivot, follows),
+        np.hypot(wall.zenith_sigma, wall.azimuth_sigma),
+        wall.axis,
+    )
+
+
+def shade(wall: WallResponse, x: Doubles, y: Doubles) -> Doubles:
+    """Return the share of the bright reference that full light is at places from the axis, mm."""
+    u, v = x / wall.radius, y / wall.radius
+    return np.asarray(
+        1 + np.tensordot(np.asarray(wall.shade, np.float64), np.stack([u, v, u * u, u * v, v * v]), 1)
+    )
+
+
+def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: bool) -> Wall:
+    """Work out what the kernel is told besides: the ends of the light, and where to begin."""
+    q = np.linspace(*wall.reach, _SAMPLES)
+    curve = np.asarray(wall.curve, np.float64)
+    light = np.polynomial.polynomial.polyval(q, curve)
+    uneven = float(np.hypot(*wall.lamps))
+    inverse = np.polynomial.Polynomial.fit(light, q, _INVERSE - 1, domain=[light.min(), light.max()])
+    numbers = np.zeros(_INVERSE)
+    coefficients = inverse.convert().coef
+    numbers[: len(coefficients)] = coefficients
+    return Wall(
+        geometry=(wall.radius, wall.rim, wall.scatter),
+        sight=wall.sight,
+        lamps=wall.lamps,
+        curve=curve,
+        reach=wall.reach,
+        ends=(float(light.min()) * (1 - uneven), float(light.max()) * (1 + uneven)),
+        inverse=numbers,
+        sense=1.0 if light[0] > light[-1] else -1.0,
+        pivot=(pivot[0] - wall.axis[0], pivot[1] - wall.axis[1], pivot[2]),
+        follows=follows,
+    )

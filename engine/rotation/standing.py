@@ -1,0 +1,114 @@
+"""How high the object stands in the sensor's body: roughly, from the normals of a rotation and the press."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.kernels.device import Device
+
+Mask = NDArray[np.bool_]
+
+_CELLS = 512  # along the longer side, at most
+_GAP = 0.3  # mm between normals across which the surface goes on
+_FILLED = 0.03  # weight of a slope that was filled in
+_TOLERANCE = 1e-3
+
+
+def standing_heights(
+    vectors: NDArray[np.float32],
+    contact: NDArray[np.uint8],
+    level: Mask,
+    pixel_size: tuple[float, float],
+    press: float,
+    device: Device,
+) -> Doubles:
+    """Return the height of the sheet above its rest plane in the mean pose.
+
+    Slopes are integrated; the highest point of each piece is taken to be as high as the body was pressed.
+    Where no normal is known, the nearest slope goes on, as over a crease; where that is because the surface
+    is too level to be seen, it becomes less towards the middle, as on a ball. Beyond the pieces, the nearest
+    height is told.
+
+    Parameters
+    ----------
+    vectors : ndarray, (H, W, 3), float32
+        Unit normals.
+    contact : ndarray, (H, W), uint8
+        0 where they mean nothing.
+    level : ndarray, (H, W), bool
+        Where the surface is too level to be seen.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+    press : float
+        Millimetres.
+    device : Device
+
+    Returns
+    -------
+    ndarray, (H, W), float64
+        Millimetres, finite, from 0 to the press; the press where there is no contact at all.
+
+    Raises
+    ------
+    mirrorskin.engine.NotConverged
+        The heights were not found.
+    """
+    shape = contact.shape
+    step = -(-max(shape) // _CELLS)
+    east, north, share, too_level = _cells(vectors, contact, level, step)
+    known = share > 0
+    if not known.any():
+        return np.full(shape, float(press))
+    size = step * pixel_size[0], step * pixel_size[1]
+    reach = max(1, math.ceil(_GAP / 2 / min(size)))
+    around = np.ones((3, 3))
+    region = ndimage.binary_fill_holes(ndimage.binary_dilation(known, around, reach))
+    inside = known | ndimage.binary_erosion(region, around, reach, border_value=1)
+    far, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
+    lasting = _lasting(far, region & ~known & (too_level > 0.5))
+    surface = integrate(
+        lasting * east[tuple(nearest)],
+        lasting * north[tuple(nearest)],
+        size,
+        mask=region,
+        weights=np.where(known, 1.0, _FILLED),
+        sigma=False,
+        tolerance=_TOLERANCE,
+        device=device,
+    )
+    piece = np.where(inside, surface.component, -1)
+    tops = ndimage.maximum(surface.height, piece, np.arange(surface.component.max() + 1))
+    heights = np.where(piece >= 0, surface.height - np.asarray(tops)[piece], np.nan)
+    nearest = ndimage.distance_transform_edt(piece < 0, return_distances=False, return_indices=True)
+    places = np.meshgrid(*((np.arange(length) + 0.5) / step - 0.5 for length in shape), indexing="ij")
+    found = ndimage.map_coordinates(heights[tuple(nearest)], places, order=1, mode="nearest")
+    return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))
+
+
+def _cells(vectors: NDArray[np.float32], contact: NDArray[np.uint8], level: Mask, step: int) -> Doubles:
+    """Return means over cells of so many pixels a side, (4, h, w).
+
+    Slopes along x and y, of which share of the pixels they are known, and of which the surface is level.
+    """
+    x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
+    known = (contact != 0) & (z > 0)
+    flat = np.where(known, z, 1.0)
+    maps = np.stack([np.where(known, -x / flat, 0), np.where(known, -y / flat, 0), known, level])
+    rows, columns = (-(-length // step) * step for length in contact.shape)
+    padded = np.pad(maps, ((0, 0), (0, rows - contact.shape[0]), (0, columns - contact.shape[1])))
+    means: Doubles = padded.reshape(4, rows // step, step, columns // step, step).mean(axis=(2, 4))
+    means[:2] /= np.where(means[2] > 0, means[2], 1)
+    return means
+
+
+def _lasting(far: Doubles, level: Mask) -> Doubles:
+    """Return which share of the nearest slope is left in each cell, so far from it."""
+    hole, count = ndimage.label(level, np.ones((3, 3)))
+    deepest = np.concatenate([[np.inf], ndimage.maximum(far, hole, np.arange(1, count + 1))])[hole]
+    return np.asarray(1 - np.minimum(far / (deepest + 0.5), 1))

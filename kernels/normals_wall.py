@@ -1,0 +1,210 @@
+"""Surface normals where a cylindrical wall makes the light: what ``normals.cl`` computes with WALL, in NumPy.
+
+As `mirrorskin.kernels.normals.normals_exact`, but samples are lights (`mirrorskin.kernels.response`), not
+zeniths, and places count. The body sees a normal n at phase alpha as Rz(alpha) Ry(tilt) Rz(-alpha) n, and the
+point p of the object at pivot + Rz(alpha) Ry(tilt) Rz(-alpha) (p - pivot).
+
+It starts from the place on the wall that shows the mean light to the centre, and from the wave's azimuth,
+which is off by degrees. Gauss-Newton steps lead to the most likely normal from there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.normals import (
+    MORE,
+    Answer,
+    Doubles,
+    Limits,
+    Samples,
+    Sums,
+    Variance,
+    conclude,
+    normalise,
+    step,
+    tangents,
+    tell,
+)
+from mirrorskin.kernels.response import light_slopes, wall_light
+
+STEPS = 3
+"""Gauss-Newton steps of all pixels: one more moves the answer by less than a tenth of its standard error."""
+
+_LEAST = 3  # samples that must be whole and within their range
+
+
+class Wall(NamedTuple):
+    """What makes the light; see `mirrorskin.io.WallResponse`.
+
+    Attributes
+    ----------
+    geometry : (float, float, float)
+        Radius of the body and height of the wall, mm; half-angle of the scatter, radians.
+    sight, lamps : (float, float)
+    curve : ndarray, (n,), float64
+        The light as a polynomial in q.
+    reach : (float, float)
+        The q between which it holds.
+    ends : (float, float)
+        The least and the greatest light within reach.
+    inverse : ndarray, (m,), float64
+        q as a polynomial in the light, about; lights are held between the ends.
+    sense : float
+        1 where a steeper mirror is brighter, -1 where it is darker.
+    pivot : (float, float, float)
+        From the wall's axis, mm.
+    follows : bool
+        Whether each pixel keeps seeing one point of the object, which moves in the picture. Otherwise it sees
+        one place, where the object rises and falls.
+    """
+
+    geometry: tuple[float, float, float]
+    sight: tuple[float, float]
+    lamps: tuple[float, float]
+    curve: Doubles
+    reach: tuple[float, float]
+    ends: tuple[float, float]
+    inverse: Doubles
+    sense: float
+    pivot: tuple[float, float, float]
+    follows: bool
+
+
+def normals_wall(
+    frames: NDArray[Any],
+    turn: Doubles,
+    scale: Doubles,
+    wall: Wall,
+    tilt: float,
+    noise: Variance,
+    limits: Limits,
+) -> Answer:
+    """Find the most likely normals.
+
+    Parameters
+    ----------
+    frames, turn, tilt, noise, limits
+        As for ``normals_exact``. What the model may leave out is an angle of the meridian here as well.
+    scale : ndarray, (5, n), float64
+        Counts without light; light per count; x and y from the wall's axis on the rest plane, and z of the
+        object in the mean pose, mm.
+    wall : Wall
+
+    Returns
+    -------
+    Answer
+        Samples that are expected out of range tell nothing of the direction.
+    """
+    ends = np.broadcast_to(np.array(wall.ends)[:, np.newaxis], (2, scale.shape[1]))
+    samples = Samples(frames, turn, np.concatenate([scale[:2], ends]), noise)
+    beginning = _start(samples, scale, wall)
+    normal, odd = beginning, samples.odd
+    sums, within = _look(normal, samples, turn, scale, wall, tilt, closely=False)
+    for _ in range(1, STEPS):
+        normal = step(normal, sums)
+        sums, within = _look(normal, samples, turn, scale, wall, tilt, closely=False)
+    normal = step(normal, sums)
+    odd = (odd | (within.sum(axis=0) < len(frames))) & (samples.plain >= _LEAST)
+    at = beginning
+    for _ in range(MORE if odd.any() else 0):
+        closer, there = _look(at, samples, turn, scale, wall, tilt, closely=True)
+        sums, within = closer.where(odd, sums), np.where(odd, there, within)
+        at = step(at, closer)
+    normal = np.where(odd[:, np.newaxis], at, normal)
+    whole = ~(samples.missing | samples.under | samples.over)
+    plain = np.minimum(samples.plain, (within & whole).sum(axis=0))
+    steepness = sums.m11 / len(frames)
+    rest = np.hypot(normal[:, 0], normal[:, 1]) < limits.rest
+    return conclude(normal, sums, samples, plain, tilt, limits, limits.model * steepness, rest)
+
+
+def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
+    """Return where the mean light and the wave point, (n, 3)."""
+    known = np.maximum((~samples.missing).sum(axis=0), 1)
+    zeniths = np.where(samples.missing, 0.0, samples.zenith)
+    mean = zeniths.sum(axis=0) / known
+    q = np.polynomial.polynomial.polyval(np.clip(mean, *wall.ends), wall.inverse)
+    q = np.clip(q, *wall.reach)
+    apart = np.where(samples.missing, 0.0, samples.zenith - mean)
+    cosine, sine = wall.sense * (samples.turn[4:] @ apart)
+    swing = np.hypot(cosine, sine)
+    east, north = np.where(
+        swing > 0, np.stack([cosine, sine]) / np.where(swing > 0, swing, 1), [[1.0], [0.0]]
+    )
+    _, _, x, y, z = scale
+    radius = wall.geometry[0]
+    slope_x, slope_y = _slopes(x, y, wall)
+    x, y = x + z * slope_x, y + z * slope_y
+    with np.errstate(invalid="ignore"):
+        along = x * east + y * north
+        out = np.sqrt(along**2 + radius**2 - x**2 - y**2) - along
+        ray = normalise(np.stack([out * east, out * north, 2 * radius * q / (1 - q**2) - z], axis=1))
+        return normalise(ray + normalise(np.stack([slope_x, slope_y, np.ones_like(z)], axis=1)))
+
+
+def _look(
+    normal: Doubles,
+    samples: Samples,
+    turn: Doubles,
+    scale: Doubles,
+    wall: Wall,
+    tilt: float,
+    closely: bool,
+) -> tuple[Sums, NDArray[np.bool_]]:
+    """Form the normal equations at a direction, and tell which samples are expected within range."""
+    turning, tilting = _rotations(turn, tilt)
+    facing = np.einsum("kij,nj->kni", turning, normal)
+    place = _places(scale, turning, wall)
+    level, within = wall_light(place, facing, wall.geometry, wall.lamps, wall.curve, wall.reach)
+    slopes = light_slopes(place, facing, wall.geometry, wall.lamps, wall.curve, wall.reach)
+    back = np.einsum("kni,kij->knj", slopes, turning)
+    along, across = tangents(normal)
+    root = turn[2][:, np.newaxis]
+    u1, u2 = root * (back * along).sum(axis=2), root * (back * across).sum(axis=2)
+    u3 = root * np.einsum("kni,kij,nj->kn", slopes, tilting, normal)
+    error = samples.zenith - level
+    share, pull, misfit = np.ones_like(error), error, error**2
+    if closely:
+        share, pull, misfit = tell(samples, level, within)
+        misfit = np.where(within, misfit, 0.0)
+    return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit), within
+
+
+def _rotations(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
+    """Return how the body at each phase sees a vector, (N, 3, 3), and how that changes with the tilt."""
+    cosine, sine = turn[:2]
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    out = np.stack([cosine, sine, zero], axis=1)
+    up = np.stack([zero, zero, one], axis=1)
+    flat, steep = (np.einsum("ki,kj->kij", axis, axis) for axis in (out, up))
+    swap = np.einsum("ki,kj->kij", out, up) - np.einsum("ki,kj->kij", up, out)
+    turning = np.eye(3) + (math.cos(tilt) - 1) * (flat + steep) + math.sin(tilt) * swap
+    return turning, math.cos(tilt) * swap - math.sin(tilt) * (flat + steep)
+
+
+def _slopes(x: Doubles, y: Doubles, wall: Wall) -> tuple[Doubles, Doubles]:
+    """Return by how much the lines of sight move along x and y for each millimetre of z."""
+    bend = wall.sight[0] + wall.sight[1] * (x**2 + y**2)
+    return -bend * x, -bend * y
+
+
+def _places(scale: Doubles, turning: Doubles, wall: Wall) -> Doubles:
+    """Return where each sample's point is seen, as `wall_light` takes it, (5, N, n)."""
+    x, y, z = scale[2:]
+    slope_x, slope_y = _slopes(x, y, wall)
+    point = np.stack([x + z * slope_x, y + z * slope_y, z])
+    pivot = np.array(wall.pivot)[:, np.newaxis]
+    moved = pivot[:, np.newaxis] + np.einsum("kij,jn->ikn", turning, point - pivot)
+    each = np.ones((len(turning), 1))
+    if not wall.follows:
+        return np.stack([x * each, y * each, moved[2], slope_x * each, slope_y * each])
+    bend = wall.sight[0] + wall.sight[1] * (x**2 + y**2)
+    slope_x, slope_y = slope_x - bend * (moved[0] - point[0]), slope_y - bend * (moved[1] - point[1])
+    return np.stack(
+        [moved[0] - moved[2] * slope_x, moved[1] - moved[2] * slope_y, moved[2], slope_x, slope_y]
+    )

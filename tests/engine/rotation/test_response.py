@@ -1,0 +1,173 @@
+"""What a calibrated response becomes for the pixels of a picture, and normals from it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import walls
+from calibrations import a_precession
+from stacks import MadeUp
+from walls import PHASE, TILT
+
+from mirrorskin.engine.rotation.normals import estimate_normals
+from mirrorskin.engine.rotation.response import make_response, response_of, shade
+from mirrorskin.io import Calibrated, Calibration, CameraId, Header, InputError
+
+SHAPE = (8, 31)
+AXES = np.linspace(-6, 6, 31), np.linspace(3, -3, 8)
+
+
+def made(wall=None, dark=10.0, bright=240.0, heights=0.5, **other):
+    return make_response(wall or walls.response(SHAPE), dark, bright, AXES, heights, **other)
+
+
+def frames_of(response, zenith, azimuth, noise=1.0, seed=0):
+    """Counts of mirrors that all face one way."""
+    x, y, z = response.planes[2:].reshape(3, -1)
+    normal = walls.facing(np.array(zenith), np.array(azimuth))
+    curve = response.wall.curve
+    light = [walls.light_of(curve, x, y, z, normal, phase, follows=False) for phase in PHASE]
+    offset, per_count = response.planes[:2].reshape(2, -1)
+    counts = np.array(light) / per_count + offset
+    counts += noise * np.random.default_rng(seed).normal(size=counts.shape)
+    return counts.reshape(-1, *SHAPE).astype(np.float32), normal
+
+
+def test_each_pixel_has_its_counts_its_place_and_its_shading():
+    dark, bright = np.full(SHAPE, 12.0), np.full(SHAPE, 200.0)
+    heights = np.random.default_rng(0).uniform(0, 1, SHAPE)
+    found = made(dark=dark, bright=bright, heights=heights, pivot=(1.0, 2.0, 3.0))
+    offset, per_count, x, y, z = found.planes
+    np.testing.assert_array_equal(offset, dark)
+    np.testing.assert_array_equal(z, heights.astype(np.float32))
+    assert x[0, 0] == pytest.approx(-6 - walls.AXIS[0])
+    assert y[0, 0] == pytest.approx(3 - walls.AXIS[1])
+    u, v = x / walls.RADIUS, y / walls.RADIUS
+    a, b, c, d, e = walls.SHADE
+    np.testing.assert_allclose(
+        1 / per_count, 188 * (1 + a * u + b * v + c * u * u + d * u * v + e * v * v), 1e-6
+    )
+    assert found.wall.pivot == pytest.approx((1 - walls.AXIS[0], 2 - walls.AXIS[1], 3))
+    assert found.wall.sense == 1
+    np.testing.assert_allclose(shade(replace(walls.response(SHAPE), shade=np.zeros(5)), x, y), 1)
+
+
+def test_the_inverse_of_the_curve_leads_near_the_place_on_the_wall():
+    for gamma in (1.0, 2.2):
+        wall = made(walls.response(SHAPE, gamma)).wall
+        q = np.linspace(*wall.reach, 50)
+        light = np.polynomial.Polynomial(wall.curve)(q)
+        assert np.max(np.abs(np.polynomial.Polynomial(wall.inverse)(light) - q)) < 0.03
+        assert wall.ends[0] < light.min() < light.max() < wall.ends[1]
+
+
+def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
+    dark = np.full(SHAPE, 10.0)
+    dark[3, 4] = np.nan
+    bright = np.full(SHAPE, 240.0)
+    bright[5, 6] = 0.0
+    wide = np.linspace(-6, 30, 31), AXES[1]
+    found = make_response(walls.response(SHAPE), dark, bright, wide, 0.5)
+    per_count = found.planes[1]
+    beyond = np.hypot(found.planes[2], found.planes[3]) >= walls.RADIUS
+    assert 0 < beyond.sum() < beyond.size
+    expected = ~beyond
+    expected[3, 4] = expected[5, 6] = False
+    np.testing.assert_array_equal(np.isfinite(per_count), expected)
+    with np.errstate(invalid="ignore"):
+        frames = np.random.default_rng(0).integers(90, 110, (8, *SHAPE)).astype(np.uint8)
+    normals = estimate_normals(frames, PHASE, TILT, response=found, noise=1.0)
+    assert np.isnan(normals.sigma[~expected]).all()
+    assert np.isfinite(normals.sigma[expected]).any()
+
+
+def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(device):
+    response = made(pivot=walls.PIVOT)
+    frames, normal = frames_of(response, 0.5, 2.0)
+    found = estimate_normals(frames, PHASE, TILT, response=response, noise=1.0, device=device)
+    error = np.linalg.norm(found.vectors - normal, axis=-1) / found.sigma
+    assert np.mean(error**2) == pytest.approx(1, abs=0.25)
+    assert found.contact.mean() > 0.98
+
+
+def test_the_noise_is_told_from_the_frames():
+    response = made(pivot=walls.PIVOT)
+    frames, _ = frames_of(response, 0.55, -1.0, noise=2.0)
+    frames[:, 0] = 10.0  # dark and still
+    found = estimate_normals(frames, PHASE, TILT, response=response)
+    assert found.noise == pytest.approx(2.0, rel=0.12)
+
+
+def test_dark_pixels_are_told_to_be_too_level():
+    response = made()
+    light = np.full(SHAPE, 0.5)
+    light[2, 3:9] = 0.01
+    mean = (response.planes[0] + light / response.planes[1]).astype(np.float32)
+    mean[0, 0] = np.nan
+    np.testing.assert_array_equal(response.level(mean), light < 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"wall": walls.response(SHAPE, pattern="uniform")}, "uniform pattern"),
+        ({"wall": walls.response(SHAPE, curve=np.ones(13))}, "13 numbers"),
+        ({"wall": walls.response(SHAPE, curve=np.ones(1))}, "1 numbers"),
+        ({"dark": None}, "references"),
+        ({"dark": 240.0, "bright": 10.0}, "swapped"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(change, told):
+    with pytest.raises(InputError, match=told) as error:
+        made(**change)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"), [({"method": "paper"}, "exact"), ({"tilt": None}, "does not tell the tilt")]
+)
+def test_what_a_response_cannot_do_is_refused(change, told):
+    frames = np.full((8, *SHAPE), 100, np.uint8)
+    known = {"phase": PHASE, "tilt": TILT, "noise": 1.0, "response": made()}
+    with pytest.raises(InputError, match=told):
+        estimate_normals(frames, **(known | change))
+
+
+def test_neither_a_gain_nor_a_response_is_too_little():
+    with pytest.raises(InputError, match="zenith gain"):
+        estimate_normals(np.full((8, *SHAPE), 100, np.uint8), PHASE, TILT)
+
+
+def test_a_source_without_a_calibration_has_no_response():
+    class Source:
+        calibration = None
+
+    assert response_of(Source()) is None
+
+
+def known_of(**parts):
+    """Return the response for a source whose calibration has a wall and other parts."""
+    camera = CameraId("", SHAPE, np.dtype(np.float32))
+    source = MadeUp(np.zeros((8, *SHAPE), np.float32), Header("axial"), phase=PHASE)
+    return response_of(Calibrated(source, Calibration(camera, zenith=walls.response(SHAPE), **parts)))
+
+
+def test_an_ellipse_that_is_taken_for_a_circle_makes_azimuths_less_sure():
+    """Waves of inclined surfaces, seen linearly: by how much the azimuth of their first harmonic is off."""
+    oval, phase = 0.02, np.arange(64) * np.pi / 32
+    precession = a_precession(tilt=0.04, ellipticity=oval, centre=(0.0, 0.0))
+    towards = np.arange(36) * np.pi / 18
+    wave = -precession.lean(phase) @ np.stack([np.cos(towards), np.sin(towards)])
+    turned = precession.phase(phase)
+    design = np.stack([np.ones_like(turned), np.cos(turned), np.sin(turned)], axis=1)
+    _, cosine, sine = np.linalg.lstsq(design, wave, rcond=None)[0]
+    off = np.angle(-(cosine + 1j * sine) * np.exp(-1j * towards))
+    assert np.max(np.abs(off)) == pytest.approx(oval / 2, rel=0.05)
+
+    plain, told = known_of(), known_of(precession=precession)
+    middle = np.pi / 4 - np.arctan(np.mean(plain.reach))
+    added = np.sqrt(told.azimuth_sigma.astype(float) ** 2 - plain.azimuth_sigma.astype(float) ** 2)
+    np.testing.assert_allclose(added, np.sqrt(np.mean(off**2)) * np.sin(middle), rtol=0.05)
+    np.testing.assert_array_equal(told.zenith_sigma, plain.zenith_sigma)
+    circle = known_of(precession=a_precession(ellipticity=0.0))
+    np.testing.assert_array_equal(circle.azimuth_sigma, plain.azimuth_sigma)

@@ -1,0 +1,179 @@
+"""Normals under a wall: the reference against plain searches and rays, and the kernel against it."""
+
+import math
+
+import numpy as np
+import pytest
+import walls
+from scipy import optimize
+from walls import PHASE, TILT, facing, light_of
+
+from mirrorskin.engine.rotation.normals import estimate_normals
+from mirrorskin.engine.rotation.phases import fit_matrix
+from mirrorskin.engine.rotation.response import make_response
+from mirrorskin.kernels.normals import Variance, contact_limits
+from mirrorskin.kernels.normals_wall import _places, _rotations, normals_wall
+from mirrorskin.kernels.response import wall_light
+
+DARK, BRIGHT = 10.0, 240.0
+
+
+def turn_of(phase=PHASE, weights=None):
+    weights = np.ones(len(phase)) if weights is None else np.asarray(weights)
+    return np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *fit_matrix(phase, weights)])
+
+
+class Scene:
+    """Mirrors of all directions all over a picture, and the counts that they make."""
+
+    def __init__(self, shape=(20, 31), follows=False, gamma=1.0, zenith=(16, 42), phase=PHASE, seed=1):
+        rng = np.random.default_rng(seed)
+        axes = np.linspace(-7, 7, shape[1]), np.linspace(5, -5, shape[0])
+        self.shape, self.phase, self.rng = shape, phase, rng
+        self.heights = rng.uniform(0, 1.2, shape)
+        wall = walls.response(shape, gamma)
+        known = wall, DARK, BRIGHT, axes, self.heights, walls.PIVOT, follows
+        self.response = make_response(*known)
+        self.scale = self.response.planes.reshape(5, -1).astype(np.float64)
+        pixels = shape[0] * shape[1]
+        angles = np.radians(rng.uniform(*zenith, pixels)), rng.uniform(-np.pi, np.pi, pixels)
+        self.normals = facing(*angles)
+        turning, _ = _rotations(turn_of(phase), TILT)
+        seen = np.einsum("kij,nj->kni", turning, self.normals)
+        place, wall = _places(self.scale, turning, self.response.wall), self.response.wall
+        self.light, within = wall_light(place, seen, wall.geometry, wall.lamps, wall.curve, wall.reach)
+        self.within = within.all(axis=0)
+
+    def frames(self, noise, dtype="float32"):
+        counts = self.light / self.scale[1] + self.scale[0] + noise * self.rng.normal(size=self.light.shape)
+        if dtype == "float32":
+            return counts.astype(np.float32)
+        return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
+
+    def answer(self, frames, noise, weights=None):
+        noise, limits = Variance(noise**2, 0.0, noise**2), contact_limits(len(frames) - 3, TILT)
+        turn = turn_of(self.phase, weights)
+        return normals_wall(frames, turn, self.scale, self.response.wall, TILT, noise, limits)
+
+
+def off(found, true):
+    return np.linalg.norm(found - true, axis=1)
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_places_and_lights_are_those_of_plain_rays(follows):
+    scene = Scene(follows=follows)
+    good = scene.within
+    _, _, x, y, z = scene.scale[:, good]
+    for number, phase in enumerate(PHASE):
+        known = scene.response.wall.curve, x, y, z, scene.normals[good].T
+        np.testing.assert_allclose(scene.light[number, good], light_of(*known, phase, follows), atol=2e-9)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize("follows", [False, True])
+def test_without_noise_the_normal_is_the_true_one(gamma, follows):
+    scene = Scene(follows=follows, gamma=gamma)
+    found = scene.answer(scene.frames(0.0).astype(np.float64), 1e-4)
+    assert scene.within.mean() > 0.8
+    assert np.max(off(found.vectors, scene.normals)[scene.within]) < 1e-4
+    assert np.median(off(found.vectors, scene.normals)[scene.within]) < 1e-6
+    assert found.contact[scene.within].all()
+
+
+def test_the_reference_finds_the_likeliest_normal():
+    scene = Scene((1, 6))
+    noise = 2.0
+    frames = scene.frames(noise)
+    found = scene.answer(frames, noise)
+    samples = (frames - scene.scale[0]) * scene.scale[1]
+    for pixel in np.flatnonzero(scene.within)[:2]:
+
+        def misfit(angles, pixel=pixel):
+            known = scene.response.wall.curve, *scene.scale[2:, [pixel]], facing(*np.array(angles))
+            return [
+                one - light_of(*known, at, follows=False)[0]
+                for one, at in zip(samples[:, pixel], PHASE, strict=True)
+            ]
+
+        vector = scene.normals[pixel]
+        start = math.acos(vector[2]), math.atan2(vector[1], vector[0])
+        best = optimize.least_squares(misfit, start, x_scale=(0.01, 0.1), diff_step=1e-5).x
+        assert off(found.vectors[[pixel]], facing(*best)[np.newaxis])[0] < 0.02 * found.sigma[pixel]
+
+
+def test_sigma_is_the_bound_and_what_errors_are():
+    scene = Scene((60, 101))
+    noise = 1.5
+    found = scene.answer(scene.frames(noise), noise)
+    good = scene.within & np.isfinite(found.sigma)
+    assert good.sum() > 0.99 * scene.within.sum()
+    square = (off(found.vectors, scene.normals) / found.sigma)[good] ** 2
+    assert np.mean(square) == pytest.approx(1, abs=0.05)
+    assert found.contact[good].mean() > 0.998
+
+
+def test_samples_beyond_the_ends_of_the_wall_tell_nothing_and_do_no_harm():
+    scene = Scene((40, 61), zenith=(14, 43))
+    noise = 0.5
+    found = scene.answer(scene.frames(noise), noise)
+    some = ~scene.within & np.isfinite(found.sigma)
+    assert some.sum() > 100
+    error = off(found.vectors, scene.normals)[some] / found.sigma[some]
+    assert np.median(error) < 1.5
+
+
+def test_a_pixel_that_does_not_follow_the_object_is_no_contact():
+    scene = Scene((2, 40))
+    frames = scene.frames(0.0)
+    frames[:, :40] = frames[:1, :40]  # still
+    frames[:, 40:60] = DARK
+    frames += 0.5 * scene.rng.normal(size=frames.shape).astype(np.float32)
+    found = scene.answer(frames, 0.5)
+    assert not found.contact[:60].any()
+    assert np.isnan(found.sigma[40:60]).all()
+    assert found.contact[60:][scene.within[60:]].all()
+
+
+# Each is a kernel of its own, and takes its time to be built.
+CASES = {
+    "uint8": ("uint8", (7, 31), {}, None),
+    "float32, follows, weights, missing": (
+        "float32",
+        (5, 9),
+        {"follows": True, "gamma": 2.2},
+        [1, 2, 3, 0.3, 1, 1, 1, 0.5],
+    ),
+    "uint16, one pixel, 3 frames": (
+        "uint16",
+        (1, 1),
+        {"phase": np.array([0.2, 2.1, 4.4]), "zenith": (30, 31)},
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernel_and_reference_agree(device, case):
+    dtype, shape, options, weights = CASES[case]
+    scene = Scene(shape, **({"zenith": (20, 50)} | options))
+    noise = 0.4
+    frames = scene.frames(noise, dtype)
+    if dtype == "float32":
+        frames[scene.rng.random(frames.shape) < 0.02] = np.nan
+    expected = scene.answer(frames, noise, weights)
+    stack = frames.reshape(-1, *shape)
+    known = {"response": scene.response, "noise": noise, "weights": weights, "device": device}
+    found = estimate_normals(stack, scene.phase, TILT, **known)
+    told = np.isfinite(found.sigma.ravel())
+    # A sample at the very end of the wall may fall on either side.
+    assert np.mean(told != np.isfinite(expected.sigma)) <= 0.01
+    assert told.any()
+    both = told & np.isfinite(expected.sigma)
+    error = off(found.vectors.reshape(-1, 3)[both], expected.vectors[both])
+    assert np.quantile(error / expected.sigma[both], 0.98) < 1e-2
+    close = np.abs(found.sigma.ravel()[both] / expected.sigma[both] - 1) < 1e-3
+    assert close.mean() > 0.98
+    assert np.mean(found.contact.ravel()[both] == expected.contact[both]) > 0.98
+    for name in ("mean", "cosine", "sine", "residual"):
+        np.testing.assert_allclose(getattr(found, name).ravel(), getattr(expected, name), 2e-5, 2e-4)
