@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.calibrated import on_the_sheet
 from mirrorskin.engine.live.types import Update
 from mirrorskin.engine.press.onset import OnsetSearch
-from mirrorskin.engine.press.vertical import fill_press
-from mirrorskin.engine.provenance import sign, told
+from mirrorskin.engine.press.vertical import finish_press
+from mirrorskin.engine.provenance import sign, told_level
 from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _ROOM = 64  # frames that may wait to be taken at once
 _UPDATES = 15.0  # a second, as many as people follow; each costs as much as many frames
 _ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
-_RANGE = "range of the type"
 
 
 class LivePress:
@@ -62,15 +62,15 @@ class LivePress:
     ) -> None:
         if source.motion != "vertical":
             raise InputError(f"{source.name} is of {source.motion} motion: heights of a press are vertical")
-        self._source, self._fill = source, fill
+        self._source, self._threshold, self._fill = source, threshold, fill
         self._process: dict[str, ProcessValue] = {
             "event": "onset",
             "method": "threshold",
             "threshold": threshold,
             "hold": hold,
             "subframe": subframe,
-            "dark": told(None, source.header.dark, _RANGE),
-            "bright": told(None, source.header.bright, _RANGE),
+            "dark": told_level(source, "dark"),
+            "bright": told_level(source, "bright"),
         }
         shape = source.shape[1:]
         self._search = OnsetSearch(
@@ -137,12 +137,10 @@ class LivePress:
         """
         onset = self._search.result()
         process = self._process | {"first_frame": 0, "frames": self._frames, "noise": onset.noise}
-        result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
-        process["fill"] = "none: not asked"
-        if self._fill:
-            travel = np.concatenate(self._travel)
-            result, process["fill"] = fill_press(result, self._source, travel, "onset")
-        return sign(result, self._source, self.device, process | {"live": True})
+        travel = np.concatenate(self._travel)
+        result, done = finish_press(onset, self._source, travel, "onset", self._threshold, self._fill)
+        signed = sign(result, self._source, self.device, process | done | {"live": True})
+        return on_the_sheet(signed, self._source)
 
     def _reset(self) -> None:
         self._frames, self._time = 0, math.nan

@@ -10,19 +10,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.calibrated import gel_of
 from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.press.changepoint import ChangePointSearch
+from mirrorskin.engine.press.elastic import correct_press
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.onset import OnsetSearch
-from mirrorskin.engine.press.search import Event
-from mirrorskin.engine.provenance import sign, told
-from mirrorskin.io import InputError, ProcessValue, Result, Source
+from mirrorskin.engine.press.search import Event, Onset
+from mirrorskin.engine.provenance import sign, told_level
+from mirrorskin.io import Calibrated, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device
 
 PressMethod = Literal["threshold", "change-point"]
 METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
 
-_RANGE = "range of the type"
 _LIGHT_AT_START = 3  # of an onset's status
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
 
@@ -114,33 +115,51 @@ def reconstruct_press(
         "hold": hold,
         "subframe": subframe,
         "noise": onset.noise,
-        "dark": "each pixel's own" if twice else told(dark, header.dark, _RANGE),
-        "bright": "each pixel's own" if twice else told(bright, header.bright, _RANGE),
+        "dark": "each pixel's own" if twice else told_level(source, "dark", dark),
+        "bright": "each pixel's own" if twice else told_level(source, "bright", bright),
     }
-    result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
-    process["fill"] = "none: not asked"
-    if fill:
-        travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-        used = None if travel is None else travel[frames.start : frames.stop]
-        result, process["fill"] = fill_press(result, source, used, event)
-    return sign(result, source, search.device, process)
+    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+    used = None if travel is None else travel[frames.start : frames.stop]
+    result, done = finish_press(onset, source, used, event, threshold, fill)
+    return sign(result, source, search.device, process | done)
 
 
-def fill_press(
-    result: Result, source: Source, travel: NDArray[np.float64] | None, event: Event
-) -> tuple[Result, str]:
-    """Fill the holes of a height map, where it is known how wide they are, and say what was done.
+def finish_press(
+    onset: Onset,
+    source: Source,
+    travel: NDArray[np.float64] | None,
+    event: Event,
+    threshold: float,
+    fill: bool,
+) -> tuple[Result, dict[str, ProcessValue]]:
+    """Put onsets right for the gel, if a calibration tells of it, and fill holes; say what was done.
 
     Parameters
     ----------
-    result : Result
-        With height, its sigma and status.
+    onset : Onset
     source : Source
-        Which tells the pixels' size.
+        Which tells the pixels' size, and the calibration.
     travel : ndarray, (T,), or None
         Of the frames that it was made of, mm; None where that is not known.
     event : {"onset", "release"}
+    threshold : float
+        Share of the way from dark to bright that is light.
+    fill : bool
+        Whether holes are to be filled.
     """
+    result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
+    done: dict[str, ProcessValue] = {"fill": "none: not asked"}
+    if isinstance(source, Calibrated):
+        result, done["gel"] = correct_press(result, source, travel, threshold, gel_of(source))
+    if fill:
+        result, done["fill"] = _fill_press(result, source, travel, event)
+    return result, done
+
+
+def _fill_press(
+    result: Result, source: Source, travel: NDArray[np.float64] | None, event: Event
+) -> tuple[Result, str]:
+    """Fill the holes of a height map, where it is known how wide they are, and say what was done."""
     assert result.height is not None
     assert result.height_sigma is not None
     pixel_size = source.header.pixel_size

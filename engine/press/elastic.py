@@ -1,0 +1,423 @@
+"""Heights of a press put right for the gel: it touches later than eq. 3 has it, and turns light before."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.integration.inputs import check_pixel_size
+from mirrorskin.engine.press.elastic_grid import Cells, Splines, cut_into_cells, touched
+from mirrorskin.engine.press.elastic_sweep import Seen, Watched, sweep
+from mirrorskin.engine.press.halfspace import HalfSpace
+from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LEARNED_AT = 0.5
+"""Share of the way from dark to bright that gels are learned with."""
+
+_LIT, _DARK, _HIDDEN = 1, 2, 3  # of an onset's status
+_FEWEST = 12  # cells that must have turned light
+_LOOKED = 250  # cells whose onset is looked at; more tell no more of so few splines
+_TRAVELS = 16  # at which the press is gone through
+_BENDING = (
+    0.1,
+    0.1,
+    0.3,
+    1.0,
+)  # third derivatives that surfaces usually have, 1/mm^2; the last from there on
+_MOST_ROUNDS = 14
+_DAMPING, _STUCK = 1.0, 1e3  # at first, in units of steps; beyond the second nothing moves any more
+_STEP = 0.3  # mm that the surface may move in a round
+_SETTLED = 0.9  # of the cost of the round before: no better is good enough
+_SLOPE_ERROR = 0.006  # of the sheet, as cells so large tell it
+_ROBUST = 2.0  # errors beyond which a cell counts less
+_MISFIT = 0.08  # median error of the slope beyond which the surface explains nothing
+_DEPTH = 0.6  # of a depth by eq. 3: half of it on a paraboloid, more on what is steeper
+_KNOWN = 0.01  # mm, of the heights that a first surface goes through
+_BEYOND = 0.3  # of the touch that may lie beyond the picture, where the object is a guess
+_SHARE_LEFT = 0.02  # of a change that is left, as the cells are coarse
+_FARTHEST = 0.05  # mm, standard deviation up to which a height goes on beyond the touch
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """Heights for a gel that gives way.
+
+    Attributes
+    ----------
+    height, sigma : ndarray, (H, W), float32
+        Millimetres, and their standard deviations, which hold what is left of the correction's own error.
+        NaN where the light came early and the touch never: there the object is known to be smooth only, and
+        soon that tells its height no more.
+    touched : ndarray, (H, W), bool
+        What the sheet lies on at the greatest travel.
+    """
+
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    touched: Mask
+
+
+def threshold_at(gel: Gel, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -> Doubles:
+    """Return the zenith that turns a pixel light.
+
+    Seen along the axis, a mirror of zenith t shows what lies 2 t off it. Towards the azimuth the wall, of
+    radius R about the axis, is ``way`` off the pixel, and its rim is as high everywhere ::
+
+        tan 2t = way / R tan 2t0,    way = (R^2 - r^2) / (b + sqrt(b^2 + R^2 - r^2))
+
+    with r the pixel's distance from the axis, b that along the azimuth, and t0 the threshold on the axis.
+
+    Parameters
+    ----------
+    gel : Gel
+    x, y : array_like
+        Place, mm.
+    azimuth : array_like
+        Of the sheet's normal, radians.
+
+    Returns
+    -------
+    ndarray, float64
+        Radians, shaped as the arguments broadcast; NaN outside the wall.
+    """
+    across = gel.curvature * (np.asarray(x, np.float64) - gel.axis[0])
+    up = gel.curvature * (np.asarray(y, np.float64) - gel.axis[1])
+    room = 1 - across**2 - up**2
+    along = across * np.cos(azimuth) + up * np.sin(azimuth)
+    room = np.where(room > 0, room, np.nan)
+    way = room / (along + np.sqrt(along**2 + room))
+    return np.asarray(np.arctan(way * math.tan(2 * gel.threshold)) / 2)
+
+
+def correct_press(
+    result: Result,
+    source: Source,
+    travel: NDArray[np.float64] | None,
+    threshold: float,
+    gel: Gel | None,
+) -> tuple[Result, str]:
+    """Correct the heights of a press or a release for a gel, where all is known that it takes.
+
+    Parameters
+    ----------
+    result : Result
+        With height, its sigma and status, not filled yet.
+    source : Source
+        Which tells the pixels' size.
+    travel : ndarray, (T,), or None
+        Of the frames that it was made of, mm; None where that is not known: the deepest onset stands for it.
+    threshold : float
+        Share of the way from dark to bright that was taken for light: as of what the gel was learned from.
+    gel : Gel or None
+
+    Returns
+    -------
+    Result
+    str
+        What was done, for the process.
+    """
+    assert result.height is not None
+    assert result.height_sigma is not None
+    assert result.status is not None
+    pixel_size = source.header.pixel_size
+    if gel is None:
+        return result, "none: the calibration has no gel"
+    if pixel_size is None:
+        return result, "none: the recording has no pixel size"
+    if threshold != LEARNED_AT:
+        return result, f"none: the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
+    try:
+        corrected = correct_onset(
+            result.height,
+            result.height_sigma,
+            result.status,
+            pixel_size,
+            gel,
+            deepest=None if travel is None else float(np.max(travel)),
+        )
+    except NotConverged as error:
+        return result, f"none: {error}"
+    lost = np.count_nonzero((result.status == _LIT) & np.isnan(corrected.height))
+    said = f"corrected; {lost} pixels turned light too far from the touch"
+    return replace(result, height=corrected.height, height_sigma=corrected.sigma), said
+
+
+def correct_onset(
+    height: ArrayLike,
+    sigma: ArrayLike,
+    status: ArrayLike,
+    pixel_size: ArrayLike,
+    gel: Gel,
+    *,
+    deepest: float | None = None,
+) -> Corrected:
+    """Find the surface whose press would turn each pixel light when it did.
+
+    Eq. 3 takes a pixel's travel at its onset for the object's depth there. A gel gives way around what it
+    touches: a paraboloid touches at twice the depth; and the sheet around the touch is steep enough for
+    light before it touches. So a smooth surface is looked for (cubic splines, no finer than an eighth of
+    what turned light), which pressed into an elastic half-space would have brought the sheet to just the
+    threshold's slope at each pixel's onset: by Gauss and Newton, with third derivatives kept small, at first
+    more than in the end. What it differs by from a surface as smooth through the heights as given is added to
+    these; so what is finer stays as it was.
+
+    Parameters
+    ----------
+    height, sigma : array_like, (H, W)
+        As ``find_onset`` gives them, or those of a release: without friction the way does not matter.
+    status : array_like, (H, W)
+        0 invalid, 1 turned light, 2 never light, 3 light at start; 3 of a release means light to the end.
+    pixel_size : float or (float, float)
+        Millimetres, along x and y.
+    gel : Gel
+    deepest : float, optional
+        Greatest travel, mm; by default that of the last onset.
+
+    Returns
+    -------
+    Corrected
+
+    Raises
+    ------
+    mirrorskin.engine.NotConverged
+        Too little turned light, or no surface explains it.
+    mirrorskin.io.InputError
+        Maps or sizes that cannot be used.
+    """
+    scene = _scene_of(_maps(height, sigma, status), check_pixel_size(pixel_size), gel, deepest)
+    smooth = _through(scene, scene.height)
+    factors, seen, form = _look_for(scene, _start(scene))
+    here, whole = (int(np.sum(part)) for part in (scene.cells.inside(seen.contact), seen.contact))
+    if whole - here > _BEYOND * whole:
+        raise NotConverged("much of what touches lies beyond the picture")
+    change, spread, touching = _on_pixels(
+        scene, factors - smooth, _variances(scene, seen, form), seen.contact
+    )
+    maps, own = scene.maps, spread + (_SHARE_LEFT * change) ** 2 + gel.error**2
+    known = np.isfinite(maps.height) & (touching | (own <= _FARTHEST**2))
+    heights = np.where(known, maps.height + change, np.nan)
+    sigmas = np.where(known, np.sqrt(maps.sigma**2 + own), np.nan)
+    return Corrected(heights.astype(np.float32), sigmas.astype(np.float32), touching)
+
+
+class _Maps(NamedTuple):
+    """Pixels: heights where they turned light, NaN elsewhere; their standard deviations, and all status."""
+
+    height: Doubles
+    sigma: Doubles
+    status: NDArray[Any]
+
+
+class _Scene(NamedTuple):
+    """A press as the search for its surface sees it."""
+
+    maps: _Maps
+    cells: Cells
+    height: Doubles  # of cells that turned light
+    looked: Mask  # some of these, all over
+    dark: Mask  # cells that never did
+    surface: Mask  # cells that there may be something in
+    x: Doubles
+    y: Doubles
+    space: HalfSpace
+    splines: Splines
+    travel: Doubles
+    gel: Gel
+
+
+def _scene_of(maps: _Maps, size: tuple[float, float], gel: Gel, deepest: float | None) -> _Scene:
+    """Prepare the search: cells, what may touch in them, and when to look."""
+    known = np.isfinite(maps.height)
+    if not known.any():
+        raise NotConverged("nothing turned light")
+    cells = cut_into_cells(known, size)
+    means = cells.means(maps.height)
+    onsets = -means[np.isfinite(means)]
+    if len(onsets) < _FEWEST:
+        raise NotConverged(
+            f"light in {len(onsets)} places is too little to tell a surface: {_FEWEST} are needed"
+        )
+    dark = cells.share(maps.status == _DARK) == 1
+    hidden = cells.inside(cells.share(maps.status == _HIDDEN)) >= 0.5
+    surface = cells.outward(touched(cells.inside(means), cells.inside(dark), hidden))
+    last = max(float(onsets.max()), -math.inf if deepest is None else deepest)
+    travel = np.unique([*np.quantile(onsets, np.linspace(0, 1, _TRAVELS)), last])
+    spacing = size[1] * cells.block[0], size[0] * cells.block[1]
+    rows, columns = (axis * step for axis, step in zip(cells.centres(), spacing, strict=True))
+    x, y = pixel_axes(maps.height.shape, size)
+    left, top = x[0] - size[0] / 2, y[0] + size[1] / 2
+    space, splines = HalfSpace(cells.shape, spacing[::-1]), Splines(cells.shape, spacing)
+    row, column = np.indices(cells.shape)
+    looked = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _LOOKED) == 0)
+    return _Scene(
+        maps, cells, means, looked, dark, surface, left + columns, top - rows, space, splines, travel, gel
+    )
+
+
+def _maps(height: ArrayLike, sigma: ArrayLike, status: ArrayLike) -> _Maps:
+    state, heights = np.asarray(status), np.asarray(height, np.float64)
+    sigmas = np.asarray(sigma, np.float64)
+    if heights.ndim != 2 or 0 in heights.shape:
+        raise InputError(f"heights have shape {heights.shape}: one map (H, W) is needed")
+    if state.shape != heights.shape or sigmas.shape not in ((), heights.shape):
+        raise InputError(
+            f"sigma {sigmas.shape} and status {state.shape} do not fit heights of shape {heights.shape}:"
+            " give one a pixel"
+        )
+    return _Maps(np.where(state == _LIT, heights, np.nan), sigmas, state)
+
+
+def _on_pixels(
+    scene: _Scene, factors: Doubles, variances: Doubles, contact: Mask
+) -> tuple[Doubles, Doubles, Mask]:
+    """Return for each pixel a surface's height, the variance, and whether there is contact; 0 elsewhere."""
+    shape, box = scene.maps.height.shape, scene.cells.box
+    rows, columns = scene.cells.places(shape)
+    at = np.stack(np.meshgrid(rows, columns, indexing="ij"))
+    height, spread, touching = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    height[box] = scene.splines.at(factors, rows, columns)
+    spread[box] = ndimage.map_coordinates(variances, at, order=1, mode="nearest")
+    touching[box] = ndimage.map_coordinates(1.0 * contact, at, order=1, mode="nearest")
+    return height, spread, touching >= 0.5
+
+
+def _through(scene: _Scene, heights: Doubles) -> Doubles:
+    """Return the factors of a smooth surface through heights of cells, NaN where it is free."""
+    known = np.isfinite(heights).ravel()
+    basis = scene.splines.basis[known]
+    form = (basis.T @ basis).toarray() / _KNOWN**2 + _stiffness(scene, _BENDING[-1])
+    return _solve(form, basis.T @ heights.ravel()[known] / _KNOWN**2)
+
+
+def _start(scene: _Scene) -> Doubles:
+    """Return the factors of a surface to begin with: flat tops, and depths nearer to those of the touch."""
+    lit = np.isfinite(scene.height)
+    row, column = ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
+    top = float(scene.height[lit].max())
+    known = np.where(lit | scene.surface, scene.height[row, column], np.nan)
+    return _through(scene, top + _DEPTH * (known - top))
+
+
+def _stiffness(scene: _Scene, bending: float) -> Doubles:
+    return scene.splines.roughness() / bending**2
+
+
+def _solve(form: Doubles, values: Doubles) -> Doubles:
+    """Solve without BLAS, whose threads wait for each other longer than so little takes."""
+    ridge = _RIDGE * float(np.trace(form)) / len(form)
+    matrix = sparse.csc_matrix(form + ridge * np.eye(len(form)))
+    return np.asarray(splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True}).solve(values))
+
+
+def _look_for(scene: _Scene, factors: Doubles) -> tuple[Doubles, Seen, Doubles]:
+    """Return the surface's factors, what it would have shown, and the form that they minimise.
+
+    Gauss and Newton's steps are damped, more after one that has made things worse (Levenberg).
+    """
+    lit, damping, accepted = np.isfinite(scene.height), _DAMPING, 0
+    still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _STEP**2
+    seen = _watch(scene, factors)
+    for _ in range(_MOST_ROUNDS):
+        stiffness = _stiffness(scene, _BENDING[min(accepted, len(_BENDING) - 1)])
+        form, pull = _normal_form(seen, stiffness, factors)
+        step = _solve(form + damping * still, pull)
+        moved = float(np.abs(scene.splines.surface(step)[lit]).max())
+        tried = factors + step * min(1.0, _STEP / max(moved, _STEP))
+        shown, before = _watch(scene, tried), _cost(seen, stiffness, factors)
+        after = _cost(shown, stiffness, tried)
+        if after >= before:
+            if damping > _STUCK:
+                break
+            damping *= 10
+            continue
+        factors, seen, accepted, damping = tried, shown, accepted + 1, damping / 3
+        if accepted > len(_BENDING) and after > _SETTLED * before:
+            break
+    misfit = float(np.median(np.abs(seen.missing))) if seen.missing.size else math.inf
+    if misfit > _MISFIT:
+        raise NotConverged(f"no surface explains when the pixels turned light: slopes differ by {misfit:.2g}")
+    return factors, seen, _normal_form(seen, _stiffness(scene, _BENDING[-1]), factors)[0]
+
+
+def _normal_form(seen: Seen, stiffness: Doubles, factors: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the normal equations of the next step: form and right side."""
+    weights = np.minimum(1.0, _ROBUST * _SLOPE_ERROR / np.maximum(np.abs(seen.missing), _RIDGE))
+    weights /= _SLOPE_ERROR**2
+    form = np.einsum("ki,k,kj->ij", seen.by_surface, weights, seen.by_surface) + stiffness
+    bend = np.einsum("ij,j->i", stiffness, factors)
+    return form, np.einsum("ki,k->i", seen.by_surface, weights * seen.missing) - bend
+
+
+def _cost(seen: Seen, stiffness: Doubles, factors: Doubles) -> float:
+    """Return what a surface costs: slopes that are missing, by Huber's measure, and bending."""
+    wrong = np.abs(seen.missing) / _SLOPE_ERROR
+    small = np.minimum(wrong, _ROBUST)
+    bent = float(np.sum(factors * np.einsum("ij,j->i", stiffness, factors)))
+    return float(np.sum(small * (2 * wrong - small))) + bent
+
+
+def _watch(scene: _Scene, factors: Doubles) -> Seen:
+    """Press a surface, and look when cells turned light."""
+    height = scene.splines.surface(factors)
+    down, across = (part @ factors for part in scene.splines.slopes)
+    azimuth = np.arctan2(down, -across).reshape(height.shape)
+    zenith = threshold_at(scene.gel, scene.x[np.newaxis], scene.y[:, np.newaxis], azimuth)
+    watched = Watched(
+        np.where(scene.looked, -scene.height, np.nan), scene.dark & ~scene.surface, np.tan(zenith)
+    )
+    surface = np.where(scene.surface, height, np.nan)
+    seen = sweep(scene.space, surface, scene.splines.basis, scene.travel, watched, scene.gel.compliance)
+    return _with_tops(scene, seen, watched.slope.ravel(), down, across)
+
+
+def _with_tops(scene: _Scene, seen: Seen, limit: Doubles, down: Doubles, across: Doubles) -> Seen:
+    """Add the dark cells of the surface that are steeper than what is dark can be."""
+    steep = np.hypot(down, across)
+    cell = np.flatnonzero((scene.dark & scene.surface).ravel() & (steep > limit))
+    along_y, along_x = (sparse.diags_array(part[cell] / steep[cell]) for part in (down, across))
+    slopes = along_y @ scene.splines.slopes[0][cell] + along_x @ scene.splines.slopes[1][cell]
+    nothing = np.zeros(len(cell))
+    return Seen(
+        np.append(seen.missing, (limit - steep)[cell]),
+        np.concatenate([seen.by_surface, slopes.toarray()]),
+        np.append(seen.by_travel, nothing),
+        np.append(seen.load, nothing),
+        np.append(seen.cell, cell),
+        seen.contact,
+    )
+
+
+def _variances(scene: _Scene, seen: Seen, form: Doubles) -> Doubles:
+    """Return the variance of the surface at each cell, mm^2: by the fit, and by what is known of the gel."""
+    covariance = _solve(form, np.eye(len(form)))
+    basis = scene.splines.basis
+    usual = 1.4826 * float(np.median(np.abs(seen.missing)))
+    worse = max(1.0, (usual / _SLOPE_ERROR) ** 2)
+    variance = worse * np.asarray(basis.multiply(basis @ covariance).sum(axis=1)).ravel()
+    for slope in _gel_slopes(scene, seen):
+        pull = np.einsum("ki,k->i", seen.by_surface, slope / _SLOPE_ERROR**2)
+        moved = basis @ np.einsum("ij,j->i", covariance, pull)
+        variance += moved**2
+    return variance.reshape(scene.cells.shape)
+
+
+def _gel_slopes(scene: _Scene, seen: Seen) -> list[Doubles]:
+    """Return by how much a standard error of each of the gel's numbers changes what slopes are missing."""
+    gel, sigma = scene.gel, scene.gel.sigma
+    slope = math.tan(gel.threshold)
+    threshold = np.full(seen.missing.shape, (1 + slope**2) * sigma.get("threshold", 0.0))
+    compliance = seen.by_travel * seen.load * sigma.get("compliance", 0.0)
+    r = np.hypot(*np.meshgrid(scene.x - gel.axis[0], scene.y - gel.axis[1])).ravel()[seen.cell]
+    curvature = slope * r * sigma.get("curvature", 0.0)
+    return [threshold, compliance, curvature]
