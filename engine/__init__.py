@@ -1,5 +1,6 @@
 """The estimators: what turns frames into maps."""
 
+from mirrorskin.engine.calibrated import calibrated
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.fusion import frames_to_read, fuse, fuse_sources
 from mirrorskin.engine.integration.integrate import integrate
@@ -42,6 +43,7 @@ __all__ = [
     "Score",
     "Summary",
     "Surface",
+    "calibrated",
     "correlate",
     "correlate_source",
     "estimate_normals",

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.calibrated import calibrated, on_the_sheet
 from mirrorskin.engine.feed import Progress
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.joint import Joint, Known
@@ -18,8 +19,9 @@ from mirrorskin.engine.press.vertical import reconstruct_press
 from mirrorskin.engine.provenance import sign
 from mirrorskin.engine.rotation.axial import Rotation, estimate_rotation, maps_of
 from mirrorskin.engine.rotation.relief import tell_integration
+from mirrorskin.engine.rotation.response import response_of
 from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
-from mirrorskin.io import InputError, Motion, ProcessValue, Recording, Result, Source
+from mirrorskin.io import InputError, Motion, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
 Mask = NDArray[np.bool_]
@@ -160,7 +162,8 @@ def fuse_sources(
     Parameters
     ----------
     vertical, axial : Source
-        On the same pixels. They are rewound first, if they can be.
+        On the same pixels. They are rewound first, if they can be, and are read as the calibrations that
+        they carry say.
     press, rotation : mapping, optional
         Further options of `reconstruct_press` and `reconstruct_rotation`: how to read the one and the other.
     register : bool
@@ -188,6 +191,7 @@ def fuse_sources(
     mirrorskin.engine.NotConverged
         The surface was not found.
     """
+    vertical, axial = calibrated(vertical), calibrated(axial)
     pixel_size = _check_sources(vertical, axial)
     rotation = rotation or {}
     _check_rotation(axial, rotation)
@@ -219,7 +223,8 @@ def fuse_sources(
     process = _both(heights.process, turned.process) | tell_integration([surface]) | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
-    return replace(_put_together(heights, found, surface), process=process)
+    together = _put_together(heights, found, surface)
+    return on_the_sheet(replace(together, process=process, calibration=turned.calibration), axial)
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:
@@ -248,7 +253,7 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
     ways = []
     if sizes[0] != sizes[1]:
         ways.append(" and ".join(f"{width} x {height} pixels" for width, height in sizes))
-    origins = [source.origin if isinstance(source, Recording) else (0, 0) for source in (vertical, axial)]
+    origins = [getattr(source, "origin", (0, 0)) for source in (vertical, axial)]
     if origins[0] != origins[1]:
         ways.append(" and ".join(f"regions from column {column}, row {row}" for row, column in origins))
     if not np.allclose(pixels[0], pixels[1], rtol=_SAME, atol=0):
@@ -263,8 +268,11 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
 
 def _check_rotation(axial: Source, rotation: Mapping[str, Any]) -> None:
     """Refuse a rotation that gives no normals, or not those of one picture."""
-    if axial.header.zenith_gain is None and rotation.get("gain") is None:
-        raise InputError(f"{axial.name} has no zenith gain, so no normals to fuse: give the gain")
+    known = axial.header.zenith_gain is not None or response_of(axial) is not None
+    if not known and rotation.get("gain") is None:
+        raise InputError(
+            f"{axial.name} has no zenith gain, so no normals to fuse: give the gain, or a calibration"
+        )
     if rotation.get("per_turn"):
         raise InputError(f"{axial.name}: all turns make one surface: do not ask for each turn's own")
 

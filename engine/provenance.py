@@ -6,32 +6,37 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.version import program_version
-from mirrorskin.io import InputError, ProcessValue, Recording, Result, Source, pixel_axes
+from mirrorskin.io import Calibrated, InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
 
 Floats = NDArray[np.float64]
 
 
 def sign(result: Result, source: Source, device: Device, process: dict[str, ProcessValue]) -> Result:
-    """Add where the pixels are, and how the maps came about."""
+    """Add where the pixels are, and how the maps came about; and the calibration, if there is one."""
     x = y = None
+    own = source.source if isinstance(source, Calibrated) else source
     if source.header.pixel_size is not None:
-        x, y = _places(source, source.header.pixel_size)
+        x, y = _places(own, source.header.pixel_size)
     origin: dict[str, ProcessValue] = {"source": source.name}
-    if isinstance(source, Recording):
+    if isinstance(own, Recording):
         origin |= {
-            "dataset": source.dataset,
-            "source_fingerprint": source.fingerprint(),
-            "source_modified": source.modified,
-            "source_region": source.region.text,
-            "source_frames": source.which,
+            "dataset": own.dataset,
+            "source_fingerprint": own.fingerprint(),
+            "source_modified": own.modified,
+            "source_region": own.region.text,
+            "source_frames": own.which,
         }
+    if isinstance(source, Calibrated):
+        origin |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
+        result = replace(result, calibration=source.whole)
     made: dict[str, ProcessValue] = {
         "program": "mirrorskin",
         "version": program_version(),
@@ -51,13 +56,24 @@ def _places(source: Source, pixel_size: tuple[float, float]) -> tuple[Floats, Fl
     return x[column : column + columns], y[row : row + rows]
 
 
-def told(given: ArrayLike | None, own: ArrayLike | None, otherwise: str) -> ProcessValue:
+def told_level(
+    source: Source, name: Literal["dark", "bright"], given: ArrayLike | None = None
+) -> ProcessValue:
+    """Say in a word where the level of dark or bright pixels came from."""
+    references = source.calibration.references if isinstance(source, Calibrated) else None
+    whose = "recording" if references is None else "calibration"
+    return told(given, getattr(source.header, name), "range of the type", whose)
+
+
+def told(
+    given: ArrayLike | None, own: ArrayLike | None, otherwise: str, whose: str = "recording"
+) -> ProcessValue:
     """Say in a word where a number or a map came from."""
     if given is not None:
         return float(given) if np.ndim(given) == 0 else "map given"  # type: ignore[arg-type]
     if own is None:
         return otherwise
-    return "map of the recording" if np.ndim(own) else float(np.asarray(own))
+    return f"map of the {whose}" if np.ndim(own) else float(np.asarray(own))
 
 
 @contextmanager

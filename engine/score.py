@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from mirrorskin.engine.angles import angle_between, true_normals
-from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io import UNDISTORTED, InputError, Result, Truth
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -210,8 +210,11 @@ def score(result: Result, truth: Truth) -> Score:
     Raises
     ------
     InputError
-        There is nothing to compare, or the sizes differ.
+        There is nothing to compare, the sizes differ, or the result was undistorted.
     """
+    if result.process.get(UNDISTORTED):
+        remedy = "score one that was made without a scale in its calibration"
+        raise InputError(f"the result is undistorted, the truth is told of the camera's pixels: {remedy}")
     known = {name: getattr(result, name) for name in ("height", "azimuth", "normals", "contact", "edges")}
     sizes = {
         name: values.shape[:-1] if name == "normals" else values.shape
@@ -226,7 +229,7 @@ def score(result: Result, truth: Truth) -> Score:
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
     # Registered frames tell of the object's points, the truth of the picture's pixels.
-    follows = result.process.get("heights", "none") != "none"
+    follows = bool(result.process.get("registered", result.process.get("heights", "none") != "none"))
     contact, edges = (None, None) if follows else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
     return Score(

@@ -289,3 +289,9 @@ ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
 )
 def test_a_result_in_one_line(maps, line):
     assert str(engine.summarise(io.Result(**maps))) == line
+
+
+def test_undistorted_maps_are_not_of_the_truth_s_pixels():
+    result = io.Result(height=np.zeros((2, 3), np.float32), process={io.UNDISTORTED: True})
+    with pytest.raises(io.InputError, match="the result is undistorted"):
+        engine.score(result, truth_of(np.zeros((2, 3), np.float32)))

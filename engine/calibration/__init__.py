@@ -1,0 +1,1 @@
+"""From recordings of known things to what the sensor is: references, lens, zenith, precession, gel."""

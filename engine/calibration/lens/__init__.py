@@ -1,0 +1,1 @@
+"""Millimetres per pixel and the lens from pictures of a board."""

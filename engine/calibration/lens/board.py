@@ -1,0 +1,203 @@
+"""Boards that tell a camera's scale: what they are, where their marks lie, and how to print them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io import InputError
+
+Doubles = NDArray[np.float64]
+
+FEWEST = 12
+"""Marks that a fit needs of each picture."""
+
+FAMILIES: dict[str, dict[int, int]] = {
+    kind: {count: getattr(cv2.aruco, f"DICT_{kind}_{count}") for count in (50, 100, 250, 1000)}
+    for kind in ("4X4", "5X5", "6X6", "7X7")
+} | {"APRILTAG_36h11": {587: cv2.aruco.DICT_APRILTAG_36h11}}
+"""Kinds of markers, and their dictionaries by how many they hold."""
+
+_INCH = 25.4
+_DOT = 0.5  # of the pitch: how wide dots are printed
+
+
+@dataclass(frozen=True, slots=True)
+class Charuco:
+    """A ChArUco board: a chessboard, black in its upper left corner, with markers in its white squares.
+
+    Attributes
+    ----------
+    columns, rows : int
+        Squares.
+    square, marker : float
+        Millimetres along an edge.
+    """
+
+    columns: int
+    rows: int
+    square: float
+    marker: float
+
+    def __post_init__(self) -> None:
+        _check(self, min(self.square, self.marker), (self.columns - 1) * (self.rows - 1), "corners")
+        if self.marker >= self.square:
+            raise InputError(
+                f"{self}: a marker lies within its square: give the square first,"
+                " such as charuco:7x5:2mm:1.5mm"
+            )
+        if self.columns * self.rows // 2 > 1000:
+            raise InputError(f"{self}: no family has so many markers: take fewer squares")
+
+    def __str__(self) -> str:
+        return f"charuco:{self.columns}x{self.rows}:{self.square:g}mm:{self.marker:g}mm"
+
+    @property
+    def pitch(self) -> float:
+        """Millimetres from mark to mark."""
+        return self.square
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height, mm."""
+        return self.columns * self.square, self.rows * self.square
+
+    def marks(self) -> Doubles:
+        """Return where its inner corners are, (n, 2), mm from its middle, y up; row by row from the top."""
+        return _grid(self.columns - 1, self.rows - 1, self.square)
+
+    def dictionary(self, family: str = "4X4") -> Any:
+        """Return OpenCV's smallest dictionary of a family that has as many markers as the board."""
+        needed = self.columns * self.rows // 2
+        fitting = [number for count, number in FAMILIES[family].items() if count >= needed]
+        return cv2.aruco.getPredefinedDictionary(fitting[0]) if fitting else None
+
+    def opencv(self, dictionary: Any) -> Any:
+        """Return OpenCV's board."""
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
+
+
+@dataclass(frozen=True, slots=True)
+class Dots:
+    """Round dots in a square grid.
+
+    Attributes
+    ----------
+    columns, rows : int
+    pitch : float
+        Millimetres from centre to centre.
+    """
+
+    columns: int
+    rows: int
+    pitch: float
+
+    def __post_init__(self) -> None:
+        _check(self, self.pitch, self.columns * self.rows, "dots")
+
+    def __str__(self) -> str:
+        return f"dots:{self.columns}x{self.rows}:{self.pitch:g}mm"
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height, mm."""
+        return self.columns * self.pitch, self.rows * self.pitch
+
+    def marks(self) -> Doubles:
+        """Return where the dots are, (n, 2), mm from the board's middle, y up; row by row from the top."""
+        return _grid(self.columns, self.rows, self.pitch)
+
+
+Board = Charuco | Dots
+
+
+def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
+    """Paint a board for printing, black on white, with a margin as wide as a square or the pitch.
+
+    Parameters
+    ----------
+    board : Charuco or Dots
+        Markers are those of the family 4X4; dots are half as wide as the pitch.
+    dots_per_inch : float
+        Of the printer.
+
+    Returns
+    -------
+    ndarray, (H, W), uint8
+        To be printed at ``dots_per_inch``: edges lie where they belong to half a pixel.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The details are finer than the pixels.
+    """
+    per_mm = dots_per_inch / _INCH
+    fine = board.marker / 6 if isinstance(board, Charuco) else board.pitch * _DOT / 2
+    if not per_mm * fine >= 2:
+        needed = math.ceil(2 / fine * _INCH)
+        raise InputError(f"{board} has details of {fine:g} mm: {needed} dots per inch or more are needed")
+    width, height = (side + 2 * board.pitch for side in board.size)
+    columns, rows = round(width * per_mm), round(height * per_mm)
+    if columns * rows > 1 << 28:
+        raise InputError(f"{board} would be {columns} x {rows} pixels: print it with fewer dots per inch")
+    x = (np.arange(columns, dtype=np.float64) + 0.5) / per_mm - width / 2
+    y = height / 2 - (np.arange(rows, dtype=np.float64) + 0.5) / per_mm
+    return _paint_dots(board, x, y) if isinstance(board, Dots) else _paint_charuco(board, x, y)
+
+
+def _paint_dots(board: Dots, x: Doubles, y: Doubles) -> NDArray[np.uint8]:
+    across, down = (
+        np.min(abs(axis[:, np.newaxis] - np.unique(places)), axis=1)
+        for axis, places in zip((x, y), board.marks().T, strict=True)
+    )
+    near = across**2 + down[:, np.newaxis] ** 2 <= (board.pitch * _DOT / 2) ** 2
+    return np.where(near, 0, 255).astype(np.uint8)
+
+
+def _paint_charuco(board: Charuco, x: Doubles, y: Doubles) -> NDArray[np.uint8]:
+    """Look each pixel's square up, and in a white square its marker's cell."""
+    dictionary = board.dictionary()
+    cells = dictionary.markerSize + 2
+    places = [
+        _cells(along / board.square, board.marker / board.square, cells, count)
+        for along, count in ((x + board.size[0] / 2, board.columns), (board.size[1] / 2 - y, board.rows))
+    ]
+    (column, across), (row, down) = places
+    painted = np.full((y.size, x.size), 255, np.uint8)
+    number = 0
+    for i in range(board.rows):
+        for j in range(board.columns):
+            place = np.ix_(np.flatnonzero(row == i), np.flatnonzero(column == j))
+            if (i + j) % 2 == 0:
+                painted[place] = 0
+                continue
+            marker = np.pad(cv2.aruco.generateImageMarker(dictionary, number, cells), 1, constant_values=255)
+            painted[place] = marker[np.ix_(down[row == i], across[column == j])]
+            number += 1
+    return painted
+
+
+def _cells(along: Doubles, share: float, cells: int, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the square of each place, -1 outside, and the cell of its marker, 0 and cells + 1 beside it."""
+    square = np.floor(along).astype(np.intp)
+    cell = np.floor(((along - square - 0.5) / share + 0.5) * cells).astype(np.intp) + 1
+    return np.where((square >= 0) & (square < count), square, -1), np.clip(cell, 0, cells + 1)
+
+
+def _grid(columns: int, rows: int, pitch: float) -> Doubles:
+    """Return the places of a grid about its middle, (n, 2), y up, row by row from the top."""
+    x = (np.arange(columns) - (columns - 1) / 2) * pitch
+    y = ((rows - 1) / 2 - np.arange(rows)) * pitch
+    return np.stack([np.tile(x, rows), np.repeat(y, columns)], axis=1)
+
+
+def _check(board: Board, length: float, marks: int, noun: str) -> None:
+    if not 0 < length < math.inf:
+        raise InputError(f"{board}: lengths are above zero")
+    if min(board.columns, board.rows) < 3 or marks < FEWEST:
+        raise InputError(f"{board} has too few {noun}: 3 each way and {FEWEST} in all are needed")

@@ -1,0 +1,1 @@
+"""Dark and bright references from recordings, with their errors, and the pixels that are defective."""

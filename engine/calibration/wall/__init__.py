@@ -1,0 +1,1 @@
+"""Brightness by place and normal, from presses of a ball."""

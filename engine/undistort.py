@@ -1,0 +1,144 @@
+"""From the camera's picture to the sheet: maps without perspective and distortion, in pixels of one size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.lens_model import picture_places
+from mirrorskin.engine.resample import Spots
+from mirrorskin.io import UNDISTORTED, InputError, Lens, Result, part_of, pixel_axes
+
+Maps = dict[str, NDArray[Any]]
+
+_NOTHING = {"status": 0, "edges": 0, "filled": 0, "contact": 0, "component": -1}
+_OF_PIECES = ("height", "height_sigma")
+_BAND = 1 << 14  # pixels that are worked on at once
+
+
+def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None) -> Result:
+    """Bring the maps of a result from the camera's pixels to even ones on the sheet.
+
+    Numbers are interpolated between the four pixels around. A pixel has no answer where the nearest one has
+    none; otherwise those without one do not count, nor do, of heights, those of another component, and of
+    everything else, those that differ in contact: nothing creeps over a border. Flags, states and components
+    are those of the nearest pixel. What the camera did not see is NaN, 0, and in no component. Where a place
+    is a pixel's own to a millionth, its value is taken as it is.
+
+    Vectors are made unit again. They are not turned: a normal was told from brightness, in the directions of
+    the sensor's light, and not from where it lies in the picture; it is only shown elsewhere. The axes of the
+    map run as those of the picture do at its centre. Zenith and azimuth are those of the vectors; without
+    vectors, azimuths are interpolated the short way round.
+
+    Standard deviations are interpolated as numbers are: right where neighbours are wrong in common, and too
+    much, never too little, where they are not.
+
+    Heights that were integrated from normals in the camera's pixels took these to be of one size. Where that
+    is too wrong, undistort the normals alone, and integrate them on the sheet.
+
+    Parameters
+    ----------
+    result : Result
+        In the camera's pixels; of each turn, too.
+    lens : Lens
+    origin : (int, int), optional
+        Row and column of the maps' first pixel in the full picture; by default those of the part that the
+        result says it is of. The same part of the undistorted map comes back.
+
+    Returns
+    -------
+    Result
+        Of the same size, with ``x`` and ``y`` on the sheet, and ``undistorted`` in its process.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The maps do not fit the lens, or were undistorted before.
+    """
+    if result.process.get(UNDISTORTED):
+        raise InputError("these maps were undistorted before, which is done once: take them as they are")
+    maps = result.maps()
+    (row, column), (rows, columns) = _part(result, maps, lens, origin)
+    across, up = pixel_axes(lens.shape, lens.pixel_size)
+    x, y = across[column : column + columns], up[row : row + rows]
+    made = {name: np.empty_like(values) for name, values in maps.items()}
+    for band in _bands(rows, columns):
+        seen = picture_places(lens, *np.meshgrid(x, y[band]))
+        spots = Spots.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
+        for turn in _turns(maps):
+            found = _resampled({name: values[turn] for name, values in maps.items()}, spots)
+            for name, values in found.items():
+                room = made[name][turn][band]
+                room[...] = values.reshape(room.shape)
+    told: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
+    return replace(result, **told)
+
+
+def _part(
+    result: Result, maps: Maps, lens: Lens, origin: tuple[int, int] | None
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first pixel of the maps in the full picture, and their size."""
+    if not maps:
+        raise InputError("there are no maps to undistort: reconstruct first")
+    rows, columns = _size(maps)[-2:]
+    told = part_of(result.process)
+    row, column = (told.origin if told else (0, 0)) if origin is None else origin
+    if min(row, column) < 0 or row + rows > lens.shape[0] or column + columns > lens.shape[1]:
+        raise InputError(
+            f"maps of {columns} x {rows} pixels from column {column}, row {row} on are not in the picture of "
+            f"{lens.shape[1]} x {lens.shape[0]} that the lens is of: calibrate again"
+        )
+    return (row, column), (rows, columns)
+
+
+def _size(maps: Maps) -> tuple[int, ...]:
+    """Return (H, W), or (turns, H, W)."""
+    name, values = next(iter(maps.items()))
+    return values.shape[:-1] if name == "normals" else values.shape
+
+
+def _turns(maps: Maps) -> Iterator[Any]:
+    """Yield what picks one picture of each map: all, or turn after turn."""
+    size = _size(maps)
+    yield from range(size[0]) if len(size) == 3 else [...]
+
+
+def _bands(rows: int, columns: int) -> Iterator[slice]:
+    step = max(1, _BAND // columns)
+    yield from (slice(first, min(first + step, rows)) for first in range(0, rows, step))
+
+
+def _resampled(maps: Maps, spots: Spots) -> Maps:
+    """Return all maps of one picture at some places, (n,) or (n, 3)."""
+    touched, pieces = (
+        spots.beside(maps[name]) if name in maps else None for name in ("contact", "component")
+    )
+    made: Maps = {}
+    for name, values in maps.items():
+        if name in _NOTHING:
+            made[name] = spots.labels(values, _NOTHING[name])
+        elif name == "normals":
+            made[name] = spots.vectors(values, touched)
+        elif name == "azimuth":
+            if "normals" not in maps:
+                made[name] = spots.angles(values, touched)
+        elif name != "zenith" or "normals" not in maps:
+            made[name] = spots.numbers(values, pieces if name in _OF_PIECES else touched)
+    return made | _directions(maps, made["normals"], spots) if "normals" in maps else made
+
+
+def _directions(maps: Maps, normals: NDArray[np.float32], spots: Spots) -> Maps:
+    """Return the zenith and azimuth of vectors, if there were such maps; a pixel's own are kept."""
+    x, y, z = normals.T
+    across = np.hypot(x, y)
+    level = np.where(across == 0, np.float32(np.nan), np.float32(0))
+    angles = {"zenith": np.arctan2(across, z), "azimuth": np.arctan2(y, x) + level}
+    return {
+        name: np.where(spots.alone, spots.labels(maps[name], np.nan), told)
+        for name, told in angles.items()
+        if name in maps
+    }

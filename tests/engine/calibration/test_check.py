@@ -1,0 +1,109 @@
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stacks import MadeUp, ball
+
+from mirrorskin import io
+from mirrorskin.engine.calibration.check import check_ball
+
+SHAPE, PIXEL = (71, 80), 0.08
+TRAVEL = np.arange(0, 1.3, 0.02)
+
+
+@pytest.fixture(scope="module")
+def press():
+    """The paper's idealisation: a ball of 10 mm, whose heights are found as they are."""
+    return ball(SHAPE, PIXEL, TRAVEL, dtype="uint8", noise=1.5, seed=3)
+
+
+def calibration(shape=SHAPE, **parts):
+    dark, bright = np.full(shape, 16, np.float32), np.full(shape, 224, np.float32)
+    little = np.full(shape, 0.1, np.float32)
+    references = io.References(dark, bright, little, little, np.zeros(shape, np.uint8))
+    return io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references, **parts)
+
+
+def test_a_sound_press_leaves_little(press):
+    found = check_ball(press, calibration(), 10.0)
+    height = found.after["height"]
+    assert found.place == pytest.approx((0, 0), abs=0.02)
+    assert float(height.whole.bias) == pytest.approx(0, abs=0.005)
+    assert float(height.whole.rms) < 0.02
+    assert int(height.whole.pixels) > 1000
+    assert found.before == {}
+
+
+def test_a_ball_of_another_size_shows(press):
+    right, wrong = (check_ball(press, calibration(), size).after["height"] for size in (10.0, 8.0))
+    assert float(wrong.whole.rms) > 3 * float(right.whole.rms)
+
+
+def test_a_ball_is_found_beside_the_middle(press):
+    press.rewind()
+    frames = np.empty(press.shape, press.dtype)
+    press.read(frames)
+    aside = MadeUp(np.roll(frames, 5, axis=2), press.header, travel=press.travel)
+    aside.rewindable, aside.rewind = True, lambda: None
+    assert check_ball(aside, calibration(), 10.0).place == pytest.approx((5 * PIXEL, 0), abs=0.03)
+
+
+def test_the_cells_add_up_to_the_whole(press):
+    height = check_ball(press, calibration(), 10.0, cells=5).after["height"]
+    assert height.cells.rms.shape == (5, 5)
+    assert height.cells.pixels.sum() == int(height.whole.pixels) == np.isfinite(height.error).sum()
+    known = np.isfinite(height.cells.rms)
+    squares = (height.cells.pixels * height.cells.rms**2)[known].sum()
+    assert math.sqrt(squares / height.cells.pixels[known].sum()) == pytest.approx(
+        float(height.whole.rms), rel=0.1
+    )
+
+
+def test_numbers_are_plain(press):
+    told = json.loads(json.dumps(check_ball(press, calibration(), 10.0).numbers()))
+    assert told["after"]["height"]["unit"] == "mm"
+    assert told["before"] == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rewindable": False}, "cannot be read twice"),
+        ({"motion": "twist"}, "twist motion"),
+    ],
+)
+def test_what_cannot_be_checked_is_refused(press, change, message):
+    source = MadeUp(np.zeros((3, *SHAPE), np.uint8), press.header, travel=np.arange(3.0))
+    source.rewindable = True
+    for name, value in change.items():
+        setattr(source, name, value)
+    with pytest.raises(io.InputError, match=message):
+        check_ball(source, calibration(), 10.0)
+
+
+@pytest.mark.parametrize(("ball_size", "cells"), [(-1.0, 8), (math.nan, 8), (4.0, 0)])
+def test_numbers_that_cannot_be_are_refused(press, ball_size, cells):
+    with pytest.raises(io.InputError, match="cannot be"):
+        check_ball(press, calibration(), ball_size, cells=cells)
+
+
+def test_a_press_on_nothing_is_told(press):
+    source = MadeUp(np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
+    source.rewindable, source.rewind = True, lambda: None
+    with pytest.raises(io.InputError, match="too little of a ball"):
+        check_ball(source, calibration(), 10.0)
+
+
+def test_a_rotation_needs_a_zenith(press):
+    header = replace(press.header, motion="axial")
+    source = MadeUp(np.zeros((8, *SHAPE), np.uint8), header, phase=np.arange(8.0))
+    source.rewindable = True
+    with pytest.raises(io.InputError, match="calibrate zenith first"):
+        check_ball(source, calibration(), 10.0)
+
+
+def test_a_calibration_of_another_camera_is_refused(press):
+    with pytest.raises(io.InputError):
+        check_ball(press, calibration((70, 80)), 10.0)

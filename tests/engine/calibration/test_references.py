@@ -1,0 +1,295 @@
+"""References taken from frames of pixels that are known, with defects put in."""
+
+import numpy as np
+import pytest
+from reference_frames import SCALES, TOPS, expose, pixels, rolled, source
+
+from mirrorskin import io
+from mirrorskin.engine.calibration.references import measure as module
+from mirrorskin.engine.calibration.references.measure import measure_references, scale_top, take_references
+
+DTYPES = ["uint8", "uint16", "float32"]
+NOISE = 1.5
+
+
+def measure(dark, light, dtype="uint8", count=24, top=None, **options):
+    """Measure pixels of which dark level and light are known, in a flat field."""
+    noise = NOISE * SCALES[dtype]
+    return measure_references(
+        source(expose(dark, noise, count, dtype, 11, top)),
+        source(expose(dark + light, 1.3 * noise, count, dtype, 12, top)),
+        **options,
+    )
+
+
+def with_defects(dtype, top):
+    """Return pixels of which some are hot, dead and saturated, and the bits that say so."""
+    dark, light = pixels(dtype=dtype)
+    scale = SCALES[dtype]
+    if top is not None:
+        light = np.minimum(light, top - 6 * scale - dark)  # the sound ones stay clear of the top
+    bits = np.zeros(dark.shape, np.uint8)
+    chosen = np.random.default_rng(8).permutation(dark.size)[:90].reshape(3, 30)
+    for bit, where in zip((1, 2, 4), chosen, strict=True):
+        bits.flat[where] = bit if bit != 4 or top is not None else 0
+    dark[bits == 1] += 60 * scale
+    light[bits == 1] = 90 * scale
+    light[bits == 2] *= np.linspace(0, 0.3, 30)
+    if top is not None:
+        light[bits == 4] = top + 10 * scale - dark[bits == 4]
+    return dark, light, bits
+
+
+@pytest.mark.parametrize("top", [True, False])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_all_defects_are_found_and_no_sound_pixel_is(dtype, top):
+    limit = (TOPS[dtype] or 1023) if top else None
+    if limit is None and dtype != "float32":
+        limit = TOPS[dtype]
+    dark, light, bits = with_defects(dtype, limit)
+    found = measure(dark, light, dtype, top=limit).references
+    np.testing.assert_array_equal(found.defects, bits)
+    for one in (found.dark, found.bright, found.dark_sigma, found.bright_sigma):
+        assert one.dtype == np.float32
+        np.testing.assert_array_equal(np.isnan(one), bits != 0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_levels_are_right_and_their_errors_honest(dtype):
+    dark, light = pixels(dtype=dtype)
+    light = np.minimum(light, (TOPS[dtype] or 1e9) - 10 * SCALES[dtype] - dark)
+    measured = measure(dark, light, dtype)
+    found = measured.references
+    for value, sigma, truth in (
+        (found.dark, found.dark_sigma, dark),
+        (found.bright, found.bright_sigma, dark + light),
+    ):
+        assert np.mean(((value - truth) / sigma) ** 2) == pytest.approx(1, abs=0.06)
+        assert abs(np.mean(value - truth)) < 0.05 * np.median(sigma)
+    noise = NOISE * SCALES[dtype]
+    assert measured.dark.sigma == pytest.approx(noise / 24**0.5, rel=0.05)
+    assert measured.bright.noise == pytest.approx(1.3 * noise, rel=0.05)
+    assert measured.dark.frames == measured.bright.frames == 24
+    assert abs(measured.dark.drift) < 0.1 * noise
+
+
+def test_several_recordings_count_as_one():
+    dark, light = pixels()
+    frames = expose(dark, NOISE, 20), expose(dark + light, NOISE, 30)
+    whole = take_references(*(source(one) for one in frames))
+    parts = [[source(part) for part in np.array_split(one, 3)] for one in frames]
+    cut = take_references(*parts)
+    for name in ("dark", "bright", "dark_sigma", "bright_sigma", "defects"):
+        np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5, err_msg=name)
+
+
+def test_a_smooth_glow_and_a_field_that_ends_are_no_hot_pixels():
+    dark, light = pixels()
+    y, x = (np.linspace(-1, 1, size) for size in dark.shape)
+    dark = 16 + 60 * np.exp(-3 * ((x - 1) ** 2 + (y[:, np.newaxis] - 1) ** 2))
+    beyond = np.hypot(x, y[:, np.newaxis]) > 1.05
+    light[beyond] = 0
+    found = measure(dark, light).references
+    assert not np.any(found.defects & 1)
+    np.testing.assert_array_equal(found.defects[beyond], 2)
+    assert np.count_nonzero(found.defects[~beyond]) == 0
+
+
+def test_a_column_that_is_dead_is_found_whole():
+    dark, light = pixels()
+    light[:, 20] = 0
+    found = measure(dark, light).references
+    assert np.all(found.defects[:, 20] == 2)
+    assert np.count_nonzero(found.defects) == len(found.defects)
+
+
+def test_a_pixel_that_flickers_in_the_dark_is_hot():
+    dark, light = pixels()
+    noise = np.full(dark.shape, NOISE)
+    noise[5, 6] = 12.0
+    found = take_references(source(expose(dark, noise, 24)), source(expose(dark + light, NOISE, 24)))
+    assert found.defects[5, 6] & 1
+    assert np.count_nonzero(found.defects) == 1
+
+
+def test_a_pixel_that_never_changes_is_dead():
+    dark, light = pixels()
+    frames = expose(dark, NOISE, 24), expose(dark + light, NOISE, 24)
+    for one in frames:
+        one[:, 9, 9] = 21
+    found = take_references(*(source(one) for one in frames))
+    assert found.defects[9, 9] == 2
+
+
+def test_samples_that_are_no_numbers_are_left_out():
+    dark, light = pixels(dtype="float32")
+    frames = expose(dark, NOISE, 24, "float32"), expose(dark + light, NOISE, 24, "float32")
+    frames[0][::2, 3, 4] = np.nan
+    frames[1][:, 8, 8] = np.nan
+    found = take_references(*(source(one) for one in frames))
+    assert found.dark[3, 4] == pytest.approx(dark[3, 4], abs=5 * float(found.dark_sigma[3, 4]))
+    assert found.dark_sigma[3, 4] == pytest.approx(1.41 * np.nanmedian(found.dark_sigma), rel=0.05)
+    assert found.defects[8, 8] == 2
+    assert np.count_nonzero(found.defects) == 1
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
+    shape = 4, 5, 7
+    measured = measure_references(source(np.full(shape, 16, dtype)), source(np.full(shape, 200, dtype)))
+    found = measured.references
+    assert np.all(found.dark == 16)
+    assert np.all(found.bright == 200)
+    assert not found.defects.any()
+    rounding = 0.0 if dtype == "float32" else 12**-0.5
+    np.testing.assert_allclose(found.dark_sigma, rounding, rtol=1e-6)
+    assert measured.dark.drift == 0
+
+
+def test_a_picture_of_one_pixel_has_references():
+    dark, light = np.full((1, 1), 16.0), np.full((1, 1), 150.0)
+    found = measure(dark, light).references
+    assert found.defects[0, 0] == 0
+    assert found.dark[0, 0] == pytest.approx(16, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("dark", "bright", "said"),
+    [
+        ((1, 16), (8, 200), "dark holds 1 frame"),
+        ((8, 16), (1, 200), "bright holds 1 frame"),
+        ((0, 16), (8, 200), "dark holds no frames"),
+        ((8, 200), (8, 16), "no brighter"),
+        ((8, 16), (8, 16), "no brighter"),
+    ],
+)
+def test_frames_that_tell_nothing_are_refused(dark, bright, said):
+    frames = [np.full((count, 5, 7), level, np.uint8) for count, level in (dark, bright)]
+    with pytest.raises(io.InputError, match=said):
+        measure_references(source(frames[0], "dark"), source(frames[1], "bright"))
+
+
+def test_frames_of_nothing_but_nan_are_refused():
+    frames = np.full((4, 5, 7), np.nan, np.float32)
+    with pytest.raises(io.InputError, match="no pixel"):
+        take_references(source(frames), source(frames + 1))
+
+
+def test_frames_of_two_cameras_are_refused():
+    with pytest.raises(io.InputError, match=r"7 x 6 uint8 and dark of 7 x 5 uint8"):
+        take_references(
+            source(np.zeros((3, 5, 7), np.uint8), "dark"), source(np.zeros((3, 6, 7), np.uint8), "bright")
+        )
+    with pytest.raises(io.InputError, match="uint16"):
+        take_references(source(np.zeros((3, 5, 7), np.uint8)), source(np.zeros((3, 5, 7), np.uint16)))
+
+
+def test_a_ball_in_place_of_a_flat_field_is_refused():
+    dark, light = pixels((21, 33))
+    with pytest.raises(io.InputError, match="--rolled"):
+        take_references(source(expose(dark, NOISE, 24)), source(rolled(dark, light, 60, 0.4, 0.1)))
+
+
+def test_dark_frames_that_see_light_are_refused():
+    dark, light = pixels((21, 33))
+    lit = dark.copy()
+    lit[:, :5] += 0.8 * light[:, :5]
+    with pytest.raises(io.InputError, match="lifted"):
+        take_references(source(expose(lit, NOISE, 24)), source(expose(dark + light, NOISE, 24)))
+
+
+def test_a_drift_is_told():
+    dark, light = pixels()
+    rising = np.linspace(0, 3, 40)[:, np.newaxis, np.newaxis]
+    measured = measure_references(
+        source(expose(dark, NOISE, 40)), source(expose(dark + light + rising, NOISE, 40))
+    )
+    assert measured.bright.drift == pytest.approx(1.54, abs=0.05)
+    assert measured.dark.drift == pytest.approx(0, abs=0.05)
+
+
+def test_the_frames_that_are_missing_are_counted():
+    dark, light = pixels()
+    level = measure(dark, light, count=16).dark
+    assert level.missing(level.sigma) == 0
+    more = level.missing(level.sigma / 2)
+    assert more == pytest.approx(48, abs=2)
+    again = measure(dark, light, count=16 + more).dark
+    assert again.sigma == pytest.approx(level.sigma / 2, rel=0.02)
+
+
+def test_no_number_of_frames_takes_rounding_away():
+    dark, light = pixels()
+    level = measure_references(source(expose(dark, 0.1, 8)), source(expose(dark + light, 0.1, 8))).dark
+    assert 0.1 < level.rounding < 0.29
+    assert level.missing(0.9 * level.rounding) is None
+    assert level.missing(1.0) == 0
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_a_rolled_ball_gives_full_light_without_bias(dtype):
+    dark, light = pixels(dtype=dtype)
+    measured = measure_references(
+        source(expose(dark, NOISE, 64, dtype)),
+        source(rolled(dark, light, 120, 0.35, 0.15, dtype=dtype)),
+        rolled=True,
+    )
+    found = measured.references
+    error = (found.bright - dark - light)[found.defects == 0]
+    sigma = found.bright_sigma[found.defects == 0]
+    assert np.count_nonzero(found.defects) == 0
+    assert abs(error.mean()) < 0.1 * np.median(sigma)
+    assert np.mean((error / sigma) ** 2) == pytest.approx(1, abs=0.08)
+    assert measured.bright.frames == 120
+    assert np.isnan(measured.bright.drift)
+
+
+def test_pixels_under_a_rolled_ball_that_are_dead_or_saturated_are_found():
+    dark, light = pixels((21, 33))
+    light[4, 5] = 0
+    light[7, 8] = 260 - dark[7, 8]
+    found = take_references(
+        source(expose(dark, NOISE, 64)), source(rolled(dark, light, 120, 0.35, 0.15)), rolled=True
+    )
+    assert found.defects[4, 5] == 2
+    assert found.defects[7, 8] == 4
+    assert np.count_nonzero(found.defects) == 2
+
+
+def test_a_rolled_ball_is_read_in_bands_where_memory_is_short(monkeypatch):
+    dark, light = pixels((11, 13))
+    frames = expose(dark, NOISE, 32), rolled(dark, light, 60, 0.4, 0.1)
+    whole = take_references(source(frames[0]), source(frames[1], again=True), rolled=True)
+    monkeypatch.setattr(module, "_MEMORY", 60 * 13 * 4)
+    told = []
+    bands = measure_references(
+        source(frames[0]), source(frames[1], again=True), rolled=True, progress=told.append
+    ).references
+    assert told[-1] == 32 + 3 * 60
+    np.testing.assert_allclose(bands.bright, whole.bright, atol=0.6)
+    with pytest.raises(io.InputError, match="record it first"):
+        take_references(source(frames[0]), source(frames[1]), rolled=True)
+
+
+@pytest.mark.parametrize(
+    ("highest", "whole", "top"),
+    [
+        (255, True, True),
+        (1023, True, True),
+        (4095, True, True),
+        (65535, True, True),
+        (65520, True, True),
+        (65472, True, True),
+        (200, True, False),
+        (240, True, False),
+        (127, True, False),
+        (254, True, False),
+        (1.0, False, True),
+        (1.0, True, False),
+        (4095.0, False, True),
+        (254.5, False, False),
+        (1e30, False, False),
+    ],
+)
+def test_the_top_of_a_camera_is_known_by_its_bits(highest, whole, top):
+    assert scale_top(highest, whole) == (highest if top else None)

@@ -1,0 +1,216 @@
+"""The zenith's calibration, from presses under the twin's wall to the light of normals that it never saw."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from calibration_scenes import Frames
+from wall_presses import BODY, DISTANCE, SHAPE, wall_presses
+
+from mirrorskin import io
+from mirrorskin.engine.calibration.wall.samples import pivot_of, read_press
+from mirrorskin.engine.calibration.wall.zenith import fit_zenith
+from mirrorskin.hw.twin.optics import Wall, make_pattern
+from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io import pixel_axes
+from mirrorskin.kernels.device import open_device
+from mirrorskin.kernels.response import wall_light
+
+SIDE, Z = 5, 0.6
+ZENITH = np.radians(np.arange(15, 44.1, 1.0))
+AZIMUTH = np.radians([10.0, 100.0, 190.0, 280.0])
+
+
+@pytest.fixture(scope="module")
+def presses():
+    return wall_presses()
+
+
+@pytest.fixture(scope="module")
+def response(presses):
+    return fit_zenith(presses, 2.0, body=(16.6, 42.0))  # told 5 % off
+
+
+def twin_light(zenith, azimuth):
+    """Trace the light of facets all over the field, and tell the lines of sight."""
+    view = View((SIDE, SIDE), (2.4, 2.4), BODY, DISTANCE)
+    wall = Wall(BODY, make_pattern("linear", BODY), view, open_device(None))
+    one = np.ones((SIDE, SIDE))
+    light = [
+        wall.light(Sheet(Z * one, -np.tan(t) * np.cos(a) * one, -np.tan(t) * np.sin(a) * one, one > 0))
+        for t in zenith
+        for a in azimuth
+    ]
+    return view, np.reshape(light, (len(zenith), len(azimuth), SIDE * SIDE))
+
+
+def told_light(response, view, zenith, azimuth):
+    x, y = view.x.ravel() - response.axis[0], view.y.ravel() - response.axis[1]
+    towards = -(response.sight[0] + response.sight[1] * (x * x + y * y))
+    t, a = (grid.reshape(-1, 1, 1) for grid in np.meshgrid(zenith, azimuth, indexing="ij"))
+    normal = np.concatenate([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)], axis=2)
+    light, within = wall_light(
+        np.stack([x, y, np.full_like(x, Z), towards * x, towards * y]),
+        np.broadcast_to(normal, (len(normal), len(x), 3)),
+        (response.radius, response.rim, response.scatter),
+        response.lamps,
+        response.curve,
+        response.reach,
+    )
+    u, v = x / response.radius, y / response.radius
+    light = light * (1 + response.shade @ np.stack([u, v, u * u, u * v, v * v]))
+    return (grid.reshape(len(zenith), len(azimuth), -1) for grid in (light, within))
+
+
+def bias(response):
+    """Return by how many degrees the zenith of noiseless facets would be off, NaN out of range."""
+    view, light = twin_light(ZENITH, AZIMUTH)
+    told, within = told_light(response, view, ZENITH, AZIMUTH)
+    off = np.degrees((told - light) / np.gradient(light, ZENITH, axis=0))
+    return np.where(within, off, np.nan)
+
+
+def test_the_light_of_normals_all_over_the_field_is_known(response):
+    off = bias(response)
+    assert np.isfinite(off).mean() > 0.85
+    by_place = np.sqrt(np.nanmean(off**2, axis=1))
+    assert np.nanquantile(by_place, 0.9) < 0.1
+
+
+def test_errors_are_as_large_as_told(response):
+    off = bias(response)
+    middle = np.sqrt(np.nanmean(off[10:22] ** 2))
+    told = np.degrees(np.sqrt(np.mean(response.zenith_sigma**2)))
+    assert 0.3 < middle / told < 2.5
+    assert response.zenith_sigma.shape == SHAPE
+    assert response.azimuth_sigma.shape == SHAPE
+    assert (response.zenith_sigma > 0).all()
+    assert (response.azimuth_sigma > 0).all()
+    assert 0.002 < math.degrees(response.error) < 0.1  # never 0: noise hides that much
+
+
+def test_wall_lamps_and_sight_are_found(response):
+    sigma = dict(zip(response.parameters, np.sqrt(np.diag(response.covariance)), strict=True))
+    assert response.radius == pytest.approx(BODY.radius, rel=0.02)
+    assert response.scatter == pytest.approx(1.05 * BODY.scatter, rel=0.03)
+    assert response.axis == pytest.approx((0, 0), abs=0.08)
+    assert response.lamps == pytest.approx((0.05 * math.cos(1), 0.05 * math.sin(1)), abs=3e-3)
+    assert 0 < sigma["radius"] < 0.2
+    assert response.pattern == "graded"
+    assert len(response.curve) <= 12
+    assert 0 < response.reach[0] < 0.05 < 0.55 < response.reach[1] < 0.66
+
+
+def test_references_of_a_calibration_go_before_those_of_the_recordings(presses):
+    header = presses[0].header
+    told = read_press(presses[0], 2.0, None, None, 500)
+    sigma = np.zeros(SHAPE, np.float32)
+    references = io.References(header.dark, header.bright, sigma, sigma, np.zeros(SHAPE, np.uint8))
+    blind = replaced(presses[0], dark=None, bright=np.ones(SHAPE, np.float32))
+    np.testing.assert_array_equal(read_press(blind, 2.0, references, None, 500).light, told.light)
+    small = io.References(*([np.zeros((3, 4), np.float32)] * 4), np.zeros((3, 4), np.uint8))
+    with pytest.raises(io.InputError, match="do not fit references"):
+        read_press(blind, 2.0, small, None, 500)
+
+
+def test_samples_at_the_ends_of_the_camera_and_of_defects_are_left_out(presses):
+    frames = presses[0].frames.copy()
+    frames[:, 24, 20:28] = 255
+    dark = presses[0].header.dark.copy()
+    dark[22] = np.nan
+    spoilt = Frames("place-1", frames, dataclasses.replace(presses[0].header, dark=dark), **presses[0].series)
+    read = read_press(spoilt, 2.0, None, None, 10**6)
+    y = pixel_axes(SHAPE, presses[0].header.pixel_size)[1]
+    assert np.isfinite(read.light).all()
+    assert read.light.max() < 1.1
+    assert not np.isin(read.place[1], y[22]).any()
+    assert np.isin(read.place[1], y[24]).any()
+
+
+def test_a_calibrated_rotation_tells_leans_and_how_well_its_pivot_is_known(presses):
+    sigma = {"pivot_x": 0.1, "pivot_y": 0.2, "pivot_z": 0.3, "phase_offset": 0.004}
+    known = io.Precession(
+        tilt=0.045,
+        phase_offset=0.0,
+        direction=1,
+        ellipticity=0.005 / 0.045,
+        major_axis=np.pi / 2,
+        centre=(0.0, 0.0),
+        pivot=(1.0, 2.0, 3.0),
+        sigma=sigma,
+    )
+    pivot = pivot_of(presses[0], known)
+    assert pivot.place == (1.0, 2.0, 3.0)
+    assert pivot.sigma == pytest.approx((0.1, 0.2, 0.3), rel=0.2)
+    assert pivot.phase_sigma == pytest.approx(0.004, rel=0.05)
+    undetermined = pivot_of(presses[0], dataclasses.replace(known, pivot=(math.nan,) * 3, sigma={}))
+    told = pivot_of(presses[0], None)
+    assert (undetermined.place, undetermined.sigma) == (told.place, told.sigma)
+    assert undetermined.phase_sigma < 0.1 < told.phase_sigma  # of a recording, any phase may be meant
+    assert undetermined.place == (0.0, 0.0, 0.0)
+    read = read_press(presses[0], 2.0, None, known, 500)
+    np.testing.assert_allclose(read.lean, known.lean(presses[0].series["phase"]), atol=1e-12)
+    assert np.ptp(np.hypot(*read.lean.T)) > 5e-3
+
+
+def test_of_many_frames_some_all_round_are_read(presses):
+    many = Frames(
+        "long",
+        np.repeat(presses[0].frames, 5, axis=0),
+        presses[0].header,
+        phase=np.repeat(presses[0].series["phase"], 5),
+    )
+    read = read_press(many, 2.0, None, None, 500)
+    assert len(read.lean) == 16
+    assert len(np.unique(read.lean.round(6), axis=0)) == 8
+
+
+def replaced(press, **fields):
+    header = dataclasses.replace(press.header, **fields)
+    return Frames(press.name, press.frames, header, **press.series)
+
+
+def test_a_press_without_a_ball_is_named(presses):
+    empty = Frames("place-2", np.full_like(presses[1].frames, 16), presses[1].header, **presses[1].series)
+    with pytest.raises(io.InputError, match="place-2: a ball of 4 mm is seen in 0 of 8 frames"):
+        fit_zenith([presses[0], empty, *presses[2:]], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"ball": 0.0}, "radius 0.0 mm cannot be"),
+        ({"ball": math.nan}, "radius nan mm cannot be"),
+        ({"pattern": "striped"}, "take graded or uniform"),
+        ({"body": (0.0, 40.0)}, "cannot be: give more"),
+    ],
+)
+def test_what_cannot_be_is_refused(presses, options, said):
+    with pytest.raises(io.InputError, match=said):
+        fit_zenith(presses, **{"ball": 2.0, **options})
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"pixel_size": None}, "differ in pixels or their size"),
+        ({"tilt": None}, "place-2: the tilt of its rotation is not told"),
+        ({"dark": None}, "place-2: there are no dark and bright references"),
+    ],
+)
+def test_what_a_recording_lacks_is_told(presses, fields, said):
+    with pytest.raises(io.InputError, match=said):
+        fit_zenith([presses[0], replaced(presses[1], **fields), *presses[2:]], 2.0)
+
+
+def test_four_presses_are_too_few(presses):
+    with pytest.raises(io.InputError, match="4 presses do not determine the wall"):
+        fit_zenith(presses[:4], 2.0)
+
+
+def test_a_vertical_recording_is_refused(presses):
+    vertical = replaced(presses[1], motion="vertical")
+    with pytest.raises(io.InputError, match="its motion is vertical"):
+        fit_zenith([presses[0], vertical, *presses[2:]], 2.0)

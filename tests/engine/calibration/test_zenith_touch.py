@@ -1,0 +1,162 @@
+"""From samples to a response: prints of any kind, gels that leave the ball early, presses that do not fit."""
+
+import math
+
+import numpy as np
+import pytest
+from calibration_scenes import Frames
+
+from mirrorskin import io
+from mirrorskin.engine.calibration.wall import curve
+from mirrorskin.engine.calibration.wall.fit import Prior
+from mirrorskin.engine.calibration.wall.model import SENSOR, Met, Samples, down, light_of, look, predict
+from mirrorskin.engine.calibration.wall.response import make_response, values_of
+from mirrorskin.engine.calibration.wall.samples import BallPress, join
+from mirrorskin.engine.calibration.wall.touch import fit_touch
+from mirrorskin.engine.calibration.wall.window import threshold_zenith
+from mirrorskin.kernels.response import wall_light
+
+NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
+NOMINAL |= {"radius": (17.5, 1.75), "rim": (40.0, 4.0), "axis_x": (0.0, 1.0), "axis_y": (0.0, 1.0)}
+NOMINAL |= {"sight_0": (0.004, 0.004), "sight_2": (0.0, 3e-7), "scatter": (0.052, 0.03)}
+NOMINAL |= {"phase_offset": (0.0, 0.03), "lamp_x": (0.0, 0.2), "lamp_y": (0.0, 0.2)}
+TRUE = dict.fromkeys(SENSOR, 0.0) | {
+    "radius": 17.1,
+    "rim": 38.5,
+    "axis_x": 0.3,
+    "axis_y": -0.2,
+    "sight_0": 0.005,
+}
+TRUE |= {"scatter": 0.055, "pivot_z": 2.0, "lamp_x": 0.03, "lamp_y": -0.02}
+CENTRES = np.array(
+    [[0.1, 0.2, -1.1], [3.6, 3.5, -1.2], [-3.7, 3.4, -1.0], [3.4, -3.7, -1.1], [-3.6, -3.5, -1.15]]
+)
+PHASE = np.arange(8) * np.pi / 4
+LEAN = math.radians(2.5) * np.stack([np.cos(PHASE), np.sin(PHASE)], axis=1)
+OFF = np.array([0.03, -0.04, 0.1])
+NOISE = 4e-3
+PICTURE = Frames("place-1", np.zeros((1, 12, 12), np.uint8), io.Header("axial", pixel_size=(1.0, 1.0)))
+
+
+def coefficients_of(exponent):
+    share = np.linspace(0, 1, 400)
+    basis = curve.means(share - 1e-6, share + 1e-6)[1:-1]
+    return np.maximum.accumulate(
+        np.maximum(np.linalg.lstsq(basis, share[1:-1] ** exponent, rcond=None)[0], 0)
+    )
+
+
+def some_presses(coefficients, balls=(2.0,) * 5, touched=1.0, each=720):
+    """Return presses of balls; the sheet leaves them at that share of the outline."""
+    rng = np.random.default_rng(8)
+    presses = []
+    for number, (centre, ball) in enumerate(zip(CENTRES, balls, strict=True), 1):
+        frame = np.repeat(np.arange(8), each // 8)
+        away, turn = 1.5 * np.sqrt(rng.random(each)), 2 * np.pi * rng.random(each)
+        offset = away * np.stack([np.cos(turn), np.sin(turn)])
+        parts = [TRUE[name] for name in SENSOR], np.diff(coefficients, prepend=0), centre
+        # The light of a flatter sheet is that of a place farther in.
+        seen = offset * np.minimum(1, 1.44 * touched / away)
+        samples, inner = (
+            Samples(np.zeros(each), centre[:2, np.newaxis] + one, frame, np.zeros(8, np.intp), LEAN, ball)
+            for one in (offset, seen)
+        )
+        light = predict(inner, np.concatenate(parts), True) + NOISE * rng.normal(size=each)
+        start = centre + OFF
+        outline = 1.44
+        presses.append(
+            BallPress(
+                f"place-{number}", light, samples.place, frame, LEAN, start, np.ones(3), outline, (0, 0, 0)
+            )
+        )
+    return presses
+
+
+def nominal(uniform=False):
+    mean, sigma = np.array([NOMINAL[name] for name in SENSOR]).T
+    steps, free = np.zeros(curve.COEFFICIENTS), np.full(curve.COEFFICIENTS, np.inf)
+    if uniform:
+        steps[0], free[1:] = 1.0, 0.0
+    start = (CENTRES + OFF).ravel()
+    return Prior(np.concatenate([mean, steps, start]), np.concatenate([sigma, free, np.ones(15)]))
+
+
+def respond(presses, uniform=False):
+    touch = fit_touch(join(presses, 2.0), presses, nominal(uniform))
+    return make_response(touch.fit, touch.samples, touch.noise, "uniform" if uniform else "graded", PICTURE)
+
+
+def bias(response, coefficients, highest):
+    """Return by how many degrees the zenith would be off all over the field."""
+    rng = np.random.default_rng(1)
+    place = rng.uniform(-4, 4, (2, 600))
+    zenith, azimuth = np.radians(rng.uniform(17, highest, 600)), rng.uniform(-np.pi, np.pi, 600)
+    z = np.full(600, 0.5)
+
+    def true(theta):
+        normal = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+        at, lean = look(place, TRUE)
+        met = Met(*(at + z * lean), z, down(lean), normal)
+        return light_of(met, TRUE, coefficients), normal
+
+    (light, normal), (more, _) = true(zenith), true(zenith + 1e-4)
+    at, lean = look(place, {name: values_of(response).get(name, 0.0) for name in SENSOR})
+    geometry = response.radius, response.rim, response.scatter
+    told, within = wall_light(
+        np.stack([*at, z, *lean]),
+        normal.T[np.newaxis],
+        geometry,
+        response.lamps,
+        response.curve,
+        response.reach,
+    )
+    u, v = at / response.radius
+    told = told[0] * (1 + response.shade @ np.stack([u, v, u * u, u * v, v * v]))
+    return np.where(within[0], np.degrees((told - light) * 1e-4 / (more - light)), np.nan)
+
+
+def test_a_printed_gamma_is_found():
+    coefficients = coefficients_of(2.2)
+    response = respond(some_presses(coefficients))
+    off = bias(response, coefficients, 43)
+    assert np.isfinite(off).mean() > 0.75
+    assert np.sqrt(np.nanmean(off**2)) < 0.1
+    told = values_of(response)
+    assert told["scatter"] == pytest.approx(response.scatter / 1.05)
+    assert set(told) == set(SENSOR) - {"pivot_x", "pivot_y", "pivot_z", "phase_offset"}
+    assert len(response.parameters) == len(response.covariance)
+
+
+def test_a_gel_that_leaves_the_ball_early_teaches_nothing_wrong():
+    coefficients = coefficients_of(1.0)
+    response = respond(some_presses(coefficients, touched=0.87))
+    off = bias(response, coefficients, 33)
+    assert np.sqrt(np.nanmean(off**2)) < 3 * np.degrees(np.nanmax(response.zenith_sigma))
+    assert np.sqrt(np.nanmean(off**2)) < 0.4
+
+
+def test_a_uniform_wall_tells_where_light_begins():
+    response = respond(some_presses(np.full(curve.COEFFICIENTS, 0.95), each=480), uniform=True)
+    assert response.curve == pytest.approx([0.95], abs=0.01)
+    assert np.isnan(response.azimuth_sigma).all()
+    assert np.nanmax(np.degrees(response.zenith_sigma)) < 0.2
+    found = threshold_zenith(response, 0.3, -0.2, 0.0, 0.475 * (1 + 0.03))
+    assert math.degrees(found) == pytest.approx(math.degrees(math.atan2(17.1, 38.5) / 2), abs=0.1)
+
+
+def test_a_wall_without_a_print_is_told_from_one_with():
+    with pytest.raises(io.InputError, match="give --pattern uniform"):
+        respond(some_presses(np.full(curve.COEFFICIENTS, 0.95), each=400))
+
+
+def test_a_press_of_another_ball_is_named():
+    presses = some_presses(coefficients_of(1.0), balls=(2.0, 2.0, 2.5, 2.0, 2.0), each=480)
+    with pytest.raises(io.InputError, match="place-3: its ball does not fit to the other presses"):
+        respond(presses)
+
+
+def test_a_press_in_which_the_ball_slipped_is_named():
+    presses = some_presses(coefficients_of(1.0), each=400)
+    presses[1].place[0, presses[1].frame >= 4] += 0.6
+    with pytest.raises(io.InputError, match="place-2: its ball does not fit to the other presses"):
+        respond(presses)
