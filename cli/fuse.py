@@ -35,6 +35,7 @@ def command(
     region: options.Region = None,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
+    calibration: options.Calibration = None,
     robust: options.Robust = False,
     register: Annotated[
         bool,
@@ -64,18 +65,18 @@ def command(
         region=region,
     )
     gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
-    rotation = {"gain": gain, "offset": zenith_offset}
+    rotation = {"gain": gain, "offset": zenith_offset, "tilt": known.get("tilt")}
     limit = bytes_of(memory, "--memory")
     target = output or vertical.with_name(f"{vertical.stem}-fused.h5")
     with (
         _open(vertical, "vertical", dataset, known, limit) as pressed,
         _open(axial, "axial", dataset, known, limit) as turned,
     ):
-        io.check_output(target, vertical, axial, phases)
+        io.check_output(target, vertical, axial, phases, calibration)
         with progress("fusing", engine.frames_to_read(pressed, turned, register)) as show:
             result = engine.fuse_sources(
-                pressed,
-                turned,
+                engine.calibrated(pressed, calibration),
+                engine.calibrated(turned, calibration),
                 rotation={name: value for name, value in rotation.items() if value is not None},
                 register=register,
                 robust=robust,

@@ -19,6 +19,7 @@ import typer
 from mirrorskin.cli import (
     batch,
     bench,
+    calibrate,
     capture,
     correlate,
     demo,
@@ -71,6 +72,7 @@ for module in (
 ):
     app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
 app.add_typer(rig.app, name="rig")
+app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(twin.app, name="twin")
 app.add_typer(bench.app, name="bench")
 

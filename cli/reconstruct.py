@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.options import MotionName
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Recording, Source
 
 
 class EventName(StrEnum):
@@ -108,6 +111,7 @@ def command(
             help="Rotation: a result with heights, or a simulation, to keep pixels on the object.",
         ),
     ] = None,
+    calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
@@ -136,18 +140,21 @@ def command(
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, recording, phases, heights)
+        io.check_output(target, recording, phases, heights, calibration)
+        calibrated = _calibrated(source, calibration, pixel_size)
         asked: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if source.motion == MotionName.axial:
             asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
-            asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else None
+            # A tilt that is given is believed, whatever the calibration says.
+            given_tilt = None if calibrated is source else known.get("tilt")
+            asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else given_tilt
             asked["heights"] = None if heights is None else io.open_heights(heights, source)
         else:
             asked |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
             asked |= {"dark": dark, "bright": bright, "fill": fill}
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
-                source,
+                calibrated,
                 **{name: value for name, value in asked.items() if value is not None},
                 memory_limit=limit,
                 device=device,
@@ -155,6 +162,18 @@ def command(
             )
     tell_what_is_missing(str(recording), result.process, _REMEDIES)
     save_and_tell(result, target, device, as_json)
+
+
+def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) -> Source:
+    """Return a recording as it is with the calibration that is given, or that it carries."""
+    from mirrorskin import engine, io
+
+    calibrated = engine.calibrated(source, path)
+    if isinstance(calibrated, io.Calibrated) and calibrated.whole.lens is not None and pixel_size is not None:
+        raise io.InputError(
+            f"{calibrated.whole.name} tells the pixel size, and so does --pixel-size: leave that out"
+        )
+    return calibrated
 
 
 def _refuse_foreign(context: typer.Context, recording: Path, motion: str) -> None:

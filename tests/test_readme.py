@@ -8,13 +8,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import boards
 import cv2
 import h5py
 import numpy as np
 import pytest
+from calibration_scenes import BALL, DEPTH, Lab
+from calibration_scorer import ball
 from commands import run
 from mishaps import starved
 from rotations import Setup, direction, expose
+from stacks import record
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
@@ -48,11 +52,30 @@ def desk(tmp_path_factory):
     video.release()
     with h5py.File(place / "theirs.h5", "w") as file:
         file["raw/images"] = frames
+    known_things(place)
     yield place
     while SERVERS:
         with SERVERS.pop() as server:
             server.terminate()
             assert server.wait(timeout=30) == 128 + signal.SIGTERM
+
+
+def known_things(place):
+    """Record what a sensor is calibrated with: few pixels, all else as in a lab."""
+    lab = Lab(shape=(96, 100), pixel_size=0.08)
+    balls = [(0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2)]
+    turned = {f"ball-{n}.h5": lab.turned(ball(BALL, at), DEPTH, n) for n, at in enumerate(balls, 1)}
+    recordings = turned | {
+        "dark.h5": lab.flat(0.0, 16, 90),
+        "flat.h5": lab.flat(1.0, 16, 91),
+        "press-ball.h5": lab.pressed(ball(BALL), np.arange(0, 1.21, 0.04), 70),
+        "other.h5": lab.turned(ball(6.0, (0.5, -0.4)), 0.8, 60),
+    }
+    for name, source in recordings.items():
+        record(source, place / name)
+    view = boards.View(shape=lab.shape, scale=lab.pixel_size, focal=200.0)
+    photo = boards.photograph(view, boards.dots(7, 5, 1.0, 0.5), blur=0.5, noise=1.0)
+    cv2.imwrite(str(place / "photo.png"), photo)
 
 
 def test_there_are_commands_to_run():

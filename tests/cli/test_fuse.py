@@ -160,6 +160,20 @@ def test_a_rotation_without_a_gain_is_refused_and_it_can_be_given():
     fuse(*scale)
 
 
+def test_both_are_read_as_a_calibration_says():
+    with io.open_recording("turn.h5") as recording:
+        shape, dark, bright = recording.shape[1:], recording.header.dark, recording.header.bright
+    little = np.full(shape, 0.1, np.float32)
+    references = io.References(dark, bright, little, little, np.zeros(shape, np.uint8))
+    io.save_calibration(io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references), "cal.h5")
+    plain, told = fuse()[0], fuse("--calibration", "cal.h5")[0]
+    assert told.process["vertical_bright"] == told.process["axial_high"] == "map of the calibration"
+    np.testing.assert_array_equal(told.calibration.references.bright, bright)
+    np.testing.assert_allclose(told.height, plain.height, atol=1e-4)
+    io.save_calibration(io.Calibration(io.CameraId("other", shape, np.dtype("uint8"))), "cal.h5")
+    assert "other" in refused("--calibration", "cal.h5")
+
+
 def test_robust_is_told_to_the_engine():
     _, ended = fuse("--robust", "--json")
     assert json.loads(ended.out)["process"]["integration"] == "robust"

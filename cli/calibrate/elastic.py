@@ -1,0 +1,170 @@
+"""``mirrorskin calibrate elastic``: how the gel gives way, from a ball of known size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.calibrate import taking
+from mirrorskin.cli.calibrate.presses import one_camera, with_scale
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.calibration.elastic import BallOnset, LearnedGel
+    from mirrorskin.io import Calibration, ProcessValue, Source
+
+_STEP, _PRESS = "0.03mm", "1.2mm"
+
+
+def command(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
+    ],
+    ball: Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")],
+    presses: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="REC.h5...", help="Vertical recordings of the ball, at one place or more."),
+    ] = None,
+    sheet: Annotated[
+        str, typer.Option(metavar="LENGTH", help="Thickness of what lies between mirror and ball.")
+    ] = "0.05mm",
+    travel_step: options.TravelStep = None,
+    travel_start: options.TravelStart = None,
+    pixel_size: options.PixelSize = None,
+    rig: taking.OptionalRig = None,
+    places: Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")] = 1,
+    press: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {_PRESS}."),
+    ] = None,
+    settle: taking.Settle = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Learn when the sheet turns light and how far the stage gives way, from presses of a ball."""
+    from mirrorskin import io
+    from mirrorskin.cli.positions import given
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.engine.calibration.elastic import fit_gel
+    from mirrorskin.io.calibration.sizes import size_facts
+
+    paths = list(presses or [])
+    radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
+    _check_call(paths, rig, press, settle, thickness)
+    io.check_output(output, *paths, rig)
+    known = io.open_calibration(output) if output.exists() else None
+    if rig is not None:
+        plans = _places(rig, places, press, travel_start, travel_step)
+        paths, travel_step, travel_start = taking.take(rig, output, plans, settle), None, None
+    told = given(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
+    told = with_scale(told, known)
+    with ExitStack() as opening:
+        sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
+        camera = one_camera(sources)
+        if known is not None:
+            io.check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
+        learned = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
+        size = sources[0].header.pixel_size
+    process = _process(paths, ball, sheet, learned) | ({} if size is None else size_facts(size))
+    io.update_calibration(output, learned.gel, camera, process)
+    _tell(output, learned, as_json)
+
+
+def _check_call(
+    paths: Sequence[Path], rig: Path | None, press: str | None, settle: str | None, sheet: float
+) -> None:
+    from mirrorskin.io import InputError
+
+    if rig is None and not paths:
+        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
+    if rig is not None and paths:
+        raise InputError("recordings and --rig both give the presses: leave one of them out")
+    for option, value in (("--press", press), ("--settle", settle)):
+        if rig is None and value is not None:
+            raise InputError(f"{option} says how a rig is to press: give --rig, too, or leave it out")
+    if sheet < 0:
+        raise InputError(f"--sheet {sheet:g}mm cannot be: give a thickness of 0 or more")
+
+
+def _places(
+    rig: Path, places: int, press: str | None, start: str | None, step: str | None
+) -> list[taking.Place]:
+    """Say how the recordings are taken."""
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.hw.rig.plans import VerticalPlan
+
+    plan = VerticalPlan(
+        length(start or "0mm", "--travel-start"),
+        length(press or _PRESS, "--press"),
+        step=length(step or _STEP, "--travel-step"),
+    )
+    prompt = "put the ball at place {} of {}, near the middle of the field"
+    return [
+        taking.Place(f"elastic-{number}", prompt.format(number, places), plan)
+        for number in range(1, places + 1)
+    ]
+
+
+def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
+    """Find when the ball turned pixels light, by the references that are known so far."""
+    from mirrorskin import engine, io
+    from mirrorskin.cli.progress import progress
+    from mirrorskin.engine.calibration.elastic import ball_onset
+    from mirrorskin.engine.press.elastic import LEARNED_AT
+
+    if source.motion != "vertical":
+        raise io.InputError(f"{source.name} is of {source.motion} motion: give presses of a ball")
+    plain = source if known is None else io.Calibrated(source, replace(known, gel=None))
+    with progress("pressing", source.shape[0]) as show:
+        result = engine.reconstruct_press(
+            plain, threshold=LEARNED_AT, fill=False, device=device, progress=show
+        )
+    return ball_onset(result, plain, radius)
+
+
+def _process(paths: Sequence[Path], ball: str, sheet: str, learned: LearnedGel) -> dict[str, ProcessValue]:
+    from datetime import UTC, datetime
+
+    from mirrorskin.engine.version import program_version
+
+    return {
+        "program": "mirrorskin",
+        "version": program_version(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "sources": ", ".join(map(str, paths)),
+        "ball": ball,
+        "sheet": sheet,
+        "untold": ", ".join(learned.untold) or "nothing",
+    }
+
+
+def _tell(output: Path, learned: LearnedGel, as_json: bool) -> None:
+    from mirrorskin.cli.output import print_json
+
+    gel = learned.gel
+    if as_json:
+        print_json({"output": str(output), "gel": gel, "balls": learned.places, "untold": learned.untold})
+        return
+    sigma = gel.sigma
+    told = [
+        f"light from {math.degrees(gel.threshold):.2f} +- {math.degrees(sigma['threshold']):.2f} deg",
+        *(
+            f"{name} {getattr(gel, name):.3f} +- {sigma[name]:.3f} /mm"
+            for name in ("compliance", "curvature")
+            if name not in learned.untold
+        ),
+        f"met at a travel of {gel.travel_zero:.3f} +- {sigma['travel_zero']:.3f} mm",
+        f"{gel.error:.3f} mm left",
+    ]
+    typer.echo(f"{output}: {', '.join(told)}")
+    for name in learned.untold:
+        typer.echo(
+            f"{name}: the presses do not tell it, 0 is kept; press deeper, at more places or larger balls",
+            err=True,
+        )

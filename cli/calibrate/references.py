@@ -1,0 +1,244 @@
+"""``mirrorskin calibrate references``: what each pixel counts without and with full light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+from mirrorskin.cli.calibrate import taking
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mirrorskin.engine.calibration.references.measure import LevelReport, Measured
+    from mirrorskin.io import CameraId, ProcessValue, References, Source
+
+_FRAMES = 64
+_PLACES = 9
+_ROUNDS = 4
+"""How often a rig is asked for what is still missing."""
+
+_PROMPTS = {
+    "dark": "take everything off the sheet, with the lamps as they are in a press",
+    "bright": "put the flat field in place, so that all pixels are in full light",
+}
+_REMEDIES = {"dark": "raise the camera's black level", "bright": "give it less light"}
+
+
+def command(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
+    ],
+    dark: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="REC.h5", help="Recording or folder of pictures of a sheet that touches nothing."
+        ),
+    ] = None,
+    bright: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="REC.h5", help="The same in full light. Both may be given several times."),
+    ] = None,
+    rolled: Annotated[
+        bool,
+        typer.Option(
+            "--rolled", help="Bright: a ball rolled about, so that all are in full light sometimes."
+        ),
+    ] = False,
+    noise: Annotated[
+        float | None,
+        typer.Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1."),
+    ] = None,
+    rig: taking.OptionalRig = None,
+    frames: Annotated[
+        int, typer.Option(min=2, help="With --rig: of each level, or of the ball at each place.")
+    ] = _FRAMES,
+    places: Annotated[int, typer.Option(min=1, help="With --rig and --rolled: of the ball.")] = _PLACES,
+    press: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help="With --rig and --rolled: how far the body is lowered: 2mm."),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Average dark and bright references to a stated noise, and find hot, dead and saturated pixels."""
+    from mirrorskin import io
+
+    darks, brights = list(dark or []), list(bright or [])
+    _check_call(darks, brights, noise, rig, rolled, press)
+    io.check_output(output, *darks, *brights, rig)
+    if rig is not None:
+        darks = darks or taking.take(rig, output, [_still("dark", rig, frames)])
+        balls = _balls(rig, places, frames, press) if rolled else [_still("bright", rig, frames)]
+        brights = brights or taking.take(rig, output, balls)
+    measured, camera = _measure(darks, brights, rolled)
+    for number in range(2, _ROUNDS + 1):
+        missing = _missing(measured, noise, rig is None or rolled)
+        if rig is None or not missing:
+            break
+        more = {name: _still(name, rig, count, number) for name, count in missing.items()}
+        for name, place in more.items():
+            (darks if name == "dark" else brights).extend(taking.take(rig, output, [place]))
+        measured, camera = _measure(darks, brights, rolled)
+    _missing(measured, noise, True)
+    io.update_calibration(output, measured.references, camera, _process(measured, darks, brights, rolled))
+    _tell(output, measured, as_json)
+
+
+def _check_call(
+    darks: Sequence[Path],
+    brights: Sequence[Path],
+    noise: float | None,
+    rig: Path | None,
+    rolled: bool,
+    press: str | None,
+) -> None:
+    from mirrorskin.io import InputError
+
+    missing = [option for option, given in (("--dark", darks), ("--bright", brights)) if not given]
+    if missing and rig is None:
+        raise InputError(
+            f"{' and '.join(missing)} missing: name recordings, or take them with --rig RIG.toml"
+        )
+    if noise is not None and not noise > 0:
+        raise InputError(f"--noise {noise:g}: no number of frames is enough for that: give some counts")
+    if press is not None and (rig is None or not rolled):
+        raise InputError("--press says how far a ball is pressed on a rig: give --rig and --rolled, too")
+    if rig is not None and rolled and not brights and press is None:
+        raise InputError("--press is missing: say how far the body is lowered on the ball, as in --press 2mm")
+
+
+def _still(name: str, rig: Path, frames: int, number: int = 1) -> taking.Place:
+    """Say how a level is taken, of half the frames at each of two places that are all but one."""
+    file = name if number == 1 else f"{name}-{number}"
+    return taking.Place(file, _PROMPTS[name], taking.still_plan(rig), max(1, -(-frames // 2)))
+
+
+def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[taking.Place]:
+    from mirrorskin.cli.quantity import length
+
+    plan = taking.still_plan(rig, length(press or "", "--press"))
+    prompt = "put the ball at place {} of {}, all over the field"
+    each = max(1, -(-frames // 2))
+    return [
+        taking.Place(f"bright-{number}", prompt.format(number, places), plan, each)
+        for number in range(1, places + 1)
+    ]
+
+
+def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tuple[Measured, CameraId]:
+    """Measure references, and tell of which camera."""
+    from mirrorskin import io
+    from mirrorskin.cli.progress import progress
+    from mirrorskin.engine.calibration.references.measure import measure_references
+
+    with ExitStack() as opening:
+        low, high = ([opening.enter_context(_open(path)) for path in paths] for paths in (darks, brights))
+        names = {source.header.camera for source in (*low, *high)} - {""}
+        if len(names) > 1:
+            raise io.InputError(
+                f"the recordings are of {' and '.join(sorted(names))}: take all with one camera"
+            )
+        camera = io.CameraId("".join(names), low[0].shape[1:], low[0].dtype)
+        with progress("averaging", sum(source.shape[0] for source in (*low, *high))) as show:
+            return measure_references(low, high, rolled=rolled, progress=show), camera
+
+
+def _open(path: Path) -> Source:
+    """Open frames; where the body was in those of a folder does not matter."""
+    from mirrorskin import io
+    from mirrorskin.io.picture_files import PICTURE_SUFFIXES
+
+    if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES:
+        return io.open_frames(path, io.Header("vertical"), travel=io.Steps(1.0))
+    return io.open_recording(path)
+
+
+def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str, int]:
+    """Count the frames that a stated noise still needs, by level, or refuse to go on with too few."""
+    from mirrorskin.io import InputError
+
+    if noise is None:
+        return {}
+    missing: dict[str, int] = {}
+    for name, level in (("dark", measured.dark), ("bright", measured.bright)):
+        count = level.missing(noise)
+        known = f"{name}: the standard error is {level.sigma:.3g} counts"
+        if count is None:
+            raise InputError(
+                f"{known}, of which rounding leaves {level.rounding:.2g} with any number of frames:"
+                f" give a --noise above that"
+            )
+        if count and refuse:
+            raise InputError(
+                f"{known}: {count} more frames are needed for --noise {noise:g}, beside {level.frames}"
+            )
+        if count:
+            missing[name] = count
+    return missing
+
+
+def _process(
+    measured: Measured, darks: Sequence[Path], brights: Sequence[Path], rolled: bool
+) -> Mapping[str, ProcessValue]:
+    from datetime import UTC, datetime
+
+    from mirrorskin.engine.version import program_version
+
+    told: dict[str, ProcessValue] = {
+        "program": "mirrorskin",
+        "version": program_version(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "bright_light": "of a ball rolled about" if rolled else "of a flat field",
+    }
+    for name, level, paths in (("dark", measured.dark, darks), ("bright", measured.bright, brights)):
+        told[f"{name}_sources"] = ", ".join(map(str, paths))
+        told |= {f"{name}_{key}": value for key, value in asdict(level).items()}
+    return told
+
+
+def _tell(output: Path, measured: Measured, as_json: bool) -> None:
+    from mirrorskin.cli.output import print_json
+
+    references = measured.references
+    defects = _count_defects(references)
+    levels = {"dark": measured.dark, "bright": measured.bright}
+    if as_json:
+        print_json({"output": str(output), **levels, "defects": defects})
+    else:
+        told = [_words(name, getattr(references, name), level) for name, level in levels.items()]
+        typer.echo(f"{output}: {'; '.join(told)}; " + ", ".join(f"{n} {what}" for what, n in defects.items()))
+    for name, level in levels.items():
+        if abs(level.drift) > level.sigma:
+            typer.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
+        if level.clipped:
+            typer.echo(
+                f"{name}: samples of {level.clipped} pixels lie on the end of the scale; their mean was"
+                f" corrected for it; better {_REMEDIES[name]}",
+                err=True,
+            )
+
+
+def _words(name: str, values: NDArray[np.float32], level: LevelReport) -> str:
+    import numpy as np
+
+    drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
+    return (
+        f"{name} {float(np.nanmedian(values)):.2f} +- {level.sigma:.2g} counts"
+        f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
+    )
+
+
+def _count_defects(references: References) -> dict[str, int]:
+    import numpy as np
+
+    from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED
+
+    bits = {"hot": HOT, "dead": DEAD, "saturated": SATURATED}
+    return {name: int(np.count_nonzero(references.defects & bit)) for name, bit in bits.items()}

@@ -1,0 +1,70 @@
+"""``mirrorskin calibrate show``: numbers and pictures of a calibration."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+if TYPE_CHECKING:
+    from mirrorskin.view.calibration.table import Row
+
+_HEAD = "part", "what", "value", "standard error", "unit"
+_NUMBERS = "value", "standard error"
+
+
+def command(
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CAL.h5", help="Calibration, or a recording or result that has one.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder to draw pictures of all maps into."),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Print a calibration's numbers with their errors, and draw its maps."""
+    from mirrorskin import io
+    from mirrorskin.cli.output import print_json
+    from mirrorskin.view import check_drawing
+    from mirrorskin.view.calibration.figures import calibration_figures
+    from mirrorskin.view.calibration.table import calibration_table
+
+    if output is not None:
+        check_drawing()
+    known = io.open_calibration(calibration)
+    rows = calibration_table(known)
+    pictures = [] if output is None else calibration_figures(known, output)
+    if as_json:
+        told = {"numbers": [row._asdict() for row in rows], "process": dict(known.process)}
+        print_json({"calibration": str(calibration), **told, "pictures": list(map(str, pictures))})
+        return
+    _print(str(calibration), rows)
+    if output is not None:
+        typer.echo(f"{output}: {', '.join(path.name for path in pictures) or 'nothing to draw'}")
+
+
+def _print(name: str, rows: Sequence[Row]) -> None:
+    from mirrorskin.cli.output import print_table
+
+    cells = [row.cells() for row in rows]
+    if not sys.stdout.isatty():
+        print_table(_HEAD, cells)
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=name, box=None, pad_edge=False, title_justify="left", title_style="bold")
+    for head in _HEAD:
+        table.add_column(head, justify="right" if head in _NUMBERS else "left")
+    before = ""
+    for part, *others in cells:
+        table.add_row(Text("" if part == before else part, style="bold cyan"), *map(Text, others))
+        before = part
+    Console().print(table)

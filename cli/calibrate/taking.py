@@ -1,0 +1,136 @@
+"""What a calibration is made of, taken on a rig: one place after the other, as the user is asked to."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import scans
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.rig.plans import Plan, VerticalPlan
+    from mirrorskin.hw.rig.rig import Rig
+
+_TOGETHER = 16
+"""Frames that are read at a time, at most."""
+
+_STILL = 0.05
+"""How far the body moves in a recording in which it stands still, mm: a press has two steps at least."""
+
+OptionalRig = Annotated[
+    Path | None,
+    typer.Option(
+        "--rig", metavar="RIG.toml", help="Take what is needed first, on this rig; see docs/rig.md."
+    ),
+]
+Settle = scans.Settle
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A recording that is to be taken.
+
+    Attributes
+    ----------
+    name : str
+        What the recording's file is told apart by: "dark", "ball-1".
+    prompt : str
+        What the user is to do before: "put the ball at place 1 of 9".
+    plan : VerticalPlan or AxialPlan
+        What the body does then.
+    frames : int
+        At each step of a plan in steps.
+    """
+
+    name: str
+    prompt: str
+    plan: Plan
+    frames: int = 1
+
+
+def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str | None = None) -> list[Path]:
+    """Take recordings, and keep them beside the calibration file.
+
+    The body is lifted, then the user is asked to make each place ready and to press Enter.
+
+    Parameters
+    ----------
+    rig_file : Path
+    calibration : Path
+        Of CAL.h5 and a place "dark" the recording is CAL-dark.h5.
+    places : sequence of Place
+    settle : str, optional
+        From rest to the first exposure of a step: ``100ms``.
+
+    Returns
+    -------
+    list of Path
+        The recordings, in the order of the places.
+
+    Raises
+    ------
+    InputError
+        A plan goes beyond the rig's limits, or a file cannot be written; nothing has moved then.
+    HardwareError
+        Stage or camera failed; the stage was stopped.
+    """
+    from mirrorskin import io
+    from mirrorskin.hw.rig.file import load_rig
+    from mirrorskin.hw.rig.possible import check_plan
+    from mirrorskin.hw.rig.rig import open_rig
+
+    settings = load_rig(rig_file)
+    paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
+    for place, path in zip(places, paths, strict=True):
+        check_plan(place.plan, settings.stage, settings.name)
+        io.check_output(path, rig_file)
+    with open_rig(settings) as rig:
+        for place, path in zip(places, paths, strict=True):
+            _take_one(rig, place, path, settle)
+    return paths
+
+
+def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
+    """Return a plan in which the body all but stands still: two steps of 0.05 mm.
+
+    Parameters
+    ----------
+    rig_file : Path
+    travel : float, optional
+        Where it ends, mm; without it, the body stays lifted.
+    """
+    from mirrorskin.hw.rig.file import load_rig
+    from mirrorskin.hw.rig.plans import VerticalPlan
+
+    start = load_rig(rig_file).stage.limits.travel[0] if travel is None else travel - _STILL
+    return VerticalPlan(start, start + _STILL, step=_STILL)
+
+
+def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
+    """Lift the body, have the user make the place ready, and record it."""
+    import numpy as np
+
+    from mirrorskin import io
+    from mirrorskin.cli.progress import progress
+
+    frames = place.frames if place.plan.in_steps else None
+    scan = scans.make_scan(rig, place.plan, settle if place.plan.in_steps else None, frames)
+    scan.lift()
+    _wait_for_enter(place.prompt)
+    recorder = io.StreamRecorder(scan, path)
+    with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
+        room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
+        while recorder.read(room) is not None:
+            show(recorder.count)
+
+
+def _wait_for_enter(prompt: str) -> None:
+    """Ask the user to make something ready; without anyone to ask, stop as at Ctrl-C."""
+    typer.echo(f"{prompt}, then press Enter", err=True)
+    if not sys.stdin.readline():
+        raise typer.Abort

@@ -1,0 +1,296 @@
+"""``--calibration`` of reconstruct, capture and live: what it changes, what is written, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibrations import a_calibration, assert_same
+from commands import run
+from rig_fakes import FakeCamera, FakeStage, settings, spreading
+from rotations import TILT, Setup, between, direction, expose
+from stacks import MadeUp, record
+
+from mirrorskin import engine, io
+from mirrorskin.hw.rig import file, rig
+
+SHAPE = (9, 11)
+X, Y = np.meshgrid(np.linspace(-1, 1, 11), np.linspace(1, -1, 9))
+ZENITH, AZIMUTH = np.radians(10 + 40 * np.hypot(X, Y) / np.sqrt(2)), np.arctan2(Y, X)
+SETUP = Setup(gain=400.0, noise=10.0, offset=2000.0, dtype="uint16")
+TURN = io.Header(
+    "axial",
+    pixel_size=(0.1, 0.1),
+    press=1.0,
+    tilt=TILT,
+    zenith_gain=np.array(SETUP.slope),
+    zenith_offset=np.array(SETUP.offset),
+    camera="left",
+)
+TRAVEL = np.arange(8) * 0.1
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def save(name="cal.h5", camera="left", dtype="uint8", shape=SHAPE, **parts):
+    calibration = io.Calibration(io.CameraId(camera, shape, np.dtype(dtype)), **parts)
+    io.save_calibration(calibration, name)
+    return calibration
+
+
+def flat_references(dark=20.0, bright=220.0):
+    full = np.ones(SHAPE, np.float32)
+    return io.References(dark * full, bright * full, full, full, np.zeros(SHAPE, np.uint8))
+
+
+def press(name="press.h5", **known):
+    """Record pixels that turn light one after the other, by a recording whose own references are wrong."""
+    steps = np.linspace(0.15, 0.55, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    share = np.clip((TRAVEL[:, None, None] - steps) / 0.2 + 0.5, 0, 1)
+    frames = np.rint(20 + 200 * share).astype(np.uint8)
+    wrong = {"dark": np.zeros(SHAPE, np.float32), "bright": np.full(SHAPE, 60, np.float32)}
+    header = io.Header("vertical", pixel_size=(0.1, 0.1), camera="left", **wrong)
+    source = MadeUp(frames, header, travel=TRAVEL)
+    with io.Recorder(source, name, **known) as recorder:
+        recorder.drain(lambda count: None)
+    return steps
+
+
+def turn(name="turn.h5", phase=SETUP.phase):
+    """Record a rotation over a dome, which says these phases."""
+    frames = expose(direction(ZENITH, AZIMUTH), SETUP, seed=3)
+    return record(MadeUp(frames, TURN, phase=np.array(phase)), Path(name))
+
+
+def reconstruct(name, *words):
+    ended = run("reconstruct", name, "-o", "out.h5", *words)
+    assert ended.code == 0, ended.said
+    return io.open_result("out.h5")
+
+
+def bias(result, steps):
+    return float(np.max(np.abs(-result.height - steps)))
+
+
+def test_a_press_is_reconstructed_with_the_references_of_the_calibration():
+    steps, calibration = press(), save(references=flat_references())
+    without, found = reconstruct("press.h5"), reconstruct("press.h5", "--calibration", "cal.h5")
+    assert bias(found, steps) < 0.005
+    assert bias(without, steps) > 0.02
+    assert_same(found.calibration, calibration)
+    assert (found.process["calibration"], found.process["calibration_parts"]) == ("cal.h5", "references")
+    assert found.process["source_region"] == "0,0,11x9"
+    assert without.calibration is None
+    assert "calibration" not in without.process
+    by_hand = reconstruct("press.h5", "--dark", "20", "--bright", "220")
+    np.testing.assert_array_equal(found.height, by_hand.height)
+
+
+def test_what_is_given_besides_is_believed():
+    press()
+    save(references=flat_references(dark=90.0))
+    found = reconstruct("press.h5", "--calibration", "cal.h5", "--dark", "20")
+    by_hand = reconstruct("press.h5", "--dark", "20", "--bright", "220")
+    np.testing.assert_array_equal(found.height, by_hand.height)
+
+
+def test_a_calibration_that_is_carried_is_used_unless_another_is_given():
+    carried = replace(a_calibration(SHAPE, only=[]), references=flat_references())
+    steps = press(calibration=carried)
+    other = save(references=flat_references(dark=100.0))
+    found = reconstruct("press.h5")
+    assert bias(found, steps) < 0.005
+    assert found.process["calibration"] == "the calibration in press.h5"
+    assert_same(found.calibration, carried)
+    given = reconstruct("press.h5", "--calibration", "cal.h5")
+    assert bias(given, steps) > 0.02
+    assert_same(given.calibration, other)
+    press("plain.h5")
+    from_a_result = reconstruct("plain.h5", "--calibration", "press.h5")
+    np.testing.assert_array_equal(from_a_result.height, found.height)
+
+
+def test_a_part_of_the_picture_has_its_part_of_the_references():
+    press()
+    references = flat_references()
+    references.dark[:, :4] = 90.0
+    save(references=references)
+    words = ("--calibration", "cal.h5")
+    whole, part = reconstruct("press.h5", *words), reconstruct("press.h5", "--region", "2,3,6x4", *words)
+    np.testing.assert_array_equal(part.height, whole.height[3:7, 2:8])
+    np.testing.assert_array_equal(part.calibration.references.dark, references.dark)
+    assert part.process["source_region"] == "2,3,6x4"
+
+
+def test_pixels_with_defects_have_no_height():
+    press()
+    references = flat_references()
+    references.dark[2, 3] = references.bright[2, 3] = np.nan
+    save(references=references)
+    words = ("--calibration", "cal.h5", "--no-fill")
+    found = reconstruct("press.h5", *words)
+    assert np.argwhere(found.status == 0).tolist() == [[2, 3]]
+    assert np.isnan(found.height[2, 3])
+
+
+def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precession():
+    turn(phase=[0.4 - phase for phase in SETUP.phase])
+    precession = io.Precession(TILT, 0.4, -1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 5.0))
+    save(dtype="uint16", precession=precession)
+    true = direction(ZENITH, AZIMUTH)
+    without, found = reconstruct("turn.h5"), reconstruct("turn.h5", "--calibration", "cal.h5")
+    assert np.degrees(np.median(between(without.normals, true))) > 5
+    assert np.degrees(np.median(between(found.normals, true))) < 1
+    assert found.process["calibration_parts"] == "tilt"
+
+
+def test_a_tilt_that_is_given_is_believed():
+    turn()
+    precession = io.Precession(TILT * 1.1, 0.0, 1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 5.0))
+    save(dtype="uint16", precession=precession)
+    told = f"{np.degrees(TILT)}deg"
+    assert reconstruct("turn.h5", "--calibration", "cal.h5").process["tilt"] == pytest.approx(TILT * 1.1)
+    given = reconstruct("turn.h5", "--calibration", "cal.h5", "--tilt", told)
+    assert given.process["tilt"] == pytest.approx(TILT)
+
+
+def test_the_engine_takes_a_path_a_calibration_or_a_source_that_has_one():
+    press()
+    calibration = save(references=flat_references())
+    with io.open_recording("press.h5") as source:
+        sources = [(source, "cal.h5"), (source, Path("cal.h5")), (source, calibration)]
+        sources.append((io.Calibrated(source, calibration), None))
+        heights = [engine.reconstruct(one, known).height for one, known in sources]
+    assert all(np.array_equal(height, heights[0]) for height in heights)
+
+
+def test_a_batch_uses_what_recordings_carry():
+    carried = replace(a_calibration(SHAPE, only=[]), references=flat_references())
+    press(calibration=carried)
+    alone = reconstruct("press.h5")
+    ended = run("batch", "press.h5", "-o", "results")
+    assert ended.code == 0, ended.said
+    (path,) = Path("results").glob("*.h5")
+    np.testing.assert_array_equal(io.open_result(path).height, alone.height)
+    assert_same(io.open_result(path).calibration, carried)
+
+
+# What is refused, in one line and with exit code 2, before anything is written.
+
+
+def older(path):
+    import h5py
+
+    with h5py.File(path, "r+") as opened:
+        opened["entry"].attrs["mirrorskin_calibration"] = 0
+
+
+REFUSALS = [
+    ({"shape": (9, 12)}, None, "cal.h5 is of 12 x 9 pixels, {} of 11 x 9: calibrate again"),
+    ({"camera": "right"}, None, "cal.h5 is of the camera 'right', {} of 'left': calibrate again"),
+    ({"dtype": "float32"}, None, "cal.h5 is of float32 samples, {} of uint8: calibrate again"),
+    ({}, older, "cal.h5 holds a calibration of an older layout, 0, where 1 is read: calibrate again"),
+    ({}, lambda path: path.unlink(), "cal.h5: no such file"),
+    ({}, lambda path: path.write_bytes(path.read_bytes()[:3000]), "cal.h5"),
+    ({}, lambda path: path.write_text("no"), "cal.h5 is not an HDF5 file"),
+]
+
+
+@pytest.mark.parametrize(("known", "change", "said"), REFUSALS)
+def test_a_wrong_calibration_is_refused_by_reconstruct(known, change, said):
+    press()
+    save(**known)
+    if change is not None:
+        change(Path("cal.h5"))
+    ended = run("reconstruct", "press.h5", "-o", "out.h5", "--calibration", "cal.h5")
+    assert ended.code == 2
+    assert said.format("press.h5") in ended.said
+    assert ended.said.count("\n") == 1
+    assert not Path("out.h5").exists()
+
+
+@pytest.mark.parametrize(("known", "change", "said"), REFUSALS)
+@pytest.mark.parametrize("command", ["capture", "live"])
+def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(monkeypatch, command, known, change, said):
+    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, name="left"))
+    monkeypatch.setattr(rig, "open_rig", None)
+    save(**known)
+    if change is not None:
+        change(Path("cal.h5"))
+    words = ["vertical", "--rig", "rig.toml", "--stop", "1mm", "--step", "1mm", "--calibration", "cal.h5"]
+    ended = run(command, *words, *(["-o", "rec.h5"] if command == "capture" else []))
+    assert ended.code == 2
+    assert said.format("fake") in ended.said
+    assert ended.said.count("\n") == 1
+
+
+def test_a_pixel_size_beside_that_of_a_lens_is_refused():
+    press()
+    io.save_calibration(a_calibration(SHAPE, only=["lens"]), "cal.h5")
+    words = ("--calibration", "cal.h5", "--pixel-size", "0.1mm")
+    ended = run("reconstruct", "press.h5", "-o", "out.h5", *words)
+    assert ended.code == 2
+    assert "cal.h5 tells the pixel size, and so does --pixel-size: leave that out" in ended.said
+
+
+def test_the_calibration_is_not_overwritten():
+    press()
+    save()
+    before = Path("cal.h5").read_bytes()
+    ended = run("reconstruct", "press.h5", "-o", "cal.h5", "--calibration", "cal.h5")
+    assert ended.code == 2
+    assert "is the input" in ended.said
+    assert Path("cal.h5").read_bytes() == before
+
+
+# Of a rig.
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """A rig whose file is read and which is opened without hardware; its own references are wrong."""
+    known = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
+
+    def opened(told):
+        stage = FakeStage()
+        return rig.Rig(stage, FakeCamera(stage.position, spreading(SHAPE), rate=60.0), told)
+
+    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **known))
+    monkeypatch.setattr(rig, "open_rig", opened)
+    Path("rig.toml").touch()
+
+
+PRESS = ("vertical", "--rig", "rig.toml", "--stop", "0.8mm", "--speed", "2mm/s", "--calibration", "cal.h5")
+
+
+def test_a_capture_carries_the_calibration_and_keeps_the_rig_s_own_references(fake):
+    calibration = save(references=flat_references())
+    ended = run("capture", *PRESS, "-o", "rec.h5")
+    assert ended.code == 0, ended.said
+    with io.open_recording("rec.h5") as recording:
+        assert_same(recording.carried, calibration)
+        assert recording.header.camera == "left"
+        assert np.all(recording.header.bright == 255)
+        dark = recording.header.dark
+        assert io.Calibrated(recording, recording.carried).header.dark[0, 0] == 20
+        assert dark[0, 0] != 20
+
+
+def test_live_uses_the_calibration_and_carries_it_in_what_it_writes(fake):
+    calibration = save(references=flat_references())
+    ended = run("live", *PRESS, "--latency", "5s", "--record", "rec.h5", "-o", "out.h5")
+    assert ended.code == 0, ended.said
+    result = io.open_result("out.h5")
+    assert_same(result.calibration, calibration)
+    assert result.process["calibration"] == "cal.h5"
+    with io.open_recording("rec.h5", live=True) as recording:
+        assert_same(recording.carried, calibration)
+        replayed = engine.reconstruct(recording, fill=False)
+    measured = result.filled == 0
+    np.testing.assert_array_equal(replayed.status, result.status)
+    np.testing.assert_array_equal(replayed.height[measured], result.height[measured])

@@ -1,0 +1,108 @@
+"""Recordings for a calibration, taken on an emulated rig as its user is asked to."""
+
+import dataclasses
+import io as texts
+import json
+
+import numpy as np
+import pytest
+from commands import run
+from reference_frames import expose, source
+from stacks import record
+
+from mirrorskin import io
+from mirrorskin.cli.calibrate import taking
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.grbl.link import Link
+from mirrorskin.hw.rig import rig as rigs
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+
+SHAPE = (12, 16)
+
+
+@pytest.fixture(scope="module")
+def rig_file(tmp_path_factory):
+    """The rig's file; its emulators run as long as the tests of this module."""
+    folder = tmp_path_factory.mktemp("rig")
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        EmulatedRig(shape=SHAPE, pixel_size=0.2, rate=60.0, delay=0.01) as rig,
+        rig.serve() as server,
+    ):
+        # Emulators are late where other programs have the processors; that is no fault here.
+        patch.setattr(rigs, "_STALL", 5.0)
+        patch.setattr(Link, "_limit", lambda link: 5.0)
+        file = rig.write(folder, server.url)
+        text = file.read_text().replace("[camera]", "[camera]\ndelay = 0.01\ndark = 16")
+        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
+        yield file
+
+
+@pytest.fixture
+def enter(monkeypatch):
+    """Let the user press Enter so many times, and then go home."""
+    return lambda times: monkeypatch.setattr("sys.stdin", texts.StringIO(times * "\n"))
+
+
+def test_each_place_is_asked_for_and_becomes_a_recording_beside_the_calibration(
+    rig_file, tmp_path, enter, capsys
+):
+    enter(2)
+    places = [
+        taking.Place("dark", "take everything off", taking.still_plan(rig_file), frames=3),
+        taking.Place("ball-1", "put the ball at place 1 of 1", AxialPlan(0.5, 0.04, 1.0, np.pi / 2)),
+    ]
+    dark, ball = taking.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
+    said = capsys.readouterr().err
+    assert said.splitlines() == [
+        "take everything off, then press Enter",
+        "put the ball at place 1 of 1, then press Enter",
+    ]
+    assert (dark, ball) == (tmp_path / "cal-dark.h5", tmp_path / "cal-ball-1.h5")
+    with io.open_recording(dark) as recording:
+        assert recording.state == "complete"
+        assert recording.shape == (6, *SHAPE)
+        assert np.ptp(recording.travel) == pytest.approx(0.05)
+    with io.open_recording(ball) as recording:
+        assert recording.motion == "axial"
+        assert recording.shape[0] == 4
+
+
+def test_who_does_not_press_enter_takes_nothing(rig_file, tmp_path, enter):
+    enter(0)
+    words = ("--rig", rig_file, "-o", tmp_path / "cal.h5", "--frames", "2")
+    ended = run("calibrate", "references", *words)
+    assert ended.code == 130
+    assert not list(tmp_path.iterdir())
+
+
+def test_references_are_taken_until_their_noise_is_as_stated(rig_file, tmp_path, enter):
+    enter(9)
+    bright = tmp_path / "bright.h5"
+    _record_flat_field(bright)
+    path = tmp_path / "cal.h5"
+    words = ("--rig", rig_file, "--bright", bright, "-o", path, "--noise", "0.45", "--frames", "4", "--json")
+    ended = run("calibrate", "references", *words)
+    assert ended.code == 0, ended.said
+    told = json.loads(ended.out)
+    assert told["dark"]["frames"] > 4
+    assert told["dark"]["sigma"] <= 0.45
+    assert ended.said.count("press Enter") >= 2
+    known = io.open_calibration(path)
+    np.testing.assert_allclose(np.nanmedian(known.references.dark), 16, atol=0.3)
+    assert (tmp_path / "cal-dark.h5").exists()
+    assert (tmp_path / "cal-dark-2.h5").exists()
+
+
+def test_nothing_moves_for_a_plan_beyond_the_rig(rig_file, tmp_path, enter, monkeypatch):
+    monkeypatch.setattr(rigs, "open_rig", None)
+    enter(1)
+    places = [taking.Place("ball", "put the ball in place", VerticalPlan(8.0, 9.0, 1.0))]
+    with pytest.raises(io.InputError, match="beyond the axis"):
+        taking.take(rig_file, tmp_path / "cal.h5", places)
+
+
+def _record_flat_field(path):
+    flat = source(expose(np.full(SHAPE, 220.0), 1.5, 32))
+    flat.header = dataclasses.replace(flat.header, camera="")
+    record(flat, path)

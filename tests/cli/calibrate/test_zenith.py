@@ -1,0 +1,196 @@
+"""``mirrorskin calibrate zenith``: what reaches the fit, what is written and told, what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from calibrations import a_lens, a_precession, a_response, some_references
+from commands import run
+from rotations import TILT
+from stacks import MadeUp, record
+
+from mirrorskin import io
+from mirrorskin.engine.calibration.wall import zenith
+from mirrorskin.io.calibration.sizes import size_facts
+
+SHAPE = (5, 7)
+PHASE = np.arange(8) * np.pi / 4
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Five recordings, place-1.h5 and so on, of a camera called left."""
+    monkeypatch.chdir(tmp_path)
+    for number in range(1, 6):
+        header = io.Header("axial", pixel_size=(0.1, 0.1), press=1.0, tilt=TILT, camera="left")
+        frames = np.full((8, *SHAPE), 16 + number, np.uint8)
+        record(MadeUp(frames, header, phase=PHASE), tmp_path / f"place-{number}.h5")
+    return tmp_path
+
+
+@pytest.fixture
+def fitted(monkeypatch):
+    """Take down what the fit is given; it answers with a response that is made up."""
+    told = {}
+
+    def fit_zenith(presses, ball, **options):
+        told.update(options, ball=ball, names=[press.name for press in presses])
+        told.update(tilts=[press.header.tilt for press in presses])
+        told.update(sizes={press.header.pixel_size for press in presses})
+        options["progress"](len(presses))
+        return response()
+
+    monkeypatch.setattr(zenith, "fit_zenith", fit_zenith)
+    return told
+
+
+def response():
+    made_up = a_response()
+    names = ("radius", "rim", "axis_x", "axis_y", "sight_0", "lamp_x", "lamp_y", "scatter")
+    fields = {name: getattr(made_up, name) for name in type(made_up).__slots__}
+    return io.WallResponse(**fields | {"parameters": names, "covariance": np.diag(np.arange(1.0, 9) ** 2)})
+
+
+def calibrate(*words, presses=5):
+    names = [f"place-{number}.h5" for number in range(1, presses + 1)]
+    return run("calibrate", "zenith", *names, "-o", "cal.h5", "--ball", "4mm", *words)
+
+
+def test_a_response_is_added_to_a_calibration(folder, fitted):
+    references, precession = some_references(), a_precession(tilt=TILT)
+    camera = io.CameraId("left", SHAPE, np.dtype(np.uint8))
+    io.save_calibration(io.Calibration(camera, references=references, precession=precession), "cal.h5")
+    ended = calibrate("--body-radius", "18mm", "--body-height", "41mm")
+    assert ended.code == 0, ended.said
+    assert ended.out.startswith("cal.h5: wall 17.50 +- 1 mm from the axis and 40.0 +- 2 mm high")
+    assert "zenith known within" in ended.out
+    assert fitted["ball"] == pytest.approx(2.0)
+    assert fitted["body"] == (18.0, 41.0)
+    assert fitted["pattern"] == "graded"
+    assert len(fitted["names"]) == 5
+    np.testing.assert_array_equal(fitted["references"].dark, references.dark)
+    assert fitted["precession"].pivot == precession.pivot
+    known = io.open_calibration("cal.h5")
+    assert known.references is not None
+    assert known.zenith is not None
+    np.testing.assert_array_equal(known.zenith.curve, a_response().curve)
+    assert any("place-3.h5" in str(value) for value in known.process.values())
+
+
+def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
+    ended = calibrate("--pattern", "uniform", "--tilt", "3deg", "--json")
+    assert ended.code == 0, ended.said
+    told = json.loads(ended.out)
+    assert told["output"] == "cal.h5"
+    assert told["found"]["rim"] == {"value": 40.0, "sigma": 2.0}
+    assert told["degrees"]["left_on_balls"] == pytest.approx(np.degrees(0.003))
+    assert fitted["references"] is None
+    assert fitted["precession"] is None
+    assert fitted["pattern"] == "uniform"
+    assert fitted["tilts"] == pytest.approx([np.radians(3)] * 5)
+    assert io.open_calibration("cal.h5").camera.name == "left"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--press", "1mm"), "--press says how a rig is to press"),
+        (("--rig", "rig.toml", "--press", "1mm"), "both give the presses"),
+        (("--ball", "4"), "--ball"),
+        (("--body-radius", "much"), "--body-radius"),
+    ],
+)
+def test_a_call_that_cannot_be_is_refused(folder, fitted, words, said):
+    ended = calibrate(*words)
+    assert ended.code == 2
+    assert said in ended.said
+    assert not (folder / "cal.h5").exists()
+
+
+def test_without_recordings_and_rig_there_is_nothing_to_do(folder):
+    ended = calibrate(presses=0)
+    assert ended.code == 2
+    assert "take them with --rig" in ended.said
+    ended = calibrate("--rig", "rig.toml", presses=0)
+    assert ended.code == 2
+    assert "--press is missing" in ended.said
+
+
+def test_a_calibration_of_another_camera_is_refused_before_the_fit(folder, fitted):
+    other = io.CameraId("right", SHAPE, np.dtype(np.uint8))
+    io.save_calibration(io.Calibration(other, references=some_references()), "cal.h5")
+    ended = calibrate()
+    assert ended.code == 2
+    assert ended.said.count("\n") == 1
+    assert "right" in ended.said
+    assert not fitted
+
+
+def test_recordings_of_two_cameras_are_refused(folder, fitted):
+    header = io.Header("axial", pixel_size=(0.1, 0.1), press=1.0, tilt=TILT, camera="right")
+    record(MadeUp(np.zeros((8, *SHAPE), np.uint8), header, phase=PHASE), folder / "place-2.h5")
+    ended = calibrate()
+    assert ended.code == 2
+    assert "left and right" in ended.said
+
+
+def test_too_few_presses_are_told_in_a_line(folder):
+    ended = calibrate(presses=3)
+    assert ended.code == 2
+    assert "3 presses do not determine the wall" in ended.said
+
+
+def test_a_recording_without_references_is_told_in_a_line(folder):
+    ended = calibrate()
+    assert ended.code == 2
+    assert "no dark and bright references" in ended.said
+    assert ended.said.count("\n") == 1
+
+
+def known(**parts):
+    process = parts.pop("process", {})
+    return io.Calibration(io.CameraId("left", SHAPE, np.dtype(np.uint8)), **parts, process=process)
+
+
+def test_the_wall_is_measured_with_the_pixels_of_the_scale(folder, fitted):
+    io.save_calibration(known(lens=a_lens()), "cal.h5")
+    bare = io.Header("axial", press=1.0, tilt=TILT, camera="left")
+    record(MadeUp(np.full((8, *SHAPE), 9, np.uint8), bare, phase=PHASE), folder / "place-1.h5")
+    ended = calibrate()
+    assert ended.code == 0, ended.said
+    assert fitted["sizes"] == {(0.5, 0.6)}
+    process = io.open_calibration("cal.h5").process
+    assert (process["zenith.pixel_size_x"], process["zenith.pixel_size_y"]) == (0.5, 0.6)
+
+
+def test_a_pixel_size_that_the_scale_denies_is_refused(folder, fitted):
+    io.save_calibration(known(lens=a_lens()), "cal.h5")
+    ended = calibrate("--pixel-size", "0.1mm")
+    assert ended.code == 2
+    assert "--pixel-size says 0.1 mm, the scale of cal.h5 0.5 mm: leave it out" in ended.said
+    assert not fitted
+
+
+def test_a_pivot_measured_with_other_pixels_is_left_out(folder, fitted):
+    process = {f"tilt.{key}": value for key, value in size_facts((0.102, 0.102)).items()}
+    io.save_calibration(known(precession=a_precession(tilt=TILT), process=process), "cal.h5")
+    ended = calibrate()
+    assert ended.code == 0, ended.said
+    assert "the calibrated tilt is left out" in ended.said
+    assert fitted["precession"] is None
+
+
+def test_presses_that_leave_the_zenith_uncertain_are_told(folder, fitted):
+    ended = calibrate()
+    assert "depth not determined, zenith known within 0.27 deg only" in ended.said
+    assert "press less" in ended.said
+    assert "at most 0.17 deg left on the balls" in ended.out
+
+
+def test_recordings_of_two_kinds_of_samples_are_refused(folder, fitted):
+    header = io.Header("axial", pixel_size=(0.1, 0.1), press=1.0, tilt=TILT, camera="left")
+    record(MadeUp(np.zeros((8, *SHAPE), np.uint16), header, phase=PHASE), folder / "place-4.h5")
+    ended = calibrate()
+    assert ended.code == 2
+    assert "place-4.h5 is of 'left', 7 x 5, uint16, place-1.h5 of 'left', 7 x 5, uint8" in ended.said
+    assert not fitted

@@ -1,0 +1,69 @@
+"""The figure of dark and bright references, their errors, and the defects."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED, References
+from mirrorskin.view.calibration.maps import draw_pixels, new_sheet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_KINDS = {"hot": HOT, "dead": DEAD, "saturated": SATURATED}
+_COLOURS = {
+    "sound": "0.9",
+    "hot": "tab:red",
+    "dead": "black",
+    "saturated": "tab:orange",
+    "several": "tab:purple",
+}
+_VISIBLE = 100  # dots in a row that can be told apart
+
+
+def draw_references(references: References) -> Figure:
+    """Draw both levels, their difference, both standard errors, and where the defects are."""
+    figure = new_sheet(17, 8.2)
+    axes = figure.subplots(2, 3)
+    light = references.bright - references.dark
+    draw_pixels(axes[0, 0], references.dark, "dark: without light", "counts")
+    draw_pixels(axes[0, 1], references.bright, "bright: in full light", "counts")
+    draw_pixels(axes[0, 2], light, "light: bright less dark", "counts")
+    draw_pixels(axes[1, 0], references.dark_sigma, "standard error of dark", "counts", "magma")
+    draw_pixels(axes[1, 1], references.bright_sigma, "standard error of bright", "counts", "magma")
+    _draw_defects(axes[1, 2], references.defects)
+    return figure
+
+
+def _draw_defects(axes: Axes, defects: NDArray[np.uint8]) -> None:
+    """Draw defects by colour, each large enough to be seen."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    names = list(_COLOURS)
+    kind = np.full(defects.shape, names.index("several"), np.uint8)
+    for name, bits in ({"sound": 0} | _KINDS).items():
+        kind[defects == bits] = names.index(name)
+    size = max(1, max(defects.shape) // _VISIBLE)
+    axes.imshow(
+        maximum_filter(kind, size),
+        cmap=ListedColormap(list(_COLOURS.values())),
+        interpolation="nearest",
+        vmin=-0.5,
+        vmax=len(names) - 0.5,
+    )
+    counts = {name: int(np.count_nonzero(kind == number)) for number, name in enumerate(names)}
+    patches = [
+        Patch(facecolor=_COLOURS[name], edgecolor="0.5", label=f"{name}: {count}")
+        for name, count in counts.items()
+        if count
+    ]
+    axes.legend(handles=patches, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes.set(title="defects\ndrawn larger than they are", xlabel="column (px)", ylabel="row (px)")
+    if size == 1:
+        axes.set_title("defects\n")
