@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.version import program_version
+from mirrorskin.engine.version import signature
 from mirrorskin.io import Calibrated, InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
 
@@ -38,9 +37,7 @@ def sign(result: Result, source: Source, device: Device, process: dict[str, Proc
         origin |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = replace(result, calibration=source.whole)
     made: dict[str, ProcessValue] = {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "device": device.info.title,
         "driver": device.info.driver,
     }

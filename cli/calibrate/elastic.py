@@ -13,7 +13,7 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import one_camera, with_scale
+from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.elastic import BallOnset, LearnedGel
@@ -56,7 +56,9 @@ def command(
 
     paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
-    _check_call(paths, rig, press, settle, thickness)
+    check_call(paths, rig, press=press, settle=settle)
+    if thickness < 0:
+        raise io.InputError(f"--sheet {sheet} cannot be: give a thickness of 0 or more")
     io.check_output(output, *paths, rig)
     known = io.open_calibration(output) if output.exists() else None
     if rig is not None:
@@ -66,30 +68,13 @@ def command(
     told = with_scale(told, known)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
-        camera = one_camera(sources)
-        if known is not None:
-            io.check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
+        cameras = [camera_of(source) for source in sources]
+        camera = one_camera([source.name for source in sources], cameras, known, output)
         learned = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
         size = sources[0].header.pixel_size
     process = _process(paths, ball, sheet, learned) | ({} if size is None else size_facts(size))
     io.update_calibration(output, learned.gel, camera, process)
     _tell(output, learned, as_json)
-
-
-def _check_call(
-    paths: Sequence[Path], rig: Path | None, press: str | None, settle: str | None, sheet: float
-) -> None:
-    from mirrorskin.io import InputError
-
-    if rig is None and not paths:
-        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
-    if rig is not None and paths:
-        raise InputError("recordings and --rig both give the presses: leave one of them out")
-    for option, value in (("--press", press), ("--settle", settle)):
-        if rig is None and value is not None:
-            raise InputError(f"{option} says how a rig is to press: give --rig, too, or leave it out")
-    if sheet < 0:
-        raise InputError(f"--sheet {sheet:g}mm cannot be: give a thickness of 0 or more")
 
 
 def _places(
@@ -104,11 +89,9 @@ def _places(
         length(press or _PRESS, "--press"),
         step=length(step or _STEP, "--travel-step"),
     )
-    prompt = "put the ball at place {} of {}, near the middle of the field"
-    return [
-        taking.Place(f"elastic-{number}", prompt.format(number, places), plan)
-        for number in range(1, places + 1)
-    ]
+    return taking.at_each(
+        "elastic", "put the ball at place {} of {}, near the middle of the field", places, plan
+    )
 
 
 def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
@@ -129,14 +112,10 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
 
 
 def _process(paths: Sequence[Path], ball: str, sheet: str, learned: LearnedGel) -> dict[str, ProcessValue]:
-    from datetime import UTC, datetime
-
-    from mirrorskin.engine.version import program_version
+    from mirrorskin.engine.version import signature
 
     return {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "sources": ", ".join(map(str, paths)),
         "ball": ball,
         "sheet": sheet,

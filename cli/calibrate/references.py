@@ -187,14 +187,10 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
 def _process(
     measured: Measured, darks: Sequence[Path], brights: Sequence[Path], rolled: bool
 ) -> Mapping[str, ProcessValue]:
-    from datetime import UTC, datetime
-
-    from mirrorskin.engine.version import program_version
+    from mirrorskin.engine.version import signature
 
     told: dict[str, ProcessValue] = {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "bright_light": "of a ball rolled about" if rolled else "of a flat field",
     }
     for name, level, paths in (("dark", measured.dark, darks), ("bright", measured.bright, brights)):

@@ -76,10 +76,7 @@ def _plan(rig: Path, places: int) -> list[taking.Place]:
     prompt = (
         "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the corners"
     )
-    return [
-        taking.Place(f"board-{number}", prompt.format(number, places), taking.still_plan(rig), _SHOTS)
-        for number in range(1, places + 1)
-    ]
+    return taking.at_each("board", prompt, places, taking.still_plan(rig), _SHOTS)
 
 
 def _read(paths: Sequence[Path], output: Path) -> tuple[Pictures, CameraId]:
@@ -114,14 +111,10 @@ def _picture(path: Path) -> tuple[NDArray[Any], str, Any]:
 
 
 def _process(fit: LensFit, board: Board, paths: Sequence[Path]) -> dict[str, ProcessValue]:
-    from datetime import UTC, datetime
-
-    from mirrorskin.engine.version import program_version
+    from mirrorskin.engine.version import signature
 
     return {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "board": str(board),
         "sources": ", ".join(map(str, paths)),
         "marks": sum(fit.marks),

@@ -13,8 +13,11 @@ import typer
 from mirrorskin.cli import scans
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.plans import Plan, VerticalPlan
+    from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
+
+TILT, _STEP = "2.5deg", "45deg"
+BALL = "put the ball at place {} of {}, all over the field"
 
 _TOGETHER = 16
 """Frames that are read at a time, at most."""
@@ -93,6 +96,46 @@ def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str
         for place, path in zip(places, paths, strict=True):
             _take_one(rig, place, path, settle)
     return paths
+
+
+def at_each(part: str, prompt: str, count: int, plan: Plan, frames: int = 1) -> list[Place]:
+    """Say that the same is to be done at several places.
+
+    Parameters
+    ----------
+    part : str
+        Of the calibration, which the files are named by.
+    prompt : str
+        With room for the number of the place, and how many there are.
+    count : int
+    plan, frames
+        As of a `Place`.
+    """
+    numbers = range(1, count + 1)
+    return [Place(f"{part}-{n}", prompt.format(n, count), plan, frames) for n in numbers]
+
+
+def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, example: str) -> AxialPlan:
+    """Return the plan of a turn on a ball, in eight steps with a tilt of 2.5 degrees unless told otherwise.
+
+    Raises
+    ------
+    InputError
+        Nobody says how far the body is lowered; the example does.
+    """
+    from mirrorskin.cli.quantity import angle, length
+    from mirrorskin.hw.rig.plans import AxialPlan
+    from mirrorskin.io import InputError
+
+    if press is None:
+        raise InputError(
+            f"--press is missing: say how far the body is lowered on the ball, as in --press {example}"
+        )
+    return AxialPlan(
+        length(press, "--press"),
+        angle(tilt or TILT, "--tilt"),
+        phase_step=angle(phase_step or _STEP, "--phase-step"),
+    )
 
 
 def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:

@@ -11,7 +11,7 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import with_scale
+from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
     from mirrorskin.cli.positions import Given
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mirrorskin.engine.calibration.tilt.turned import BallTurn, PlateTurn
     from mirrorskin.io import Calibration, CameraId, Precession, ProcessValue, Source
 
-_TILT, _STEP = "2.5deg", "45deg"
 _TRIFLE = math.radians(0.1)  # of azimuth, or of the mean lean, that is not worth a line
 _SURE = 3.0  # standard errors from which on it is
 _ANGLES = ("tilt", "phase_offset", "major_axis", "centre_x", "centre_y")
@@ -54,7 +53,7 @@ def command(
         str | None, typer.Option(metavar="LENGTH", help="With --rig: how far the body is lowered: 0.5mm.")
     ] = None,
     tilt: Annotated[
-        str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {_TILT}.")
+        str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {taking.TILT}.")
     ] = None,
     settle: taking.Settle = None,
     as_json: options.Json = False,
@@ -67,12 +66,13 @@ def command(
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
     radius = length(ball, "--ball") / 2
-    _check_call(paths, flats, wedges, rig, press=press, tilt=tilt, settle=settle)
+    check_call(paths if rig else [*paths, *flats, *wedges], rig, press=press, tilt=tilt, settle=settle)
     io.check_output(output, *paths, *flats, *wedges, rig)
     known = io.open_calibration(output) if output.exists() else None
     told = given(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
-        paths, told = taking.take(rig, output, _places(places, press, tilt, phase_step), settle), {}
+        plan = taking.turn_plan(press, tilt, phase_step, "0.5mm")
+        paths, told = taking.take(rig, output, taking.at_each("tilt", taking.BALL, places, plan), settle), {}
     told = with_scale(told, known)
     every = [*flats, *wedges, *paths]
     camera = _camera(every, known, output, told)
@@ -84,44 +84,6 @@ def command(
         process |= size_facts(size)
     io.update_calibration(output, study.precession, camera, process)
     _tell(output, study, as_json)
-
-
-def _check_call(
-    balls: Sequence[Path],
-    flats: Sequence[Path],
-    wedges: Sequence[Path],
-    rig: Path | None,
-    **asked: str | None,
-) -> None:
-    from mirrorskin.io import InputError
-
-    if rig is None and not [*balls, *flats, *wedges]:
-        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
-    if rig is not None and balls:
-        raise InputError("recordings of the ball and --rig are both given: leave one of them out")
-    if rig is not None and asked["press"] is None:
-        raise InputError(
-            "--press is missing: say how far the body is lowered on the ball, as in --press 0.5mm"
-        )
-    for name, value in asked.items():
-        if rig is None and value is not None:
-            raise InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
-
-
-def _places(count: int, press: str | None, tilt: str | None, phase_step: str | None) -> list[taking.Place]:
-    """Say how the recordings are taken."""
-    from mirrorskin.cli.quantity import angle, length
-    from mirrorskin.hw.rig.plans import AxialPlan
-
-    plan = AxialPlan(
-        length(press or "", "--press"),
-        angle(tilt or _TILT, "--tilt"),
-        phase_step=angle(phase_step or _STEP, "--phase-step"),
-    )
-    prompt = "put the ball at place {} of {}, all over the field"
-    return [
-        taking.Place(f"tilt-{number}", prompt.format(number, count), plan) for number in range(1, count + 1)
-    ]
 
 
 def _scale(gain: str | None, offset: float | None) -> Mapping[str, Any]:
@@ -144,22 +106,8 @@ def _camera(paths: Sequence[Path], known: Calibration | None, output: Path, told
     cameras = []
     for path in paths:
         with io.open_recording(path, **told) as source:
-            cameras.append(io.CameraId(source.header.camera, source.shape[1:], source.dtype))
-    for path, camera in zip(paths, cameras, strict=True):
-        if not _same(camera, cameras[0]):
-            raise io.InputError(
-                f"{path} is of {camera}, {paths[0]} of {cameras[0]}: take all with one camera"
-            )
-    name = max(camera.name for camera in cameras)
-    camera = io.CameraId(name, cameras[0].shape, cameras[0].dtype)
-    if known is not None:
-        io.check_camera(known, camera, str(paths[0]), f"name another file than {output} with -o")
-    return camera
-
-
-def _same(one: CameraId, other: CameraId) -> bool:
-    names = {one.name, other.name} - {""}
-    return len(names) < 2 and (one.shape, one.dtype) == (other.shape, other.dtype)
+            cameras.append(camera_of(source))
+    return one_camera([str(path) for path in paths], cameras, known, output)
 
 
 def _shown(source: Source, known: Calibration | None, scale: Mapping[str, Any]) -> Shown:
@@ -218,14 +166,10 @@ def _study(turns: Iterator[BallTurn | PlateTurn], count: int, shown: Shown) -> S
 def _process(
     study: Study, ball: str, balls: Sequence[Path], flats: Sequence[Path], wedges: Sequence[Path]
 ) -> dict[str, ProcessValue]:
-    from datetime import UTC, datetime
-
-    from mirrorskin.engine.version import program_version
+    from mirrorskin.engine.version import signature
 
     told: dict[str, ProcessValue] = {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "ball": ball,
         "taken_for_granted": "; ".join(study.notes),
     }

@@ -12,12 +12,11 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import one_camera, with_scale
+from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Calibration, CameraId, Precession, ProcessValue, Source, WallResponse
+    from mirrorskin.io import Calibration, Precession, ProcessValue, Source, WallResponse
 
-_TILT, _STEP = "2.5deg", "45deg"
 _DOUBTFUL = 0.1
 """Degrees by which zeniths may be off, in the middle of all pixels, before a warning."""
 
@@ -68,63 +67,22 @@ def command(
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    _check_call(paths, rig, press, settle)
+    check_call(paths, rig, press=press, settle=settle)
     io.check_output(output, *paths, rig)
     known = io.open_calibration(output) if output.exists() else None
     if rig is not None:
-        balls = _balls(places, press, tilt, phase_step)
+        plan = taking.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
+        balls = taking.at_each("zenith", taking.BALL, places, plan)
         paths, tilt, phase_step = taking.take(rig, output, balls, settle), None, None
     told = with_scale(given(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size), known)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
-        camera = _camera(sources, known, output)
+        cameras = [camera_of(source) for source in sources]
+        camera = one_camera([source.name for source in sources], cameras, known, output)
         response = _fit(sources, radius, known, pattern.value, body)
         process = _process(paths, ball, body) | _size(sources[0])
     io.update_calibration(output, response, camera, process)
     _tell(output, response, as_json)
-
-
-def _check_call(paths: Sequence[Path], rig: Path | None, press: str | None, settle: str | None) -> None:
-    from mirrorskin.io import InputError
-
-    if rig is None and not paths:
-        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
-    if rig is not None and paths:
-        raise InputError("recordings and --rig both give the presses: leave one of them out")
-    if rig is not None and press is None:
-        raise InputError(
-            "--press is missing: say how far the body is lowered on the ball, as in --press 0.4mm for 4 mm"
-        )
-    for option, value in (("--press", press), ("--settle", settle)):
-        if rig is None and value is not None:
-            raise InputError(f"{option} says how a rig is to press: give --rig, too, or leave it out")
-
-
-def _balls(places: int, press: str | None, tilt: str | None, phase_step: str | None) -> list[taking.Place]:
-    """Say how the recordings are taken."""
-    from mirrorskin.cli.quantity import angle, length
-    from mirrorskin.hw.rig.plans import AxialPlan
-
-    plan = AxialPlan(
-        length(press or "", "--press"),
-        angle(tilt or _TILT, "--tilt"),
-        phase_step=angle(phase_step or _STEP, "--phase-step"),
-    )
-    prompt = "put the ball at place {} of {}, all over the field"
-    return [
-        taking.Place(f"zenith-{number}", prompt.format(number, places), plan)
-        for number in range(1, places + 1)
-    ]
-
-
-def _camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
-    """Return the camera that all recordings are of, if it is that of the calibration."""
-    from mirrorskin import io
-
-    camera = one_camera(sources)
-    if known is not None:
-        io.check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
-    return camera
 
 
 def _fit(
@@ -171,14 +129,10 @@ def _precession(known: Calibration, source: Source) -> Precession | None:
 
 
 def _process(paths: Sequence[Path], ball: str, body: tuple[float, float]) -> dict[str, ProcessValue]:
-    from datetime import UTC, datetime
-
-    from mirrorskin.engine.version import program_version
+    from mirrorskin.engine.version import signature
 
     return {
-        "program": "mirrorskin",
-        "version": program_version(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **signature(),
         "sources": ", ".join(map(str, paths)),
         "ball": ball,
         "body_radius": body[0],
