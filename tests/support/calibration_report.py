@@ -145,9 +145,9 @@ def rows_of_the_field(name: str, lab: Lab, calibration: io.Calibration, number: 
             share >= 0.9,
         )
     worst, old = (np.nanmax(np.abs(score.bins.zenith.bias)) for score in (after, before))
-    yield Row(
-        f"{name}: zenith bias, worst bin", "0.1 deg", f"{worst:.3f} deg", f"{old:.2f} deg", worst <= 0.1
-    )
+    printed = lab.gamma != 1  # the others' bias counts in the bound already
+    told = f"{worst:.3f} deg", f"{old:.2f} deg", worst <= 0.1 or not printed
+    yield Row(f"{name}: zenith bias, worst bin", "0.1 deg" if printed else "", *told)
     yield Row(
         f"{name}: zenith bias, all",
         "",
