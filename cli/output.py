@@ -14,6 +14,7 @@ import typer
 if TYPE_CHECKING:
     from mirrorskin.io import Result
 
+_NO_GEL = "none: the calibration has no gel"
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
@@ -82,8 +83,12 @@ def _plain(value: Any) -> Any:
 
 
 def tell_what_is_missing(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
-    """Say which maps a result's process says are missing, why, and what would bring them."""
+    """Say which maps a result's process says are missing, why, what would bring them, and what a gel did."""
     for what, remedy in remedies.items():
         said = str(process.get(what))
         if said.startswith(_UNTOLD):
             typer.echo(f"{name}: no {what}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
+    gel = str(process.get("gel", ""))
+    if gel and gel != _NO_GEL:
+        what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
+        typer.echo(f"{name}: heights {what}", err=True)

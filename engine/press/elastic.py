@@ -149,7 +149,7 @@ def correct_press(
     except NotConverged as error:
         return result, f"none: {error}"
     lost = np.count_nonzero((result.status == _LIT) & np.isnan(corrected.height))
-    said = f"corrected; {lost} pixels turned light too far from the touch"
+    said = f"corrected for the gel; {lost} pixels turned light too far from the touch"
     return replace(result, height=corrected.height, height_sigma=corrected.sigma), said
 
 

@@ -1,0 +1,29 @@
+"""What commands say besides what was asked for."""
+
+import pytest
+
+from mirrorskin.cli.output import tell_what_is_missing
+
+
+@pytest.mark.parametrize(
+    ("process", "said"),
+    [
+        (
+            {"height": "none: the recording has no pixel size"},
+            "a.h5: no height: the recording has no pixel size; give it",
+        ),
+        ({"height": "made"}, ""),
+        ({"gel": "none: the calibration has no gel"}, ""),
+        (
+            {"gel": "none: nothing turned light"},
+            "a.h5: heights not corrected for the gel: nothing turned light",
+        ),
+        (
+            {"gel": "corrected for the gel; 3 pixels more"},
+            "a.h5: heights corrected for the gel; 3 pixels more",
+        ),
+    ],
+)
+def test_what_is_missing_and_what_a_gel_did_is_told_in_a_line(process, said, capsys):
+    tell_what_is_missing("a.h5", process, {"height": "it"})
+    assert capsys.readouterr() == ("", f"{said}\n" if said else "")
