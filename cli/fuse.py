@@ -73,10 +73,11 @@ def command(
         _open(axial, "axial", dataset, known, limit) as turned,
     ):
         io.check_output(target, vertical, axial, phases, calibration)
+        told = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", engine.frames_to_read(pressed, turned, register)) as show:
             result = engine.fuse_sources(
-                engine.calibrated(pressed, calibration),
-                engine.calibrated(turned, calibration),
+                engine.calibrated(pressed, told),
+                engine.calibrated(turned, told),
                 rotation={name: value for name, value in rotation.items() if value is not None},
                 register=register,
                 robust=robust,

@@ -72,3 +72,7 @@ Calibration = Annotated[
 Memory = Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]
 NewRecording = Annotated[Path, typer.Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]
+LearnedCalibration = Annotated[
+    Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
+]
+Ball = Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")]

@@ -8,13 +8,13 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.calibrated import calibrated, on_the_sheet
 from mirrorskin.engine.feed import Progress
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.joint import Joint, Known
+from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.press.vertical import reconstruct_press
 from mirrorskin.engine.provenance import sign
 from mirrorskin.engine.rotation.axial import Rotation, estimate_rotation, maps_of
@@ -207,12 +207,12 @@ def fuse_sources(
         found = estimate_rotation(
             axial,
             **rotation,
-            heights=_everywhere(known) if register else None,
+            heights=with_nearest(known) if register else None,
             progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
             **common,
         )
         joint = Joint(onset, _slopes_of(found), pixel_size, robust, opened)
-        before, known = _everywhere(known), joint.heights()
+        before, known = with_nearest(known), joint.heights()
         moved = _moved(before, known, found.normals.tilt, pixel_size)
         if moved <= _STILL:
             break
@@ -299,12 +299,6 @@ def _put_together(heights: Result, rotation: Rotation, surface: Surface) -> Resu
         x=heights.x,
         y=heights.y,
     )
-
-
-def _everywhere(height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return heights with those of the nearest known pixels where none is known."""
-    nearest = ndimage.distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
-    return np.asarray(height[tuple(nearest)])
 
 
 def _moved(

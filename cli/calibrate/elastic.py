@@ -23,10 +23,8 @@ _STEP, _PRESS = "0.03mm", "1.2mm"
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
-    ],
-    ball: Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")],
+    output: options.LearnedCalibration,
+    ball: options.Ball,
     presses: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC.h5...", help="Vertical recordings of the ball, at one place or more."),

@@ -33,9 +33,7 @@ _REMEDIES = {"dark": "raise the camera's black level", "bright": "give it less l
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
-    ],
+    output: options.LearnedCalibration,
     dark: Annotated[
         list[Path] | None,
         typer.Option(

@@ -26,9 +26,7 @@ _SHOTS = 8
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
-    ],
+    output: options.LearnedCalibration,
     board: BoardText,
     pictures: Annotated[
         list[Path] | None,

@@ -26,10 +26,8 @@ _ANGLES = ("tilt", "phase_offset", "major_axis", "centre_x", "centre_y")
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
-    ],
-    ball: Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")],
+    output: options.LearnedCalibration,
+    ball: options.Ball,
     balls: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC.h5...", help="Axial recordings of the ball, at one place or more."),

@@ -33,7 +33,7 @@ def command(
         Path,
         typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration to add to; it has references."),
     ],
-    ball: Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")],
+    ball: options.Ball,
     presses: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC.h5...", help="Axial recordings of one ball at five places or more."),

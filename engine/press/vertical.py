@@ -13,7 +13,6 @@ from mirrorskin.engine.bands import MEMORY_LIMIT
 from mirrorskin.engine.calibrated import gel_of
 from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.press.changepoint import ChangePointSearch
-from mirrorskin.engine.press.elastic import correct_press
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.engine.press.search import Event, Onset
@@ -150,6 +149,8 @@ def finish_press(
     result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
     done: dict[str, ProcessValue] = {"fill": "none: not asked"}
     if isinstance(source, Calibrated):
+        from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
+
         result, done["gel"] = correct_press(result, source, travel, threshold, gel_of(source))
     if fill:
         result, done["fill"] = _fill_press(result, source, travel, event)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from mirrorskin.engine.feed import Progress, feed
+from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.first_turn import FirstTurn
@@ -77,7 +78,8 @@ class Run:
         """
         response = first_response(wall, self.source, self.header)
         if heights is not None:
-            how, stand = "given", _filled(check_heights(heights, self.source.shape[1:]))
+            known = check_heights(heights, self.source.shape[1:])
+            how, stand = "given", with_nearest(known).astype(np.float64)
         elif self.source.rewindable:
             how, stand = "found in the first turn", self._stand(response)
         else:
@@ -159,14 +161,6 @@ class Run:
             white = white if self.noise is not None else white / frames.noise_gain
             normals = _mend(normals, frames.noise_gain, given=self.noise is not None)
         return Found(normals, white, edges)
-
-
-def _filled(heights: NDArray[np.float32]) -> Doubles:
-    """Return heights that are known everywhere: the nearest ones."""
-    places = ndimage.distance_transform_edt(
-        ~np.isfinite(heights), return_distances=False, return_indices=True
-    )
-    return np.asarray(heights[tuple(places)], np.float64)
 
 
 def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:

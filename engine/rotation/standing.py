@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.rotation.phases import Doubles
 from mirrorskin.kernels.device import Device
 
@@ -85,9 +86,8 @@ def standing_heights(
     piece = np.where(inside, surface.component, -1)
     tops = ndimage.maximum(surface.height, piece, np.arange(surface.component.max() + 1))
     heights = np.where(piece >= 0, surface.height - np.asarray(tops)[piece], np.nan)
-    nearest = ndimage.distance_transform_edt(piece < 0, return_distances=False, return_indices=True)
     places = np.meshgrid(*((np.arange(length) + 0.5) / step - 0.5 for length in shape), indexing="ij")
-    found = ndimage.map_coordinates(heights[tuple(nearest)], places, order=1, mode="nearest")
+    found = ndimage.map_coordinates(with_nearest(heights), places, order=1, mode="nearest")
     return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))
 
 

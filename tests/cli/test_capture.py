@@ -4,10 +4,9 @@ import re
 
 import pytest
 from commands import run
+from served_rig import served_rig
 
 from mirrorskin import io
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.rig import rig as rigs
 
 SHAPE = (24, 32)
@@ -16,19 +15,8 @@ SHAPE = (24, 32)
 @pytest.fixture(scope="module")
 def emulated(tmp_path_factory):
     """The rig's file; its emulators run as long as the tests of this module."""
-    folder = tmp_path_factory.mktemp("rig")
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        EmulatedRig(shape=SHAPE, pixel_size=0.2, rate=40.0, delay=0.02) as rig,
-        rig.serve() as server,
-    ):
-        # Emulators are late where other programs have the processors; that is no fault here.
-        patch.setattr(rigs, "_STALL", 5.0)
-        patch.setattr(Link, "_limit", lambda link: 5.0)
-        file = rig.write(folder, server.url)
-        text = file.read_text().replace("[camera]", "[camera]\ndelay = 0.02\ndark = 16")
-        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
-        yield rig, file
+    with served_rig(tmp_path_factory.mktemp("rig"), SHAPE, rate=40.0, delay=0.02) as served:
+        yield served
 
 
 def capture(emulated, *words):

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from commands import run
 from reference_frames import expose, source
+from served_rig import served_rig
 from stacks import record
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import taking
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 
@@ -23,19 +22,8 @@ SHAPE = (12, 16)
 @pytest.fixture(scope="module")
 def rig_file(tmp_path_factory):
     """The rig's file; its emulators run as long as the tests of this module."""
-    folder = tmp_path_factory.mktemp("rig")
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        EmulatedRig(shape=SHAPE, pixel_size=0.2, rate=60.0, delay=0.01) as rig,
-        rig.serve() as server,
-    ):
-        # Emulators are late where other programs have the processors; that is no fault here.
-        patch.setattr(rigs, "_STALL", 5.0)
-        patch.setattr(Link, "_limit", lambda link: 5.0)
-        file = rig.write(folder, server.url)
-        text = file.read_text().replace("[camera]", "[camera]\ndelay = 0.01\ndark = 16")
-        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
-        yield file
+    with served_rig(tmp_path_factory.mktemp("rig"), SHAPE, rate=60.0, delay=0.01) as served:
+        yield served[1]
 
 
 @pytest.fixture

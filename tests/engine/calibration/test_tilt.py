@@ -30,7 +30,7 @@ def precession(**known):
     return replace(usual, **known)
 
 
-def scale_of(body, shape=SHAPE):
+def scale_of(body, shape=SHAPE, camera=None):
     twin = Twin(
         object=Ball(1.0),
         shape=shape,
@@ -38,6 +38,7 @@ def scale_of(body, shape=SHAPE):
         movement=Axial([0.0], 0.04, 0.1),
         pattern="linear",
         body=body,
+        camera=camera,
     )
     return LinearShown.of_header(twin.header, shape)
 
@@ -263,16 +264,8 @@ def test_a_ball_is_placed_within_its_errors_whatever_its_pixels_gains():
     truth = precession()
     camera = Camera(noise=1.5, seed=9, gain_deviation=0.05, offset_deviation=1.0)
     turn = ball_turn(truth, 0.31, -0.17, camera=camera)
-    twin = Twin(
-        object=Ball(1.0),
-        shape=SHAPE,
-        pixel_size=0.1,
-        movement=Axial([0.0], 0.04, 0.1),
-        pattern="linear",
-        camera=camera,
-    )
 
-    seen = track_ball(turn, LinearShown.of_header(twin.header, SHAPE))
+    seen = track_ball(turn, scale_of(None, camera=camera))
 
     error = seen.centres - moved((0.31, -0.17, DEPTH - RADIUS), truth.lean(EIGHTHS), truth.pivot)
     assert (seen.sigma[:, :2] < 2e-3).all()

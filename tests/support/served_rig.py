@@ -1,0 +1,32 @@
+"""An emulated rig behind its file, for tests of commands: emulators that may be late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.grbl.link import Link
+from mirrorskin.hw.rig import rig as rigs
+
+
+@contextmanager
+def served_rig(
+    folder: Path, shape: tuple[int, int], rate: float, delay: float
+) -> Iterator[tuple[EmulatedRig, Path]]:
+    """Run the emulators, and give them and the rig's file."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        EmulatedRig(shape=shape, pixel_size=0.2, rate=rate, delay=delay) as rig,
+        rig.serve() as server,
+    ):
+        # Emulators are late where other programs have the processors; that is no fault here.
+        patch.setattr(rigs, "_STALL", 5.0)
+        patch.setattr(Link, "_limit", lambda link: 5.0)
+        file = rig.write(folder, server.url)
+        text = file.read_text().replace("[camera]", f"[camera]\ndelay = {delay}\ndark = 16")
+        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
+        yield rig, file
