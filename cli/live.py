@@ -205,7 +205,7 @@ def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterat
 
 def _estimator(source: LiveSource, plan: Plan, rate: float, asked: _Wanted) -> LivePress | LiveRotation:
     """Make what tells the maps; the source has its references."""
-    from mirrorskin.engine.live import LivePress, LiveRotation
+    from mirrorskin.engine.live import LivePress, LiveRotation, choose_window
     from mirrorskin.hw.rig.plans import VerticalPlan
 
     if isinstance(plan, VerticalPlan):
@@ -214,34 +214,8 @@ def _estimator(source: LiveSource, plan: Plan, rate: float, asked: _Wanted) -> L
         return LivePress(
             source, threshold=threshold, hold=_HOLD if asked.hold is None else asked.hold, **known
         )
-    window, every = _window(plan, rate, asked)
+    window, every = choose_window(plan.frames_a_turn(rate, asked.frames or 1), asked.window)
     return LiveRotation(source, window=window, every=every, noise=asked.noise, device=asked.device)
-
-
-def _window(plan: Plan, rate: float, asked: _Wanted) -> tuple[int, int]:
-    """Return how many frames are a turn, and which so-manieth is to be used."""
-    import math
-
-    from mirrorskin.engine.live import choose_window
-    from mirrorskin.hw.rig.plans import VerticalPlan
-    from mirrorskin.io import InputError
-
-    assert not isinstance(plan, VerticalPlan)
-    if plan.phase_step is not None:
-        turn = math.tau / plan.phase_step * (asked.frames or 1)
-    else:
-        turn = rate / (plan.rate or math.inf)
-        if not math.isfinite(turn) or turn <= 0:
-            raise InputError(
-                "nobody knows how many frames a turn has: give the camera's rate in the rig file"
-            )
-    turn *= min(1.0, plan.turns)
-    window, every = choose_window(turn)
-    if asked.window is None:
-        return window, every
-    if asked.window > round(turn):
-        raise InputError(f"--window {asked.window}: a turn has {round(turn)} frames only: leave it out")
-    return asked.window, max(1, int(round(turn) // asked.window))  # within one turn
 
 
 def _save(live: _Live, output: Path | None, settings: RigSettings, asked: _Wanted) -> None:

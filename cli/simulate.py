@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mirrorskin.cli import options
+from mirrorskin.cli import options, sensor
 from mirrorskin.cli.movements import DEFAULTS, FRAMES_MAX
 
 
@@ -18,20 +18,6 @@ class FrameType(StrEnum):
     uint8 = "uint8"
     uint16 = "uint16"
     float32 = "float32"
-
-
-class ContactName(StrEnum):
-    """How the sheet lies on the object."""
-
-    conform = "conform"
-    elastic = "elastic"
-
-
-class OpticsName(StrEnum):
-    """How the light of a slope is found."""
-
-    ideal = "ideal"
-    cylinder = "cylinder"
 
 
 class ReferenceName(StrEnum):
@@ -62,8 +48,8 @@ def command(
             " heights in NPY, PNG or TIFF, or a mesh in STL, PLY or OBJ.",
         ),
     ] = "sphere",
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "480x480",
-    pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.025mm",
+    size: sensor.Size = "480x480",
+    pixel_size: sensor.PixelSize = "0.025mm",
     frames: Annotated[
         int | None,
         typer.Option(
@@ -105,12 +91,8 @@ def command(
     twist_step: Annotated[
         str | None, _of(_TWIST, "twist-step", "ANGLE", "Twist: from frame to frame.")
     ] = None,
-    contact: Annotated[
-        ContactName, typer.Option(help="The sheet takes the object's shape (eq. 1), or resists.")
-    ] = ContactName.conform,
-    optics: Annotated[
-        OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")
-    ] = OpticsName.ideal,
+    contact: sensor.Contact = sensor.ContactName.conform,
+    optics: sensor.Optics = sensor.OpticsName.ideal,
     pattern: Annotated[
         str, typer.Option(metavar="NAME", help="Of the wall: uniform, linear in the zenith, or a picture.")
     ] = "uniform",

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from mirrorskin.cli import options
-from mirrorskin.cli.simulate import ContactName, OpticsName
+from mirrorskin.cli import options, sensor
+from mirrorskin.cli.groups import Group
 
 _LOOK = 0.2  # seconds from one look whether all is well to the next
 _PRESS = "vertical --stop 1.5mm --speed 0.5mm/s"
 _TURN = "axial --press 1mm --rate 0.5"  # which needs the zenith's scale
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(cls=Group, no_args_is_help=True)
 
 
 @app.callback()
@@ -32,20 +32,16 @@ def serve(
         str,
         typer.Option("--object", metavar="NAME", help="What to press on, as in 'mirrorskin simulate'."),
     ] = "sphere",
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")] = "320x240",
-    pixel_size: Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")] = "0.04mm",
+    size: sensor.Size = "320x240",
+    pixel_size: sensor.PixelSize = "0.04mm",
     pattern: Annotated[
         str,
         typer.Option(
             metavar="NAME", help="Of the wall: uniform, for presses; linear, for rotations; or a picture."
         ),
     ] = "uniform",
-    contact: Annotated[
-        ContactName, typer.Option(help="The sheet takes the object's shape (eq. 1), or resists.")
-    ] = ContactName.conform,
-    optics: Annotated[
-        OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")
-    ] = OpticsName.ideal,
+    contact: sensor.Contact = sensor.ContactName.conform,
+    optics: sensor.Optics = sensor.OpticsName.ideal,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 20.0,
     delay: Annotated[
         str, typer.Option(metavar="TIME", help="From a frame's exposure to its sending.")

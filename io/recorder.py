@@ -16,10 +16,10 @@ from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.layout import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import SERIES, TRUTH, TRUTH_UNITS
+from mirrorskin.io.passing import Passing
 from mirrorskin.io.types import Block, Floats, InputError, Source, Truth
 from mirrorskin.io.writing import (
     Compression,
-    check_compression,
     new_group,
     new_stack,
     packing,
@@ -32,7 +32,7 @@ from mirrorskin.io.writing import (
 _BLOCK = 64_000_000
 
 
-class Recorder:
+class Recorder(Passing[Source]):
     """Pass on the frames of a source, and write them to a recording as they go by.
 
     The recording appears under its name when the recorder is left without an error.
@@ -54,8 +54,6 @@ class Recorder:
         The source's; what was recorded cannot be read again.
     """
 
-    rewindable = False
-
     def __init__(
         self,
         source: Source,
@@ -64,17 +62,11 @@ class Recorder:
         truth: Truth | Callable[[], Truth] | None = None,
         calibration: Calibration | None = None,
     ) -> None:
-        check_compression(compression)
-        self.source = source
-        self.path = Path(path)
-        self.name, self.header, self.motion = source.name, source.header, source.motion
-        self.shape, self.dtype = source.shape, source.dtype
-        self._compression = compression
+        super().__init__(source, path, compression, calibration)
+        self.header, self.shape, self.dtype = source.header, source.shape, source.dtype
         self._truth = truth
-        self._calibration = calibration
         self._count = 0
         self._series: dict[str, Floats] = {}
-        self._exit = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
@@ -89,11 +81,6 @@ class Recorder:
             self._frames = new_stack(self._new.root, self.shape, self.dtype, **storage)
             self._exit = opening.pop_all()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self._exit.__exit__(kind, error, trace)
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the source's next frames and write them; see ``Source.read``.
@@ -116,10 +103,6 @@ class Recorder:
                     self._series.setdefault(name, room)[part] = values
             self._new.check()
         return block
-
-    def rewind(self) -> None:
-        """Refuse: what was written stays written."""
-        raise RuntimeError("a recorder cannot be rewound")
 
     def drain(self, progress: Callable[[int], None]) -> None:
         """Write all frames, for their recording alone; ``progress`` is told how many there are so far."""

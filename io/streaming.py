@@ -20,9 +20,10 @@ from mirrorskin.io.atomic import MAKE_ROOM, check_output, new_file
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.growing import GrowingRecording
 from mirrorskin.io.layout import COMPLETE, CUT_SHORT
+from mirrorskin.io.passing import Passing
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource
-from mirrorskin.io.writing import Compression, check_compression
+from mirrorskin.io.writing import Compression
 
 _LOOK = 0.5  # seconds from one look whether the program is still there to the next
 _BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
@@ -44,7 +45,7 @@ class _End:
     state: str
 
 
-class StreamRecorder:
+class StreamRecorder(Passing[LiveSource]):
     """Pass on the frames of a live source at once, and write them to a recording behind its back.
 
     The recording appears under its name with the first frame, and an older file of that name is replaced
@@ -74,8 +75,6 @@ class StreamRecorder:
         Frames that were taken, and those of them that are in the file.
     """
 
-    rewindable = False
-
     def __init__(
         self,
         source: LiveSource,
@@ -84,19 +83,13 @@ class StreamRecorder:
         period: float = 0.5,
         calibration: Calibration | None = None,
     ) -> None:
-        check_compression(compression)
-        self.source = source
-        self.path = Path(path)
-        self.name, self.motion = source.name, source.motion
+        super().__init__(source, path, compression, calibration)
         self.count = self.written = 0
-        self._compression: Compression = compression
         self._period = period
-        self._calibration = calibration
         self._queue: queue.SimpleQueue[Block | _Mark | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
         self._writer = threading.Thread(target=self._write, name="recorder")
-        self._exit = ExitStack()
 
     @property
     def header(self) -> Header:
@@ -122,11 +115,6 @@ class StreamRecorder:
             self._exit = opening.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self._exit.__exit__(kind, error, trace)
-
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the source's next frames, and hand them to the thread that writes them.
 
@@ -141,10 +129,6 @@ class StreamRecorder:
         if block is not None:
             self._hand_over(block)
         return block
-
-    def rewind(self) -> None:
-        """Refuse: what was written stays written."""
-        raise RuntimeError("a recorder cannot be rewound")
 
     def now(self) -> float:
         """Return the source's time."""

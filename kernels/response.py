@@ -114,6 +114,27 @@ def light_slopes(
     return np.asarray(np.moveaxis(-2 * (facing * by_ray + pull * ray.sight), 0, -1))
 
 
+def reflect(sight: Doubles, normal: Doubles) -> Doubles:
+    """Return where lines of sight go from mirrors: r of unit vectors s and n, each (3, ...)."""
+    return np.asarray(sight - 2 * (sight * normal).sum(axis=0) * normal)
+
+
+def way_to_wall(along: Doubles, across: Doubles, room: Doubles) -> tuple[Doubles, Doubles]:
+    """Return how far it is to the wall, and the ray's cosine to the wall's normal times the radius.
+
+    Parameters
+    ----------
+    along : ndarray
+        A: the place times the ray, across the axis, mm.
+    across : ndarray
+        The square of the ray's part across the axis.
+    room : ndarray
+        What is left to the wall: the radius squared less the place squared, mm^2.
+    """
+    cosine = np.sqrt(along**2 + across * room)
+    return room / (along + cosine), cosine
+
+
 def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> _Ray:
     """Follow lines of sight by way of mirrors to the wall."""
     x, y, z, slope_x, slope_y = np.asarray(place, np.float64)
@@ -121,11 +142,10 @@ def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> _Ray:
     x, y = x + z * slope_x, y + z * slope_y
     sight = np.stack([-slope_x, -slope_y, -np.ones_like(slope_x)]) / np.sqrt(slope_x**2 + slope_y**2 + 1)
     sight = np.broadcast_to(sight.reshape(3, -1, x.shape[-1]), normal.shape)
-    ray = sight - 2 * (sight * normal).sum(axis=0) * normal
+    ray = reflect(sight, normal)
     room, along = radius**2 - x**2 - y**2, x * ray[0] + y * ray[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.sqrt(along**2 + (ray[0] ** 2 + ray[1] ** 2) * room)
-        way = room / (along + cosine)
+        way, cosine = way_to_wall(along, ray[0] ** 2 + ray[1] ** 2, room)
         at, height = np.stack([x + way * ray[0], y + way * ray[1]]), z + way * ray[2]
         return _Ray(sight, ray, at, cosine, way, height, height / (radius + np.hypot(height, radius)))
 

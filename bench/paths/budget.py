@@ -35,23 +35,8 @@ _MAPS = 64  # bytes a pixel for all maps
 
 
 @dataclass(frozen=True, slots=True)
-class BudgetCase:
-    """A press in files of several kinds, ten times as large as the memory that is given.
-
-    Attributes
-    ----------
-    name : str
-    shape : (int, int, int)
-        Frames, rows and columns, of uint8.
-    """
-
-    name: str
-    shape: tuple[int, int, int]
-
-    @property
-    def bytes(self) -> int:
-        """Of the frames."""
-        return math.prod(self.shape)
+class BudgetCase(files.FileCase):
+    """A press in files of several kinds, ten times as large as the memory that is given."""
 
     @property
     def budget(self) -> int:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,26 @@ _PAGE = 4096
 _SPARE = 64  # bytes behind the frames, so that a kernel may load its last word whole
 _TRIES, _WAIT = 5, 0.2  # and seconds more from one to the next, for what a look begins to read
 _FAR = 2**25  # bytes from one look into the page cache to the next: a look may bring in what is near it
+
+
+@dataclass(frozen=True, slots=True)
+class FileCase:
+    """Frames in a file.
+
+    Attributes
+    ----------
+    name : str
+    shape : (int, int, int)
+        Frames, rows and columns, of uint8.
+    """
+
+    name: str
+    shape: tuple[int, int, int]
+
+    @property
+    def bytes(self) -> int:
+        """Of the frames."""
+        return math.prod(self.shape)
 
 
 class Frames(Closing):

@@ -33,23 +33,8 @@ _MAPS = 64  # bytes a pixel for all maps
 
 
 @dataclass(frozen=True, slots=True)
-class LabCase:
-    """A press in a file, contiguous, and heights by equation 4 of it.
-
-    Attributes
-    ----------
-    name : str
-    shape : (int, int, int)
-        Frames, rows and columns, of uint8.
-    """
-
-    name: str
-    shape: tuple[int, int, int]
-
-    @property
-    def bytes(self) -> int:
-        """Of the frames."""
-        return math.prod(self.shape)
+class LabCase(files.FileCase):
+    """A press in a file, contiguous, and heights by equation 4 of it."""
 
     @property
     def title(self) -> str:

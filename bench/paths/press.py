@@ -38,26 +38,16 @@ _MAPS = 64  # bytes a pixel for all maps
 
 
 @dataclass(frozen=True, slots=True)
-class PressCase:
+class PressCase(files.FileCase):
     """A press in a file.
 
     Attributes
     ----------
-    name : str
-    shape : (int, int, int)
-        Frames, rows and columns, of uint8.
     compression : {"raw", "bitshuffle"}
         Raw frames lie in one piece, others in one chunk a frame.
     """
 
-    name: str
-    shape: tuple[int, int, int]
     compression: Literal["raw", "bitshuffle"] = "raw"
-
-    @property
-    def bytes(self) -> int:
-        """Of the frames."""
-        return math.prod(self.shape)
 
     @property
     def title(self) -> str:

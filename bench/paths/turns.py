@@ -38,27 +38,17 @@ _MAPS = 128  # bytes a pixel for all maps
 
 
 @dataclass(frozen=True, slots=True)
-class TurnsCase:
-    """Many turns in a file, contiguous.
+class TurnsCase(files.FileCase):
+    """Whole turns, many of them, in a file, contiguous.
 
     Attributes
     ----------
-    name : str
-    shape : (int, int, int)
-        Frames, whole turns of them, rows and columns, of uint8.
     wanted : {"normals", "wave"}
         What is reconstructed: normals by the exact method, as with a zenith gain, or the wave of the
         brightness, as without one.
     """
 
-    name: str
-    shape: tuple[int, int, int]
     wanted: Literal["normals", "wave"]
-
-    @property
-    def bytes(self) -> int:
-        """Of the frames."""
-        return math.prod(self.shape)
 
     @property
     def title(self) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import typer
 
 from mirrorskin.cli.calibrate import board, check, elastic, references, scale, show, tilt, zenith
+from mirrorskin.cli.groups import Group
 
 app = typer.Typer(
+    cls=Group,
     help="Find out what a sensor's counts and pixels mean; docs/calibration.md tells in which order.",
     no_args_is_help=True,
 )

@@ -16,7 +16,8 @@ from mirrorskin.cli.calibrate import taking
 from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.calibration.elastic import BallOnset, LearnedGel
+    from mirrorskin.engine.calibration.ball.onset import BallOnset
+    from mirrorskin.engine.calibration.elastic import LearnedGel
     from mirrorskin.io import Calibration, ProcessValue, Source
 
 _STEP, _PRESS = "0.03mm", "1.2mm"
@@ -96,7 +97,7 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
     """Find when the ball turned pixels light, by the references that are known so far."""
     from mirrorskin import engine, io
     from mirrorskin.cli.progress import progress
-    from mirrorskin.engine.calibration.elastic import ball_onset
+    from mirrorskin.engine.calibration.ball.onset import ball_onset
     from mirrorskin.engine.press.elastic import LEARNED_AT
 
     if source.motion != "vertical":

@@ -113,6 +113,23 @@ class Check:
                     rows.append([name, when, *_words(parts[name])])
         return rows
 
+    def notes(self) -> list[str]:
+        """Say why the table has no number, where it has none."""
+        parts = {
+            name: [when[name] for when in (self.before, self.after) if name in when] for name in self.after
+        }
+        untold = [name for name, each in parts.items() if all(math.isnan(one.expected) for one in each)]
+        few = [name for name, each in parts.items() if any(np.isnan(one.cells.rms).all() for one in each)]
+        notes = []
+        if untold:
+            notes.append(f"expected: a result tells no errors of {' and '.join(untold)} alone")
+        if few:
+            notes.append(
+                f"worst cell's rms: no cell has {_FEWEST} pixels of {' and '.join(few)} that could be judged:"
+                " take fewer cells, or press deeper"
+            )
+        return notes
+
 
 def check_ball(
     source: Source,

@@ -114,7 +114,7 @@ class SurfaceSolver:
         same = self._is_same(inputs, flags)
         relief = self._find(inputs, wish, start, same)
         if not relief.converged and wish.deadline is None:
-            raise NotConverged(_explain(relief, wish.tolerance))
+            raise NotConverged(explain(relief.iterations, relief.residual, wish.tolerance))
         begun = time.perf_counter()
         surface = self._finish(inputs, wish, relief, same)
         self._rest = time.perf_counter() - begun
@@ -243,8 +243,9 @@ class SurfaceSolver:
         return find_sigma(inputs, room, self._settler, solve, links, misfit)
 
 
-def _explain(relief: _Relief, tolerance: float | None) -> str:
+def explain(iterations: int, residual: float, tolerance: float | None) -> str:
+    """Say why a surface is not told, where so many iterations did not get as near as was asked for."""
     asked = "" if tolerance is None else f", more than {tolerance:.2g}"
-    reached = f"{relief.iterations} iterations left a residual of {relief.residual:.2g}{asked}"
+    reached = f"{iterations} iterations left a residual of {residual:.2g}{asked}"
     remedy = "give engine.integrate a larger tolerance, or None to take it as it is"
     return f"the surface did not converge: {reached}; {remedy}"

@@ -22,6 +22,7 @@ from mirrorskin.engine.rotation.correlation import Correlation, Correlator
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.launch import NormalMethod
 from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.options import options_of
 from mirrorskin.engine.rotation.relief import find_relief
 from mirrorskin.engine.rotation.relief_maps import SlopeMaps
 from mirrorskin.engine.rotation.response import first_response, response_of
@@ -38,22 +39,28 @@ _NO_GAIN = "none: the source has no zenith gain"
 _NO_PIXEL_SIZE = "none: the source has no pixel size"
 
 
-def choose_window(frames_a_turn: float) -> tuple[int, int]:
+def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int, int]:
     """Return how many frames a window should have for one turn, and which so-manieth frame should be used.
 
     Parameters
     ----------
     frames_a_turn : float
+    window : int, optional
+        How many are wanted; by default as many as there are, up to 64.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Fewer than three, from which no wave can be told.
+        A turn has fewer than three, from which no wave can be told, or fewer than are wanted.
     """
     if not _FEWEST <= frames_a_turn < math.inf:
         raise InputError(f"{frames_a_turn:g} frames a turn: at least 3 are needed; turn more slowly")
-    every = math.ceil(round(frames_a_turn) / LONGEST)
-    return max(_FEWEST, round(frames_a_turn / every)), every
+    if window is None:
+        every = math.ceil(round(frames_a_turn) / LONGEST)
+        return max(_FEWEST, round(frames_a_turn / every)), every
+    if window > round(frames_a_turn):
+        raise InputError(f"--window {window}: a turn has {round(frames_a_turn)} frames only: leave it out")
+    return window, max(1, round(frames_a_turn) // window)  # within one turn
 
 
 class LiveRotation:
@@ -125,15 +132,7 @@ class LiveRotation:
                 shape,
                 source.dtype,
                 window=window,
-                tilt=header.tilt,
-                gain=header.zenith_gain,
-                offset=0.0 if header.zenith_offset is None else header.zenith_offset,
-                method=method,
-                noise=noise,
-                low=header.dark,
-                high=header.bright,
-                response=self._response,
-                device=device,
+                **options_of(header, method, noise, self._response, device),
             )
             self.device = self._normals.device
         known = self._normals is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -13,22 +13,14 @@ from mirrorskin.engine.bands import MEMORY_LIMIT, Band, cut_into_bands
 from mirrorskin.engine.noise import thin_out, thinning
 from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.fits import TurnFit, fit_of
-from mirrorskin.engine.rotation.launch import (
-    MAPS,
-    NORMAL_METHODS,
-    NormalLaunch,
-    NormalMethod,
-    Samples,
-    settle,
-)
+from mirrorskin.engine.rotation.launch import MAPS, NormalMethod, Samples, settle
+from mirrorskin.engine.rotation.options import NormalOptions, set_up
 from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
 from mirrorskin.engine.rotation.response import Response
-from mirrorskin.engine.rotation.scale import make_scale
-from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
-from mirrorskin.engine.samples import check_dtype, check_frames
+from mirrorskin.engine.samples import check_frames
 from mirrorskin.io import Block, InputError, check_phase
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Device
 
 
 @dataclass(frozen=True)
@@ -192,30 +184,15 @@ class NormalEstimator:
         shape: tuple[int, int],
         dtype: DTypeLike,
         *,
-        tilt: float | None,
-        gain: ArrayLike | None = None,
-        offset: ArrayLike = 0.0,
-        method: NormalMethod = "exact",
-        noise: float | None = None,
-        low: ArrayLike | None = None,
-        high: ArrayLike | None = None,
-        response: Response | None = None,
         longest: int = LONGEST,
         per_turn: bool = False,
-        device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
+        **options: Unpack[NormalOptions],
     ) -> None:
-        self._dtype = np.dtype(dtype)
-        check_dtype(self._dtype)
-        if method not in NORMAL_METHODS:
-            raise InputError(f"unknown method {method!r}; known are {', '.join(NORMAL_METHODS)}")
-        self._given_tilt = None if tilt is None else check_tilt(tilt)
-        self._scale = response or make_scale(gain, offset, low, high, shape)
-        self._shape = shape
-        self._given_noise = None if noise is None else even_noise(noise)
+        self._shape, self._dtype = shape, np.dtype(dtype)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn
-        self.device = open_device(device)
-        self._launch = NormalLaunch(self.device, self._dtype, self._scale, method)
+        self._setup = set_up(shape, self._dtype, **options)
+        self.device, self._launch = self._setup.device, self._setup.launch
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(
             self.device, shape, self._dtype, self._launch.planes, length, self._longest + 1
@@ -230,7 +207,7 @@ class NormalEstimator:
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another rotation of the same sensor."""
-        self._tilt, self._noise = self._given_tilt, self._given_noise
+        self._tilt, self._noise = self._setup.tilt, self._setup.noise
         self._phase, self._weights = np.empty(0), np.empty(0)
         self._turns = self._frames = 0
         self._each: list[list[NDArray[Any]]] = []
@@ -364,7 +341,7 @@ class NormalEstimator:
     def _settle(self, turn: slice, matrix: Doubles) -> None:
         """Tell from a turn what was not given: the noise, and the tilt."""
         samples = self._buffer[turn].reshape(turn.stop - turn.start, -1)[:, :: thinning(self._shape)]
-        known = self._phase[turn], self._weights[turn], matrix, self._scale, self._noise, self._tilt
+        known = self._phase[turn], self._weights[turn], matrix, self._setup.scale, self._noise, self._tilt
         self._noise, self._tilt = settle(samples, self._shape, *known)
 
     def _maps(self) -> list[NDArray[Any]]:
@@ -380,13 +357,6 @@ class NormalEstimator:
             vectors, *others = (band.hand_over(name).reshape(-1) for name in MAPS)
         flat = [one[: band.pixels].reshape(rows) for one in others]
         return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
-
-
-def even_noise(noise: float) -> CountNoise:
-    """Return the noise of samples that all have the same, of a standard deviation in counts."""
-    if not 0 < noise < np.inf:
-        raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
-    return CountNoise(noise**2, 0.0, noise**2)
 
 
 def tell_normals(

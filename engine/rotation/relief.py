@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,13 +11,15 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.integration.solver import explain
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
 from mirrorskin.io import ProcessValue
 from mirrorskin.kernels.device import Device
 
-_ENOUGH = 1e-4  # residual that will do where the solver's own tolerance is not met
+_ENOUGH = 1e-4  # residual that will do where that is not met, of many small facets: normals err far more
+_FOREVER = 1e9  # seconds: with a budget, what was reached is returned
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,20 +105,19 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
     """Return the surface of one picture; one of no pixels, where there is no normal to begin with."""
     if not slopes.known.any():
         return _nothing(slopes.known.shape)
-    solve = functools.partial(
-        integrate,
+    surface = integrate(
         slopes.dz_dx,
         slopes.dz_dy,
         pixel_size,
         mask=slopes.known,
         weights=slopes.weights,
         robust=robust,
+        budget=_FOREVER,
         device=device,
     )
-    try:
-        return solve()
-    except NotConverged:  # of many small facets, by a little; the normals' noise is far more
-        return solve(tolerance=_ENOUGH)
+    if not (surface.converged or surface.residual <= _ENOUGH):
+        raise NotConverged(explain(surface.iterations, surface.residual, _ENOUGH))
+    return surface
 
 
 def _nothing(shape: tuple[int, ...]) -> Surface:

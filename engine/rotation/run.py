@@ -16,6 +16,7 @@ from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.first_turn import FirstTurn
 from mirrorskin.engine.rotation.launch import NormalMethod
 from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
+from mirrorskin.engine.rotation.options import options_of
 from mirrorskin.engine.rotation.phases import Doubles
 from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, first_response
@@ -131,24 +132,15 @@ class Run:
         self, frames: Source, response: Response | None, per_turn: bool, progress: Progress | None
     ) -> Normals:
         """Feed the frames through an estimator."""
-        header, size = self.header, 2 * math.prod(frames.shape) * frames.dtype.itemsize
-        offset = 0.0 if header.zenith_offset is None else header.zenith_offset
+        size = math.prod(frames.shape) * frames.dtype.itemsize
         with naming(self.source):
             estimator = NormalEstimator(
                 frames.shape[1:],
                 frames.dtype,
-                tilt=header.tilt,
-                gain=header.zenith_gain,
-                offset=offset,
-                method=self.method,
-                noise=self.noise,
-                low=header.dark,
-                high=header.bright,
-                response=response,
                 longest=_longest_turn(frames),
                 per_turn=per_turn,
-                device=self.device,
-                memory_limit=min(self.memory_limit, size),
+                memory_limit=min(self.memory_limit, 2 * size),
+                **options_of(self.header, self.method, self.noise, response, self.device),
             )
             feed(frames, estimator, range(frames.shape[0]), progress)
             return estimator.result()

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.bands import Band
 from mirrorskin.engine.noise import thinning
 from mirrorskin.engine.rotation.correlation import Correlation, tell_wave
 from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.fits import TurnFit, fit_of
-from mirrorskin.engine.rotation.launch import MAPS, NormalLaunch, NormalMethod, Samples, settle
-from mirrorskin.engine.rotation.normals import Normals, even_noise, tell_normals
+from mirrorskin.engine.rotation.launch import MAPS, Samples, settle
+from mirrorskin.engine.rotation.normals import Normals, tell_normals
+from mirrorskin.engine.rotation.options import NormalOptions, set_up
 from mirrorskin.engine.rotation.phases import check_phases
-from mirrorskin.engine.rotation.response import Response
-from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.sums import WindowSums
-from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.samples import check_dtype, check_frames
+from mirrorskin.engine.samples import check_frames
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.correlation import WINDOW
-from mirrorskin.kernels.device import Device, open_device
 
 _ROOM = 16  # frames that may be pushed at once without a copy
 
@@ -65,26 +62,15 @@ class NormalWindow:
         dtype: DTypeLike,
         *,
         window: int,
-        tilt: float | None,
-        gain: ArrayLike | None = None,
-        offset: ArrayLike = 0.0,
-        method: NormalMethod = "exact",
-        noise: float | None = None,
-        low: ArrayLike | None = None,
-        high: ArrayLike | None = None,
-        response: Response | None = None,
-        device: str | Device | None = None,
+        **options: Unpack[NormalOptions],
     ) -> None:
         self._shape, self._dtype = shape, np.dtype(dtype)
-        check_dtype(self._dtype)
         if not 3 <= window <= WINDOW:
             raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
         self._window = window
-        self._tilt = self._given_tilt = None if tilt is None else check_tilt(tilt)
-        self._noise = self._given_noise = None if noise is None else even_noise(noise)
-        self._scale = response or make_scale(gain, offset, low, high, shape)
-        self.device = open_device(device)
-        self._launch = NormalLaunch(self.device, self._dtype, self._scale, method)
+        self._setup = set_up(shape, self._dtype, **options)
+        self._tilt, self._noise = self._setup.tilt, self._setup.noise
+        self.device, self._launch = self._setup.device, self._setup.launch
         beside = self._launch.planes
         self._sums = WindowSums(self.device, shape, self._dtype, _ROOM, window, beside)
         for band in self._sums.bands:
@@ -115,7 +101,7 @@ class NormalWindow:
     def reset(self) -> None:
         """Forget the frames so far, and what was told from them."""
         self._sums.reset()
-        self._tilt, self._noise, self.count = self._given_tilt, self._given_noise, 0
+        self._tilt, self._noise, self.count = self._setup.tilt, self._setup.noise, 0
 
     def push(self, block: Block) -> None:
         """Take in the next frames.
@@ -232,7 +218,7 @@ class NormalWindow:
         fit = self._fit()
         phase, weight = self._sums.seen()
         known: tuple[CountNoise | None, float | None] = self._noise, self._tilt
-        told = self._samples(), self._shape, phase, weight, fit.matrix, self._scale
+        told = self._samples(), self._shape, phase, weight, fit.matrix, self._setup.scale
         self._noise, self._tilt = settle(*told, *known)
 
     def _samples(self) -> NDArray[Any]:

@@ -224,6 +224,31 @@ class AxialPlan:
             raise ValueError("this plan has steps")
         return Trapezoid.planned(math.tau * self.turns, math.tau * self.rate)
 
+    def frames_a_turn(self, frame_rate: float, each: int = 1) -> float:
+        """Return how many frames a turn has, or what there is of the only one.
+
+        Parameters
+        ----------
+        frame_rate : float
+            Of the camera, Hz; in steps, it does not count.
+        each : int
+            Frames at each place, in steps.
+
+        Raises
+        ------
+        InputError
+            Without a halt the frame rate must be known.
+        """
+        if self.phase_step is not None:
+            turn = math.tau / self.phase_step * each
+        else:
+            turn = frame_rate / (self.rate or math.inf)
+            if not math.isfinite(turn) or turn <= 0:
+                raise InputError(
+                    "nobody knows how many frames a turn has: give the camera's rate in the rig file"
+                )
+        return turn * min(1.0, self.turns)
+
     def place(self, phase: float) -> Position:
         """Return where the body stands at a phase, radians."""
         return Position(self.press, self.tilt * math.cos(phase), self.tilt * math.sin(phase))

@@ -231,7 +231,21 @@ class Axial:
         return replace(block, phase=self.positions[_frames(block)])
 
 
-class Horizontal(_Upright):
+class _Pressed(_Upright):
+    """What movements share that go on at one depth."""
+
+    motion: Motion
+
+    def __init__(self, positions: Floats, name: str, press: float) -> None:
+        _check_frames(positions, name)
+        self.positions, self.deepest = positions, _check_press(press)
+
+    def header(self) -> Header:
+        """Tell motion and press."""
+        return Header(self.motion, press=self.deepest)
+
+
+class Horizontal(_Pressed):
     """Move the pressed body sideways.
 
     Parameters
@@ -250,26 +264,21 @@ class Horizontal(_Upright):
     motion: Motion = "horizontal"
 
     def __init__(self, displacement: ArrayLike, press: float) -> None:
-        self.positions = np.asarray(displacement, np.float64)
-        if self.positions.ndim != 2 or self.positions.shape[1] != 2:
-            raise InputError(f"displacement of shape {self.positions.shape} cannot be: give x and y a frame")
-        _check_frames(self.positions, "displacement")
-        self.deepest = _check_press(press)
+        positions = np.asarray(displacement, np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 2:
+            raise InputError(f"displacement of shape {positions.shape} cannot be: give x and y a frame")
+        super().__init__(positions, "displacement", press)
 
     def pose(self, place: Floats, /) -> Pose:
         """Move the body by x and y, mm: the object goes the other way in the picture."""
         return Pose(np.eye(3), np.array([-place[0], -place[1], self.deepest]))
-
-    def header(self) -> Header:
-        """Tell motion and press."""
-        return Header(self.motion, press=self.deepest)
 
     def mark(self, block: Block, /) -> Block:
         """Add the displacement."""
         return replace(block, displacement=self.positions[_frames(block)])
 
 
-class Twist(_Upright):
+class Twist(_Pressed):
     """Turn the pressed body about its axis.
 
     Parameters
@@ -288,19 +297,14 @@ class Twist(_Upright):
     motion: Motion = "twist"
 
     def __init__(self, twist: ArrayLike, press: float) -> None:
-        self.positions = np.asarray(twist, np.float64)
-        if self.positions.ndim != 1:
-            raise InputError(f"twist of shape {self.positions.shape} cannot be: give one angle a frame")
-        _check_frames(self.positions, "twist")
-        self.deepest = _check_press(press)
+        positions = np.asarray(twist, np.float64)
+        if positions.ndim != 1:
+            raise InputError(f"twist of shape {positions.shape} cannot be: give one angle a frame")
+        super().__init__(positions, "twist", press)
 
     def pose(self, place: Floats, /) -> Pose:
         """Turn the body by an angle: the object goes the other way in the picture."""
         return Pose(_about_z(-float(place)), np.array([0.0, 0.0, self.deepest]))
-
-    def header(self) -> Header:
-        """Tell motion and press."""
-        return Header(self.motion, press=self.deepest)
 
     def mark(self, block: Block, /) -> Block:
         """Add the twist."""

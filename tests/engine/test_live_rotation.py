@@ -187,6 +187,18 @@ def test_a_turn_of_too_few_frames_is_refused(turn):
         choose_window(turn)
 
 
+@pytest.mark.parametrize(
+    ("turn", "wanted", "every"), [(40, 24, 1), (40, 20, 2), (40, 8, 5), (39.6, 40, 1), (400, 64, 6)]
+)
+def test_a_window_that_is_wanted_is_spread_over_a_turn(turn, wanted, every):
+    assert choose_window(turn, wanted) == (wanted, every)
+
+
+def test_a_window_of_more_frames_than_a_turn_has_is_refused():
+    with pytest.raises(InputError, match="--window 41: a turn has 40 frames only"):
+        choose_window(40.2, 41)
+
+
 def test_a_press_and_a_step_of_none_are_refused():
     with pytest.raises(InputError, match="axial"):
         LiveRotation(paced(turn_frames(SHAPE), press_header(), PHASE), window=8)

@@ -190,3 +190,21 @@ def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
 def test_a_stage_that_does_not_lean_goes_round_in_no_way(way):
     with pytest.raises(InputError, match="tilt"):
         check_plan(AxialPlan(1.0, 0.04, **way), replace(STAGE, pitch=None, roll=None), "stage")
+
+
+@pytest.mark.parametrize("turns", [1.0, 3.0])
+def test_a_turn_in_steps_has_as_many_frames_as_it_has_places(turns):
+    plan = AxialPlan(1.0, 0.04, turns=turns, phase_step=math.tau / 8)
+    assert plan.frames_a_turn(math.nan) == pytest.approx(len(plan.values) / turns)
+    assert plan.frames_a_turn(math.nan, each=3) == pytest.approx(3 * len(plan.values) / turns)
+
+
+@pytest.mark.parametrize(("turns", "frames"), [(2.0, 40.0), (1.0, 40.0), (0.5, 20.0)])
+def test_a_turn_without_a_halt_has_as_many_frames_as_come_in_it(turns, frames):
+    assert AxialPlan(1.0, 0.04, turns=turns, rate=0.5).frames_a_turn(20.0) == pytest.approx(frames)
+
+
+@pytest.mark.parametrize("rate", [0.0, math.nan, math.inf])
+def test_how_many_frames_a_turn_has_needs_the_cameras_rate(rate):
+    with pytest.raises(InputError, match="give the camera's rate"):
+        AxialPlan(1.0, 0.04, rate=0.5).frames_a_turn(rate)

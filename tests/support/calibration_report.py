@@ -29,6 +29,7 @@ from calibration_scorer import Judge, Score, Surface
 
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import elastic, shown
+from mirrorskin.engine.calibration.ball.onset import ball_onset
 from mirrorskin.engine.calibration.references import measure as references
 from mirrorskin.engine.calibration.tilt import fit as tilt
 from mirrorskin.engine.calibration.tilt import turned
@@ -198,7 +199,7 @@ def rows_of_the_gel(cache: Path) -> Iterator[Row]:
     plain = io.Calibration(io.CameraId("", lab.shape, np.dtype("uint8")), taken)
     learned = lab.pressed(scorer.ball(BALL), TRAVEL, 1, COMPLIANCE)
     onset = engine.reconstruct(learned, calibration=plain, fill=False)
-    gel = elastic.fit_gel([elastic.ball_onset(onset, learned, BALL / 2)]).gel
+    gel = elastic.fit_gel([ball_onset(onset, learned, BALL / 2)]).gel
     x, y = scorer.pixel_grid(lab.shape, lab.pixel_size)
     for take, size in enumerate((6.0, 10.0), 2):
         press = lab.pressed(scorer.ball(size), TRAVEL, take, COMPLIANCE)

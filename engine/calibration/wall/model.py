@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.ball.scene import rotations
 from mirrorskin.engine.calibration.wall import curve
+from mirrorskin.kernels.response import reflect, way_to_wall
 
 Doubles = NDArray[np.float64]
 
@@ -128,11 +129,11 @@ def reach_wall(met: Met, named: Mapping[str, float]) -> Wall:
     to the wall's normal; straight up and down it is ``way da / (rx^2 + ry^2)`` across the axis.
     """
     radius = named["radius"]
-    ray = met.sight - 2 * (met.sight * met.normal).sum(axis=0) * met.normal
+    ray = reflect(met.sight, met.normal)
+    # A ray that goes straight up, and a place that a trial of the fit puts outside, have an answer, too.
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
-    along, room = met.x * ray[0] + met.y * ray[1], radius**2 - met.x**2 - met.y**2
-    cosine = np.sqrt(along**2 + out**2 * np.maximum(room, 1e-6))
-    way = np.maximum(room, 1e-6) / (along + cosine)
+    room = np.maximum(radius**2 - met.x**2 - met.y**2, 1e-6)
+    way, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, room)
     elevation = np.arctan2(ray[2], out)
     turn = named["scatter"] * np.sqrt(out**2 + (ray[2] * radius * out / cosine) ** 2)
     whole = np.arctan2(named["rim"], radius)

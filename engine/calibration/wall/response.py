@@ -73,22 +73,6 @@ def make_response(
     return _with_errors(response, fit, source, left)
 
 
-def values_of(response: WallResponse) -> dict[str, float]:
-    """Return the sensor's parameters of a response by name, but for the pivot and the phases."""
-    return {
-        "radius": response.radius,
-        "rim": response.rim,
-        "axis_x": response.axis[0],
-        "axis_y": response.axis[1],
-        "sight_0": response.sight[0],
-        "sight_2": response.sight[1],
-        "scatter": response.scatter / _MARGIN,
-        "lamp_x": response.lamps[0],
-        "lamp_y": response.lamps[1],
-        **{f"shade_{number}": float(value) for number, value in enumerate(response.shade)},
-    }
-
-
 def _with_errors(response: WallResponse, fit: WallFit, source: Source, left: float) -> WallResponse:
     """Add how far zenith and azimuth are off: in the middle of the reach, or where light begins.
 

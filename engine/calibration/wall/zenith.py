@@ -10,7 +10,7 @@ import numpy as np
 from mirrorskin.engine.calibration.wall import curve
 from mirrorskin.engine.calibration.wall.fit import Prior
 from mirrorskin.engine.calibration.wall.model import SENSOR
-from mirrorskin.engine.calibration.wall.response import make_response, values_of
+from mirrorskin.engine.calibration.wall.response import make_response
 from mirrorskin.engine.calibration.wall.samples import BallPress, Pivot, join, pivot_of, read_press
 from mirrorskin.engine.calibration.wall.touch import fit_touch
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
@@ -40,7 +40,6 @@ def fit_zenith(
     *,
     references: References | None = None,
     precession: Precession | None = None,
-    start: WallResponse | None = None,
     pattern: str = "graded",
     body: tuple[float, float] = (BODY_RADIUS, BODY_HEIGHT),
     progress: Callable[[int], None] | None = None,
@@ -65,8 +64,6 @@ def fit_zenith(
         Dark and bright; by default each recording's own.
     precession : Precession, optional
         The calibrated rotation; by default the tilt and the pivot that the recordings tell.
-    start : WallResponse, optional
-        A former calibration to begin with.
     pattern : {"graded", "uniform"}
         Whether the wall's brightness changes with its height.
     body : (float, float)
@@ -91,7 +88,7 @@ def fit_zenith(
         read.append(read_press(source, ball, references, precession, _SAMPLES // len(presses)))
         if progress:
             progress(number)
-    prior = _prior(read, pivot_of(presses[0], precession), start, pattern, body)
+    prior = _prior(read, pivot_of(presses[0], precession), pattern, body)
     touch = fit_touch(join(read, ball), read, prior)
     return make_response(touch.fit, touch.samples, touch.noise, pattern, presses[0])
 
@@ -99,7 +96,6 @@ def fit_zenith(
 def _prior(
     presses: Sequence[BallPress],
     pivot: Pivot,
-    start: WallResponse | None,
     pattern: str,
     body: tuple[float, float],
 ) -> Prior:
@@ -109,8 +105,6 @@ def _prior(
     for axis, *told in zip("xyz", pivot.place, pivot.sigma, strict=True):
         known[f"pivot_{axis}"] = told[0], told[1]
     known["phase_offset"] = (0.0, pivot.phase_sigma)
-    if start is not None:
-        known |= {name: (mean, known[name][1]) for name, mean in values_of(start).items()}
     mean, sigma = np.array([known[name] for name in SENSOR], np.float64).T
     centres = np.concatenate([press.centre for press in presses])
     steps = np.zeros(curve.COEFFICIENTS), np.full(curve.COEFFICIENTS, np.inf)

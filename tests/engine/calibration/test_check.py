@@ -61,6 +61,20 @@ def test_the_cells_add_up_to_the_whole(press):
     )
 
 
+def test_what_the_table_has_no_number_for_is_explained(press):
+    assert check_ball(press, calibration(), 10.0).notes() == []
+    fine = check_ball(press, calibration(), 10.0, cells=40)  # of 2 x 2 pixels
+    assert fine.table()[0][4] == "-"
+    (note,) = fine.notes()
+    assert "no cell has 20 pixels of height" in note
+    (height,) = fine.after.values()
+    bare = replace(height, expected=math.nan)
+    maps = {"zenith": bare, "azimuth": bare, "normal": height}
+    found = replace(fine, after=maps, before=maps | {"normal": bare})
+    assert found.notes()[0] == "expected: a result tells no errors of zenith and azimuth alone"
+    assert "of zenith and azimuth and normal that" in found.notes()[1]
+
+
 def test_numbers_are_plain(press):
     told = json.loads(json.dumps(check_ball(press, calibration(), 10.0).numbers()))
     assert told["after"]["height"]["unit"] == "mm"

@@ -293,6 +293,25 @@ def test_heights_that_were_not_found_are_no_answer(monkeypatch):
         reconstruct()
 
 
+@pytest.mark.parametrize(
+    ("residual", "is_told"), [(5e-5, True), (5e-4, False), (np.inf, False), (np.nan, False)]
+)
+def test_heights_that_are_nearly_as_near_as_asked_are_told_at_once(monkeypatch, residual, is_told):
+    found = []
+
+    def miss(*slopes, **options):
+        found.append(replace(engine.integrate(*slopes, **options), converged=False, residual=residual))
+        return found[-1]
+
+    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", miss)
+    if is_told:
+        np.testing.assert_array_equal(reconstruct().height, found[0].height)
+    else:
+        with pytest.raises(engine.NotConverged, match="left a residual of"):
+            reconstruct()
+    assert len(found) == 1
+
+
 @pytest.mark.parametrize("shape", [(3, 3), SHAPE])
 def test_heights_at_which_nothing_is_seen_leave_no_answer(shape):
     far = replace(HEADER, pivot=(0.0, 0.0, 400.0))
