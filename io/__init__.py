@@ -14,6 +14,9 @@ from mirrorskin.io.calibration.types import (
     WallResponse,
 )
 from mirrorskin.io.describe import describe
+from mirrorskin.io.export.mesh import Mesh, surface_mesh
+from mirrorskin.io.export.result import check_export, export_result
+from mirrorskin.io.export.table import save_table
 from mirrorskin.io.frames import open_frames
 from mirrorskin.io.heights import open_heights
 from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
@@ -22,6 +25,7 @@ from mirrorskin.io.recording import Recording, Steps, open_recording
 from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result, save_result
 from mirrorskin.io.streaming import StreamRecorder
+from mirrorskin.io.turns import of_turn
 from mirrorskin.io.types import (
     FRAME_DTYPES,
     MOTIONS,
@@ -54,6 +58,7 @@ __all__ = [
     "InputError",
     "Lens",
     "LiveSource",
+    "Mesh",
     "Motion",
     "Positions",
     "Precession",
@@ -69,11 +74,14 @@ __all__ = [
     "Truth",
     "WallResponse",
     "check_camera",
+    "check_export",
     "check_output",
     "check_phase",
     "check_stroke",
     "check_travel",
     "describe",
+    "export_result",
+    "of_turn",
     "open_calibration",
     "open_frames",
     "open_heights",
@@ -83,5 +91,7 @@ __all__ = [
     "pixel_axes",
     "save_calibration",
     "save_result",
+    "save_table",
+    "surface_mesh",
     "update_calibration",
 ]

@@ -96,6 +96,12 @@ class Hdf5File(Closing):
         with plainly(f"{self.path}: {group}"):
             return isinstance(entry, h5py.Group) and mark in entry.attrs
 
+    def check_layout(self, mark: str, known: int = 1) -> None:
+        """Raise InputError if a file of ours is laid out as nobody knew when this was written."""
+        layout = self.attribute("/entry", mark)
+        if isinstance(layout, int) and layout > known:
+            raise InputError(f"{self.path} is of layout {layout}, where {known} is read: update the program")
+
     def attribute(self, name: str, attribute: str) -> Any:
         """Return an attribute, a text or a number, of an object; None where it has none."""
         node = self.find(name)

@@ -230,6 +230,7 @@ def open_recording(
     with ExitStack() as opening:
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
+        file.check_layout(MARK)
         stack, taken = _find_stack(file, dataset, ours)
         shape = (taken.count, *_shape(stack)[1:])
         cut = _cut(str(path), shape, frames, region)

@@ -22,7 +22,7 @@ from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"
-_UNITS = (
+UNITS = (
     dict.fromkeys(("height", "height_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
@@ -34,6 +34,8 @@ _DTYPES = (
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
 _VECTORS, _OFFSETS = "normals", "offset_unknown"
+# Where viewers look for the errors of a map, and which map they are.
+_ERRORS = {"height_errors": "height_sigma"}
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 _AGAIN = "reconstruct it again"
 
@@ -84,19 +86,23 @@ def _write(
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = file.create_group("entry")
     entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
-    entry.create_group("result").attrs.update(NX_class="NXdata", **plot)
+    shown = entry.create_group("result")
+    shown.attrs.update(NX_class="NXdata", **plot)
     entry.create_group("process").attrs["NX_class"] = "NXprocess"
     for name, attributes in more.items():
         file.create_group(name).attrs.update(attributes)
     for part in parts:
         write_part(file, part)
+    for name, target in _ERRORS.items():
+        if target in shown:
+            shown[name] = h5py.SoftLink(f"{_RESULT}/{target}")
 
 
 def _parts_of_maps(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Part]:
     """Yield the maps, and what is known of a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
         said = {} if name == _VECTORS else {"interpretation": "image"}
-        yield Part(f"{_RESULT}/{name}", values, said | ({"units": _UNITS[name]} if name in _UNITS else {}))
+        yield Part(f"{_RESULT}/{name}", values, said | ({"units": UNITS[name]} if name in UNITS else {}))
     if result.offset_unknown is not None:
         yield Part(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
     for name, positions in _axes_of(result, maps).items():
@@ -145,6 +151,9 @@ def open_result(path: str | Path) -> Result:
             for name, (node, shape) in _find_maps(file).items()
         }
         maps |= _read_offsets(file, maps.get("component"))
+        for name, direction in (("x", 1), ("y", -1)):
+            if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
+                raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
         return Result(**maps, process=read_process(file, _PROCESS), calibration=carried_by(file))
 
 
@@ -165,6 +174,7 @@ def _opened(path: Path) -> Iterator[Hdf5File]:
     with Hdf5File(path) as file:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
+        file.check_layout(MARK)
         yield file
 
 

@@ -74,6 +74,7 @@ def test_a_result_has_the_layout_of_the_design(path):
         assert {name: (node.shape, node.dtype.str[1:], dict(node.attrs)) for name, node in maps.items()} == {
             "height": ((5, 7), "f4", image | mm),
             "height_sigma": ((5, 7), "f4", image | mm),
+            "height_errors": ((5, 7), "f4", image | mm),  # a link to it, for viewers
             "status": ((5, 7), "u1", image),
             "x": ((7,), "f8", mm),
             "y": ((5,), "f8", mm),
@@ -396,6 +397,8 @@ def test_what_is_no_result_is_refused(tmp_path, path):
             np.zeros(5),
             r"/entry/result/x has shape \(5,\) where \(7,\) is needed: recon",
         ),
+        ("result/x", np.zeros(7), "/entry/result/x does not run as pixels do: recon"),
+        ("result/y", np.arange(5.0), "/entry/result/y does not run as pixels do: recon"),
         (
             "result/height_sigma",
             np.zeros((5, 7), "S2"),

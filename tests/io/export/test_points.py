@@ -1,0 +1,65 @@
+"""Points without a surface: PLY as trimesh opens it, and text as NumPy does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from mirrorskin import io
+
+COLUMNS = ["x[mm]", "y[mm]", "z[mm]", "nx", "ny", "nz", "sigma[mm]", "filled"]
+
+
+def test_a_ply_of_points_has_no_triangles(slope, tmp_path):
+    path = tmp_path / "out.ply"
+    assert io.export_result(slope, path, points=True) == "53 points"
+    cloud = trimesh.load(path)
+    assert isinstance(cloud, trimesh.PointCloud)
+    np.testing.assert_allclose(cloud.bounds[:, :2], [[-2, -0.625], [2, 0.625]])
+    np.testing.assert_array_equal(cloud.vertices[:, 2], slope.height[np.isfinite(slope.height)])
+    assert b"element face" not in path.read_bytes()
+
+
+def test_points_that_are_in_no_triangle_are_points_all_the_same(slope, tmp_path):
+    height = np.full((6, 9), np.nan, np.float32)
+    height[::2, ::2] = 1
+    alone = replace(slope, height=height)
+    assert io.export_result(alone, tmp_path / "out.ply", points=True) == "15 points"
+    assert io.export_result(alone, tmp_path / "out.xyz") == "15 points"
+
+
+def test_text_is_one_line_a_point_and_names_its_columns(slope, tmp_path):
+    path = tmp_path / "out.xyz"
+    assert io.export_result(slope, path) == "53 points"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
+    assert comments[0] == "source: Münze 五円.h5"
+    assert comments[-1].split() == COLUMNS
+    assert len(lines) == len(comments) + 53
+    table = np.loadtxt(path, encoding="utf-8")
+    known = np.isfinite(slope.height)
+    rows, columns = np.nonzero(known)
+    expected = [
+        *(slope.x[columns], slope.y[rows], slope.height[known], *slope.normals[known].T),
+        *(slope.height_sigma[known], slope.filled[known]),
+    ]
+    np.testing.assert_allclose(table, np.stack(expected, axis=1), atol=0.51e-6)
+    # What has no normal says so, and does not get one from its neighbours.
+    assert np.isnan(table[0, 3:6]).all()
+    assert np.isnan(table[:, 6]).sum() == 1
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (6, 1), (6, 9), (8, 7)])
+def test_text_of_any_size_is_whole(shape, tmp_path, monkeypatch):
+    monkeypatch.setattr("mirrorskin.io.export.xyz._TOGETHER", 7)
+    path = tmp_path / "out.xyz"
+    x, y = io.pixel_axes(shape, (0.5, 0.25))
+    height = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    height[0, 1:2] = np.nan
+    told = io.export_result(io.Result(height=height, x=x, y=y), path)
+    assert told == f"{np.isfinite(height).sum()} points"
+    table = np.loadtxt(path, ndmin=2)
+    np.testing.assert_allclose(table[:, 2], height[np.isfinite(height)], atol=0.51e-6)

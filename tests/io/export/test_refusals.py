@@ -1,0 +1,104 @@
+"""What cannot be exported is one line that says why and what to do, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from mirrorskin import io
+
+PICTURES = ["out.png", "out.tif", "out.tiff"]
+IN_MILLIMETRES = ["out.ply", "out.stl", "out.xyz", "out.csv", *PICTURES]
+
+
+def refused(result, path, **options):
+    with pytest.raises(io.InputError) as caught:
+        io.export_result(result, path, **options)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    return str(caught.value).removeprefix(str(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("out.obj", "obj is no format"), ("out", "its name does not say a format")]
+)
+def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, name, wrong):
+    line = refused(slope, tmp_path / name)
+    assert wrong in line
+    assert line.endswith("name a file that ends with one of .ply .stl .xyz .png .tif .tiff .npz .csv")
+
+
+@pytest.mark.parametrize("name", IN_MILLIMETRES)
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"x": None, "y": None}, "the result has no pixel size: reconstruct it again with --pixel-size, or"),
+        ({"height": None}, ": the result has no heights: reconstruct it again with them, or export"),
+        ({"height": np.full((6, 9), np.nan, np.float32)}, ": no height of the result is known: look at its"),
+    ],
+)
+def test_what_needs_millimetres_is_not_made_without(slope, tmp_path, name, change, line):
+    lacking = replace(slope, **change)
+    assert line in refused(lacking, tmp_path / name)
+    with pytest.raises(io.InputError, match=r"as \.npz"):
+        io.check_export(lacking, tmp_path / name)
+    io.check_export(lacking, tmp_path / "out.npz")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["out.ply", "out.stl"])
+@pytest.mark.parametrize("shape", [(1, 9), (6, 1), (1, 1)])
+def test_a_single_row_is_no_surface(tmp_path, name, shape):
+    x, y = io.pixel_axes(shape, (0.5, 0.5))
+    row = io.Result(height=np.zeros(shape, np.float32), x=x, y=y)
+    line = refused(row, tmp_path / name)
+    assert line == ": no three known heights are neighbours, so there is no surface: export points, .xyz"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_package_that_is_missing_is_named(slope, tmp_path, monkeypatch, name):
+    module, package = ("PIL", "Pillow") if name == "out.png" else ("tifffile", "tifffile")
+    monkeypatch.setitem(sys.modules, module, None)
+    line = refused(slope, tmp_path / name)
+    assert line == f" needs {package}: pip install 'mirrorskin[export]'"
+    assert io.export_result(slope, tmp_path / "out.ply")
+
+
+def test_a_table_takes_a_cross_section(slope, tmp_path):
+    assert "none is given" in refused(slope, tmp_path / "out.csv")
+
+
+@pytest.mark.parametrize("name", ["ply", "stl", "xyz", "png", "tif", "npz", "csv"])
+def test_a_file_that_cannot_be_written_is_one_line(slope, tmp_path, name):
+    section = {"distance": np.zeros(2), "height": np.zeros(2)}
+    assert "there is no folder" in refused(slope, tmp_path / "nowhere" / f"out.{name}", section=section)
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_older_file(slope, tmp_path, monkeypatch):
+    class Full(BytesIO):
+        def writelines(self, parts):
+            raise OSError(errno.ENOSPC, "no room")
+
+    path = tmp_path / "out.ply"
+    path.write_text("older")
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fdopen", lambda *given, **options: Full())
+        assert " could not be written: No space left on device; make room" in refused(slope, path)
+    assert path.read_text() == "older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_older_file_stays_if_a_new_one_cannot_be_made(slope, tmp_path):
+    path = tmp_path / "out.ply"
+    path.write_text("older")
+    refused(replace(slope, component=np.arange(54, dtype=np.int32).reshape(6, 9)), path)
+    assert path.read_text() == "older"
+    io.export_result(slope, path)
+    assert path.read_bytes().startswith(b"ply\n")
+    assert list(tmp_path.iterdir()) == [path]

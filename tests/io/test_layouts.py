@@ -1,0 +1,40 @@
+"""Files that a later version laid out in another way are refused, not misread."""
+
+import h5py
+import numpy as np
+import pytest
+from stacks import record, sphere
+
+from mirrorskin import io
+from mirrorskin.io.heights import open_heights
+
+
+def later(path, mark):
+    with h5py.File(path, "r+") as file:
+        assert file["entry"].attrs[mark] == 1
+        file["entry"].attrs[mark] = 2
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    record(sphere(), tmp_path / "rec.h5")
+    return later(tmp_path / "rec.h5", "mirrorskin_recording")
+
+
+@pytest.fixture
+def result(tmp_path):
+    io.save_result(io.Result(height=np.zeros((3, 4), np.float32)), tmp_path / "res.h5")
+    return later(tmp_path / "res.h5", "mirrorskin_result")
+
+
+@pytest.mark.parametrize("read", [io.open_recording, io.describe, open_heights])
+def test_a_later_recording_is_refused(recording, read):
+    with pytest.raises(io.InputError, match="layout 2, where 1 is read: update the program"):
+        read(recording)
+
+
+@pytest.mark.parametrize("read", [io.open_result, io.describe, open_heights])
+def test_a_later_result_is_refused(result, read):
+    with pytest.raises(io.InputError, match="layout 2, where 1 is read: update the program"):
+        read(result)
