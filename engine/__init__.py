@@ -6,6 +6,13 @@ from mirrorskin.engine.fusion import frames_to_read, fuse, fuse_sources
 from mirrorskin.engine.integration.integrate import integrate
 from mirrorskin.engine.integration.live import Integrator
 from mirrorskin.engine.integration.surface import Surface
+from mirrorskin.engine.measure.measure import FormName, Measures, measure
+from mirrorskin.engine.measure.plane import Plane, fit_plane
+from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.engine.measure.section import Section, section
+from mirrorskin.engine.measure.sphere import Sphere, fit_sphere
+from mirrorskin.engine.measure.steps import Step, step_height
+from mirrorskin.engine.measure.texture import Roughness, roughness
 from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.onset import OnsetSearch, find_onset
@@ -30,17 +37,25 @@ __all__ = [
     "Correlator",
     "EdgeScore",
     "Event",
+    "FormName",
     "HeightScore",
     "Integrator",
+    "Measures",
     "NormalEstimator",
     "NormalMethod",
     "Normals",
     "NotConverged",
     "Onset",
     "OnsetSearch",
+    "Plane",
     "PressMethod",
+    "Quantity",
     "Registered",
+    "Roughness",
     "Score",
+    "Section",
+    "Sphere",
+    "Step",
     "Summary",
     "Surface",
     "calibrated",
@@ -51,13 +66,19 @@ __all__ = [
     "find_change_point",
     "find_edges",
     "find_onset",
+    "fit_plane",
+    "fit_sphere",
     "frames_to_read",
     "fuse",
     "fuse_sources",
     "integrate",
+    "measure",
     "reconstruct",
     "reconstruct_press",
     "reconstruct_rotation",
+    "roughness",
     "score",
+    "section",
+    "step_height",
     "summarise",
 ]

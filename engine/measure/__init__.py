@@ -1,0 +1,1 @@
+"""Numbers of a height map as metrology defines them, each with its standard uncertainty."""

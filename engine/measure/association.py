@@ -1,0 +1,217 @@
+"""Least squares of distances: a form is moved until it fits the points best."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.measure.smooth import covariance
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Frame = tuple[Doubles, Doubles]
+
+_STEPS, _HALVINGS = 50, 10
+_SETTLED = 1e-6  # of the residuals, by which a step may still change them
+_SINGULAR = 1e-14  # least eigenvalue of the normal equations, of columns of length 1
+_MEDIAN = 0.6745  # of the magnitude of a normal variate
+_FAR = 5.0  # standard deviations, as the median of the distances tells them, beyond which points are outliers
+_FEW = 0.15  # of the points: if more are that far, they belong to the surface
+_PASSES = 5  # over the outliers
+_ENOUGH = 65536  # points to begin with
+_ROOM = 16384  # points at a time: what is worked out of them stays in the processor's cache
+_NOTHING = 1e-300
+_ROUNDING = 1e-9  # of the points' extent: distances below it are none
+
+
+class Form(Protocol):
+    """What a surface must tell of itself to be fitted."""
+
+    @property
+    def lift(self) -> int:
+        """Number of the parameter that moves it along z: distances go with that as with heights."""
+
+    def start(self) -> Doubles:
+        """Return parameters, (k,), to begin with."""
+
+    def distance(self, points: Doubles, parameters: Doubles) -> Doubles:
+        """Return the distances, (n,), of points, (3, n), positive on the camera's side."""
+
+    def jacobian(self, points: Doubles, parameters: Doubles) -> Doubles:
+        """Return their derivatives by the parameters, (k, n)."""
+
+
+class Association(NamedTuple):
+    """A form that fits, and how well.
+
+    Attributes
+    ----------
+    parameters : ndarray, (k,), float64
+    covariance : ndarray, (k, k), float64
+        NaN where points are too few to tell.
+    kept : ndarray, (n,), bool
+        False of outliers.
+    birge : float
+        Birge's ratio: root mean square of the weighted distances that are left, over what standard deviations
+        make it; much more than 1 if the surface is not of this form. NaN where these are unknown.
+    """
+
+    parameters: Doubles
+    covariance: Doubles
+    kept: Mask
+    birge: float
+
+
+def associate(form: Form, points: Doubles, sigma: Doubles) -> Association | None:
+    """Fit a form to points.
+
+    Distances are weighted by their inverse variances; no point counts as surer than the median. Outliers are
+    left out: points beyond five standard deviations, as the median of the weighted distances tells them, if
+    they are at most 15 %. If more are that far, they are part of the surface and all count.
+
+    Parameters
+    ----------
+    form : Form
+    points : ndarray, (3, n), float64
+        Millimetres.
+    sigma : ndarray, (n,), float64
+        Their standard deviations, mm; all NaN where they are unknown and so alike.
+
+    Returns
+    -------
+    Association or None
+        None where no form of this kind fits.
+    """
+    weight = _weights(sigma)
+    rounding = _ROUNDING * float(np.ptp(points, axis=1).max())
+    # Nearly all steps are taken with few points, and the last ones with all.
+    every = max(1, weight.size // _ENOUGH)
+    near = _hold_back(form, points[:, ::every], weight[::every], form.start(), rounding)
+    found = None if near is None else _leave_out(form, points, weight, near, rounding)
+    if found is None:
+        return None
+    parameters, kept = found
+    if not kept.all():
+        points, weight, sigma = points[:, kept], weight[kept], sigma[kept]
+    gram = _gram(form, points, weight, parameters, _frame(points))
+    claimed = 0.0
+    if np.isfinite(sigma[0]):
+        steepness = form.jacobian(points, parameters)[form.lift]
+        claimed = float(np.sum(weight * (sigma * steepness) ** 2))
+    birge = float(np.sqrt(gram[-1, -1] / claimed)) if claimed > 0 else np.nan
+    return Association(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
+
+
+def _hold_back(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> Doubles | None:
+    """Fit so that far points pull no more than near ones (Huber 1964): some to one side do not spoil it."""
+    held: Doubles | None = parameters
+    share = np.ones_like(weight)
+    for _ in range(_PASSES):
+        held = _settle(form, points, weight * share, parameters, rounding)
+        if held is None:
+            return None
+        parameters = held
+        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
+        share = 1 / np.maximum(misfit / (_typical(misfit) + rounding), 1)
+    return parameters
+
+
+def _leave_out(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> tuple[Doubles, Mask] | None:
+    """Leave out what is far, and fit, until the same points are left out."""
+    kept = np.zeros(weight.size, bool)
+    for _ in range(_PASSES):
+        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
+        near = misfit <= _FAR * max(_typical(misfit), rounding)
+        if np.count_nonzero(~near) > _FEW * near.size:
+            near[:] = True
+        if np.array_equal(kept, near):
+            break
+        kept = near
+        part = (points, weight) if kept.all() else (points[:, kept], weight[kept])
+        settled = _settle(form, *part, parameters, rounding)
+        if settled is None:
+            return None
+        parameters = settled
+    return parameters, kept
+
+
+def _typical(misfit: Doubles) -> float:
+    """Return the standard deviation that a median of magnitudes tells."""
+    return float(np.median(misfit)) / _MEDIAN
+
+
+def _weights(sigma: Doubles) -> Doubles:
+    """Return inverse variances, (n,), as shares of a typical one; ones where there are none."""
+    typical = float(np.median(sigma))
+    if not typical > 0:
+        return np.ones_like(sigma)
+    return np.asarray(np.maximum(sigma / typical, 1.0) ** -2)
+
+
+def _settle(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> Doubles | None:
+    """Go down from parameters to the least sum of squares, by Gauss and Newton's steps."""
+    gram = _gram(form, points, weight, parameters)
+    least = rounding**2 * weight.size
+    for _ in range(_STEPS):
+        found = _step(gram)
+        if found is None:
+            return None
+        step, gain = found
+        before = gram[-1, -1]
+        for _ in range(_HALVINGS):
+            gram = _gram(form, points, weight, parameters + step)
+            if gram[-1, -1] <= before + least:
+                break
+            step = step / 2
+        parameters = parameters + step
+        if gain <= _SETTLED**2 * before + least:
+            return parameters
+    return None
+
+
+def _step(gram: Doubles) -> tuple[Doubles, float] | None:
+    """Return the step that is best where distances are linear, and the sum of squares that it takes away."""
+    scale = np.sqrt(np.diag(gram)[:-1])
+    if not np.all(scale > 0):
+        return None
+    normal, right = gram[:-1, :-1] / np.multiply.outer(scale, scale), -gram[:-1, -1] / scale
+    if np.linalg.eigvalsh(normal)[0] < _SINGULAR:
+        return None
+    step = np.linalg.solve(normal, right)
+    return step / scale, float(step @ normal @ step)
+
+
+def _gram(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, frame: Frame | None = None
+) -> Doubles:
+    """Return the weighted sums that steps and `covariance` need, the latter with smooth shapes in a frame."""
+    total: Doubles | float = 0.0
+    for start in range(0, weight.size, _ROOM):
+        part = points[:, start : start + _ROOM]
+        shapes = [] if frame is None else _shapes(part, frame)
+        rows = np.stack([*form.jacobian(part, parameters), *shapes, form.distance(part, parameters)])
+        rows *= np.sqrt(weight[start : start + _ROOM])
+        total = total + rows @ rows.T
+    return np.asarray(total)
+
+
+def _frame(points: Doubles) -> Frame:
+    """Return the middle of the points along x and y, and how far they reach from it."""
+    low, high = points[:2].min(axis=1), points[:2].max(axis=1)
+    return (low + high) / 2, np.maximum((high - low) / 2, _NOTHING)
+
+
+def _shapes(points: Doubles, frame: Frame) -> list[Doubles]:
+    """Return the products of two and of three of x and y, (n,) each, within -1 and 1."""
+    (x_middle, y_middle), (x_reach, y_reach) = frame
+    x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
+    xx, xy, yy = x * x, x * y, y * y
+    return [xx, xy, yy, xx * x, xx * y, yy * x, yy * y]

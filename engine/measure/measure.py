@@ -1,0 +1,210 @@
+"""All that can be told of a result in numbers."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from mirrorskin.engine.measure.extent import areas, volume
+from mirrorskin.engine.measure.levels import border, levels
+from mirrorskin.engine.measure.patch import Patch, patch_of
+from mirrorskin.engine.measure.plane import Plane, fit_plane
+from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.engine.measure.section import Point
+from mirrorskin.engine.measure.section import section as cut
+from mirrorskin.engine.measure.sphere import Sphere, fit_sphere
+from mirrorskin.engine.measure.steps import along, step_height
+from mirrorskin.engine.measure.texture import roughness
+from mirrorskin.io import InputError, Region, Result
+
+FormName = Literal["plane", "sphere", "none"]
+
+_MUCH_BETTER = 0.5  # of a plane's residual, below which a sphere is taken for the form
+_CLEAR = 2.0  # standard uncertainties that a step must have to be told
+# With which power of the pixel size a quantity goes: by its unit or its name. For a cap that is not deep, the
+# radius goes with the square of its width, and its centre lies a radius away from its top.
+_POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
+_POWERS |= dict.fromkeys(("sphere centre x", "sphere centre y", "section length", "distance in space"), 1)
+_POWERS |= dict.fromkeys(("step at", "plane tilt", "slope", "slope beside step"), 1)
+_RATIO = 2.0  # of what is left to what its errors make it, above which a surface is not of a form
+
+
+@dataclass(frozen=True, slots=True)
+class Measures:
+    """What was measured.
+
+    Attributes
+    ----------
+    quantities : dict of str to Quantity
+        By name, in reading order.
+    notes : list of str
+        What was left out, and what was assumed.
+    """
+
+    quantities: dict[str, Quantity]
+    notes: list[str]
+
+
+def measure(
+    result: Result,
+    *,
+    region: Region | None = None,
+    form: FormName | None = None,
+    cutoff: float | None = None,
+    section: tuple[Point, Point] | None = None,
+) -> Measures:
+    """Measure the height map of a result.
+
+    Parameters
+    ----------
+    result : Result
+        Of one picture, with heights and a pixel size.
+    region : Region, optional
+        In its pixels; by default all of it.
+    form : {"plane", "sphere", "none"}, optional
+        What is fitted, and what roughness is measured from; by default the sphere where it leaves less than
+        half of what the plane leaves, else the plane. Without a form, roughness is that of the heights.
+    cutoff : float, optional
+        Longest waves that count as roughness, mm.
+    section : ((float, float), (float, float)), optional
+        Both ends of a section to be measured, mm from the picture's centre.
+
+    Returns
+    -------
+    Measures
+        Heights, areas, volumes, the form, roughness, and the section, each with its standard uncertainty.
+        See the functions for how that is found.
+
+    Raises
+    ------
+    InputError
+        Nothing can be measured, or not as it was asked for.
+    """
+    patch, comparable = patch_of(result, region)
+    quantities, notes = levels(patch), list(patch.notes)
+    quantities |= areas(patch)
+    quantities |= _volumes(patch, quantities.get("rim height"))
+    quantities |= _forms(patch, form, cutoff, notes)
+    if section is not None:
+        quantities |= _section(comparable, section, notes)
+    lens = None if result.calibration is None else result.calibration.lens
+    scale = 0.0 if lens is None else lens.scale_sigma
+    return Measures(_scaled(quantities, scale), [*notes, *_assumed(patch, scale)])
+
+
+def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
+    """Return volumes above the rim, and below the sheet's rest plane where heights are absolute."""
+    told: dict[str, Quantity] = {}
+    if base is not None:
+        told |= volume(patch, base.value, base.sigma, "volume above rim")
+    if patch.absolute:
+        for name, above in volume(patch, 0.0, 0.0, "volume below rest plane").items():
+            told[name] = Quantity(-above.value, above.sigma, above.unit)
+    return told
+
+
+def _forms(
+    patch: Patch, form: FormName | None, cutoff: float | None, notes: list[str]
+) -> dict[str, Quantity]:
+    """Return what fits the surface, and how rough it is."""
+    fitted = _fit(patch, form)
+    about, residual = "their mean", patch.height
+    told: dict[str, Quantity] = {}
+    if fitted is not None:
+        kind = "plane" if isinstance(fitted, Plane) else "sphere"
+        about, residual, told = f"the {kind}", fitted.residual, fitted.quantities()
+        notes.extend(_fit_notes(fitted, kind))
+    rough = roughness(residual, patch.pixel_size, cutoff=cutoff, sigma=patch.sigma)
+    waves = "" if cutoff is None else f", of waves up to {cutoff:g} mm"
+    notes.append(f"roughness by ISO 25178-2 from {about}{waves}, over {rough.pixels} pixels, noise included")
+    if rough.left_out:
+        notes.append(
+            f"pixels left out of roughness, too near to holes or ends for the filter: {rough.left_out}"
+        )
+    if rough.unsure:
+        notes.append(
+            f"pixels left out of roughness and lowest point, far less sure than others: {rough.unsure}"
+        )
+    return told | rough.quantities()
+
+
+def _fit_notes(fitted: Plane | Sphere, kind: str) -> list[str]:
+    """Say how well a form fits."""
+    notes = []
+    if fitted.outliers:
+        notes.append(
+            f"outliers left out of the fit of the {kind}, but not of its residual: {fitted.outliers}"
+        )
+    if fitted.birge > _RATIO:
+        notes.append(
+            f"the surface is no {kind} within its errors:"
+            f" what the fit leaves is {fitted.birge:.0f} times as large"
+        )
+    return notes
+
+
+def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
+    """Fit what was asked for; by default what leaves little, or nothing where nothing fits."""
+    cloud = patch.height, patch.x, patch.y, patch.sigma
+    if form == "plane":
+        return fit_plane(*cloud)
+    if form == "sphere":
+        return fit_sphere(*cloud)
+    if form == "none":
+        return None
+    found: Plane | Sphere | None = None
+    with suppress(InputError):
+        found = plane = fit_plane(*cloud)
+        sphere = fit_sphere(*cloud)
+        if sphere.rms.value < _MUCH_BETTER * plane.rms.value:
+            found = sphere
+    return found
+
+
+def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dict[str, Quantity]:
+    """Return what a section tells, and a step where there is one."""
+    profile = cut(result, *ends)
+    told = along(profile)
+    ends_known = np.isfinite(profile.height[[0, -1]]) & ~profile.filled[[0, -1]]
+    if not ends_known.all():
+        notes.append(
+            "section: an end has no measured height: difference, distance and slope end where one has"
+        )
+    with suppress(InputError):
+        step = step_height(profile)
+        if abs(step.height.value) > _CLEAR * step.height.sigma:
+            return told | {"step height": step.height, "step at": step.place, "slope beside step": step.slope}
+    notes.append("no step along the section: no two levels that differ clearly")
+    return told
+
+
+def _scaled(quantities: dict[str, Quantity], scale: float) -> dict[str, Quantity]:
+    """Add what comes of the uncertainty of the pixel size, given as a share of it."""
+    told: dict[str, Quantity] = {}
+    for name, quantity in quantities.items():
+        if name == "sphere centre z":
+            change = 2 * quantities["sphere radius"].value
+        else:
+            change = _POWERS.get(quantity.unit, _POWERS.get(name, 0)) * quantity.value
+        told[name] = replace(quantity, sigma=math.hypot(quantity.sigma, scale * change))
+    return told
+
+
+def _assumed(patch: Patch, scale: float) -> list[str]:
+    """Say what values and their uncertainties take for granted."""
+    size = f"known within {100 * scale:.2g} %" if scale else "taken as exact"
+    said = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
+    filled = int(np.count_nonzero(np.isfinite(patch.filled)))
+    if filled:
+        said.append(f"pixels filled, not measured, that count only in what says 'filled': {filled}")
+    if filled and np.nanmax(patch.filled) > np.nanmax(patch.height):
+        said.append("the top was filled, not measured: 'highest point' is the highest that was measured")
+    if np.count_nonzero(border(patch.contact, ends=True)) > np.count_nonzero(border(patch.contact)):
+        said.append("contact reaches the picture's border: areas and volumes are of what is seen")
+    if patch.sigma is None:
+        said.append("the result has no standard deviations of heights: uncertainties of these are unknown")
+    return said

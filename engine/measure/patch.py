@@ -1,0 +1,199 @@
+"""The part of a result that is measured: checked, cut out, and told apart from what was filled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io import InputError, Region, Result
+from mirrorskin.io.turns import of_turn
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """Heights to measure, in a rectangle of the picture.
+
+    Attributes
+    ----------
+    height : ndarray, (H, W), float64
+        Millimetres where heights were measured, else NaN.
+    filled : ndarray, (H, W), float64
+        Millimetres where they were filled, else NaN.
+    sigma : ndarray, (H, W), float64, or None
+        Standard deviations of the measured heights, mm; None where the result tells none.
+    contact : ndarray, (H, W), bool
+        Where the object was touched: as told, else where there is a height, filled ones too.
+    contact_told : bool
+    secant : ndarray, (H, W), float64, or None
+        Surface for each area of the picture, from the normals; NaN where they are unknown.
+    normal_sigma : ndarray, (H, W), float64, or None
+        Standard deviations of the normals, radians.
+    x, y : ndarray, (W,) and (H,), float64
+        Millimetres of the pixel centres.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+    absolute : bool
+        Whether heights are above the sheet's rest plane; else above the mean of their piece.
+    notes : tuple of str
+        What was left out.
+    """
+
+    height: Doubles
+    filled: Doubles
+    sigma: Doubles | None
+    contact: Mask
+    contact_told: bool
+    secant: Doubles | None
+    normal_sigma: Doubles | None
+    x: Doubles
+    y: Doubles
+    pixel_size: tuple[float, float]
+    absolute: bool
+    notes: tuple[str, ...]
+
+    @property
+    def measured(self) -> Mask:
+        """Where heights were measured, (H, W)."""
+        return np.isfinite(self.height)
+
+    @property
+    def pixel_area(self) -> float:
+        """Square millimetres."""
+        width, height = self.pixel_size
+        return width * height
+
+    def sigmas(self) -> Doubles:
+        """Return the standard deviations of the measured heights, (n,), mm; NaN where none are told."""
+        where = self.measured
+        return np.full(np.count_nonzero(where), np.nan) if self.sigma is None else self.sigma[where]
+
+
+def heights_of(result: Result) -> NDArray[np.float32]:
+    """Return the heights of one picture, (H, W).
+
+    Raises
+    ------
+    InputError
+        There are none, or one map for each turn.
+    """
+    height = of_turn(result, None).height
+    if height is None:
+        raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
+    return height
+
+
+def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Result]:
+    """Cut out what is to be measured.
+
+    Only heights that were measured and whose standard deviation is finite count. Of several pieces, those
+    whose height is relative cannot be compared with others: they are left out where others are absolute, and
+    all but the largest where none is.
+
+    Parameters
+    ----------
+    result : Result
+        Of one picture.
+    region : Region, optional
+        In its pixels; by default all of it.
+
+    Returns
+    -------
+    (Patch, Result)
+        And the whole result with no other heights than those that can be compared with the patch's.
+
+    Raises
+    ------
+    InputError
+        No height, no pixel size, one map for each turn, or a region beyond the picture.
+    """
+    height = heights_of(result)
+    if result.height_sigma is not None and not np.isfinite(result.height_sigma).any():
+        result = replace(result, height_sigma=None)
+    if result.x is None or result.y is None:
+        raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
+    pixel_size = pixel_size_of(result.x, result.y)
+    if region is None:
+        region = Region.whole((height.shape[0], height.shape[1]))
+    region.check((height.shape[0], height.shape[1]), "--region")
+    part = region.slices
+    filled = np.zeros(height.shape, bool) if result.filled is None else result.filled != 0
+    known, notes = _known(result, height, filled)
+    known, absolute, told = _comparable(result, known, part)
+    if not np.any(known[part] & ~filled[part]):
+        raise InputError("no height was measured there: choose another region, or another result")
+    contact = known if result.contact is None else result.contact != 0
+    patch = Patch(
+        np.where(known & ~filled, height, np.nan)[part].astype(np.float64),
+        np.where(known & filled, height, np.nan)[part].astype(np.float64),
+        None if result.height_sigma is None else result.height_sigma[part].astype(np.float64),
+        contact[part],
+        result.contact is not None,
+        None if result.normals is None else _secant(result.normals[part]),
+        None if result.normal_sigma is None else result.normal_sigma[part].astype(np.float64),
+        result.x[part[1]],
+        result.y[part[0]],
+        pixel_size,
+        absolute,
+        (*told, *notes),
+    )
+    return patch, replace(result, height=np.where(known, height, np.float32(np.nan)))
+
+
+def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:
+    """Return which heights count, and what is to be said of that."""
+    known, notes = np.isfinite(height), []
+    if result.height_sigma is not None:
+        unsure = known & ~np.isfinite(result.height_sigma) & ~filled
+        known &= ~unsure
+        if unsure.any():
+            notes.append(f"pixels left out, whose height has no standard deviation: {unsure.sum()}")
+    if 1 in height.shape:
+        notes.append("a single row or column: pixels are taken to be square")
+    return known, notes
+
+
+def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple[Mask, bool, list[str]]:
+    """Return which heights can be compared, whether they are absolute, and what is to be said of that."""
+    component, unknown = result.component, result.offset_unknown
+    if component is None or unknown is None or not np.any(unknown):
+        return known, True, []
+    # Numbers from -1 on: what belongs to no piece comes first, and counts as absolute.
+    relative = np.concatenate([[False], unknown != 0])[component + 1]
+    inside = np.zeros(known.shape, bool)
+    inside[part] = known[part]
+    if np.any(inside & ~relative):
+        lost = np.unique(component[inside & relative]).size
+        told = f"pieces left out, whose height is only relative: {lost}"
+        return known & ~relative, True, [told] if lost else []
+    pieces, counts = np.unique(component[inside], return_counts=True)
+    notes = ["heights are relative: their mean is 0"]
+    if pieces.size > 1:
+        known = known & (component == pieces[np.argmax(counts)])
+        notes.append(f"only the largest of {pieces.size} pieces is measured: how high they lie is unknown")
+    return known, False, notes
+
+
+def _secant(normals: NDArray[np.float32]) -> Doubles:
+    """Return one over their z; NaN of normals that do not face the camera."""
+    z = normals[..., 2].astype(np.float64)
+    return 1 / np.where(z > 0, z, np.nan)
+
+
+def pixel_size_of(x: Doubles, y: Doubles) -> tuple[float, float]:
+    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels.
+
+    Raises
+    ------
+    InputError
+        There is only one pixel.
+    """
+    steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
+    known = [float(step) for step in steps if step is not None]
+    if not known:
+        raise InputError("the result has a single pixel, which does not tell how large it is: take more")
+    return known[0], known[-1]

@@ -1,0 +1,170 @@
+"""Cross-sections of height maps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.measure.patch import heights_of, pixel_size_of
+from mirrorskin.engine.resample import Spots
+from mirrorskin.io import InputError, Result, pixel_axes
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Point = tuple[float, float]
+
+_ROUNDING = 1e-6  # of a pixel
+_WINDOW = 3  # pixels a side of the median that spikes do not get past
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """Heights along a straight line across the picture.
+
+    Attributes
+    ----------
+    distance : ndarray, (n,), float64
+        From its start, in ``unit``; samples are one pixel apart.
+    x, y : ndarray, (n,), float64
+        Where it runs, from the picture's centre, in ``unit``.
+    height, sigma : ndarray, (n,), float64
+        Millimetres: heights between four pixels, NaN beside a hole and between pieces; and their standard
+        deviations, NaN where they are not known or a height was filled.
+    filled : ndarray, (n,), bool
+        Where a height was filled, not measured.
+    unit : {"mm", "px"}
+        Millimetres, or pixels where their size is not known.
+    """
+
+    distance: Doubles
+    x: Doubles
+    y: Doubles
+    height: Doubles
+    sigma: Doubles
+    filled: Mask
+    unit: str = "mm"
+
+
+def section(result: Result, start: Point | None = None, end: Point | None = None) -> Section:
+    """Cut through the height map of a result.
+
+    Parameters
+    ----------
+    result : Result
+        Of one picture, with heights.
+    start, end : (float, float), optional
+        Millimetres from the picture's centre, x to the right and y up. Without them, the row of the highest
+        point is taken, from the picture's left to its right; the highest after a median over 3 x 3
+        pixels, which leaves spikes out, measured or filled.
+
+    Returns
+    -------
+    Section
+        NaN as well where the line runs outside of the outermost pixel centres.
+
+    Raises
+    ------
+    InputError
+        No heights, one map for each turn, only one end, both ends in one point, ends where the pixel size
+        is not known, or one further outside of the picture than that is large.
+    """
+    height = heights_of(result)
+    known = result.x is not None and result.y is not None
+    if (start is None) != (end is None):
+        raise InputError("a section needs both ends, or neither")
+    if start is not None and not known:
+        raise InputError(
+            "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
+        )
+    x, y = (result.x, result.y) if result.x is not None and result.y is not None else _pixels(height.shape)
+    size = pixel_size_of(x, y) if height.size > 1 else (1.0, 1.0)
+    if start is None or end is None:
+        row, _ = apex(height)
+        start, end = (float(x[0]), float(y[row])), (float(x[-1]), float(y[row]))
+    elif start == end:
+        raise InputError("both ends of the section are one point: give two")
+    else:
+        _check_near((start, end), x, y, size)
+    along, distance = _samples(start, end, size)
+    column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
+    values = _between(result, height, Spots.at(column, row_of, (height.shape[0], height.shape[1])))
+    return Section(distance, along[0], along[1], *values, "mm" if known else "px")
+
+
+def apex(height: NDArray[np.floating]) -> tuple[int, int]:
+    """Return row and column of the highest point, after a median that leaves spikes out.
+
+    Parameters
+    ----------
+    height : ndarray, (H, W)
+        NaN where there is none; the median takes that for lower than everything.
+
+    Raises
+    ------
+    InputError
+        There is no height.
+    """
+    known = np.isfinite(height)
+    if not known.any():
+        raise InputError("there is no height to look for the highest point")
+    lowest = float(np.min(height[known]))
+    below = np.nextafter(np.float32(lowest), np.float32(-np.inf)) - np.float32(1)
+    calm = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
+    calm[~known] = below
+    # Where all that is known is thinner than the window, there is no median to go by.
+    chosen = calm if np.any(calm > below) else np.where(known, height, below)
+    row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
+    return int(row), int(column)
+
+
+def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[float, float]) -> None:
+    """Raise InputError if an end is further outside of the picture than that is large."""
+    reach = size[0] * len(x), size[1] * len(y)
+    if np.any(abs(np.subtract(ends, (x.mean(), y.mean()))) > reach):
+        raise InputError("the section ends far outside of the picture: give points in it, in mm from its centre")
+
+
+def _pixels(shape: tuple[int, ...]) -> tuple[Doubles, Doubles]:
+    """Place pixels of size 1."""
+    return pixel_axes((shape[0], shape[1]), (1.0, 1.0))
+
+
+def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubles, Doubles]:
+    """Return evenly spaced points from end to end, (2, n), about a pixel apart, and their distances, (n,)."""
+    step = np.subtract(end, start)
+    length = math.hypot(*step)
+    pixels = math.hypot(step[0] / size[0], step[1] / size[1])
+    share = np.linspace(0, 1, max(round(pixels), 1) + 1) if length > 0 else np.zeros(1)
+    return np.add.outer(np.asarray(start), 0 * share) + np.multiply.outer(step, share), length * share
+
+
+def _between(result: Result, height: NDArray[np.float32], spots: Spots) -> tuple[Doubles, Doubles, Mask]:
+    """Return heights, their standard deviations and whether they were filled, (n,), at places."""
+    counts = spots.shares > _ROUNDING
+    whole = spots.whole
+    if result.component is not None:
+        whole = whole & np.all(spots.beside(result.component) | ~counts, axis=0)
+    values = _mean(height, spots, counts)
+    filled = np.zeros(values.shape, bool)
+    if result.filled is not None:
+        filled = np.any((result.filled.ravel()[spots.pixels] != 0) & counts, axis=0)
+    sigma = np.full(values.shape, np.nan)
+    if result.height_sigma is not None:
+        # Errors of neighbours go together, so those of a mean are no smaller.
+        sigma = _mean(result.height_sigma, spots, counts)
+    there = whole & np.isfinite(values)
+    return (
+        np.where(there, values, np.nan),
+        np.where(there & ~filled, sigma, np.nan),
+        filled & there,
+    )
+
+
+def _mean(values: NDArray[np.float32], spots: Spots, counts: Mask) -> Doubles:
+    """Return weighted means of four pixels, NaN where one that counts is."""
+    around = np.where(counts, values.ravel()[spots.pixels], 0).astype(np.float64)
+    return np.asarray(np.sum(np.where(counts, spots.shares, 0) * around, axis=0))

@@ -1,0 +1,159 @@
+"""Spheres through height maps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.measure.association import associate
+from mirrorskin.engine.measure.cloud import Cloud, spread
+from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.io import InputError
+
+Doubles = NDArray[np.float64]
+
+_POINTS = 4
+_FLATTEST = 1e-9  # sagitta over extent, below which a surface has no radius
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sphere:
+    """The sphere that fits a height map: a ball, or where its centre lies towards the camera a hollow.
+
+    Attributes
+    ----------
+    radius : Quantity
+        Millimetres.
+    x, y, z : Quantity
+        Its centre, mm.
+    top : Quantity
+        Height of its point that is nearest to the camera, of a hollow farthest from it, mm.
+    rms : Quantity
+        Root mean square of the distances that are left, of outliers too, µm.
+    residual : ndarray, (H, W), float64
+        Distances from it, mm, positive on the camera's side; NaN where there is no height.
+    outliers : int
+        Pixels that did not count.
+    hollow : bool
+    birge : float
+        Residual over what standard deviations make it; see `Association`.
+    """
+
+    radius: Quantity
+    x: Quantity
+    y: Quantity
+    z: Quantity
+    top: Quantity
+    rms: Quantity
+    residual: Doubles
+    outliers: int
+    hollow: bool
+    birge: float
+
+    def quantities(self) -> dict[str, Quantity]:
+        """Return what it tells, by name."""
+        return {
+            "sphere radius": self.radius,
+            "sphere centre x": self.x,
+            "sphere centre y": self.y,
+            "sphere centre z": self.z,
+            "sphere bottom" if self.hollow else "sphere top": self.top,
+            "sphere residual RMS": self.rms,
+        }
+
+
+def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Sphere:
+    """Fit a sphere to a height map by least squares of the distances from it.
+
+    Parameters
+    ----------
+    height, x, y, sigma
+        As for `fit_plane`.
+
+    Returns
+    -------
+    Sphere
+        Uncertainties are those of `covariance`; to those of heights comes the mean standard deviation of the
+        heights, which may all be wrong together.
+
+    Raises
+    ------
+    InputError
+        Fewer than four pixels, or a surface without curvature.
+    """
+    cloud = Cloud.of(height, x, y, sigma)
+    form = _Form.of(cloud.points)
+    found = None if form is None else associate(form, cloud.points, cloud.sigma)
+    if form is None or found is None:
+        raise InputError("no sphere fits: a curved surface of at least four pixels is needed")
+    x_centre, y_centre, z_centre, radius = map(float, found.parameters)
+    sigmas = np.sqrt(np.diag(found.covariance))
+    residual, rms = cloud.residual(form.distance(cloud.points, found.parameters))
+    return Sphere(
+        Quantity(radius, float(sigmas[3]), "mm"),
+        Quantity(x_centre, float(sigmas[0]), "mm"),
+        Quantity(y_centre, float(sigmas[1]), "mm"),
+        Quantity(z_centre, math.hypot(sigmas[2], cloud.common), "mm"),
+        Quantity(
+            z_centre + form.side * radius,
+            math.hypot(spread(found.covariance, 0, 0, 1, form.side), cloud.common),
+            "mm",
+        ),
+        rms,
+        residual,
+        int(np.count_nonzero(~found.kept)),
+        form.side < 0,
+        found.birge,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """Spheres by centre and radius; the side is 1 of a ball's top, -1 of a hollow."""
+
+    side: int
+    first: Doubles
+
+    @property
+    def lift(self) -> int:
+        return 2
+
+    @classmethod
+    def of(cls, points: Doubles) -> _Form | None:
+        """Begin with the paraboloid that fits, of which a sphere's cap is nearly one."""
+        if points.shape[1] < _POINTS:
+            return None
+        x, y, z = points
+        rows = np.stack([np.ones_like(x), x, y, x * x + y * y])
+        scale = np.abs(rows).max(axis=1)
+        if not np.all(scale > 0):
+            return None
+        rows /= scale[:, np.newaxis]
+        offset, p, q, bend = np.linalg.pinv(rows @ rows.T, hermitian=True) @ (rows @ z) / scale
+        extent = float(max(np.ptp(x), np.ptp(y)))
+        if not abs(bend) * extent > _FLATTEST:
+            return None
+        centre = np.array([-p / (2 * bend), -q / (2 * bend)])
+        top = offset + (p * centre[0] + q * centre[1]) / 2
+        return cls(-int(np.sign(bend)), np.array([*centre, top + 0.5 / bend, abs(0.5 / bend)]))
+
+    def start(self) -> Doubles:
+        return self.first
+
+    def distance(self, points: Doubles, parameters: Doubles) -> Doubles:
+        return np.asarray(self.side * (_length(points - parameters[:3, np.newaxis]) - parameters[3]))
+
+    def jacobian(self, points: Doubles, parameters: Doubles) -> Doubles:
+        rows = np.empty((4, points.shape[1]))
+        np.subtract(points, parameters[:3, np.newaxis], out=rows[:3])
+        rows[:3] /= -self.side * _length(rows[:3])
+        rows[3] = -self.side
+        return rows
+
+
+def _length(vectors: Doubles) -> Doubles:
+    """Return the lengths, (n,), of vectors, (3, n)."""
+    return np.asarray(np.sqrt(np.einsum("kn,kn->n", vectors, vectors)))

@@ -1,0 +1,328 @@
+"""All numbers of a height map, of surfaces whose numbers are known in closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from height_maps import cap, places, result_of
+
+from mirrorskin import engine, io
+
+NAN = np.nan
+SHAPE, SIZE = (211, 207), (0.03, 0.03)
+RADIUS, WIDTH = 5.0, 2.5
+SAG = RADIUS - np.sqrt(RADIUS**2 - WIDTH**2)
+
+
+def values(result, **options):
+    return {name: one.value for name, one in engine.measure(result, **options).quantities.items()}
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A cap that touches the rest plane with its top."""
+    return result_of(cap(SHAPE, SIZE, RADIUS, WIDTH), SIZE, sigma=0.001)
+
+
+def test_a_cap_has_the_numbers_of_its_closed_form(ball):
+    told = values(ball)
+    volume = np.pi * SAG**2 * (3 * RADIUS - SAG) / 3
+    assert told["highest point"] == pytest.approx(0, abs=1e-3 * SAG)
+    assert told["lowest point"] == pytest.approx(-SAG, abs=5e-3 * SAG)  # a pixel lies within the rim
+    assert told["height range"] == pytest.approx(SAG, rel=5e-3)
+    assert told["rim height"] == pytest.approx(-SAG, rel=2e-2)
+    assert told["height above rim"] == pytest.approx(SAG, rel=2e-2)
+    assert told["measured area"] == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
+    assert told["contact area"] == told["measured area"]
+    assert told["volume above rim"] == pytest.approx(
+        volume - (told["rim height"] + SAG) * np.pi * WIDTH**2, rel=1e-3
+    )
+    # Here the rim counts, whose pixels are in or out as a whole.
+    assert told["volume below rest plane"] == pytest.approx(np.pi * WIDTH**2 * SAG - volume, rel=2e-3)
+    assert told["sphere radius"] == pytest.approx(RADIUS, rel=1e-6)
+    assert told["Sq"] == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(31, 45), (90, 121)])
+def test_a_paraboloid_has_the_volume_of_its_closed_form(shape):
+    size = 3.0 / shape[0], 4.0 / shape[1]  # millimetres up and across
+    x, y = places(shape, size[::-1])
+    found = values(result_of(0.5 - (x**2 + y**2) / 40, size[::-1]), form="plane")
+    assert found["highest point"] == pytest.approx(0.5, rel=1e-3)
+    assert found["measured area"] == pytest.approx(12)
+    bend = (3**2 + 4**2) / 12 / 40  # the mean of x^2 + y^2 over a rectangle of a x b is (a^2 + b^2) / 12
+    assert found["volume below rest plane"] == pytest.approx(-12 * (0.5 - bend), rel=1e-3)
+    assert "sphere radius" not in found
+
+
+def test_the_surface_in_contact_is_told_by_normals(ball):
+    x, y = places(SHAPE, SIZE)
+    up = np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.1)) / RADIUS
+    normals = np.stack([x / RADIUS, y / RADIUS, up], axis=-1).astype(np.float32)
+    normals[np.isnan(ball.height)] = NAN
+    told = engine.measure(
+        dataclasses.replace(ball, normals=normals, normal_sigma=np.full(SHAPE, 1e-3, np.float32))
+    ).quantities["contact surface area"]
+    assert told.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
+    assert 0.5e-3 < told.sigma / told.value < 1e-2
+    assert "contact surface area" not in engine.measure(ball).quantities
+
+
+def test_contact_that_is_told_is_taken_for_the_contact(ball):
+    x, y = places(SHAPE, SIZE)
+    contact = (x**2 + y**2 < 4).astype(np.uint8)
+    told = engine.measure(dataclasses.replace(ball, contact=contact)).quantities
+    assert told["contact area"].value == pytest.approx(4 * np.pi, rel=1e-3)
+    # Half a pixel all around, to one side.
+    assert told["contact area"].sigma == pytest.approx(4 * np.pi * 0.015 / np.sqrt(3), rel=0.15)
+    assert told["measured area"].value == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
+
+
+def test_uncertainties_of_volumes_are_those_of_errors_that_all_go_together(ball):
+    sure, unsure = (engine.measure(result_of(ball.height, SIZE, sigma=s)).quantities for s in (1e-6, 0.01))
+    name = "volume below rest plane"
+    edge = 2 * np.pi * WIDTH * 0.015 / np.sqrt(3) * SAG
+    area = sure["measured area"].value
+    assert sure[name].sigma == pytest.approx(edge, rel=0.15)
+    assert unsure[name].sigma == pytest.approx(np.hypot(sure[name].sigma, 0.01 * area), rel=1e-3)
+    lifted = engine.measure(result_of(ball.height + 0.01, SIZE, sigma=0.01)).quantities
+    assert lifted[name].value == pytest.approx(unsure[name].value - 0.01 * area)
+
+
+def test_the_highest_point_is_not_the_one_with_the_largest_error():
+    rng = np.random.default_rng(2)
+    clean = cap((61, 61), (0.05, 0.05), RADIUS, 1.4)
+    pulls, largest = [], []
+    for _ in range(40):
+        noisy = clean + rng.normal(0, 0.01, clean.shape)
+        told = engine.measure(result_of(noisy, (0.05, 0.05), sigma=0.01), form="none").quantities[
+            "highest point"
+        ]
+        pulls.append(told.value / told.sigma)
+        largest.append(np.nanmax(noisy))
+    assert np.mean(np.abs(pulls) < 2) >= 0.95
+    assert abs(np.mean(pulls)) < 0.6
+    assert np.mean(largest) > 0.015
+
+
+def test_a_single_low_pixel_is_not_the_lowest_point():
+    height = cap((61, 61), (0.05, 0.05), RADIUS, 1.4)
+    before = values(result_of(height), form="none")["lowest point"]
+    height[20, 30] = -4.0
+    assert values(result_of(height), form="none")["lowest point"] == before
+
+
+def test_the_lowest_of_many_noisy_pixels_is_known_to_be_too_low():
+    noisy = np.random.default_rng(3).normal(0, 0.01, (80, 80))
+    told = engine.measure(result_of(noisy, sigma=0.01)).quantities["lowest point"]
+    assert abs(told.value) < 2 * told.sigma
+
+
+def test_what_was_filled_is_told_apart(ball):
+    filled = np.asarray(ball.height > -0.1).astype(np.uint8)
+    sigma = np.where(filled, np.float32(NAN), ball.height_sigma)
+    part = engine.measure(dataclasses.replace(ball, filled=filled, height_sigma=sigma))
+    whole, told = engine.measure(ball).quantities, part.quantities
+    for name in ("measured area", "volume above rim", "volume below rest plane"):
+        assert told[f"{name} with filled"].value == pytest.approx(whole[name].value)
+        assert abs(told[name].value) < abs(whole[name].value)
+        assert np.isfinite(told[name].sigma)
+    assert np.isnan(told["volume above rim with filled"].sigma)
+    # What a press fills it touched, or else surrounded: nobody knows.
+    assert told["contact area with filled"] == whole["contact area"]
+    assert "contact area" not in told
+    contact = np.isfinite(ball.height).astype(np.uint8)
+    sure = dataclasses.replace(ball, filled=filled, height_sigma=sigma, contact=contact)
+    assert engine.measure(sure).quantities["contact area"] == whole["contact area"]
+    assert told["highest point"].value < -0.09
+    assert told["highest point with filled"].value == pytest.approx(0, abs=1e-4)
+    assert told["height above rim with filled"].value == pytest.approx(
+        whole["height above rim"].value, abs=1e-3
+    )
+    assert any(note.startswith("the top was filled, not measured") for note in part.notes)
+    assert told["sphere radius"].value == pytest.approx(RADIUS, rel=1e-6)
+    assert f"pixels filled, not measured, that count only in what says 'filled': {filled.sum()}" in part.notes
+
+
+def test_the_form_is_the_sphere_where_it_leaves_much_less(ball):
+    x, _ = places((30, 40), (0.1, 0.1))
+    assert "sphere radius" in values(ball)
+    assert "plane tilt" in values(result_of(0.3 * x))
+    rough = np.random.default_rng(12).normal(0, 0.01, x.shape)
+    assert "plane tilt" in values(result_of(0.3 * x + rough))  # a huge sphere fits no worse
+    assert "plane tilt" in values(ball, form="plane")
+    assert not any("plane " in name and "rest" not in name for name in values(ball, form="none"))
+    spoilt = ball.height.copy()
+    spoilt[105, 75:85] = 1.0
+    notes = engine.measure(result_of(spoilt, SIZE, sigma=0.001)).notes
+    assert "outliers left out of the fit of the sphere, but not of its residual: 10" in notes
+
+
+def test_roughness_is_that_from_the_form(ball):
+    x, _ = places(SHAPE, SIZE)
+    wave = 0.002 * np.cos(2 * np.pi * x / 0.2)
+    told = values(result_of(ball.height + wave, SIZE))
+    assert told["Sq"] == pytest.approx(2 * np.sqrt(0.5 * (1 - WIDTH**2 / (2 * RADIUS**2))), rel=1e-2)
+    filtered = engine.measure(result_of(ball.height + wave, SIZE), cutoff=0.4)
+    assert filtered.quantities["Sq"].value == pytest.approx(told["Sq"] * (1 - 0.5**4), rel=0.02)
+    assert any("of waves up to 0.4 mm" in note for note in filtered.notes)
+    assert any(note.startswith("pixels left out of roughness") for note in filtered.notes)
+
+
+def test_a_region_is_measured_alone(ball):
+    region = io.Region((80, 140), (60, 150))
+    told = values(ball, region=region)
+    assert told["measured area"] == pytest.approx(60 * 90 * SIZE[0] * SIZE[1])
+    assert told["sphere radius"] == pytest.approx(RADIUS, rel=1e-5)
+    assert "rim height" not in told
+    assert any("border" in note for note in engine.measure(ball, region=region).notes)
+    with pytest.raises(io.InputError, match="--region: a region of rows 0 to 500"):
+        engine.measure(ball, region=io.Region((0, 500), (0, 10)))
+
+
+def pieces(unknown):
+    """Two pieces: a level one of 6 x 20 pixels at 1 mm, and one of 6 x 10 at 5 mm."""
+    height = np.full((20, 20), NAN)
+    component = np.full((20, 20), -1, np.int32)
+    height[2:8], component[2:8] = 1.0, 0
+    height[10:16, :10], component[10:16, :10] = 5.0, 1
+    return result_of(height, component=component, offset_unknown=np.array(unknown, np.uint8))
+
+
+def test_pieces_whose_height_is_relative_are_not_compared_with_others():
+    both, second, largest = (engine.measure(pieces(unknown)) for unknown in ([0, 0], [0, 1], [1, 1]))
+    assert both.quantities["height range"].value == pytest.approx(4)
+    assert second.quantities["height range"].value == 0
+    assert second.quantities["highest point"].value == 1
+    assert "pieces left out, whose height is only relative: 1" in second.notes
+    assert largest.quantities["measured area"].value == pytest.approx(1.2)
+    assert "volume below rest plane" not in largest.quantities
+    assert largest.notes[0] == "heights are relative: their mean is 0"
+    assert largest.notes[1].startswith("only the largest of 2 pieces")
+
+
+def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
+    lens = io.Lens(SIZE, np.eye(3), np.zeros(5), np.eye(3), SHAPE, 0.1, 0.01)
+    plain = engine.measure(ball)
+    with_lens = engine.measure(dataclasses.replace(ball, calibration=io.Calibration(camera=None, lens=lens)))
+    for name, power in {
+        "measured area": 2,
+        "sphere radius": 2,
+        "sphere centre z": 2,
+        "sphere centre x": 1,
+        "highest point": 0,
+    }.items():
+        before, after = (one.quantities[name] for one in (plain, with_lens))
+        assert after.sigma == pytest.approx(np.hypot(before.sigma, power * 0.01 * before.value), rel=1e-3)
+    assert any("known within 1 %" in note for note in with_lens.notes)
+    assert any("taken as exact" in note for note in plain.notes)
+
+
+@pytest.mark.parametrize(("power", "form"), [(2, "sphere"), (-1, "plane")])
+def test_what_a_wrong_pixel_size_does_to_a_form_is_within_its_uncertainty(power, form):
+    shape, off = (31, 41), 1e-3
+    x, _ = places(shape, SIZE)
+    height = cap(shape, SIZE, RADIUS, 2.0) if form == "sphere" else 0.1 * x
+    at = io.pixel_axes(shape, SIZE)
+    right, wrong = (fit(height, *(one * by for one in at), form) for by in (1, 1 + off))
+    assert wrong / right - 1 == pytest.approx(power * off, rel=0.15)
+
+
+def fit(height, x, y, form):
+    if form == "sphere":
+        return engine.fit_sphere(height, x, y).radius.value
+    return engine.fit_plane(height, x, y).tilt.value
+
+
+def test_a_section_compares_no_heights_of_pieces_that_lie_nobody_knows_how_high():
+    ends = (-0.7, -0.85), (-0.7, 0.95)
+    assert engine.measure(pieces([0, 0]), section=ends).quantities["height difference"].value == -4
+    alone = engine.measure(pieces([1, 1]), section=ends)
+    assert alone.quantities["height difference"].value == 0
+    assert any(note.startswith("section: an end has no measured height") for note in alone.notes)
+
+
+def notes_of_fit(height, form, sigma=0.001):
+    result = result_of(height, (0.1, 0.1), sigma=sigma)
+    return [note for note in engine.measure(result, form=form).notes if "within its errors" in note]
+
+
+def test_a_form_that_does_not_fit_is_told():
+    shape = 51, 57
+    clean = cap(shape, (0.1, 0.1), RADIUS, WIDTH)
+    noisy = clean + np.random.default_rng(5).normal(0, 0.001, shape)
+    x, y = places(shape, (0.1, 0.1))
+    bent = noisy + 0.008 * np.cos(3 * x) * np.cos(3 * y)
+    assert notes_of_fit(clean, "sphere") == notes_of_fit(noisy, "sphere") == []
+    for form, unlike in {"sphere": bent, "plane": clean}.items():
+        (note,) = notes_of_fit(unlike, form)
+        assert note.startswith(f"the surface is no {form} within its errors")
+        assert notes_of_fit(unlike, form, sigma=None) == []  # which nobody knows
+
+
+def test_what_hardly_knows_its_height_is_not_the_lowest_and_not_rough():
+    rng = np.random.default_rng(7)
+    height = rng.normal(0, 0.001, (40, 50))
+    sigma = np.full((40, 50), 0.001, np.float32)
+    height[5:7, 30], sigma[5:7, 30] = -0.8, 0.4
+    found = engine.measure(result_of(height, height_sigma=sigma), form="plane")
+    assert found.quantities["lowest point"].value > -0.005
+    assert found.quantities["Sz"].value < 10
+    assert "pixels left out of roughness and lowest point, far less sure than others: 2" in found.notes
+    sure = engine.measure(result_of(height, sigma=0.001), form="plane").quantities
+    assert sure["lowest point"].value == pytest.approx(-0.8)
+    assert sure["Sz"].value > 800
+
+
+def test_heights_without_a_standard_deviation_are_left_out_and_that_is_told():
+    height = np.zeros((9, 9))
+    height[4, 4:6] = 3.0
+    sigma = np.where(height > 0, NAN, 0.01).astype(np.float32)
+    found = engine.measure(result_of(height, height_sigma=sigma))
+    assert found.quantities["highest point"].value == 0
+    assert "pixels left out, whose height has no standard deviation: 2" in found.notes
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (9, 1), (2, 1), (2, 2), (3, 3)])
+@pytest.mark.parametrize("sigma", [None, 0.01, 0.0])
+def test_tiny_pictures_of_all_equal_heights_are_measured(shape, sigma):
+    told = engine.measure(result_of(np.full(shape, -0.5), sigma=sigma)).quantities
+    assert told["highest point"].value == told["lowest point"].value == told["median height"].value == -0.5
+    assert told["Sz"].value == pytest.approx(0, abs=1e-9)
+    assert told["measured area"].value == pytest.approx(np.prod(shape) * 0.01)
+    assert told["volume below rest plane"].value == pytest.approx(np.prod(shape) * 0.005)
+
+
+def test_one_known_pixel_is_measured():
+    height = np.full((5, 6), NAN)
+    height[2, 3] = -0.25
+    told = engine.measure(result_of(height, sigma=0.01)).quantities
+    assert (told["highest point"].value, told["lowest point"].value) == (-0.25, -0.25)
+    assert told["rim height"].value == -0.25
+    assert told["measured area"].value == pytest.approx(0.01)
+
+
+def test_without_standard_deviations_uncertainties_of_heights_are_unknown(ball):
+    for sigma in (None, NAN):
+        found = engine.measure(result_of(ball.height, SIZE, sigma=sigma))
+        for name in ("highest point", "lowest point", "volume above rim", "Sq"):
+            assert np.isnan(found.quantities[name].sigma)
+        assert np.isfinite(found.quantities["sphere radius"].sigma)
+        assert any("no standard deviations" in note for note in found.notes)
+
+
+def test_what_cannot_be_measured_is_refused_in_a_line(ball):
+    refused = {
+        "has no heights": io.Result(azimuth=np.zeros((3, 3), np.float32)),
+        "maps of 2 turns": io.Result(height=np.zeros((2, 3, 3), np.float32)),
+        "no pixel size: .*--pixel-size": dataclasses.replace(ball, x=None, y=None),
+        "no height was measured": result_of(np.full((3, 3), NAN)),
+        "no height was measured there": result_of(np.zeros((3, 3)), filled=np.ones((3, 3), np.uint8)),
+        "a single pixel": result_of(np.zeros((1, 1))),
+    }
+    for said, result in refused.items():
+        with pytest.raises(io.InputError, match=said) as caught:
+            engine.measure(result)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(io.InputError, match="no sphere fits"):
+        engine.measure(result_of(np.zeros((9, 9))), form="sphere")
