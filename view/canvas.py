@@ -1,26 +1,36 @@
-"""What all figures share: a canvas, where a map lies on it, and how it becomes a file."""
+"""What all figures share: a canvas, where a map lies on it and in what colours, and how it becomes a file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
+from mirrorskin.io.export.writing import write_new
 from mirrorskin.io.types import Floats
+from mirrorskin.view.colours import FILLED_SHADES, MISSING
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
-MISSING = "lightsteelblue"
-"""Colour of what has no answer."""
-FILLED = "tab:orange"
-"""Colour of what was not measured but filled."""
-FILLED_SHADES = "#331a00", "#ffb266"
-"""Its shades, from the lowest to the highest."""
+Extent = tuple[float, float, float, float]
+"""Outer edges of a map's pixels: left, right, bottom and top."""
+
+BESIDE: Mapping[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False}
+"""Where a legend stands that hides nothing: at the right of a panel."""
+
+_ROUND = 1, 2, 5, 10
+_DPI = 110  # pixels an inch, of a file
 
 
 def check_drawing() -> None:
@@ -40,19 +50,120 @@ def new_figure(width: float, height: float) -> Figure:
 def save_figure(figure: Figure, title: str, path: Path) -> None:
     """Write a figure with its title into a PNG, or raise InputError."""
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
+    write_figure(figure, path)
 
 
-def extent(x: Floats, y: Floats) -> tuple[float, float, float, float]:
-    """Return the outer edges of a map's pixels, mm: left, right, bottom and top."""
-    half = (abs(x[1] - x[0]) / 2, abs(y[1] - y[0]) / 2)
-    return float(x[0] - half[0]), float(x[-1] + half[0]), float(y[-1] - half[1]), float(y[0] + half[1])
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as it is into a PNG, which exists whole or not at all, or raise InputError."""
+    write_new(path, [encode_figure(figure, _DPI)])
 
 
-def check_same_size(shape: tuple[int, ...], truth: NDArray[np.float32]) -> None:
-    """Raise InputError unless a result and the truth are of one stack."""
-    if truth.shape != shape:
-        raise InputError(f"the result is {shape} pixels, the truth {truth.shape}: not of one stack")
+def encode_figure(figure: Figure, dpi: float) -> bytes:
+    """Return a figure as a PNG of so many pixels an inch."""
+    target = BytesIO()
+    figure.savefig(target, format="png", dpi=dpi)
+    return target.getvalue()
+
+
+def extent(x: Floats, y: Floats) -> Extent:
+    """Return the outer edges of a map's pixels, in the unit of ``x`` and ``y``.
+
+    A picture of one row or one column is as high or wide as its pixels are the other way; one of one pixel
+    is 1 x 1.
+    """
+    steps = [abs(float(along[1] - along[0])) if len(along) > 1 else None for along in (x, y)]
+    across, up = ((step or steps[1 - axis] or 1.0) / 2 for axis, step in enumerate(steps))
+    return float(x[0] - across), float(x[-1] + across), float(y[-1] - up), float(y[0] + up)
+
+
+def draw_image(
+    axes: Axes,
+    values: NDArray[Any],
+    place: Extent | None = None,
+    label: str = "",
+    extend: str = "neither",
+    **colours: Any,
+) -> AxesImage:
+    """Draw a map, pixel by pixel; what has no answer has a colour of its own.
+
+    Parameters
+    ----------
+    axes : Axes
+    values : ndarray, (H, W), (H, W, 3) or (H, W, 4)
+        NaN without an answer; or colours.
+    place : Extent, optional
+        Where it lies; without it, along pixels.
+    label : str
+        Quantity and unit beside its colours; without it, they are not explained.
+    extend : {"neither", "min", "max", "both"}
+        Ends of the colours that are exceeded.
+    **colours
+        As ``imshow`` has them: ``cmap``, ``vmin``, ``vmax``, ``norm``, ``interpolation``.
+    """
+    axes.set_facecolor(MISSING)
+    picture = axes.imshow(values, extent=place, **{"interpolation": "nearest", **colours})
+    if label:
+        explain_colours(axes, picture, label, extend)
+    return picture
+
+
+def explain_colours(axes: Axes, picture: ScalarMappable, label: str, extend: str = "neither") -> None:
+    """Draw the colours of a map right beside it."""
+    bar = axes.inset_axes((1.03, 0, 0.04, 1))
+    axes.figure.colorbar(picture, cax=bar, label=label, extend=extend)
+
+
+def exceeded(values: NDArray[Any], low: float, high: float) -> str:
+    """Tell which ends of the colours values exceed, in the words of ``explain_colours``."""
+    below, above = bool(np.any(values < low)), bool(np.any(values > high))
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+
+
+def draw_classes(
+    axes: Axes,
+    classes: NDArray[np.uint8],
+    colours: Sequence[str],
+    labels: Mapping[int, str],
+    place: Extent | None = None,
+    interpolation: str = "nearest",
+) -> AxesImage:
+    """Draw a map of classes, with those beside it that have a label.
+
+    Parameters
+    ----------
+    axes : Axes
+    classes : ndarray, (H, W), uint8
+        Numbers of colours.
+    colours : sequence of str
+    labels : mapping
+        What classes are called.
+    place : Extent, optional
+    interpolation : str
+        How pixels that are smaller than those of the figure become colours.
+    """
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Patch
+
+    table = np.array([np.multiply(255, to_rgb(colour)).round() for colour in colours], np.uint8)
+    picture = draw_image(axes, table[classes], place, interpolation=interpolation)
+    patches = [
+        Patch(facecolor=colours[number], edgecolor="0.5", label=label) for number, label in labels.items()
+    ]
+    axes.legend(handles=patches, handlelength=1, handleheight=1, **BESIDE)
+    return picture
+
+
+def filled_colours() -> Colormap:
+    """Return the colours of heights that were filled, from the lowest to the highest."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("filled", FILLED_SHADES)
+
+
+def round_length(length: float, up: bool = False) -> float:
+    """Return the nearest 1, 2 or 5 times a power of ten that is not longer, or with ``up`` not shorter."""
+    power = 10.0 ** np.floor(np.log10(length))
+    steps = [factor * power for factor in _ROUND]
+    if up:
+        return float(next(step for step in steps if step >= length * (1 - 1e-9)))
+    return float(max(step for step in steps if step <= length * (1 + 1e-9)))

@@ -29,7 +29,7 @@ def command(
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.check import check_ball
     from mirrorskin.view import check_drawing
-    from mirrorskin.view.check import check_figure
+    from mirrorskin.view.calibration.check import check_figure
 
     if picture is not None:
         check_drawing()
@@ -44,4 +44,6 @@ def command(
         return
     head = ("what", "when", "rms", "bias", "worst cell's rms", "expected", "pixels")
     print_table(head, found.table())
+    for note in found.notes():
+        typer.echo(note)
     typer.echo(f"ball of {found.ball:g} mm found at {found.place[0]:.3f}, {found.place[1]:.3f} mm")

@@ -1,3 +1,5 @@
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -7,7 +9,7 @@ import pytest
 
 from mirrorskin.engine.live.types import SHOWN, Latency, Status, Update
 from mirrorskin.io import InputError
-from mirrorskin.view import live
+from mirrorskin.view import live, viewer
 
 SHAPE = (5, 8)
 
@@ -39,14 +41,6 @@ def test_a_section_of_nothing_is_empty():
     assert live.section(np.full((3, 7), np.nan, np.float32), np.arange(7.0)) == []
 
 
-def test_normals_have_the_customary_colours():
-    normals = np.array([[[0, 0, 1], [1, 0, 0], [np.nan] * 3, [0, -1, 0]]], np.float32)
-    edges = np.array([[0, 0, 0, 1]], np.uint8)
-    assert live.normal_colours(normals, edges).tolist() == [
-        [[127, 127, 255], [255, 127, 127], [176, 196, 222], [0, 0, 0]]
-    ]
-
-
 def test_colours_of_a_height_do_not_change_when_others_come():
     colours = live._Range()
     first = colours.colour(np.array([[0.0, 1.0]], np.float32))
@@ -67,7 +61,7 @@ def test_a_file_keeps_all_that_was_shown(tmp_path):
     view.show(update(), Status())
     view.show(known(), STATUS)
     view.close()
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
+    command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(path)]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     for name in ("/camera", "/height", "/normals", "/section/surface", "/contact/area", "/status"):
         assert name in told
@@ -92,24 +86,24 @@ def test_a_viewer_in_the_browser_listens_on_this_machine_only(monkeypatch):
         started.append((words, popen(words, **options)))
         return started[-1][1]
 
-    monkeypatch.setattr(live.subprocess, "Popen", start)
-    view = live.LiveView(live.BROWSER, SHAPE)
-    (words, viewer), begun = started[0], time.monotonic()
+    monkeypatch.setattr(viewer.subprocess, "Popen", start)
+    view = live.LiveView(viewer.BROWSER, SHAPE)
+    (words, process), begun = started[0], time.monotonic()
     try:
         view.show(known(), STATUS)
         view.close()
         assert time.monotonic() - begun < 20
         assert words[words.index("--bind") + 1] == "127.0.0.1"
-        assert viewer.poll() is None  # it stays open for its user
+        assert process.poll() is None  # it stays open for its user
     finally:
-        viewer.kill()
-        viewer.wait()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def test_a_viewer_that_does_not_start_has_a_remedy(monkeypatch):
-    monkeypatch.setattr(live.sys, "executable", "false")
+    monkeypatch.setattr(viewer.sys, "executable", "false")
     with pytest.raises(InputError, match=r"does not start here: take --view browser, or --view FILE.rrd"):
-        live.LiveView(live.WINDOW, SHAPE)
+        live.LiveView(viewer.WINDOW, SHAPE)
 
 
 def test_a_file_that_cannot_be_is_refused(tmp_path):
@@ -118,6 +112,6 @@ def test_a_file_that_cannot_be_is_refused(tmp_path):
 
 
 def test_without_rerun_a_remedy_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(live, "find_spec", lambda name: None)
+    monkeypatch.setattr(viewer, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'mirrorskin\[live\]'"):
         live.LiveView(tmp_path / "run.rrd", SHAPE)

@@ -10,6 +10,7 @@ import numpy as np
 from mirrorskin.io.calibration.types import Lens
 from mirrorskin.io.types import Floats
 from mirrorskin.view.calibration.maps import draw_pixels, new_sheet
+from mirrorskin.view.canvas import round_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,7 +98,7 @@ def _draw_grid(axes: Axes, lens: Lens) -> None:
     rows, columns = lens.shape
     corners = np.array([[0, 0], [columns - 1, 0], [0, rows - 1], [columns - 1, rows - 1]], np.float64)
     x, y = _project(lens.camera, corners)
-    step = _round_step(max(np.ptp(x), np.ptp(y)) / _LINES)
+    step = round_length(max(np.ptp(x), np.ptp(y)) / _LINES, up=True)
     to_picture = np.asarray(np.linalg.inv(lens.camera))
     for across, (low, high), (start, stop) in (
         (True, (x.min(), x.max()), (y.min(), y.max())),
@@ -121,9 +122,3 @@ def _draw_grid(axes: Axes, lens: Lens) -> None:
         ylabel="row (px)",
         title=f"the sheet as the camera sees it\nlines every {step:g} mm; red: x = 0, y = 0",
     )
-
-
-def _round_step(step: float) -> float:
-    """Return the next 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(step))
-    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= step * (1 - 1e-9))

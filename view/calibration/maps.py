@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import MISSING, new_figure
+from mirrorskin.view.canvas import draw_image, exceeded, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
     from matplotlib.projections.polar import PolarAxes
 
 AZIMUTHS = np.linspace(0, math.tau, 181)
@@ -56,20 +55,11 @@ def draw_pixels(
         low = -high
     if high - low <= 1e-6 * max(abs(low), abs(high)):  # one value is no range
         low, high = low - 0.5, high + 0.5
-    axes.set_facecolor(MISSING)
-    picture = axes.imshow(shown, cmap=colours, interpolation="nearest", vmin=low, vmax=high)
-    below, above = bool(known.size and known.min() < low), bool(known.size and known.max() > high)
-    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    explain_colours(axes, picture, label, extend[below, above])
+    beyond = exceeded(known, low, high)
+    draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
     told = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
     blue = "; blue: no answer" if 0 < known.size < shown.size else ""
     axes.set(title=f"{title}\n{told}{blue}", xlabel="column (px)", ylabel="row (px)")
-
-
-def explain_colours(axes: Axes, picture: AxesImage, label: str, extend: str = "neither") -> None:
-    """Draw the colours of a map right beside it."""
-    bar = axes.inset_axes((1.03, 0, 0.04, 1))
-    axes.figure.colorbar(picture, cax=bar, label=label, extend=extend)
 
 
 def draw_azimuths(axes: PolarAxes, zeniths: Mapping[str, Floats], title: str) -> None:

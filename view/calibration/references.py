@@ -10,6 +10,7 @@ from scipy.ndimage import maximum_filter
 
 from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED, References
 from mirrorskin.view.calibration.maps import draw_pixels, new_sheet
+from mirrorskin.view.canvas import draw_classes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,28 +43,14 @@ def draw_references(references: References) -> Figure:
 
 def _draw_defects(axes: Axes, defects: NDArray[np.uint8]) -> None:
     """Draw defects by colour, each large enough to be seen."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
-
     names = list(_COLOURS)
     kind = np.full(defects.shape, names.index("several"), np.uint8)
     for name, bits in ({"sound": 0} | _KINDS).items():
         kind[defects == bits] = names.index(name)
     size = max(1, max(defects.shape) // _VISIBLE)
-    axes.imshow(
-        maximum_filter(kind, size),
-        cmap=ListedColormap(list(_COLOURS.values())),
-        interpolation="nearest",
-        vmin=-0.5,
-        vmax=len(names) - 0.5,
-    )
-    counts = {name: int(np.count_nonzero(kind == number)) for number, name in enumerate(names)}
-    patches = [
-        Patch(facecolor=_COLOURS[name], edgecolor="0.5", label=f"{name}: {count}")
-        for name, count in counts.items()
-        if count
-    ]
-    axes.legend(handles=patches, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    counts = np.bincount(kind.ravel(), minlength=len(names))
+    labels = {number: f"{names[number]}: {count}" for number, count in enumerate(counts) if count}
+    draw_classes(axes, maximum_filter(kind, size), list(_COLOURS.values()), labels)
     axes.set(title="defects\ndrawn larger than they are", xlabel="column (px)", ylabel="row (px)")
     if size == 1:
         axes.set_title("defects\n")

@@ -14,11 +14,11 @@ from mirrorskin.view.calibration.maps import (
     AZIMUTHS,
     draw_azimuths,
     draw_pixels,
-    explain_colours,
     new_sheet,
     places_about,
 )
-from mirrorskin.view.canvas import MISSING
+from mirrorskin.view.canvas import explain_colours
+from mirrorskin.view.colours import MISSING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

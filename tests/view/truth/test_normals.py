@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io, view
+from mirrorskin.view.truth import normals
 
 SHAPE = (20, 30)
 ZENITH = np.radians(30)
@@ -29,15 +30,16 @@ def truth_of(azimuth=0.5, contact=None):
 def drawn(results, truth, tmp_path, monkeypatch):
     """Draw; return the axes, row by row, and the file."""
     kept = []
-    monkeypatch.setattr(view.normals, "save_figure", lambda figure, title, path: kept.append(figure))
+    monkeypatch.setattr(normals, "save_figure", lambda figure, title, path: kept.append(figure))
     view.normal_figure(results, truth, "title", tmp_path / "x.png")
     axes = [one for one in kept[0].axes if one.get_label() != "<colorbar>"]
     return np.array(axes).reshape(-1, 3)
 
 
-def test_normals_become_a_picture(tmp_path):
+def test_normals_become_a_picture_and_nothing_in_contact_does(tmp_path):
     path = tmp_path / "normals.png"
-    view.normal_figure({"one": result_of(), "two": result_of(0.6)}, truth_of(), "title", path)
+    none = result_of(contact=np.zeros(SHAPE, np.uint8))
+    view.normal_figure({"one": result_of(), "none": none}, truth_of(), "title", path)
     assert cv2.imread(str(path)).shape[0] > 600
 
 
@@ -91,7 +93,7 @@ def test_what_cannot_be_drawn_is_said(tmp_path, kind):
         view.normal_figure({"one": results[kind]}, truth_of(), "title", tmp_path / "x.png")
 
 
-def test_nothing_in_contact_is_drawn_too(tmp_path):
-    none = np.zeros(SHAPE, np.uint8)
-    view.normal_figure({"one": result_of(contact=none)}, truth_of(), "title", tmp_path / "x.png")
-    assert (tmp_path / "x.png").exists()
+def test_nothing_in_contact_at_all_is_said(tmp_path, monkeypatch):
+    none = result_of(contact=np.zeros(SHAPE, np.uint8))
+    (axes,) = drawn({"one": none}, truth_of(), tmp_path, monkeypatch)
+    assert axes[2].get_title().startswith("no pixel in contact")

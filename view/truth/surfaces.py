@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirrorskin.io import Result, Truth
-from mirrorskin.view.canvas import FILLED, MISSING, extent, new_figure, save_figure
-from mirrorskin.view.relief import (
+from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.colours import FILLED
+from mirrorskin.view.truth.relief import (
     Relief,
     dots_on_row,
     draw_cuts,
@@ -75,16 +76,8 @@ def _draw_errors(axes: Axes, relief: Relief, truth: Truth) -> None:
     known = error[np.isfinite(error)]
     worst = float(np.percentile(np.abs(known), _WORST)) if known.size else 1.0
     told = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
-    axes.set_facecolor(MISSING)
-    picture = axes.imshow(
-        error,
-        extent=extent(relief.x, relief.y),
-        cmap="RdBu_r",
-        interpolation="nearest",
-        vmin=-worst,
-        vmax=worst,
-    )
-    axes.figure.colorbar(picture, ax=axes, label="height - truth (\N{MICRO SIGN}m)", shrink=0.85)
+    place, label = extent(relief.x, relief.y), "height - truth (\N{MICRO SIGN}m)"
+    draw_image(axes, error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
     if relief.filled.any():
         marks = relief.filled.astype(float)
         axes.contour(relief.x, relief.y, marks, levels=[0.5], colors=FILLED, linewidths=1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mirrorskin.io import Result, Truth
 from mirrorskin.view.canvas import new_figure, save_figure
-from mirrorskin.view.relief import draw_cuts, draw_map, draw_surface, relief_of
+from mirrorskin.view.truth.relief import draw_cuts, draw_map, draw_surface, relief_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirrorskin.engine.calibration.check import Check, Errors
-from mirrorskin.view.canvas import MISSING, extent, new_figure, save_figure
+from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,16 +44,8 @@ def check_figure(check: Check, title: str, path: Path) -> None:
 
 
 def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> None:
-    axes.set_facecolor(MISSING)
-    picture = axes.imshow(
-        errors.error,
-        extent=extent(check.x, check.y),
-        cmap="RdBu_r",
-        interpolation="nearest",
-        vmin=-worst,
-        vmax=worst,
-    )
-    axes.figure.colorbar(picture, ax=axes, label=f"found - true ({errors.unit})", shrink=0.85)
+    place, label = extent(check.x, check.y), f"found - true ({errors.unit})"
+    draw_image(axes, errors.error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
     digits = 3 if errors.unit == "deg" else 4
     rms, bias = (round(float(value), digits) + 0.0 for value in (errors.whole.rms, errors.whole.bias))
     told = f"RMS {rms:.{digits}f}, bias {bias:+.{digits}f} {errors.unit}"

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from mirrorskin.engine.angles import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import MISSING, check_same_size, extent, new_figure, save_figure
+from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.truth.relief import check_same_size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,8 +92,7 @@ def _draw_colours(axes: Axes, name: str, result: Result) -> None:
         colours[result.edges.astype(bool)] = 0, 0, 0, 1
         known = known | result.edges.astype(bool)
     colours[~known, 3] = 0
-    axes.set_facecolor(MISSING)
-    axes.imshow(colours, extent=extent(x, y), interpolation="nearest")
+    draw_image(axes, colours, extent(x, y))
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}; black: edges, blue: no answer")
 
 
@@ -128,9 +128,5 @@ def _draw_errors(axes: Axes, result: Result, error: Floats, worst: float) -> Non
     _, x, y = _maps(result)
     known = error[np.isfinite(error)]
     told = f"median {np.median(known):.2f} deg" if known.size else "no pixel in contact"
-    axes.set_facecolor(MISSING)
-    picture = axes.imshow(
-        error, extent=extent(x, y), cmap="magma", interpolation="nearest", vmin=0, vmax=worst
-    )
-    axes.figure.colorbar(picture, ax=axes, label="angle to the truth (deg)", shrink=0.85)
+    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", cmap="magma", vmin=0, vmax=worst)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{told}; blue: no lasting contact")

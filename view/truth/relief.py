@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import FILLED, FILLED_SHADES, MISSING, check_same_size, extent
+from mirrorskin.view.canvas import draw_image, extent, filled_colours
+from mirrorskin.view.colours import FILLED, span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,22 +83,12 @@ def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float3
 
 def draw_map(axes: Axes, name: str, relief: Relief) -> None:
     """Draw heights by brightness, filled ones in shades of orange."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    axes.set_facecolor(MISSING)
     lowest, highest = span(relief.height)
-    shades: list[str | Colormap] = ["gray", LinearSegmentedColormap.from_list("filled", FILLED_SHADES)]
+    shades: list[str | Colormap] = ["gray", filled_colours()]
     for filled in (False, True) if relief.filled.any() else (False,):
-        picture = axes.imshow(
-            np.where(relief.filled == filled, relief.height, np.nan),
-            extent=extent(relief.x, relief.y),
-            cmap=shades[filled],
-            interpolation="nearest",
-            vmin=lowest,
-            vmax=highest,
-        )
-        if not filled:
-            axes.figure.colorbar(picture, ax=axes, label="height (mm)", shrink=0.85)
+        shown, place = np.where(relief.filled == filled, relief.height, np.nan), extent(relief.x, relief.y)
+        label = "" if filled else "height (mm)"
+        draw_image(axes, shown, place, label, cmap=shades[filled], vmin=lowest, vmax=highest)
     axes.axhline(0, color="tab:red", lw=0.8, ls=":")
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}\n{relief.notes('blue: no answer')}")
 
@@ -153,8 +144,7 @@ def dots_on_row(axes: Axes, values: Mapping[str, NDArray[np.float32]], reliefs: 
             axes.plot(relief.x, np.where(filled, values[name], np.nan), marker="o", mfc="none", **style)
 
 
-def span(height: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest and highest height but for a few pixels at the edge of visibility."""
-    heights = height[np.isfinite(height)]
-    lowest, highest = np.percentile(heights, [0.2, 99.8]) if heights.size else (-1.0, 0.0)
-    return float(lowest), float(highest)
+def check_same_size(shape: tuple[int, ...], truth: NDArray[np.float32]) -> None:
+    """Raise InputError unless a result and the truth are of one stack."""
+    if truth.shape != shape:
+        raise InputError(f"the result is {shape} pixels, the truth {truth.shape}: not of one stack")

@@ -1,0 +1,318 @@
+"""Each panel shows its map, where it lies and in words that are true."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from shown import ball, colours_at, rendered
+
+from mirrorskin import engine, io
+from mirrorskin.view.colours import MISSING_RGB, normal_colours
+from mirrorskin.view.result.classes import draw_edges, draw_status
+from mirrorskin.view.result.height import draw_height
+from mirrorskin.view.result.histogram import draw_histogram
+from mirrorskin.view.result.normals import draw_normals
+from mirrorskin.view.result.scalars import draw_azimuth, draw_height_sigma, draw_modulation, draw_normal_sigma
+from mirrorskin.view.result.section import draw_section
+from mirrorskin.view.result.sheet import percent, sheet_of
+
+
+def panel_of(draw, result, *more):
+    axes = Figure(figsize=(5, 4)).add_axes((0.15, 0.15, 0.6, 0.65))
+    draw(axes, sheet_of(result), *more)
+    return axes
+
+
+def note(axes):
+    """Return the small letters below the title."""
+    return next(text.get_text() for text in axes.texts if text.xyann == (0, 5))
+
+
+def named(axes):
+    return {text.get_text() for text in axes.get_legend().get_texts()}
+
+
+def along(shape=(20, 60), pixel_size=(0.1, 0.1), span=1.0):
+    """A parabola along x, flat along y, with a hole and something that was filled."""
+    x, y = io.pixel_axes(shape, pixel_size)
+    height = np.broadcast_to(-span * (x / x[-1]) ** 2, shape).astype(np.float32)
+    filled = np.zeros(shape, np.uint8)
+    height[:, 10:13] = np.nan
+    filled[:, 20:40] = 1
+    sigma = np.where(filled == 1, np.nan, np.float32(0.01) * span)
+    return io.Result(height=height, height_sigma=sigma.astype(np.float32), filled=filled, x=x, y=y)
+
+
+def cut_of(result, *ends):
+    return sheet_of(result), engine.section(result, *ends)
+
+
+def test_the_height_lies_as_the_picture_does():
+    result = ball()
+    corner = result.height.copy()
+    corner[:4, :5] = 5.0  # the upper left
+    axes = panel_of(draw_height, ball(height=corner))
+    assert axes.get_xlim() == pytest.approx((-1.6, 1.6))
+    assert axes.get_ylim() == pytest.approx((-1.44, 1.44))
+    yellow, hole = colours_at(axes, [(-1.45, 1.2), (1.45, 1.2)])
+    assert yellow[0] > 150 > yellow[2]
+    np.testing.assert_allclose(hole, MISSING_RGB, atol=2)
+
+
+@pytest.mark.parametrize("draw", [draw_height, draw_normals, draw_edges, draw_status, draw_azimuth])
+def test_a_millimetre_is_as_long_up_as_it_is_across(draw):
+    axes = panel_of(draw, ball())
+    axes.apply_aspect()
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
+    assert x1 - x0 == pytest.approx(y1 - y0)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
+
+
+def test_the_scale_bar_is_as_long_as_it_says():
+    axes = panel_of(draw_height, ball())
+    (bar,) = axes.lines
+    told = next(text.get_text() for text in axes.texts if text.get_text().endswith("mm"))
+    assert np.ptp(bar.get_xdata()) == pytest.approx(float(told.removesuffix(" mm")))
+    assert told == "0.5 mm"  # the longest round length below 0.3 of 3.2 mm
+
+
+def test_a_single_pixel_has_no_scale_bar_as_nobody_knows_its_size():
+    assert not panel_of(draw_height, ball((1, 1))).lines
+
+
+def test_what_is_filled_without_a_height_is_not_counted():
+    filled = np.ones((24, 32), np.uint8)
+    axes = panel_of(draw_height, ball(height=np.full((24, 32), np.nan, np.float32), filled=filled))
+    assert note(axes) == "blue: no answer (100.0 %)"
+
+
+def test_without_pixel_size_heights_lie_along_pixels_and_have_no_scale_bar():
+    axes = panel_of(draw_height, ball(x=None, y=None))
+    assert axes.get_xlabel() == "x (px)"
+    assert axes.get_xlim() == (-16, 16)
+    assert not axes.lines
+
+
+def test_notes_tell_what_colours_mean_and_what_a_level_is_worth():
+    assert note(panel_of(draw_height, ball())) == "orange: filled (1.6 %); blue: no answer (10.9 %)"
+    whole = ball(filled=None, height=np.zeros((24, 32), np.float32))
+    assert note(panel_of(draw_height, whole)) == ""
+    alone = panel_of(draw_height, ball(offset_unknown=np.ones(1, np.uint8)))
+    assert note(alone).endswith("; mean 0")
+    assert alone.get_title("left") == "Relative height"
+    some = panel_of(draw_height, ball(offset_unknown=np.array([1, 0, 1], np.uint8)))
+    assert note(some).endswith("; 2 of 3 pieces about its mean")
+    assert some.get_title("left") == "Height"
+
+
+def test_the_line_of_a_section_runs_from_a_to_b():
+    ends = (-1.0, -0.9), (0.5, 0.7)
+    axes = panel_of(draw_height, ball(), engine.section(ball(), *ends))
+    _, line = axes.lines
+    np.testing.assert_allclose(line.get_xydata(), ends)
+    letters = {text.get_text(): text.xy for text in axes.texts if text.get_text() in ("A", "B")}
+    assert letters["A"] == pytest.approx(ends[0])
+    assert letters["B"] == pytest.approx(ends[1])
+
+
+@pytest.mark.parametrize(
+    ("ends", "sides"),
+    [
+        (((-0.1, 0), (0.1, 0.1)), ("right", "left")),
+        (((0.1, 0), (-0.1, 0.1)), ("left", "right")),
+        (((0.1, 0.2), (0.1, 0.1)), ("right", "left")),
+        (((-1.55, 0), (1.55, 0)), ("left", "right")),
+        (((1.55, 0), (-1.55, 0)), ("right", "left")),
+    ],
+    ids=["short", "backwards", "upright", "across", "across backwards"],
+)
+def test_a_and_b_stand_beyond_the_ends_but_within_the_picture(ends, sides):
+    axes = panel_of(draw_height, ball(), engine.section(ball(), *ends))
+    letters = {text.get_text(): text.get_ha() for text in axes.texts}
+    assert (letters["A"], letters["B"]) == sides  # the side of a letter that is at the end
+
+
+def test_a_section_has_gaps_at_holes_and_what_was_filled_is_dashed():
+    sheet, cut = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, cut)
+    lines = {line.get_label(): line for line in axes.lines}
+    measured, filled = lines["measured"], lines["filled"]
+    expected = along().height[10].astype(float)
+    inside = along().filled[10] == 1
+    np.testing.assert_allclose(measured.get_ydata(), np.where(inside, np.nan, expected))
+    assert np.isnan(measured.get_ydata()[10:13]).all()
+    np.testing.assert_allclose(filled.get_ydata()[inside], expected[inside])
+    assert np.isnan(filled.get_ydata()[[0, 12, 18, 41, -1]]).all()
+    assert filled.is_dashed()
+    assert not measured.is_dashed()
+    np.testing.assert_allclose(measured.get_xdata(), 0.1 * np.arange(60), atol=1e-9)
+
+
+def test_a_section_has_a_band_of_one_standard_deviation():
+    sheet, cut = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, cut)
+    corners = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
+    at_start = corners[np.isclose(corners[:, 0], 0), 1]
+    np.testing.assert_allclose([at_start.min(), at_start.max()], [-1.01, -0.99], atol=1e-6)
+    assert not np.any((corners[:, 0] > 2.05) & (corners[:, 0] < 3.85))  # filled: nobody knows how well
+    assert named(axes) == {"measured", "highest measured", "filled", "± 1 sigma"}
+
+
+def test_the_highest_measured_point_is_marked():
+    sheet, cut = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, cut)
+    mark = next(line for line in axes.lines if line.get_marker() == "v")
+    assert mark.get_xydata()[0] == pytest.approx((1.9, cut.height[19]))
+    assert f"{cut.height[19]:.3f} mm" in [text.get_text() for text in axes.texts]
+
+
+@pytest.mark.parametrize(("span", "told"), [(2.5, 1), (1.0, 2), (0.3, 10), (0.001, 2000), (50, 1 / 20)])
+def test_a_section_is_stretched_as_it_says(span, told):
+    sheet, cut = cut_of(along(span=span))
+    axes = panel_of(draw_section, sheet.result, cut)
+    axes.apply_aspect()
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
+    assert (y1 - y0) / (x1 - x0) == pytest.approx(told)
+    words = f"stretched {told} times" if told > 1 else "shrunk 20 times"
+    assert note(axes).endswith("true to scale" if told == 1 else words)
+    low, high = axes.get_ylim()
+    assert low < -span < 0 < high
+
+
+def test_a_section_without_errors_or_holes_tells_of_neither():
+    level = io.Result(height=np.zeros((3, 9), np.float32), x=np.arange(9.0), y=np.arange(3.0)[::-1])
+    sheet, cut = cut_of(level)
+    axes = panel_of(draw_section, sheet.result, cut)
+    assert named(axes) == {"measured", "highest measured"}
+    assert note(axes).startswith("A (0, 2) to B (8, 2) mm")
+
+
+def test_a_section_across_nothing_but_a_hole_is_empty():
+    cut = engine.section(ball(), (1.0, 1.3), (1.5, 1.3))
+    assert not np.isfinite(cut.height).any()
+    axes = panel_of(draw_section, ball(), cut)
+    assert not axes.lines
+    assert axes.get_legend() is None
+
+
+def test_normals_have_the_customary_colours_and_the_key_explains_them():
+    result = ball()
+    axes = panel_of(draw_normals, result)
+    np.testing.assert_array_equal(axes.images[0].get_array(), normal_colours(result.normals, result.edges))
+    (key,) = axes.child_axes
+    colours = key.images[0].get_array()
+    middle = len(colours) // 2
+    np.testing.assert_allclose(colours[middle, middle, :3], (127, 127, 255), atol=1)
+    np.testing.assert_allclose(colours[middle, -1, :3], (255, 127, 127), atol=1)  # to the right: x
+    np.testing.assert_allclose(colours[0, middle, :3], (127, 255, 127), atol=1)  # up: y
+    assert colours[0, 0, 3] == 0
+    assert note(axes) == "black: edges; blue: no answer"
+
+
+def test_edges_lie_on_contact():
+    contact = np.ones((4, 10), np.uint8)
+    contact[:, 5:] = 0
+    edges = np.zeros((4, 10), np.uint8)
+    edges[1] = 1
+    axes = panel_of(draw_edges, io.Result(edges=edges, contact=contact))
+    shown = axes.images[0].get_array()
+    assert shown[1].max() == 0
+    assert tuple(shown[0, 9]) == MISSING_RGB
+    assert shown[0, 0].min() > 200
+    assert named(axes) == {"in contact\n37.5 %", "edge\n25.0 %", "no lasting contact\n37.5 %"}
+    alone = panel_of(draw_edges, io.Result(edges=edges))
+    assert named(alone) == {"no edge\n75.0 %", "edge\n25.0 %"}
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ("onset", ["invalid input", "onset", "never light", "light at start"]),
+        ("release", ["invalid input", "release", "dark at start", "light to the end"]),
+    ],
+)
+def test_status_is_told_in_the_words_of_the_event(event, words):
+    status = np.repeat(np.arange(4, dtype=np.uint8), [1, 2, 3, 4])[np.newaxis]
+    axes = panel_of(draw_status, io.Result(status=status, process={"event": event}))
+    shares = zip(words, ("10.0 %", "20.0 %", "30.0 %", "40.0 %"), strict=True)
+    assert named(axes) == {f"{word}\n{share}" for word, share in shares}
+    colours = [tuple(colour) for colour in axes.images[0].get_array()[0]]
+    assert len(set(colours)) == 4
+    legend = [np.multiply(255, patch.get_facecolor()[:3]) for patch in axes.get_legend().get_patches()]
+    np.testing.assert_allclose(legend, [colours[place] for place in (0, 1, 3, 6)], atol=1)
+
+
+def test_a_status_that_has_no_word_is_shown_as_such():
+    status = np.array([[1, 1, 4, 255]], np.uint8)
+    axes = panel_of(draw_status, io.Result(status=status))
+    assert named(axes) == {"onset\n50.0 %", "unknown number\n50.0 %"}
+    np.testing.assert_array_equal(axes.images[0].get_array()[0, 2:], 255)
+
+
+def test_a_status_that_no_pixel_has_is_not_explained():
+    axes = panel_of(draw_status, io.Result(status=np.full((3, 4), 2, np.uint8)))
+    assert named(axes) == {"never light\n100.0 %"}
+
+
+def test_a_share_that_is_not_nothing_does_not_look_like_nothing():
+    assert percent(0, 10**6) == "0.0 %"
+    assert percent(1, 10**6) == "< 0.1 %"
+
+
+@pytest.mark.parametrize(
+    ("draw", "unit", "factor", "name"),
+    [
+        (draw_height_sigma, "µm", 1e3, "height_sigma"),
+        (draw_normal_sigma, "deg", 180 / np.pi, "normal_sigma"),
+        (draw_modulation, "counts", 1, "modulation"),
+    ],
+)
+def test_numbers_are_shown_in_the_units_people_speak_of(draw, unit, factor, name):
+    values = np.linspace(0.002, 0.003, 12, dtype=np.float32).reshape(3, 4)
+    values[0, 0] = np.nan
+    axes = panel_of(draw, io.Result(**{name: values}))
+    shown = np.ma.filled(axes.images[0].get_array(), np.nan)
+    np.testing.assert_allclose(shown, factor * values, rtol=1e-6)
+    assert axes.child_axes[0].get_ylabel().endswith(f"({unit})")
+    assert note(axes) == f"median {factor * np.nanmedian(values):.3g} {unit}; blue: no answer"
+    assert not isinstance(axes.images[0].norm, LogNorm)
+
+
+def test_errors_that_span_decades_are_shown_by_their_logarithm():
+    values = np.geomspace(1e-4, 1e-1, 60, dtype=np.float32).reshape(6, 10)
+    assert isinstance(panel_of(draw_height_sigma, io.Result(height_sigma=values)).images[0].norm, LogNorm)
+
+
+@pytest.mark.parametrize("value", [0.0, np.inf])
+def test_errors_that_are_all_the_same_are_shown(value):
+    axes = panel_of(draw_height_sigma, io.Result(height_sigma=np.full((3, 4), value, np.float32)))
+    rendered(axes.figure)
+    assert (note(axes) == "no answer") == (not np.isfinite(value))
+
+
+def test_azimuths_go_round():
+    azimuth = np.radians([[0, 90, 180, 270, 359, -90]]).astype(np.float32)
+    picture = panel_of(draw_azimuth, io.Result(azimuth=azimuth)).images[0]
+    shown = np.asarray(picture.get_array())[0]
+    np.testing.assert_allclose(np.abs(shown[2]), 180, atol=1e-4)
+    np.testing.assert_allclose(shown[[0, 1, 3, 4, 5]], [0, 90, -90, -1, -90], atol=1e-4)
+    ends = picture.cmap(picture.norm([-180.0, 180.0]))
+    np.testing.assert_allclose(*ends, atol=0.02)
+
+
+def test_the_distribution_counts_every_height_once():
+    result = ball()
+    axes = panel_of(draw_histogram, result)
+    areas = {patch.get_label(): patch.get_data() for patch in axes.patches}
+    known = np.isfinite(result.height)
+    for name, part in (("measured", known & (result.filled == 0)), ("filled", known & (result.filled == 1))):
+        counts = areas[name].values - areas[name].baseline
+        assert counts.sum() == np.count_nonzero(part)
+    assert note(axes).endswith("median expected error 2 µm")
+
+
+@pytest.mark.parametrize("value", [-1.5, np.nan])
+def test_heights_that_are_all_the_same_are_shown(value):
+    result = io.Result(height=np.full((3, 4), value, np.float32), x=np.arange(4.0), y=np.arange(3.0)[::-1])
+    for draw in (draw_height, draw_histogram):
+        rendered(panel_of(draw, result).figure)

@@ -1,0 +1,81 @@
+"""Colours that all pictures share, and how heights and normals become colours; needs no Matplotlib."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MISSING = "lightsteelblue"
+"""Colour of what has no answer."""
+MISSING_RGB = (176, 196, 222)
+"""The same as red, green and blue."""
+FILLED = "tab:orange"
+"""Colour of what was not measured but filled."""
+FILLED_RGB = (255, 127, 14)
+"""The same as red, green and blue."""
+FILLED_SHADES = "#331a00", "#ffb266"
+"""Its shades, from the lowest to the highest."""
+EDGE_RGB = (0, 0, 0)
+"""Colour of edges, as red, green and blue."""
+
+Colours = NDArray[np.uint8]
+
+_SHOWN = 0.2, 99.8  # per cent of the values that the colours tell apart
+
+
+def span(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the lowest and highest value but for a few pixels at the edge of visibility.
+
+    Parameters
+    ----------
+    values : ndarray
+        What is not finite does not count. Without any value, -1 and 0 come back.
+    """
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
+    return float(low), float(high)
+
+
+def grey(values: NDArray[Any], low: float, high: float) -> Colours:
+    """Return shades from black at ``low`` to white at ``high``, of any shape; NaN is black."""
+    width = high - low if high > low else 1.0
+    return np.asarray(np.nan_to_num((values - low) * (255 / width)).clip(0, 255), np.uint8)
+
+
+def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
+    """Return colours from violet at ``low`` to yellow at ``high``; what has no answer has its own.
+
+    Parameters
+    ----------
+    values : ndarray, (H, W)
+
+    Returns
+    -------
+    ndarray, (H, W, 3), uint8
+    """
+    shades = cv2.applyColorMap(grey(values, low, high), cv2.COLORMAP_VIRIDIS)
+    colours = np.asarray(cv2.cvtColor(shades, cv2.COLOR_BGR2RGB), np.uint8)
+    colours[np.isnan(values)] = MISSING_RGB
+    return colours
+
+
+def normal_colours(normals: NDArray[np.float32], edges: NDArray[np.uint8] | None = None) -> Colours:
+    """Return the customary colours: red, green and blue for x, y and z from -1 to 1; edges are black.
+
+    Parameters
+    ----------
+    normals : ndarray, (H, W, 3), float32
+    edges : ndarray, (H, W), uint8, optional
+
+    Returns
+    -------
+    ndarray, (H, W, 3), uint8
+    """
+    colours: Colours = ((np.nan_to_num(normals) + 1) * 127.5).astype(np.uint8)
+    colours[np.isnan(normals[..., 2])] = MISSING_RGB
+    if edges is not None:
+        colours[edges > 0] = EDGE_RGB
+    return colours

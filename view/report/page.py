@@ -1,0 +1,106 @@
+"""The page: what it is told, and how it becomes one file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+from collections.abc import Mapping
+from importlib import resources
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from mirrorskin.io import InputError, Result, of_turn
+from mirrorskin.io.atomic import MAKE_ROOM, new_file
+from mirrorskin.io.plain import plainly
+from mirrorskin.view.canvas import check_drawing
+from mirrorskin.view.report.contents import contents_of
+from mirrorskin.view.report.pictures import Ends
+
+_SCRIPTS = ("grid.js", "scene.js", "view.js", "surface.js")
+
+
+def check_report() -> None:
+    """Raise InputError if no page can be made, before any work is done for one."""
+    check_drawing()
+    if find_spec("jinja2") is None:
+        raise InputError("a report needs Jinja2: pip install 'mirrorskin[view]'")
+
+
+def write_report(
+    result: Result,
+    path: str | Path,
+    *,
+    name: str,
+    section: Ends | None = None,
+    turn: int | None = None,
+) -> None:
+    """Write one page that shows a result, and needs nothing but a browser.
+
+    Pictures, numbers, scripts and styles are in the page itself, and its policy of content forbids all else.
+
+    Parameters
+    ----------
+    result : Result
+    path : str or Path
+        HTML file to write; it exists whole or not at all.
+    name : str
+        What to call the result: the name of its file.
+    section : ((float, float), (float, float)), optional
+        Ends of the cross-section, x and y in mm; without them, it goes across the apex.
+    turn : int, optional
+        Of a result of each turn: which one, from 0.
+
+    Raises
+    ------
+    InputError
+        Matplotlib or Jinja2 is not installed, there is no such turn, there is a section and no pixel
+        size to place it by, or the file cannot be written.
+    """
+    check_report()
+    page = _render(contents_of(of_turn(result, turn), name, section, turn))
+    path = Path(path)
+    with (
+        new_file(path) as descriptor,
+        plainly(f"{path} could not be written", MAKE_ROOM),
+        os.fdopen(os.dup(descriptor), "w", encoding="utf-8", errors="replace", newline="\n") as file,
+    ):
+        file.write(page)
+
+
+def _render(contents: Mapping[str, Any]) -> str:
+    import jinja2
+
+    own = resources.files("mirrorskin.view.report")
+    texts = {name: own.joinpath(name).read_text("utf-8") for name in ("page.html", "page.css", *_SCRIPTS)}
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
+    )
+    script = "\n".join(texts[name] for name in _SCRIPTS)
+    return environment.from_string(texts["page.html"]).render(
+        **contents,
+        policy=_policy(script, texts["page.css"]),
+        style=_unescaped(texts["page.css"]),
+        script=_unescaped(script),
+    )
+
+
+def _unescaped(text: str) -> Any:
+    """Mark a file of this package as what may stand in the page as it is."""
+    import markupsafe
+
+    return markupsafe.Markup(text)
+
+
+def _policy(script: str, style: str) -> str:
+    """Allow the page's own script, style and pictures, and nothing else."""
+    own = {"script-src": script, "style-src": style}
+    hashes = [f"{kind} 'sha256-{_hash(text)}'" for kind, text in own.items()]
+    return "; ".join(
+        ["default-src 'none'", "img-src data:", *hashes, "base-uri 'none'", "form-action 'none'"]
+    )
+
+
+def _hash(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

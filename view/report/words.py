@@ -1,0 +1,140 @@
+"""What a page says in plain words: of pictures, of maps, and of how a result came about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+PICTURES: Mapping[str, tuple[str, str]] = {
+    "height": (
+        "Height, lit from the upper left. Blue has no answer, and orange was filled, not measured.",
+        "Map of the height in millimetres, hill-shaded, seen from above",
+    ),
+    "section": (
+        "Cut along the line from A to B, with the standard deviation that is expected of it.",
+        "Cross-section: height along the line from A to B",
+    ),
+    "normals": (
+        "Normals: red, green and blue stand for their parts along x, y and z; edges are black.",
+        "Map of the surface normals in colours",
+    ),
+    "azimuth": (
+        "Azimuth: which way the surface faces, counter-clockwise from x.",
+        "Map of the azimuth in the colours of a circle",
+    ),
+    "modulation": (
+        "Modulation: how far the brightness swings in a turn.",
+        "Map of the modulation in counts",
+    ),
+    "edges": ("Edges: where the normal jumps or contact ends.", "Map of the edges"),
+    "status": ("What became of each pixel.", "Map of the status of the pixels, with a legend"),
+    "sigma": (
+        "Expected errors: the standard deviation that is expected of each pixel's answer.",
+        "Map of the expected errors",
+    ),
+    "histogram": ("How often each height occurs.", "Histogram of the heights"),
+}
+"""Of each picture its caption, and what stands for it where it cannot be seen."""
+
+MAPS: Mapping[str, tuple[str, str]] = {
+    "height": ("mm", "height of the surface; 0 is the sheet at rest, and z runs towards the camera"),
+    "height_sigma": ("mm", "the standard deviation that is expected of the height"),
+    "status": (
+        "",
+        "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
+        "2 dark at start, 3 light to the end",
+    ),
+    "normals": ("", "unit vectors along x, y and z that stand upright on the surface"),
+    "zenith": ("rad", "angle between the normal and the direction to the camera"),
+    "azimuth": ("rad", "which way the normal leans, counter-clockwise from x"),
+    "normal_sigma": ("rad", "the angle by which the normal is expected to be wrong (RMS)"),
+    "mean": ("counts", "mean brightness over the turn"),
+    "cosine": ("counts", "part of the brightness that goes with the cosine of the phase"),
+    "sine": ("counts", "part of the brightness that goes with the sine of the phase"),
+    "modulation": ("counts", "amplitude of the brightness over the turn"),
+    "residual": ("counts", "standard deviation of the brightness that the turn does not explain"),
+    "edges": ("", "1 where the normal jumps or contact ends"),
+    "filled": ("", "1 where nothing was measured, and the height is a smooth surface between those around"),
+    "contact": ("", "1 where the sheet was in contact in every frame"),
+    "component": (
+        "",
+        "connected pixels are one piece, and share a number; heights of two pieces say nothing of "
+        "each other. -1: no height",
+    ),
+}
+"""Of each map its unit in the file, and what it says."""
+
+UNITS = (
+    "Lengths are in millimetres. x runs to the right and y up the picture, both from its centre to the "
+    "centres of the pixels; z runs towards the camera. Angles are radians in the file, and degrees in "
+    "pictures.",
+    "A pixel without an answer is NaN in the file and empty in pictures. Every uncertainty is a standard "
+    "uncertainty (k = 1).",
+)
+"""What holds for all numbers of a result."""
+
+PIXELS = "This result does not know the size of its pixels, so places are told in pixels from the centre."
+
+_FIRST = (
+    "program",
+    "version",
+    "date",
+    "source",
+    "dataset",
+    "source_fingerprint",
+    "source_modified",
+    "source_region",
+    "source_frames",
+    "device",
+    "driver",
+    "calibration",
+    "calibration_parts",
+)
+"""What a process says of where a result comes from; all else are parameters."""
+
+_UNITS = {
+    "tilt": "rad",
+    "zenith_error": "rad",
+    "zenith_gain": "counts/rad",
+    **dict.fromkeys(("zenith_offset", "noise", "dark", "bright", "low", "high"), "counts"),
+}
+_MOTIONS = {"vertical": "Press", "axial": "Rotation"}
+_FUSED = "fusion"
+
+Rows = list[tuple[str, str]]
+
+
+def told_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[str, Rows]]:
+    """Put what a result's process says into words.
+
+    Parameters
+    ----------
+    process : mapping
+        As of a ``Result``; of a fused one, names begin with the motion that they are of.
+
+    Returns
+    -------
+    parameters, provenance : dict
+        Names and values, under the movement that they are of; under an empty name what is of all.
+    """
+    parameters: dict[str, Rows] = {}
+    provenance: dict[str, Rows] = {}
+    for name, value in process.items():
+        motion, own = _motion_of(name) if process.get("method") == _FUSED else ("", name)
+        place = provenance if own in _FIRST else parameters
+        place.setdefault(motion, []).append((own.replace("_", " "), _told(own, value)))
+    for rows in provenance.values():
+        rows.sort(key=lambda row: _FIRST.index(row[0].replace(" ", "_")))
+    return parameters, provenance
+
+
+def _motion_of(name: str) -> tuple[str, str]:
+    motion, _, own = name.partition("_")
+    return (_MOTIONS[motion], own) if motion in _MOTIONS else ("", name)
+
+
+def _told(name: str, value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g} {_UNITS.get(name, '')}".strip()
+    return str(value)

@@ -1,0 +1,5 @@
+"""Pictures of one result, for people."""
+
+from mirrorskin.view.result.figures import figures_of, overview, png_of
+
+__all__ = ["figures_of", "overview", "png_of"]

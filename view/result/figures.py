@@ -1,0 +1,184 @@
+"""Figures of one result: each of its pictures alone, or all on one page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from textwrap import wrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mirrorskin.engine import summarise
+from mirrorskin.io import InputError, Result
+from mirrorskin.view.canvas import encode_figure, new_figure
+from mirrorskin.view.result.classes import draw_edges, draw_status
+from mirrorskin.view.result.height import draw_height
+from mirrorskin.view.result.histogram import draw_histogram
+from mirrorskin.view.result.normals import draw_normals
+from mirrorskin.view.result.scalars import draw_azimuth, draw_height_sigma, draw_modulation, draw_normal_sigma
+from mirrorskin.view.result.section import draw_section
+from mirrorskin.view.result.sheet import BOX, TEXT, Sheet, sheet_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from mirrorskin.engine import Section
+
+Ends = tuple[tuple[float, float], tuple[float, float]]
+"""Where a section begins and ends, x and y, mm."""
+
+MAPS = ("height", "section", "normals", "edges", "status", "sigma", "histogram", "azimuth", "modulation")
+"""What can be drawn, where a result has it."""
+
+_GRAPHS = "section", "histogram"  # which are no maps
+_IN_A_ROW = 3  # panels; more stand in two
+# Inches: of a map, at its sides, below and above it, and above all.
+_WIDTH, _HIGHEST = 3.5, 5.2
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 1.45, 0.55, 0.5
+_MARGIN, _GAP = 0.15, 0.2
+_NAME = 13  # points
+_LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches across and down that a letter takes, of a size of one point
+
+
+@dataclass(frozen=True, slots=True)
+class _Panel:
+    """A picture of a result: what it is called, and what draws it."""
+
+    name: str
+    draw: Callable[[Axes], None]
+
+
+def figures_of(
+    result: Result, *, name: str, section: Ends | None = None, maps: Sequence[str] | None = None
+) -> dict[str, Figure]:
+    """Draw each picture of a result as a figure of its own.
+
+    Parameters
+    ----------
+    result : Result
+        Of one turn. Without pixel size, pictures are drawn along pixels.
+    name : str
+        What the result is called in titles.
+    section : ((float, float), (float, float)), optional
+        Where the section begins and ends, x and y, mm; without it, the row through the apex.
+    maps : sequence of str, optional
+        Only these, of `MAPS`.
+
+    Returns
+    -------
+    dict of str to Figure
+        Only of what the result has, in the order of `MAPS`.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Matplotlib is not installed, the result has several turns or nothing of what is asked, or a section
+        cannot be where it is asked.
+    """
+    sheet = sheet_of(result)
+    panels: dict[str, list[_Panel]] = {}
+    for panel in _chosen(sheet, name, section, maps):
+        panels.setdefault(panel.name, []).append(panel)
+    return {which: _figure(sheet, same, name) for which, same in panels.items()}
+
+
+def overview(
+    result: Result, *, name: str, section: Ends | None = None, maps: Sequence[str] | None = None
+) -> Figure:
+    """Draw all pictures of a result, or some, on one page; see ``figures_of``."""
+    sheet = sheet_of(result)
+    return _figure(sheet, _chosen(sheet, name, section, maps), name)
+
+
+def png_of(figure: Figure, width_px: int) -> bytes:
+    """Return a figure as a PNG of so many pixels across."""
+    return encode_figure(figure, width_px / figure.get_figwidth())
+
+
+def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] | None) -> list[_Panel]:
+    """Return the panels that are asked for, or raise InputError."""
+    panels = list(_panels_of(sheet, section))
+    has = list(dict.fromkeys(panel.name for panel in panels))
+    lacking = [one for one in maps or () if one not in has]
+    if not has:
+        raise InputError(f"{name} has no map to draw: 'mirrorskin export' writes all it has into an .npz")
+    if lacking:
+        raise InputError(f"{name} has no {' and no '.join(lacking)} to draw: it has {', '.join(has)}")
+    if section is not None and "section" not in has:
+        raise InputError(f"{name} has no heights to cut: leave the section out")
+    return [panel for panel in panels if maps is None or panel.name in maps]
+
+
+def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
+    """Yield what a result has, in the order of `MAPS`."""
+    result = sheet.result
+    cut = _cut(sheet, section)
+    if result.height is not None:
+        yield _Panel("height", partial(draw_height, sheet=sheet, cut=cut))
+    if cut is not None:
+        yield _Panel("section", partial(draw_section, sheet=sheet, cut=cut))
+    for name, values, draw in (
+        ("normals", result.normals, draw_normals),
+        ("edges", result.edges, draw_edges),
+        ("status", result.status, draw_status),
+        ("sigma", result.height_sigma, draw_height_sigma),
+        ("sigma", result.normal_sigma, draw_normal_sigma),
+        ("histogram", result.height, draw_histogram),
+    ):
+        if values is not None:
+            yield _Panel(name, partial(draw, sheet=sheet))
+    if result.normals is None:  # which tell more
+        if result.azimuth is not None:
+            yield _Panel("azimuth", partial(draw_azimuth, sheet=sheet))
+        if result.modulation is not None:
+            yield _Panel("modulation", partial(draw_modulation, sheet=sheet))
+
+
+def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
+    """Cut the heights, if there are any, and more than one along the way."""
+    from mirrorskin.engine import section
+
+    height = sheet.result.height
+    if height is None or not np.isfinite(height).any():
+        return None
+    cut = section(sheet.result, *(ends or ()))
+    if not np.isfinite(cut.height).any():
+        raise InputError("no height is known along the section: choose other points, or leave it out")
+    return cut if len(cut.distance) > 1 else None
+
+
+def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
+    """Draw panels in rows, as high as the picture needs them, under one title."""
+    rows = 1 if len(panels) <= _IN_A_ROW else 2
+    columns = math.ceil(len(panels) / rows)
+    maps = any(panel.name not in _GRAPHS for panel in panels)
+    high = min(max(_WIDTH / sheet.proportion if maps else 0.0, BOX * _WIDTH), _HIGHEST)
+    wide, tall = _LEFT + _WIDTH + _RIGHT, _BELOW + high + _ABOVE
+    words = [
+        _wrapped(text, wide * columns, size)
+        for text, size in ((name, _NAME), (str(summarise(sheet.result)), TEXT))
+    ]
+    head = _MARGIN + sum(height for _, height in words) + _GAP
+    size = wide * columns, tall * rows + head
+    figure = new_figure(*size)
+    figure.set_layout_engine("none")  # all panels are alike, so that their places are plain arithmetic
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
+        corner = column * wide + _LEFT, (rows - 1 - row) * tall + _BELOW
+        place = corner[0] / size[0], corner[1] / size[1], _WIDTH / size[0], high / size[1]
+        panel.draw(figure.add_axes(place))
+    (title, above), (line, _) = words
+    side, top = _MARGIN / size[0], 1 - _MARGIN / size[1]
+    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top")
+    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top")
+    return figure
+
+
+def _wrapped(text: str, width: float, size: float) -> tuple[str, float]:
+    """Break a text of so many points into lines that fit a width, and tell how high they are, inches."""
+    lines = wrap(text, int((width - 2 * _MARGIN) / (_LETTER * size)))
+    return "\n".join(lines), _LINE * size * len(lines)

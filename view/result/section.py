@@ -1,0 +1,115 @@
+"""The picture of a cut through the heights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.types import Floats
+from mirrorskin.view.canvas import BESIDE, round_length
+from mirrorskin.view.colours import FILLED
+from mirrorskin.view.result.height import outlined, quantity
+from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from mirrorskin.engine import Section
+
+_ROOM = 1.15  # times the heights' range
+_NEAR = 0.1  # of the width: so near to the side words lean inwards
+
+
+def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
+    """Draw heights along a section, with a band of one standard deviation either way.
+
+    What was filled is dashed; a hole is a gap; the highest measured point is marked.
+
+    Parameters
+    ----------
+    axes : Axes
+    sheet : Sheet
+    cut : Section
+        Of the sheet's result.
+    """
+    measured = np.where(cut.filled, np.nan, cut.height)
+    if np.isfinite(measured).any():
+        axes.plot(cut.distance, measured, color="tab:blue", lw=1.5, label="measured")
+        _draw_apex(axes, cut.distance, measured)
+    if cut.filled.any():
+        axes.plot(cut.distance, _joined(cut), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled")
+    if np.isfinite(cut.sigma).any():
+        band = measured - cut.sigma, measured + cut.sigma
+        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label="± 1 sigma")
+    told = _scale(axes, sheet, cut)
+    for name, end in (("A", 0), ("B", 1)):
+        axes.annotate(
+            name,
+            (end, 0),
+            (0, -17),
+            "axes fraction",
+            "offset points",
+            fontsize=TEXT,
+            weight="bold",
+            ha="center",
+            va="top",
+        )
+    axes.set_xlabel(f"distance from A ({sheet.unit})", fontsize=TEXT)
+    axes.set_ylabel(f"{quantity(sheet)} (mm)", fontsize=TEXT)
+    axes.tick_params(labelsize=SMALL)
+    axes.grid(alpha=0.3)
+    if np.isfinite(cut.height).any():
+        axes.legend(fontsize=SMALL, **BESIDE)
+    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{told}")
+
+
+def _joined(cut: Section) -> Floats:
+    """Return the heights that were filled, and the measured ones beside them, so that lines meet."""
+    near: NDArray[np.bool_] = cut.filled.copy()
+    near[1:] |= cut.filled[:-1]
+    near[:-1] |= cut.filled[1:]
+    return np.where(near, cut.height, np.nan)
+
+
+def _draw_apex(axes: Axes, distance: Floats, height: Floats) -> None:
+    """Mark the highest measured point."""
+    top = int(np.nanargmax(height))
+    axes.plot(distance[top], height[top], "v", color="tab:red", ms=5, label="highest measured")
+    share = (distance[top] - distance[0]) / (distance[-1] - distance[0] or 1.0)
+    axes.annotate(
+        f"{height[top]:.3f} mm",
+        (float(distance[top]), float(height[top])),
+        (0, 6),
+        textcoords="offset points",
+        ha="left" if share < _NEAR else "right" if share > 1 - _NEAR else "center",
+        fontsize=SMALL,
+        color="tab:red",
+        path_effects=outlined(2.5),
+    )
+
+
+def _scale(axes: Axes, sheet: Sheet, cut: Section) -> str:
+    """Give the panel its limits, such that heights are a round number of times as large; say how many."""
+    axes.set_box_aspect(BOX)
+    length = float(cut.distance[-1] - cut.distance[0]) or 1.0
+    axes.set_xlim(float(cut.distance[0]), float(cut.distance[0]) + length)
+    known = cut.height[np.isfinite(cut.height)]
+    if sheet.unit != "mm" or not known.size:
+        axes.margins(y=0.2)
+        return ""
+    low, high = float(known.min()), float(known.max())
+    times = round_length(BOX * length / max(_ROOM * (high - low), 1e-6))
+    half = BOX * length / times / 2
+    middle = (low + high) / 2
+    axes.set_ylim(middle - half, middle + half)
+    if times == 1:
+        return "; true to scale"
+    return f"; heights stretched {times:g} times" if times > 1 else f"; heights shrunk {1 / times:g} times"
+
+
+def _ends(cut: Section, unit: str) -> str:
+    """Tell where the section begins and ends."""
+    a, b = (f"({cut.x[place]:.3g}, {cut.y[place]:.3g})" for place in (0, -1))
+    return f"A {a} to B {b} {unit}"

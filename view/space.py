@@ -1,0 +1,108 @@
+"""A surface in space, to be turned and looked at from all sides, in rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mirrorskin.engine import summarise
+from mirrorskin.io import InputError, Mesh, Result, of_turn, surface_mesh
+from mirrorskin.io.export.mesh import normals_around
+from mirrorskin.view.colours import FILLED_RGB, Colours, height_colours, span
+from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
+
+_END = 60.0  # seconds for a surface to reach the viewer
+
+
+def show_surface(result: Result, where: str | Path, name: str) -> None:
+    """Show a result's heights as a surface, in millimetres along all three axes.
+
+    Colours go from violet to yellow with the height; what was filled is orange, and a hole is a hole.
+
+    Parameters
+    ----------
+    result : Result
+        Of one turn, with heights and pixel size.
+    where : str or Path
+        "window", "browser", or a file to write; see ``open_stream``.
+    name : str
+        What the result is called.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The result has no heights of three neighbours, or no pixel size; rerun is not installed or does
+        not start, or the file cannot be written.
+    """
+    result = of_turn(result, None)
+    mesh = _mesh(result, name)
+    assert result.height is not None
+    rr = load_rerun()
+    stream = open_stream(where, "--3d")
+    stream.send_blueprint(_blueprint(name))
+    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    surface = rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=normals_around(mesh, np.ones(len(mesh.vertices), bool)),
+        vertex_colors=_colours(result, mesh),
+    )
+    stream.log("surface", surface, static=True)
+    text = "\n\n".join(_told(result, name))
+    stream.log("about", rr.TextDocument(text, media_type="text/markdown"), static=True)
+    close_stream(stream, _END)
+
+
+def _mesh(result: Result, name: str) -> Mesh:
+    """Return the surface, if there is one."""
+    if result.height is None:
+        raise InputError(f"{name} has no heights: there is no surface to show")
+    if result.x is None or result.y is None:
+        raise InputError(
+            f"{name} does not say how large its pixels are: reconstruct it again with --pixel-size"
+        )
+    mesh = surface_mesh(result.height, result.x, result.y, component=result.component)
+    if not mesh.faces.size:
+        raise InputError(f"{name} has no three neighbours with heights: there is no surface to show")
+    return mesh
+
+
+def _colours(result: Result, mesh: Mesh) -> Colours:
+    """Return the colours of the vertices, (N, 3)."""
+    assert result.height is not None
+    colours = height_colours(result.height, *span(result.height)).reshape(-1, 3)[mesh.pixels]
+    if result.filled is not None:
+        colours[result.filled.ravel()[mesh.pixels] > 0] = FILLED_RGB
+    return colours
+
+
+def _told(result: Result, name: str) -> Iterator[str]:
+    """Tell in paragraphs what is seen."""
+    assert result.height is not None
+    low, high = span(result.height)
+    yield f"**{name}**"
+    yield str(summarise(result))
+    yield "x to the right, y up the picture, z towards the camera; all in millimetres"
+    yield f"heights from {low:.3f} (violet) to {high:.3f} mm (yellow)"
+    if result.filled is not None and result.filled.any():
+        yield "orange: not measured but filled"
+    if result.offset_unknown is not None and result.offset_unknown.any():
+        yield "heights of a piece are about its mean: nobody knows how high it lies"
+
+
+def _blueprint(name: str) -> Any:
+    """Return where everything stands."""
+    import rerun.blueprint as rrb
+
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin="/", name=name),
+            rrb.TextDocumentView(origin="about", name="About"),
+            column_shares=[4, 1],
+        ),
+        auto_views=False,
+        collapse_panels=True,
+    )

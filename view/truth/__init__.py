@@ -1,0 +1,1 @@
+"""Pictures of results beside the truth that a simulation knows."""

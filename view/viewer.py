@@ -1,0 +1,117 @@
+"""rerun's viewer: started on this machine for this machine alone, or a file that it shows later."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from mirrorskin.io import InputError, check_output
+
+WINDOW, BROWSER = "window", "browser"
+"""Where pictures can be shown, besides a file."""
+
+_HERE = "127.0.0.1"
+_SUFFIX = ".rrd"
+_START = 20.0  # seconds for the viewer to listen
+_MEMORY = "1GB"  # of pictures that the viewer keeps, the newest ones
+_VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive what they show
+
+
+def load_rerun() -> Any:
+    """Return the module rerun, or raise InputError with the remedy."""
+    if find_spec("rerun") is None:
+        raise InputError("live pictures and surfaces in space need rerun: pip install 'mirrorskin[live]'")
+    import rerun
+
+    return rerun
+
+
+def open_stream(where: str | Path, option: str) -> Any:
+    """Open what pictures are logged to.
+
+    Parameters
+    ----------
+    where : str or Path
+        "window" starts rerun's own viewer, "browser" one in a browser; both are reached from this machine
+        only, and outlive this program. Anything else is a file to write, which ``rerun FILE`` shows.
+    option : str
+        What asked for it, for the remedy.
+
+    Returns
+    -------
+    rerun.RecordingStream
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        rerun is not installed or does not start, or the file cannot be written.
+    """
+    check_place(where, option)
+    stream = load_rerun().RecordingStream("mirrorskin", send_properties=False)
+    if str(where) in (WINDOW, BROWSER):
+        stream.connect_grpc(f"rerun+http://{_HERE}:{_start(str(where), option)}/proxy")
+    else:
+        stream.save(where)
+    return stream
+
+
+def check_place(where: str | Path, option: str) -> None:
+    """Raise InputError if nothing can be shown there, before any work is done for it; see ``open_stream``."""
+    load_rerun()
+    if str(where) in (WINDOW, BROWSER):
+        return
+    if Path(where).suffix.lower() != _SUFFIX:
+        raise InputError(f"{option} {where}: give {WINDOW}, {BROWSER} or a FILE{_SUFFIX}")
+    check_output(Path(where))
+
+
+def close_stream(stream: Any, patience: float) -> None:
+    """Let the last pictures arrive within so many seconds, and let go of the viewer, which stays open."""
+    with suppress(RuntimeError, ValueError):  # the viewer was closed
+        stream.flush(timeout_sec=patience)
+    with suppress(RuntimeError, ValueError):
+        stream.disconnect()
+
+
+def _start(where: str, option: str) -> int:
+    """Start a viewer, wait until it listens, and return its port."""
+    port = _free_port()
+    # Not by way of "rerun", which takes most of a second to import.
+    words = [sys.executable, "-m", "rerun_cli", "--bind", _HERE, "--port", str(port)]
+    words += ["--server-memory-limit", _MEMORY, "--memory-limit", _MEMORY]
+    if where == BROWSER:
+        words += ["--web-viewer", "--web-viewer-port", str(_free_port())]
+    quiet = subprocess.DEVNULL
+    # In a session of its own, for Ctrl-C ends the run and leaves its pictures there.
+    viewer = subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    _VIEWERS.append(viewer)
+    deadline = time.monotonic() + _START
+    while not _listens(port):
+        if viewer.poll() is not None or time.monotonic() > deadline:
+            with suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # the module starts a program of its own
+            viewer.wait()
+            remedy = f"take {option} {BROWSER}, or {option} FILE.rrd" if where == WINDOW else "see 'rerun'"
+            raise InputError(f"rerun's viewer does not start here: {remedy}")
+        time.sleep(0.05)
+    return port
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((_HERE, 0))
+        return int(probe.getsockname()[1])
+
+
+def _listens(port: int) -> bool:
+    with suppress(OSError), socket.create_connection((_HERE, port), timeout=0.2):
+        return True
+    return False
