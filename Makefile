@@ -1,10 +1,10 @@
-# make [demo|test|soak|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-browser|docs|soak|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test soak lint types bench portability clean
+.PHONY: demo test test-browser docs soak lint types bench portability clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -18,7 +18,16 @@ demo: $(READY)
 
 # A process for each core, each with files of its own: much of a test is compiling kernels, on one core.
 test: lint types
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+
+# Pages in a real browser, which the system brings: Debian's package chromium.
+test-browser: .venv/.browser
+	@$(BIN)/python -m pytest tests/browser
+
+# The site, in site/; warnings are errors.
+docs: .venv/.docs
+	@(cd tests && ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml ../docs/site/hooks.py)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Batches that are killed at random, 20 times each, in one process, so that there is one table; 'make test' does each once.
 soak: $(READY)
@@ -40,7 +49,7 @@ portability: $(READY)
 	@$(BIN)/python tests/support/portability.py
 
 clean:
-	@rm -rf .venv build dist *.egg-info .hypothesis .import_linter_cache
+	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache
 	find . -name .git -prune -o -type d \( -name __pycache__ -o -name '.*_cache' \) -prune -exec rm -rf {} +
 
 # The stamp is written last, so a half-made environment never passes for done.
@@ -71,4 +80,9 @@ $(READY): pyproject.toml
 	site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 	mkdir -p "$$site/mirrorskin"
 	for package in $(PACKAGES); do ln -sfn "$$PWD/$$package" "$$site/mirrorskin/$$package"; done
+	touch $@
+
+# What only some need comes with the first of them.
+.venv/.browser .venv/.docs: $(READY)
+	@$(PIP) install --editable '.[$(@F:.%=%)]'
 	touch $@

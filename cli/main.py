@@ -1,11 +1,11 @@
-"""The command ``mirrorskin``: collects the commands, and turns the project's errors into one line.
+"""The command ``mirrorskin``: names the commands, and turns the project's errors into one line.
 
-Nothing heavy is imported here or at the top of a command's module: ``--help`` must be quick.
+Nothing heavy is imported here or at the top of a command's module, nor any command's module here: ``--help``
+must be quick.
 """
 
 from __future__ import annotations
 
-import logging
 import signal
 import sys
 import traceback
@@ -16,30 +16,39 @@ from typing import Annotated
 
 import typer
 
-from mirrorskin.cli import (
-    batch,
-    bench,
-    calibrate,
-    capture,
-    correlate,
-    demo,
-    devices,
-    fuse,
-    import_,
-    info,
-    live,
-    reconstruct,
-    rig,
-    score,
-    simulate,
-    twin,
-)
+from mirrorskin.cli.groups import lazy_group
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
+_HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
+
+PURPOSES = {
+    "demo": "Repeat the paper's experiments on the twin.",
+    "simulate": "Record what the twin sees, with the truth.",
+    "import": "Make a recording of a video or pictures.",
+    "capture": "Move the stage, and record what the camera sees.",
+    "live": "Reconstruct while the stage moves.",
+    "reconstruct": "Reconstruct heights from a press, or normals and heights from a rotation.",
+    "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
+    "fuse": "Make one surface of a press and a rotation.",
+    "batch": "Reconstruct many recordings.",
+    "view": "Show heights, a section, normals, edges, status, expected errors.",
+    "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
+    "report": "Write a page with pictures, numbers and the surface.",
+    "export": "Write a result as meshes, points, pictures, tables or arrays.",
+    "score": "Compare a result with a simulation's truth.",
+    "info": "Tell what a file holds.",
+    "devices": "List the OpenCL devices of this machine.",
+    "rig": "Look at a stage and a camera before they are used.",
+    "calibrate": "Find out what a sensor's counts and pixels mean.",
+    "twin": "Emulate a whole rig: its stage and its camera.",
+    "bench": "Time the kernels and whole paths against the limits and against others.",
+}
+"""What the commands are for, in the order of the help; each stands in the module of its name."""
 
 app = typer.Typer(
     name="mirrorskin",
+    cls=lazy_group("mirrorskin.cli", PURPOSES),
     help="Shape from active tactile sensors with a mirror-like skin.",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -52,29 +61,10 @@ app = typer.Typer(
 def _common(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks, and what is logged.")] = False,
 ) -> None:
+    import logging
+
     _OneLine.debug = debug
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
-
-
-for module in (
-    demo,
-    simulate,
-    import_,
-    capture,
-    live,
-    reconstruct,
-    correlate,
-    fuse,
-    batch,
-    score,
-    info,
-    devices,
-):
-    app.command(module.__name__.rsplit(".", 1)[-1].rstrip("_"))(module.command)
-app.add_typer(rig.app, name="rig")
-app.add_typer(calibrate.app, name="calibrate")
-app.add_typer(twin.app, name="twin")
-app.add_typer(bench.app, name="bench")
 
 
 class _OneLine:
@@ -98,7 +88,10 @@ class _OneLine:
         if self.debug:
             traceback.print_exception(error)
         message = usage() if usage else str(error)
-        sys.stderr.write(f"mirrorskin: {' '.join(message.split())}\n")
+        if kind is not None and kind.__name__ == _HELP:
+            sys.stderr.write(f"{message}\n")
+        else:
+            sys.stderr.write(f"mirrorskin: {' '.join(message.split())}\n")
         sys.exit(code)
 
 

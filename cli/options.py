@@ -64,6 +64,19 @@ Region = Annotated[
 Frames = Annotated[
     str | None, typer.Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")
 ]
+ResultFile = Annotated[Path, typer.Argument(metavar="RES.h5", help="Result to take.")]
+Turn = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=0, help="Of a result of each turn: which one, from 0."),
+]
+Section = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X1,Y1:X2,Y2",
+        help="Cut between two points, from the picture's centre: -2mm,0mm:2mm,0mm.",
+        show_default="across the apex",
+    ),
+]
 Dataset = Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")]
 Calibration = Annotated[
     Path | None,

@@ -76,6 +76,20 @@ def vector(text: str, count: int, option: str = "") -> tuple[float, ...]:
     return values
 
 
+def segment(text: str, option: str = "") -> tuple[tuple[float, float], tuple[float, float]]:
+    """Read two points, as in ``-2mm,0mm:2mm,1mm``: x and y of each, in millimetres; see ``length``.
+
+    Raises
+    ------
+    InputError
+        It is not that, or both are one point.
+    """
+    ends = tuple(vector(part, 2, option) for part in text.split(":"))
+    if len(ends) != 2 or ends[0] == ends[1]:
+        raise _error(text, option, "two points are needed", "-2mm,0mm:2mm,0mm")
+    return (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1])
+
+
 def compliance(text: str, option: str = "") -> float:
     """Read by how much a newton moves something, as in ``0.01mm/N``, in mm/N; see ``length``."""
     distance, slash, newton = text.strip().rpartition("/")

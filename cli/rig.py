@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Group
 from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.finding import Finding
     from mirrorskin.hw.settings import RigSettings
 
-app = typer.Typer(help="Look at a stage and a camera before they are used.", no_args_is_help=True)
+app = typer.Typer(cls=Group, help="Look at a stage and a camera before they are used.", no_args_is_help=True)
 
 _COLOURS = {"ok": "green", "warning": "yellow", "failed": "red"}
 

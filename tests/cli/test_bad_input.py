@@ -206,13 +206,6 @@ def test_reconstruct_refuses_in_one_line(monkeypatch, capfd, case):
             ["reconstruct", "bad.h5", *GIVEN],
             "bad.h5: frames 2 to 3 of /x cannot be read: it is damaged",
         ),
-        (a_result, ["reconstruct", "bad.h5"], "bad.h5 is a result"),
-        (lambda: None, ["reconstruct", "."], ". is a folder: an HDF5 file is needed"),
-        (
-            stack(),
-            ["reconstruct", "bad.h5", *GIVEN, "-o", "bad.h5/r.h5"],
-            "there is no folder bad.h5: make it first",
-        ),
     ],
 )
 def test_a_process_ends_with_one_line(make, words, said):
@@ -232,6 +225,12 @@ def test_a_process_ends_with_one_line(make, words, said):
         ),
         (change(f"{STAGE}/motion"), ["info", "bad.h5"], "does not say how the sensor moved"),
         (cut_to(900), ["info", "bad.h5"], "truncated"),
+        (lambda: None, ["reconstruct", "."], ". is a folder: an HDF5 file is needed"),
+        (
+            stack(),
+            ["reconstruct", "bad.h5", *GIVEN, "-o", "bad.h5/r.h5"],
+            "there is no folder bad.h5: make it first",
+        ),
         (stack(), ["import", "bad.h5", *GIVEN, "-o", "bad.h5"], "bad.h5 is the input"),
         (stack(), ["simulate", "vertical", "--object", "bad.h5", "-o", "bad.h5"], "bad.h5 is the input"),
     ],

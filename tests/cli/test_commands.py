@@ -197,7 +197,7 @@ def test_a_terminated_simulation_leaves_nothing(tmp_path):
 
 CARELESS = """
 import signal, sys, time
-from mirrorskin.cli import main
+from mirrorskin.cli import info, main
 
 class Careless:
     def __del__(self):
@@ -208,8 +208,8 @@ def command():
     time.sleep(30)
     print("went on")
 
-main.app.command("careless")(command)
-sys.argv = ["mirrorskin", "careless"]
+info.command = command
+sys.argv = ["mirrorskin", "info"]
 main.main()
 """
 

@@ -17,6 +17,7 @@ from mirrorskin.cli.quantity import (
     lengths,
     memory,
     per_angle,
+    segment,
     vector,
 )
 from mirrorskin.io import InputError
@@ -30,7 +31,7 @@ def three(text, option=""):
     return vector(text, 3, option)
 
 
-READERS = [angle, compliance, duration, frame_size, length, lengths, memory, per_angle, two, three]
+READERS = [angle, compliance, duration, frame_size, length, lengths, memory, per_angle, segment, two, three]
 
 
 @pytest.mark.parametrize(
@@ -283,3 +284,15 @@ def test_any_text_is_a_finite_number_or_an_input_error(text):
 def test_pint_is_imported_only_when_needed():
     program = "import sys, mirrorskin.cli.quantity; sys.exit('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_a_segment_is_two_points():
+    assert segment("-2mm,0mm:0.3cm,1mm") == ((-2.0, 0.0), (3.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    "text", ["1mm,1mm", "1mm,1mm:1mm,1mm", "1mm:2mm", "1mm,2mm:3mm,4mm:5mm,6mm", "1,2:3,4"]
+)
+def test_what_is_no_segment_is_refused(text):
+    with pytest.raises(InputError, match="--section"):
+        segment(text, "--section")

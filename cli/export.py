@@ -1,0 +1,68 @@
+"""``mirrorskin export``: a result as files that other programs open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mirrorskin.cli import options
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mirrorskin.io import Result
+
+Point = tuple[float, float]
+
+
+def command(
+    result: options.ResultFile,
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="File to write, more than once if you like: a mesh .ply or .stl, points .xyz, heights in"
+            " 16 bits .png or .tif, a cross-section .csv, arrays .npz.",
+        ),
+    ],
+    turn: options.Turn = None,
+    section: options.Section = None,
+    points: Annotated[bool, typer.Option("--points", help="A .ply of points, without triangles.")] = False,
+) -> None:
+    """Write a result as meshes, points, pictures, tables or arrays."""
+    from mirrorskin import io
+    from mirrorskin.cli.quantity import segment
+
+    suffixes = {path.suffix.lower() for path in output}
+    for asked, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
+        if asked and suffix not in suffixes:
+            raise io.InputError(f"{option} is for a {suffix} file: name one with -o, or leave {option} out")
+    ends = None if section is None else segment(section, "--section")
+    for number, path in enumerate(output):
+        if path.resolve() in (other.resolve() for other in output[:number]):
+            raise io.InputError(f"{path} is to be written twice: name another output with -o")
+        io.check_output(path, result)
+    found = io.of_turn(io.open_result(result), turn)
+    for path in output:
+        io.check_export(found, path)
+    columns = _section(found, ends) if ".csv" in suffixes else None
+    for path in output:
+        typer.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
+
+
+def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDArray[Any]]:
+    """Cut a result between two points, or across its apex, into the columns of a table."""
+    import numpy as np
+
+    from mirrorskin import engine, io
+
+    cut = engine.section(result, *(ends or ()))
+    if not np.isfinite(cut.height).any():
+        raise io.InputError("no height is known along the section: choose other points, or leave it out")
+    known = {"sigma": result.height_sigma, "filled": result.filled}
+    names = ("distance", "x", "y", "height", *(name for name, values in known.items() if values is not None))
+    return {name: getattr(cut, name) for name in names}

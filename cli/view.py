@@ -1,0 +1,144 @@
+"""``mirrorskin view``: look at a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mirrorskin.cli import options
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Result
+    from mirrorskin.view.result.figures import Ends
+
+_PICTURE = ".png"
+
+
+def command(
+    result: options.ResultFile,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="NAME",
+            help="Only height, section, normals, edges, status, sigma, histogram, azimuth or modulation;"
+            " may be given again.",
+            show_default="all that the result has",
+        ),
+    ] = None,
+    section: options.Section = None,
+    turn: options.Turn = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PICTURE.png|DIR",
+            help="Write one picture of all, or a picture of each into a folder, and open no window.",
+            show_default="a window; where there is no screen, RES-view.png",
+        ),
+    ] = None,
+    space: Annotated[
+        str | None,
+        typer.Option(
+            "--3d",
+            metavar="WHERE",
+            help="Show the surface in space instead, in a 'window', a 'browser', or write a FILE.rrd.",
+        ),
+    ] = None,
+) -> None:
+    """Show heights, a section, normals, edges, status, expected errors."""
+    from mirrorskin import io, view
+    from mirrorskin.cli.quantity import segment
+
+    ends = None if section is None else segment(section, "--section")
+    name = result.name if turn is None else f"{result.name}, turn {turn}"
+    if space is not None:
+        _refuse_beside_space(map_, section, output)
+        _show_in_space(result, turn, space, name)
+        return
+    view.check_drawing()
+    if output is not None:
+        _check(output, result)
+    _show(io.of_turn(io.open_result(result), turn), result, name, ends, map_, output)
+
+
+def _refuse_beside_space(map_: list[str] | None, section: str | None, output: Path | None) -> None:
+    """Refuse options of pictures where a surface is shown instead."""
+    from mirrorskin import io
+
+    for option, given in (("--map", map_), ("--section", section), ("-o", output)):
+        if given is not None:
+            raise io.InputError(f"{option} is of pictures, and --3d shows none: leave one of them out")
+
+
+def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
+    from mirrorskin import io
+    from mirrorskin.view.space import show_surface
+    from mirrorskin.view.viewer import BROWSER, WINDOW, check_place
+
+    check_place(where, "--3d")
+    kept = where not in (WINDOW, BROWSER)
+    if kept:
+        io.check_output(Path(where), path)
+    show_surface(io.of_turn(io.open_result(path), turn), where, name)
+    if kept:
+        typer.echo(f"written to {where}: 'rerun {where}' shows it")
+
+
+def _is_picture(output: Path) -> bool:
+    return output.suffix.lower() == _PICTURE
+
+
+def _check(output: Path, result: Path) -> None:
+    """Refuse a place that cannot be written to, before anything is drawn."""
+    from mirrorskin import io
+
+    if _is_picture(output):
+        io.check_output(output, result)
+    elif output.suffix and not output.is_dir():
+        raise io.InputError(f"-o {output}: name a picture that ends in {_PICTURE}, or a folder")
+    else:
+        nearest = next(one for one in (output, *output.absolute().parents) if one.exists())
+        if not nearest.is_dir():
+            raise io.InputError(f"{output} cannot be made: {nearest} is no folder; name another with -o")
+
+
+def _show(
+    shown: Result, path: Path, name: str, ends: Ends | None, maps: list[str] | None, output: Path | None
+) -> None:
+    """Draw what is asked for, into a window, a picture or a folder."""
+    from mirrorskin import io
+    from mirrorskin.view.canvas import write_figure
+    from mirrorskin.view.result import figures_of, overview
+    from mirrorskin.view.window import has_screen, show_figure
+
+    if output is None and has_screen():
+        show_figure(overview(shown, name=name, section=ends, maps=maps), name)
+        return
+    no_screen = output is None
+    if output is None:
+        output = path.with_name(f"{path.stem}-view{_PICTURE}")
+        io.check_output(output)
+    if _is_picture(output):
+        figures = {output: overview(shown, name=name, section=ends, maps=maps)}
+    else:
+        each = figures_of(shown, name=name, section=ends, maps=maps)
+        figures = {output / f"{which}{_PICTURE}": figure for which, figure in each.items()}
+        _make_folder(output)
+    if no_screen:
+        typer.echo("there is no screen for a window", err=True)
+    for target, figure in figures.items():
+        write_figure(figure, target)
+        typer.echo(f"written to {target}")
+
+
+def _make_folder(folder: Path) -> None:
+    from mirrorskin import io
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise io.InputError(f"{folder} cannot be made: {error.strerror}; name another with -o") from error

@@ -1,0 +1,104 @@
+"""``mirrorskin measure``: numbers with units and uncertainties, to read and for programs."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from commands import run
+from height_maps import cap, places, result_of
+
+from mirrorskin import io
+
+SHAPE, SIZE = (61, 71), (0.1, 0.1)
+
+
+@pytest.fixture
+def ball(tmp_path):
+    """A result of a ball of 10 mm, in a file."""
+    path = tmp_path / "ball.h5"
+    io.save_result(result_of(cap(SHAPE, SIZE, 5.0, 2.5), SIZE, sigma=0.001), path)
+    return path
+
+
+def told(*words):
+    """Return what a call prints as JSON."""
+    ended = run("measure", *words, "--json")
+    assert (ended.code, ended.said) == (0, "")
+    return json.loads(ended.out)
+
+
+def refused(*words):
+    """Return the line of a call that is refused."""
+    ended = run("measure", *words)
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.said.count("\n") == 1
+    return ended.said
+
+
+def test_numbers_are_printed_with_uncertainty_and_unit(ball):
+    ended = run("measure", ball)
+    assert (ended.code, ended.said) == (0, "")
+    lines = dict(line.split("  ", 1) for line in ended.out.splitlines() if "  " in line)
+    radius, plus, sigma, unit = lines["sphere radius"].split()
+    assert (float(radius), plus, unit) == (pytest.approx(5, abs=0.002), "±", "mm")
+    assert 0 < float(sigma) < 0.03
+    assert lines["contact area"].endswith("mm2")
+    assert lines["volume above rim"].endswith("mm3")
+    assert lines["Sq"].endswith("µm")
+    table, notes = ended.out.split("\n\n")
+    assert len(table.splitlines()) == len(lines)
+    assert "± is the standard uncertainty (k = 1)" in notes
+
+
+def test_programs_get_value_sigma_and_unit(ball):
+    measures = told(ball)
+    assert set(measures) == {"quantities", "notes"}
+    assert set(measures["quantities"]["sphere radius"]) == {"value", "sigma", "unit"}
+    assert measures["quantities"]["sphere radius"]["value"] == pytest.approx(5, abs=1e-3)
+    assert measures["quantities"]["Sq"]["unit"] == "µm"
+
+
+def test_options_say_where_and_from_what(ball):
+    part = told(ball, "--region", "20,20,10x15")["quantities"]
+    assert part["measured area"]["value"] == pytest.approx(1.5)
+    assert "plane tilt" in told(ball, "--form", "plane")["quantities"]
+    rough, filtered = (
+        told(ball, "--form=plane", *more)["quantities"]["Sq"] for more in ([], ["--cutoff=0.5mm"])
+    )
+    assert filtered["value"] < 0.1 * rough["value"]
+    line = told(ball, "--section=-1mm,0mm:500um,0mm")["quantities"]
+    assert line["section length"]["value"] == pytest.approx(1.5)
+
+
+def test_a_step_is_measured_along_a_section(tmp_path):
+    x, _ = places(SHAPE, SIZE)
+    io.save_result(result_of(np.where(x > 0, 0.25, 0.0), SIZE), tmp_path / "step.h5")
+    step = told(tmp_path / "step.h5", "--section=-3mm,1mm:3mm,1mm")["quantities"]["step height"]
+    assert step["value"] == pytest.approx(0.25)
+    assert step["unit"] == "mm"
+
+
+def test_one_turn_of_several_is_measured(tmp_path):
+    path = tmp_path / "turns.h5"
+    height = cap(SHAPE, SIZE, 5.0, 2.5).astype(np.float32)
+    one = result_of(height, SIZE)
+    io.save_result(dataclasses.replace(one, height=np.stack([height, height - 1])), path)
+    first, second = (told(path, "--turn", n)["quantities"]["highest point"]["value"] for n in (0, 1))
+    assert first - second == pytest.approx(1)
+    assert "choose one with --turn" in refused(path)
+    assert "none of turn 2" in refused(path, "--turn", "2")
+
+
+def test_what_cannot_be_measured_is_told_in_a_line(ball, tmp_path):
+    result = io.open_result(ball)
+    io.save_result(dataclasses.replace(result, x=None, y=None), tmp_path / "unsized.h5")
+    assert "reconstruct it again with --pixel-size" in refused(tmp_path / "unsized.h5")
+    io.save_result(io.Result(azimuth=np.zeros(SHAPE, np.float32)), tmp_path / "wave.h5")
+    assert "has no heights" in refused(tmp_path / "wave.h5")
+    assert "--region" in refused(ball, "--region", "0,0,100x100")
+    assert "a unit is needed" in refused(ball, "--cutoff", "0.8")
+    assert "too long for this surface" in refused(ball, "--cutoff", "1m")
+    assert "--section" in refused(ball, "--section", "0mm,0mm")
+    assert "--form" in refused(ball, "--form", "cube")
+    assert "no such file" in refused(tmp_path / "none.h5").lower()

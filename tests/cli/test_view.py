@@ -1,0 +1,145 @@
+"""``mirrorskin view``: pictures of a result, in a window, in a file, in a folder, or in space."""
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from shown import ball
+from typer.testing import CliRunner
+
+from mirrorskin import io
+from mirrorskin.cli import view as command
+from mirrorskin.view import space, viewer, window
+from mirrorskin.view.result.figures import MAPS
+
+app = typer.Typer()
+app.command()(command.command)
+
+
+@pytest.fixture
+def result(tmp_path, monkeypatch):
+    """The path of a result, and no screen."""
+    monkeypatch.setattr(window, "has_screen", lambda: False)
+    path = tmp_path / "ball.h5"
+    io.save_result(ball(), path)
+    return path
+
+
+def view(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def made(result):
+    """Return what lies beside a result now."""
+    return sorted(str(one.relative_to(result.parent)) for one in result.parent.rglob("*.png"))
+
+
+def test_without_a_screen_a_picture_lies_beside_the_result(result):
+    done = view(result, "--map", "status")
+    assert done.exit_code == 0, done.output
+    assert "no screen" in done.stderr
+    assert done.stdout == f"written to {result.with_name('ball-view.png')}\n"
+    assert made(result) == ["ball-view.png"]
+    assert cv2.imread(str(result.with_name("ball-view.png"))).shape[0] > 300
+
+
+def test_with_a_screen_all_is_in_one_window_and_nothing_is_written(result, monkeypatch):
+    shown = []
+    monkeypatch.setattr(window, "has_screen", lambda: True)
+    monkeypatch.setattr(window, "show_figure", lambda figure, title: shown.append((figure, title)))
+    assert view(result).exit_code == 0
+    ((figure, title),) = shown
+    assert title == "ball.h5"
+    assert len(figure.axes) == 8
+    assert made(result) == []
+
+
+def test_a_folder_gets_a_picture_of_each_map(result):
+    folder = result.parent / "new" / "pictures"
+    done = view(
+        result, "-o", folder, "--map", "section", "--map", "status", "--section", "-1mm,0mm:1mm,0.1mm"
+    )
+    assert done.exit_code == 0, done.output
+    assert made(result) == ["new/pictures/section.png", "new/pictures/status.png"]
+    assert done.stdout.count("written to") == 2
+
+
+def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result):
+    azimuth = np.zeros((2, 5, 6), np.float32)
+    io.save_result(io.Result(azimuth=azimuth), result)
+    assert "--turn 0 to 1" in str(view(result).exception)
+    path = result.with_name("TURN.PNG")
+    done = view(result, "--turn", 1, "-o", path)
+    assert done.exit_code == 0, done.output
+    assert cv2.imread(str(path)).shape[0] > 300
+    assert sorted(result.parent.iterdir()) == [path, result]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--map", "normal"], "ball.h5 has no normal to draw: it has height, section"),
+        (["-o", "{}"], "name a picture that ends in .png, or a folder"),
+        (["-o", "a.jpg"], "name a picture that ends in .png, or a folder"),
+        (["-o", "nowhere/a.png"], "no folder"),
+        (["-o", "{}/folder"], "ball.h5 is no folder; name another with -o"),
+        (["-o", "a.png/folder", "--map", "nothing"], "has no nothing to draw"),
+        (["--section", "1mm,0mm"], "two points are needed"),
+        (["--section", "5mm,5mm:6mm,6mm"], "no height is known along the section"),
+        (["--turn", "0"], "leave --turn out"),
+        (["--3d", "here"], "--3d here: give window, browser or a FILE.rrd"),
+        (["--3d", "{}"], "give window, browser or a FILE.rrd"),
+        (["--3d", "window", "--map", "height"], "--map is of pictures"),
+        (["--3d", "window", "-o", "a.png"], "-o is of pictures"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_line(result, monkeypatch, words, told):
+    monkeypatch.chdir(result.parent)
+    before = result.read_bytes()
+    done = view(result, *(word.format(result) for word in words))
+    assert isinstance(done.exception, io.InputError), done.output
+    assert told in str(done.exception)
+    assert "\n" not in str(done.exception)
+    assert result.read_bytes() == before
+    assert made(result) == []
+
+
+def test_a_picture_is_not_written_over_a_result_that_is_called_like_one(result):
+    sly = result.rename(result.with_suffix(".png"))
+    assert "is the input" in str(view(sly, "-o", sly).exception)
+    assert io.open_result(sly).height is not None
+
+
+def test_a_surface_is_not_written_over_a_result_that_is_called_like_one(result):
+    sly = result.rename(result.with_suffix(".rrd"))
+    assert "is the input" in str(view(sly, "--3d", sly).exception)
+    assert io.open_result(sly).height is not None
+
+
+def test_a_surface_is_written_to_be_shown_later(result):
+    path = result.with_suffix(".rrd")
+    done = view(result, "--3d", path)
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"written to {path}: 'rerun {path}' shows it\n"
+    assert path.stat().st_size > 10_000
+    assert made(result) == []
+
+
+@pytest.mark.parametrize("where", [viewer.WINDOW, viewer.BROWSER])
+def test_a_surface_in_a_viewer_needs_no_word(result, monkeypatch, where):
+    shown = []
+    monkeypatch.setattr(space, "show_surface", lambda *told: shown.append(told))
+    done = view(result, "--3d", where)
+    assert (done.exit_code, done.output) == (0, "")
+    ((_, place, name),) = shown
+    assert (place, name) == (where, "ball.h5")
+
+
+def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):
+    monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
+    assert "pip install 'mirrorskin[view]'" in str(view(result).exception)
+
+
+def test_the_help_names_every_map_there_is():
+    told = " ".join(view("--help").output.split())
+    assert [name for name in MAPS if name not in told] == []
