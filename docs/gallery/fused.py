@@ -1,0 +1,32 @@
+"""A press and a rotation make one surface.
+
+The press tells how high slopes lie, in steps, and nothing of what is level. The rotation tells which way
+each pixel faces, but not how high it lies. Fused, they are one surface in millimetres: the crater of the
+press closes, and the ball's radius comes out.
+"""
+
+import numpy as np
+
+from mirrorskin import engine, hw, io
+from mirrorskin.hw.twin import Axial, Camera, Vertical
+from mirrorskin.view.result import figures_of
+
+ball = {"object": "sphere", "shape": (128, 128), "pixel_size": 0.08, "camera": Camera(electrons=40)}
+press = hw.Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
+turn = hw.Twin(
+    movement=Axial(phase=np.radians(45) * np.arange(8), tilt=np.radians(2.5), press=1.5),
+    pattern="linear",
+    **ball,
+)
+result = engine.fuse_sources(press, turn)
+
+error = engine.score(result, press.truth).height
+print(f"RMS error {1000 * error.rms:.1f} um at {error.answered} pixels")
+found = engine.measure(result, form="sphere").quantities
+for name in ("sphere radius", "sphere top", "sphere residual RMS"):
+    print(f"{name}: {found[name]}")
+
+io.export_result(result, "ball.ply")  # triangles in mm, for any program that shows meshes
+figures = figures_of(result, name="a ball of 10 mm, fused")
+for what in ("height", "section", "normals", "sigma"):
+    figures[what].savefig(f"{what}.png", dpi=110)

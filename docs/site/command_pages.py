@@ -1,0 +1,91 @@
+"""The pages of the commands, from the command line itself."""
+
+from __future__ import annotations
+
+import functools
+import html
+import inspect
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import typer
+
+from mirrorskin.cli.main import app
+
+_PROGRAM = "mirrorskin"
+_PAGE = re.compile(r"docs/(\w+\.md)")
+
+
+@functools.cache
+def pages() -> dict[str, str]:
+    """Return a page for each command, by its name in the site; groups have theirs on one page."""
+    whole: Any = typer.main.get_command(app)
+    context = typer.Context(whole, info_name=_PROGRAM)
+    commands = {name: whole.get_command(context, name) for name in whole.list_commands(context)}
+    rows = [
+        f"| [`{_PROGRAM} {name}`]({name}.md) | {_linked(_first(command))} |"
+        for name, command in commands.items()
+    ]
+    index = [
+        "# Commands\n",
+        f"What `--help` says; `{_PROGRAM} --debug` before a command shows tracebacks, and what is logged.\n",
+        "| command | |\n|---|---|",
+        *rows,
+    ]
+    told = {
+        f"commands/{name}.md": "\n".join(_page(command, context, name, 1))
+        for name, command in commands.items()
+    }
+    return {"commands/index.md": "\n".join(index), **told}
+
+
+def uris() -> list[str]:
+    """Return the names of the pages, the index first."""
+    return list(pages())
+
+
+def _first(command: Any) -> str:
+    return _text(command).partition("\n")[0]
+
+
+def _text(command: Any) -> str:
+    return inspect.cleandoc(command.help or "").partition("\f")[0]
+
+
+def _page(command: Any, above: Any, name: str, level: int) -> Iterator[str]:
+    """Return the lines on a command, and on those below it."""
+    context = typer.Context(command, info_name=name, parent=above)
+    yield f"{'#' * level} {context.command_path}\n"
+    yield f"{_linked(_text(command))}\n"
+    is_group = hasattr(command, "list_commands")
+    if command.params or not is_group:  # some groups do something by themselves
+        yield from _options(command, context)
+    if is_group:
+        for one in command.list_commands(context):
+            yield from _page(command.get_command(context, one), context, one, level + 1)
+
+
+def _options(command: Any, context: Any) -> Iterator[str]:
+    """Return the lines on a command's usage, and on its arguments and options."""
+    yield f"```text\n{' '.join([context.command_path, *command.collect_usage_pieces(context)])}\n```\n"
+    yield "| | |\n|---|---|"
+    for parameter in command.get_params(context):
+        told = parameter.get_help_record(context)
+        if told is not None:
+            names, meaning = told
+            yield f"| <code>{_cell(names).replace('&#124;', '&#124;<wbr>')}</code> | {_cell(meaning)} |"
+    yield ""
+
+
+def _cell(text: str) -> str:
+    """Return text in which nothing is taken for Markdown or HTML."""
+    told = html.escape(" ".join(text.split()))
+    for sign in "|*_[`\\":
+        told = told.replace(sign, f"&#{ord(sign)};")
+    return _linked(told)
+
+
+def _linked(text: str) -> str:
+    """Return text whose names of pages lead there."""
+    return _PAGE.sub(r"[\g<0>](../\1)", text)

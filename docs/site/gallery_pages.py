@@ -1,0 +1,96 @@
+"""The pages of the gallery: scripts that run while the site is built, with what they print and draw."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import os
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from mkdocs.exceptions import PluginError
+
+_FOLDER = Path(__file__).resolve().parents[1] / "gallery"
+_ORDER = ["sphere", "coin", "fused", "own_data"]
+_LONGEST = 300  # seconds
+
+
+def uris() -> list[str]:
+    """Return the names of the pages, the index first."""
+    return ["gallery/index.md", *(f"gallery/{name}.md" for name in _ORDER)]
+
+
+def pages() -> dict[str, str | bytes]:
+    """Run all scripts, and return their pages and pictures by their names in the site.
+
+    Raises
+    ------
+    mkdocs.exceptions.PluginError
+        A script fails, or draws no picture.
+    """
+    scripts = [_FOLDER / f"{name}.py" for name in _ORDER]
+    if set(scripts) != set(_FOLDER.glob("*.py")):
+        raise PluginError("gallery: the scripts are not those that docs/site/gallery_pages.py names")
+    texts = [script.read_text(encoding="utf-8") for script in scripts]
+    with ThreadPoolExecutor(2) as pool:  # much of the time is starting Python, on one core
+        done = list(pool.map(_run, scripts, texts))
+    firsts = [next(iter(drawn)) for _, drawn in done]
+    made: dict[str, str | bytes] = {"gallery/index.md": _index(texts, firsts)}
+    for name, text, (printed, drawn) in zip(_ORDER, texts, done, strict=True):
+        made[f"gallery/{name}.md"] = _page(name, text, printed, list(drawn))
+        made |= {f"gallery/{picture}": content for picture, content in drawn.items()}
+    return made
+
+
+@functools.cache
+def _run(script: Path, text: str) -> tuple[str, dict[str, bytes]]:
+    """Run a script as it is now; return what it prints, and its pictures in the order of drawing."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "MPLBACKEND": "agg"}
+        done = subprocess.run(
+            [sys.executable, "-P", str(script)],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=_LONGEST,
+        )
+        pictures = sorted(Path(folder).glob("*.png"), key=lambda path: path.stat().st_mtime_ns)
+        if done.returncode or not pictures:
+            drawn = f"{len(pictures)} pictures"
+            raise PluginError(f"{script} ended with status {done.returncode} and {drawn}:\n{done.stderr}")
+        return done.stdout, {f"{script.stem}-{path.name}": path.read_bytes() for path in pictures}
+
+
+def _parts(text: str) -> tuple[str, str, str]:
+    """Return a script's title, its words, and its code."""
+    words = ast.get_docstring(ast.parse(text)) or ""
+    title, _, rest = words.partition("\n")
+    return title.rstrip("."), rest.strip(), text.partition('"""\n')[2].strip()
+
+
+def _index(texts: list[str], pictures: list[str]) -> str:
+    cards = []
+    for name, text, picture in zip(_ORDER, texts, pictures, strict=True):
+        title = _parts(text)[0]
+        cards.append(f"- [![{title}]({picture})]({name}.md)\n\n    [{title}]({name}.md)")
+    about = "Scripts that run whenever this site is built, and what they draw."
+    listed = "\n\n".join(cards)
+    return f"# Gallery\n\n{about}\n\n<div class='gallery' markdown>\n\n{listed}\n\n</div>\n"
+
+
+def _page(name: str, text: str, printed: str, pictures: list[str]) -> str:
+    title, words, code = _parts(text)
+    drawn = "\n".join(f"![{_what(picture)}]({picture})" for picture in pictures)
+    return (
+        f"# {title}\n\n{words}\n\n<div class='drawn' markdown>\n\n{drawn}\n\n</div>\n\n"
+        f"It prints:\n\n```text\n{printed}```\n\n`python docs/gallery/{name}.py`:\n\n```python\n{code}\n```\n"
+    )
+
+
+def _what(picture: str) -> str:
+    """Return in a word what a picture shows."""
+    return Path(picture).stem.rpartition("-")[2]

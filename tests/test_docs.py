@@ -1,0 +1,108 @@
+"""What the documentation tells people to type can be typed: the first steps run, all else is understood."""
+
+import re
+import shlex
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import typer
+from commands import run
+
+from mirrorskin.cli.main import app
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+SMALL = "--size", "48x40", "--pixel-size", "0.25mm"  # for what start.md simulates
+
+
+def blocks_of(page, language):
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def commands_of(page):
+    """Return the words of each mirrorskin command in a page's shell blocks."""
+    lines = "".join(blocks_of(page, "sh")).replace("\\\n", " ").splitlines()
+    split = [shlex.split(line, comments=True) for line in lines]
+    return [words[1:] for words in split if words[:1] == ["mirrorskin"]]
+
+
+WRITTEN = [(page.name, words) for page in PAGES for words in commands_of(page)]
+STEPS = commands_of(DOCS / "start.md")
+# Where a message is put together, or a value is filled in, it cannot be found as a whole.
+FILLED_IN = re.compile(
+    r"\.\.\.|[:;,] |[()'\"]| of mean|horizontal|PoCL|pyopencl|NAME.cl|/dev/videoN|[A-Z]+_[A-Z_]+|\b[NM]\b|\d+"
+)
+COMMAND = typer.main.get_command(app)
+
+
+@pytest.fixture
+def desk(tmp_path):
+    """A folder with the frames that somebody brings along."""
+    y, x = np.mgrid[1.0:-1.0:24j, -1.3:1.3:32j]
+    travel = 0.1 * np.arange(1, 13)
+    frames = np.where(travel[:, None, None] > 0.5 * np.hypot(x, y), 180, 10).astype(np.uint8)
+    with h5py.File(tmp_path / "theirs.h5", "w") as file:
+        file["raw/images"] = frames
+    (tmp_path / "frames").mkdir()
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "frames" / f"frame{number}.png"), frame)
+    return tmp_path
+
+
+def test_there_are_steps_and_commands():
+    assert len(STEPS) >= 10
+    assert len(WRITTEN) >= 40
+
+
+def test_the_steps_of_the_start_run_one_after_the_other(desk, monkeypatch):
+    monkeypatch.chdir(desk)
+    for words in STEPS:
+        small = SMALL if words[0] == "simulate" else ()
+        ended = run(*words, *small)
+        assert ended.code == 0, f"{' '.join(words)}: {ended.said}"
+    for page in ("start.md", "index.md"):
+        (code,) = blocks_of(DOCS / page, "python")
+        known = {}
+        exec(code, known)
+        assert np.isfinite(known["result"].height).any()
+
+
+@pytest.mark.parametrize(("page", "words"), WRITTEN, ids=[f"{page}: {' '.join(w)}" for page, w in WRITTEN])
+def test_a_command_of_the_documentation_is_understood(page, words):
+    understood(words)
+
+
+def test_messages_that_troubleshooting_tells_of_are_those_of_the_program():
+    folders = ("cli", "engine", "hw", "io", "kernels", "view")
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    source = "".join(file.read_text(encoding="utf-8") for file in files)
+    joined = re.sub(r"""["']\s*\n\s*f?["']""", "", source)
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    told = re.findall(r"^ *> (.*)$", page, re.MULTILINE)
+    assert len(told) > 60
+    parts = [part.strip() for line in told for part in FILLED_IN.split(line)]
+    assert [part for part in parts if len(part) > 8 and part not in joined] == []
+
+
+def test_a_command_that_is_none_is_not_understood():
+    with pytest.raises(Exception, match="such"):
+        understood(["reconstruct", "press.h5", "--travel-stop", "1mm"])
+
+
+def understood(words):
+    """Parse a command as the command line does, and do nothing."""
+    command, above = COMMAND, None
+    words = [word for word in words if word != "&"]
+    while True:
+        context = command.make_context(command.name, list(words), parent=above)
+        if not hasattr(command, "resolve_command"):
+            return
+        _, command, words = command.resolve_command(
+            context, [*getattr(context, "_protected_args", []), *context.args]
+        )
+        above = context

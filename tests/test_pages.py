@@ -1,0 +1,97 @@
+"""What docs/formats.md and docs/sensor.md say is so."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import sensor_report
+from stacks import ball
+
+from mirrorskin import engine, hw, io
+
+DOCS = Path(__file__).parents[1] / "docs"
+TRAVEL = np.round(np.arange(0.0, 1.3, 0.1), 10)
+
+
+def examples(page):
+    """Return the examples in Python of a page."""
+    return re.findall(
+        r"^```python\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
+
+
+def named(page):
+    """Return all that a page names as code, without the folders before it."""
+    return {name.rsplit("/", 1)[-1] for name in re.findall(r"`([^`\n]+)`", (DOCS / page).read_text("utf-8"))}
+
+
+def datasets(path):
+    """Return the names of a file's datasets, but for what a process tells."""
+    found = []
+    with h5py.File(path) as file:
+        file.visititems(lambda name, node: found.append(name) if isinstance(node, h5py.Dataset) else None)
+    return {name.rsplit("/", 1)[-1] for name in found if "/process/" not in name}
+
+
+def turn(phases=8):
+    return hw.Twin(
+        object="sphere",
+        shape=(21, 24),
+        pixel_size=0.3,
+        movement=hw.twin.Axial(2 * np.pi / phases * np.arange(phases), 0.05, 1.2),
+        pattern="linear",
+    )
+
+
+def test_a_recording_of_another_program_needs_no_more_than_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = ball((20, 24), 0.3, TRAVEL)
+    frames = source.read(np.empty(source.shape, source.dtype)).frames
+    exec(examples("formats.md")[0], {"frames": frames, "travel": TRAVEL})
+    with io.open_recording("press.h5") as recording:
+        assert recording.motion == "vertical"
+        assert recording.header.pixel_size == (0.03, 0.03)
+        np.testing.assert_array_equal(recording.travel, TRAVEL)
+        assert np.isfinite(engine.reconstruct(recording).height).any()
+
+
+def test_a_result_is_read_without_the_program(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    result = engine.reconstruct(ball((40, 44), 0.15, TRAVEL))
+    io.save_result(result, "res.h5")
+    names = {}
+    exec(examples("formats.md")[1], names)
+    np.testing.assert_array_equal(names["height"], result.height)
+    np.testing.assert_array_equal(names["y"], result.y)
+    np.testing.assert_array_equal(names["measured"], np.isfinite(result.height) & (result.filled == 0))
+    assert 0 < names["measured"].sum() < names["known"].sum()
+    assert f"{np.nanmax(result.height)!s} mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("per_turn", [False, True])
+def test_all_that_is_in_a_result_is_described(tmp_path, per_turn):
+    io.save_result(engine.reconstruct(turn(), per_turn=per_turn), tmp_path / "turn.h5")
+    found = datasets(tmp_path / "turn.h5")
+    assert {"height", "normals", "contact", "offset_unknown", "x"} < found
+    assert found <= named("formats.md")
+
+
+def test_all_that_is_in_a_recording_is_described(tmp_path):
+    source = turn()
+    with io.Recorder(source, tmp_path / "turn.h5", truth=source.truth) as recorder:
+        recorder.drain(lambda count: None)
+    found = datasets(tmp_path / "turn.h5")
+    assert {"data", "phase", "pivot", "zenith_gain"} < found
+    assert found <= named("formats.md")
+
+
+@pytest.mark.parametrize("name", ["dimensions", "gap", "distance", "skin"])
+def test_a_table_of_the_sensor_is_what_the_report_prints(name):
+    page = (DOCS / "sensor.md").read_text(encoding="utf-8").splitlines()
+    printed = [line for line in str(sensor_report.TABLES[name]()).splitlines() if line.startswith("|")]
+    start = page.index(printed[0])
+    assert page[start : start + len(printed)] == printed
