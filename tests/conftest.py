@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import pytest
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device, list_devices
 from mirrorskin.kernels.shape import BESIDE, CORE
+
+# The processes that tests start, a hundred of them, need not each compile all modules anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# A test opens no window, which nobody would close.
+os.environ["MPLBACKEND"] = "agg"
 
 FOUND = list_devices()
 if not FOUND:

@@ -95,7 +95,8 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     frames = random_press(dtype, 40, size, seed=6)
     travel = np.arange(40) * 0.1
     placed = lent(frames, offset)
-    search = OnsetSearch(size, dtype, dark=SPEC[dtype][0], bright=SPEC[dtype][1], device=device)
+    dark, bright = SPEC[dtype]
+    search = OnsetSearch(size, dtype, dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
     room = search.room.copy()
     for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
         search.push(Block(placed[part], part.start, travel=travel[part], lent=True))

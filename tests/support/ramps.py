@@ -12,7 +12,7 @@ FRAMES = 64
 WIDTHS = (0, 0.5, 1, 1.5, 2, 2.5, 3, 4, 5.5, 8, 11, 16)  # frames from dark to light
 NOISES = (1, 2, 3, 5, 8, 12, 16, 20)
 THRESHOLDS = np.arange(4, 17) / 20
-HOLDS = (1, 2, 3, 4, 6, 8)
+HOLDS = (1, 2, 3)  # longer ones were never the best, not even for one width of a ramp
 
 
 def ramps(noise, pixels, seed, dark=20, bright=220, widths=WIDTHS):

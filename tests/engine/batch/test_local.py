@@ -127,6 +127,7 @@ def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):
 HANGS = """
 import signal, threading
 from mirrorskin.engine.batch import local
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which programs in the background do without
 for wait in (0.5, 1.0, 1.5):
     threading.Timer(wait, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
 local._wait(threading.Semaphore(0))

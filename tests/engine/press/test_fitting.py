@@ -105,7 +105,7 @@ def test_both_shapes_give_the_same(device, monkeypatch, dtype):
     found = []
     for shape in (CORE, BESIDE):
         monkeypatch.setattr(device, "shape", shape)
-        search = OnsetSearch((13, 29), dtype, dark=10, bright=200, hold=3, noise=8.0, device=device)
+        search = OnsetSearch((13, 29), dtype, dark=10, bright=200, noise=8.0, device=device)
         search.push(Block(frames, 0, travel=np.arange(70.0)))
         found.append(search.result())
     for name in ("height", "sigma", "status", "frame"):

@@ -4,6 +4,8 @@ import subprocess
 import sys
 import textwrap
 
+import numpy as np
+
 BLOCK = 8_000_000
 
 PRESS = textwrap.dedent(
@@ -30,8 +32,9 @@ def make_recording(path, shape):
 
     with h5py.File(path, "w") as file:
         frames = file.create_dataset("frames", shape, "u1")
+        dark, light = (np.full(shape[1:], level, np.uint8) for level in (20, 200))
         for number in range(shape[0]):
-            frames[number] = 200 if number >= shape[0] // 2 else 20
+            frames[number] = light if number >= shape[0] // 2 else dark
 
 
 def test_peak_memory_is_two_blocks_and_the_maps(tmp_path):

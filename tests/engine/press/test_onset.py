@@ -2,12 +2,24 @@
 
 import numpy as np
 import pytest
-from presses import SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
+from presses import (
+    SPEC,
+    assert_equal,
+    assert_within_an_ulp,
+    first_run,
+    looks_between,
+    numpy_onset,
+    random_press,
+)
 
 from mirrorskin.engine import OnsetSearch, find_onset
 from mirrorskin.io import Block, InputError
+from mirrorskin.kernels.shape import CORE
 
 DTYPES = sorted(SPEC)
+ODD, EVEN = (33, 61), (32, 64)  # pixels: a frame of the latter is whole words
+# Three frames from an onset on are looked at in any case, and 32 at once.
+BY_HOLD = pytest.mark.parametrize(("hold", "size"), [(1, ODD), (2, ODD), (3, EVEN), (5, ODD), (300, EVEN)])
 
 
 def uneven_travel(count, start=0.0):
@@ -34,14 +46,14 @@ def test_the_reference_finds_the_first_run_that_holds(dtype, hold):
     np.testing.assert_array_equal(found.status, np.select([expected == -1, expected == 0], [2, 3], 1))
 
 
-@pytest.mark.parametrize("subframe", [True, False])
-@pytest.mark.parametrize("hold", [1, 2, 5, 300])
+@BY_HOLD
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_a_device_agrees_with_the_reference(device, dtype, hold, subframe):
-    frames = random_press(dtype, 40, (33, 61), seed=3)
+def test_a_device_agrees_with_the_reference(device, dtype, hold, size):
+    frames = random_press(dtype, 40, size, seed=3)
     dark, bright = SPEC[dtype]
     noise = 0.008 * (bright - dark)
     travel = uneven_travel(40, start=-1.7)
+    subframe = looks_between(device, dtype, hold)
     options = {"threshold": 0.4, "hold": hold, "subframe": subframe, "noise": noise}
     found = find_onset(frames, travel, dark, bright, device=device, **options)
     assert {1, 2, 3} <= set(found.status.flat)
@@ -68,12 +80,13 @@ def test_references_of_each_pixel_are_obeyed(device, dtype):
 
 @pytest.mark.parametrize("cuts", [range(1, 40), range(7, 40, 7), [1, 2, 39], [20]])
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("hold", [1, 2, 6])
-def test_blocks_make_no_difference(device, dtype, cuts, hold):
-    frames = random_press(dtype, 40, (19, 29), seed=1, noise=0.15)
+@BY_HOLD
+def test_blocks_make_no_difference(device, dtype, cuts, hold, size):
+    frames = random_press(dtype, 40, size, seed=1, noise=0.15)
     travel = uneven_travel(40)
     dark, bright = SPEC[dtype]
-    options = {"dark": dark, "bright": bright, "hold": hold, "device": device}
+    subframe = looks_between(device, dtype, hold)
+    options = {"dark": dark, "bright": bright, "hold": hold, "subframe": subframe, "device": device}
     whole = search_in_blocks(frames, travel, [], **options)
     assert_equal(search_in_blocks(frames, travel, list(cuts), **options), whole)
 
@@ -336,9 +349,9 @@ def test_a_few_pixels_alone_are_not_taken_for_done(device):
     assert np.all(found.frame == 9)
 
 
-@pytest.mark.parametrize("hold", [2**31 - 1, 2**31 - 2, 70_000])
+@pytest.mark.parametrize("hold", [2**31 - 1, 2**31 - 2])
 def test_a_hold_longer_than_any_stack_waits_for_the_end(device, hold):
-    frames = np.full((9, 1, 1), 20, np.uint8)
+    frames = np.full((9, 1, 1), 20, np.float32)
     frames[2:5] = 200
     options = {"dark": 20, "bright": 220, "hold": hold, "device": device}
     assert (
@@ -403,21 +416,21 @@ def test_a_saturated_sample_below_its_level_is_not_taken_for_dark(device):
     assert np.all(found.sigma > 0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("hold", [31, 32, 33, 64, 100])
-def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold):
+@pytest.mark.parametrize(("number", "hold"), list(enumerate([31, 32, 33, 64, 100])))
+def test_long_runs_are_counted_over_spans_and_cuts(device, number, hold):
     """Runs of about `hold` light frames, broken now and then: where they begin and end is chance."""
+    dtype = DTYPES[(number + (device.shape is CORE)) % 3]  # a kernel for each of them all takes long to build
     generator = np.random.default_rng([hold, DTYPES.index(dtype)])
     dark, bright = SPEC[dtype]
-    share = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 43))
-    light = generator.random((150, 3, 43)) < share
+    share = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 64))
+    light = generator.random((150, 3, 64)) < share
     light[:: hold - 1, :, ::8] = light[-1, :, ::4] = False  # or else there is a run in every pixel
     frames = np.where(light, bright, dark).astype(dtype)
     options = {"hold": hold, "noise": 0.01 * (bright - dark)}
     travel = uneven_travel(150)
     expected = numpy_onset(frames, travel, dark, bright, **options)
     assert {1, 2, 3} <= set(expected.status.flat)
-    runs = np.array([first_run(series, hold) for series in light.reshape(150, -1).T]).reshape(3, 43)
+    runs = np.array([first_run(series, hold) for series in light.reshape(150, -1).T]).reshape(3, 64)
     np.testing.assert_array_equal(expected.frame, runs)
     for cuts in ([], [1], [32, 64, 96, 128], *(np.unique(generator.integers(1, 150, n)) for n in (3, 9, 40))):
         found = search_in_blocks(
@@ -427,12 +440,12 @@ def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("noise", [1.5, None])
-def test_pictures_of_any_width(device, dtype, noise):
+def test_pictures_of_any_width(device, dtype):
     """Frames that begin anywhere in a word, and words that only partly lie in the picture."""
     dark, bright = SPEC[dtype]
     travel = uneven_travel(40)
     for width in range(1, 131):
+        noise = [1.5, None][width % 2]
         frames = random_press(dtype, 40, (1 + width % 3, width), seed=width)
         found = find_onset(frames, travel, dark, bright, noise=noise, device=device)
         expected = numpy_onset(frames, travel, dark, bright, noise=found.noise)
@@ -483,24 +496,24 @@ def test_a_negative_zero_is_a_zero(device, level):
     np.testing.assert_array_equal(found.frame, [[2, 2]])
 
 
-# What kernels are built for: few enough that building them takes no time worth saving.
+# What kernels are built for: what other tests need as well, because building them takes the longest.
 BUILDS = [
     ("uint8", 1, "onset"),
     ("uint8", 2, "release"),
-    ("uint8", 35, "onset"),
+    ("uint8", 33, "onset"),
     ("uint16", 2, "onset"),
     ("uint16", 5, "release"),
     ("float32", 2, "onset"),
-    ("float32", 3, "release"),
+    ("float32", 1, "release"),
 ]
 
 
 @pytest.mark.parametrize(("dtype", "hold", "event"), BUILDS)
-@pytest.mark.parametrize("subframe", [True, False])
-def test_tiny_stacks_of_all_kinds(device, dtype, hold, event, subframe):
+def test_tiny_stacks_of_all_kinds(device, dtype, hold, event):
     """Levels, references, noise, sizes, cuts and broken samples by chance, against the reference."""
+    subframe = looks_between(device, dtype, hold)
     generator = np.random.default_rng([DTYPES.index(dtype), hold, subframe])
-    for turn in range(12):
+    for turn in range(24):
         count = int(generator.integers(2, 90))
         shape = tuple(generator.integers(1, [4, 40]))
         frames = random_press(dtype, count, shape, seed=turn, noise=generator.choice([0.0, 0.02, 0.3]))
