@@ -16,9 +16,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo
 
-# A process for each core, each with files of its own: much of a test is compiling kernels, on one core.
-test: lint types
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+# A process for each core, each with files of its own: much of a test is compiling kernels, on one core. Types
+# are checked meanwhile, as some tests wait for clocks.
+test: lint
+	@$(MAKE) --no-print-directory types & types=$$!
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+	wait $$types
 
 # Pages in a real browser, which the system brings: Debian's package chromium.
 test-browser: .venv/.browser

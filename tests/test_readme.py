@@ -36,7 +36,7 @@ OF_THEIR_OWN = (
     "live",
 )  # in processes, which they start or end
 FEWER = "--size", "424x296", "--pixel-size", "0.035mm"  # where a simulation takes the default; a ball fits in
-TRIES = 3  # of what a machine may be too busy for to emulate in time
+TRIES = 5  # of what a machine may be too busy for to emulate in time
 RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); import commands; commands.main_with_a_small_demo()"
 
 

@@ -125,7 +125,7 @@ def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[f
     """Raise InputError if an end is further outside of the picture than that is large."""
     reach = size[0] * len(x), size[1] * len(y)
     if np.any(abs(np.subtract(ends, (x.mean(), y.mean()))) > reach):
-        raise InputError("the section ends far outside of the picture: give points in it, in mm from its centre")
+        raise InputError("the section ends far outside of the picture: give mm from its centre")
 
 
 def _pixels(shape: tuple[int, ...]) -> tuple[Doubles, Doubles]:

@@ -139,7 +139,7 @@ def test_a_filled_height_is_told_apart_in_a_cross_section():
         (["-o", "a.stl", "--points"], "--points is for a .ply file: name one with -o, or leave --points out"),
         (["-o", "a.csv", "--section", "0mm,0mm"], "two points are needed"),
         (["-o", "a.csv", "--section", "0,0:1,1"], "a unit is needed"),
-        (["-o", "a.csv", "--section", "5mm,5mm:6mm,6mm"], "no height is known along the section"),
+        (["-o", "a.csv", "--section", "0.9mm,0.9mm:1mm,1mm"], "no height is known along the section"),
         (["-o", "a.ply", "-o", "a.stl", "-o", "./a.ply"], "a.ply is to be written twice"),
         ([], "Missing option '--output'"),
     ],

@@ -85,7 +85,7 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
         (["-o", "{}/folder"], "ball.h5 is no folder; name another with -o"),
         (["-o", "a.png/folder", "--map", "nothing"], "has no nothing to draw"),
         (["--section", "1mm,0mm"], "two points are needed"),
-        (["--section", "5mm,5mm:6mm,6mm"], "no height is known along the section"),
+        (["--section", "0.9mm,0.9mm:1mm,1mm"], "no height is known along the section"),
         (["--turn", "0"], "leave --turn out"),
         (["--3d", "here"], "--3d here: give window, browser or a FILE.rrd"),
         (["--3d", "{}"], "give window, browser or a FILE.rrd"),
