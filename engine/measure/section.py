@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 
 _ROUNDING = 1e-6  # of a pixel
+_LEVEL = 0.01  # of the range of heights: what is as high as the highest point
 _WINDOW = 3  # pixels a side of the median that spikes do not get past
 
 
@@ -59,7 +60,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     start, end : (float, float), optional
         Millimetres from the picture's centre, x to the right and y up. Without them, the row of the highest
         point is taken, from the picture's left to its right; the highest after a median over 3 x 3
-        pixels, which leaves spikes out, measured or filled.
+        pixels, which leaves spikes out, measured or filled. Of a flat top it is the row in its middle.
 
     Returns
     -------
@@ -83,7 +84,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     x, y = (result.x, result.y) if result.x is not None and result.y is not None else _pixels(height.shape)
     size = pixel_size_of(x, y) if height.size > 1 else (1.0, 1.0)
     if start is None or end is None:
-        row, _ = apex(height)
+        row = _top_row(height)
         start, end = (float(x[0]), float(y[row])), (float(x[-1]), float(y[row]))
     elif start == end:
         raise InputError("both ends of the section are one point: give two")
@@ -119,6 +120,13 @@ def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     chosen = calm if np.any(calm > below) else np.where(known, height, below)
     row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
     return int(row), int(column)
+
+
+def _top_row(height: NDArray[np.float32]) -> int:
+    """Return the row of the highest point, or the one nearest to the middle of all that is as high."""
+    top = height[apex(height)]
+    rows, _ = np.nonzero((height <= top) & (height >= top - _LEVEL * (top - np.nanmin(height))))
+    return int(rows[np.argmin(abs(rows - rows.mean()))])
 
 
 def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[float, float]) -> None:

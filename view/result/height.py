@@ -112,19 +112,20 @@ def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
     """Draw the line of a section, and its ends A and B beyond it, or within where it ends at the edge."""
     (line,) = axes.plot(cut.x[[0, -1]], cut.y[[0, -1]], color="black", lw=1, ls=(0, (6, 3)))
     line.set_path_effects(outlined(2.5))
-    left, right, _, _ = sheet.place
+    left, right, _, top = sheet.place
     edge = _EDGE * (right - left)
     to_left = cut.x[0] <= cut.x[-1]
     for name, place, beyond in (("A", 0, to_left), ("B", -1, not to_left)):
         room = (cut.x[place] - left if beyond else right - cut.x[place]) > edge
         align = "right" if beyond == room else "left"
+        above = top - cut.y[place] > edge
         axes.annotate(
             name,
             (float(cut.x[place]), float(cut.y[place])),
-            (3 if align == "left" else -3, 3),
+            (3 if align == "left" else -3, 3 if above else -3),
             textcoords="offset points",
             ha=align,
-            va="bottom",
+            va="bottom" if above else "top",
             fontsize=SMALL + 2,
             weight="bold",
             path_effects=outlined(2.5),

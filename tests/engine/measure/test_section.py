@@ -56,6 +56,13 @@ def test_without_ends_it_is_the_row_of_the_highest_point():
     assert np.nanmax(cut.sigma) == pytest.approx(0.002)
 
 
+def test_of_a_flat_ring_the_section_goes_through_the_middle():
+    x, y = places((41, 41), (0.1, 0.1))
+    height = np.where(abs(np.hypot(x, y) - 1.5) < 0.3, 0.0, -1.0)
+    height += 0.002 * y  # nearly level
+    assert abs(engine.section(result_of(height, (0.1, 0.1))).y[0]) <= 0.05
+
+
 def test_a_spike_is_not_the_highest_point():
     height = cap(SHAPE, SIZE, 5.0, 2.0)
     height[3, 5] = 9.0

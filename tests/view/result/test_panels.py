@@ -184,7 +184,7 @@ def test_a_section_without_errors_or_holes_tells_of_neither():
     sheet, cut = cut_of(level)
     axes = panel_of(draw_section, sheet.result, cut)
     assert named(axes) == {"measured", "highest measured"}
-    assert note(axes).startswith("A (0, 2) to B (8, 2) mm")
+    assert note(axes).startswith("A (0, 1) to B (8, 1) mm")
 
 
 def test_a_section_across_nothing_but_a_hole_is_empty():
