@@ -189,7 +189,8 @@ def test_files_that_are_no_meshes(tmp_path: Path, suffix: str, content: bytes) -
 def test_half_a_file(tmp_path: Path, name: str, kept: int) -> None:
     path = save(tmp_path / name, box((1, 1, 1), (0, 0, 0)))
     path.write_bytes(path.read_bytes()[:kept])
-    refused(path, "can be read")
+    # Where a package is installed that guesses encodings, trimesh takes what is left of an STL for letters.
+    refused(path, "no surface|can be read")
 
 
 def one_triangle(path: Path, corners: list[list[float]]) -> Path:
