@@ -1,27 +1,33 @@
-# make [demo|test|test-browser|docs|soak|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-browser|docs|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-browser docs soak lint types bench portability clean
+.PHONY: demo test test-all test-browser docs lint types bench portability clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
 BIN := .venv/bin
 READY := .venv/.ready
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal --ignore tests/browser
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo
 
-# A process for each core, each with files of its own: much of a test is compiling kernels, on one core. Types
-# are checked meanwhile, as some tests wait for clocks.
+# Types are checked meanwhile, as some tests wait for clocks. --dist worksteal: processes that have no tests left take others'.
 test: lint
 	@$(MAKE) --no-print-directory types & types=$$!
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+	$(PYTEST) -m 'not slow'
 	wait $$types
+
+# What 'make test' leaves out: the second work shape of every device, statistics over many draws, recordings
+# of full size, batches that are killed, the documentation, and reports in a real browser.
+test-all: $(READY)
+	@$(PYTEST) -m slow
+	$(MAKE) --no-print-directory docs test-browser
 
 # Pages in a real browser, which the system brings: Debian's package chromium.
 test-browser: .venv/.browser
@@ -31,10 +37,6 @@ test-browser: .venv/.browser
 docs: .venv/.docs
 	@(cd tests && ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml ../docs/site/hooks.py)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-
-# Batches that are killed at random, 20 times each, in one process, so that there is one table; 'make test' does each once.
-soak: $(READY)
-	@MIRRORSKIN_SOAK=20 $(BIN)/python -m pytest tests/soak
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.plain import is_flagged, plainly
 from mirrorskin.io.storage import check_storage
 from mirrorskin.io.types import Closing, InputError
-from mirrorskin.io.units import factor
+from mirrorskin.io.units import conversion_factor
 
 Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
 Shape = tuple[int, ...]
@@ -164,7 +164,7 @@ class Hdf5File(Closing):
             given = str(_first(_attribute(node.id, b"units")) or unit) if stated else unit
         if given is None or unit is None or given == unit:
             return values
-        return values * factor(given, unit, self.where(node))
+        return values * conversion_factor(given, unit, self.where(node))
 
     def value(self, node: Node) -> Any:
         """Read one text or number, alone or in an array of one."""

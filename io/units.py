@@ -1,24 +1,73 @@
-"""Numbers in files that say their unit."""
+"""Units of measurement, in terms of each other: those in common use from a table, the rest from pint."""
 
 from __future__ import annotations
 
 import functools
+import math
 import re
-from typing import Any
+from typing import Any, Literal
 
 from mirrorskin.io.types import InputError
 
-# pint would compute what it is given; it is given names alone.
-_NAMES = re.compile(r"([^\W\d]+|1)/[^\W\d]+|[^\W\d]+|°")
+Kind = Literal["length", "angle", "time", "memory"]
+
+BASE: dict[Kind, str] = {"length": "mm", "angle": "rad", "time": "s", "memory": "byte"}
+"""The unit that each kind of quantity is converted to."""
+
+_COMMON: dict[Kind, dict[str, float]] = {
+    "length": {
+        "mm": 1.0,
+        "um": 0.001,
+        "\u00b5m": 0.001,
+        "\u03bcm": 0.001,
+        "cm": 10.0,
+        "m": 1000.0,
+        "in": 25.4,
+    },
+    "angle": {"rad": 1.0, "mrad": 0.001, "deg": math.pi / 180, "°": math.pi / 180, "turn": math.tau},
+    "time": {"s": 1.0, "ms": 0.001, "us": 1e-6, "min": 60.0},
+    "memory": {"byte": 1, "B": 1, "kB": 1e3, "MB": 1e6, "GB": 1e9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30},
+}
+_NOUN: dict[Kind, str] = {
+    "length": "a length",
+    "angle": "an angle",
+    "time": "a time",
+    "memory": "an amount of memory",
+}
+_SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given single names only
 
 
-def factor(given: str, wanted: str, where: str) -> float:
-    """Return the number that turns a value in one unit into another.
+def in_base(symbol: str, kind: Kind) -> float:
+    """Return how many base units one unit is.
 
     Parameters
     ----------
-    given, wanted : str
-        Units, as in ``um`` or ``1/deg``.
+    symbol : str
+        Such as ``um``.
+    kind : {"length", "angle", "time", "memory"}
+        What it must measure; the base units are `BASE`.
+
+    Raises
+    ------
+    ValueError
+        The unit is unknown, or measures something else; the message says which.
+
+    Examples
+    --------
+    >>> in_base("cm", "length")
+    10.0
+    """
+    known = _COMMON[kind].get(symbol)
+    return _pint_factor(symbol, kind) if known is None else known
+
+
+def conversion_factor(unit: str, wanted: str, where: str) -> float:
+    """Return the number that converts a value of a file from its unit.
+
+    Parameters
+    ----------
+    unit, wanted : str
+        Units, as in ``um`` or ``1/deg``; the wanted one is a base unit, or one over it.
     where : str
         What holds the value, for messages.
 
@@ -27,22 +76,38 @@ def factor(given: str, wanted: str, where: str) -> float:
     InputError
         The unit is unknown or of another kind.
     """
-    if given == wanted:
+    if unit == wanted:
         return 1.0
-    import pint  # a third of a second, and files in our own units do not need it
-
+    over, _, base = wanted.rpartition("/")
+    given_over, _, symbol = unit.rpartition("/")
     try:
-        if not _NAMES.fullmatch(given):
-            raise ValueError(given)
-        one = _registry()(given)
-        # A pixel of a style sheet, px, is a length, but nobody here means that one.
-        if "css_pixel" in str(one.units):
-            raise ValueError(given)
-        return float(one.to(wanted).magnitude)
-    except (pint.PintError, AttributeError, ValueError, TypeError) as error:
+        if given_over != over:
+            raise ValueError(f"{unit} is no {wanted}")
+        (kind,) = (kind for kind, name in BASE.items() if name == base)
+        factor = in_base(symbol, kind)
+    except ValueError as error:
         raise InputError(
-            f"{where} is in {given!r}, which cannot be turned into {wanted}: correct its attribute units"
+            f"{where} is in {unit!r}, which cannot be turned into {wanted}: correct its attribute units"
         ) from error
+    return 1 / factor if over else factor
+
+
+def _pint_factor(symbol: str, kind: Kind) -> float:
+    import pint  # its table of units takes most of a second to load
+
+    registry = _registry()
+    try:
+        if not _SYMBOL.fullmatch(symbol):
+            raise ValueError(symbol)
+        unit = registry.Unit(symbol)
+    except (pint.UndefinedUnitError, ValueError) as error:
+        raise ValueError(f"{symbol} is not a known unit") from error
+    base = registry.Unit(BASE[kind])
+    # A pixel of a style sheet is a length, but nobody here means that one.
+    same = registry.get_root_units(unit)[1] == registry.get_root_units(base)[1]
+    if not same or unit == registry.Unit("css_pixel"):
+        raise ValueError(f"{unit}s are not {_NOUN[kind]}")
+    return float(registry.convert(1.0, unit, base))
 
 
 @functools.cache

@@ -32,6 +32,7 @@ WAYS = [
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "device: runs on each OpenCL device")
+    config.addinivalue_line("markers", "slow: only 'make test-all' runs it")
 
 
 def pytest_collection_modifyitems(items):
@@ -40,11 +41,12 @@ def pytest_collection_modifyitems(items):
             item.add_marker("device")
 
 
-@pytest.fixture(
-    scope="session",
-    params=WAYS,
-    ids=[f"{FOUND[n].kind}{n}-{'shared' if s else 'copied'}-{t}" for n, s, t in WAYS],
-)
+def _way(number, shared, shape):
+    name = f"{FOUND[number].kind}{number}-{'shared' if shared else 'copied'}-{shape}"
+    return pytest.param((number, shared, shape), id=name, marks=[pytest.mark.slow] if shape != "core" else [])
+
+
+@pytest.fixture(scope="session", params=[_way(*way) for way in WAYS])
 def device(request):
     """Every OpenCL device, in either shape of work; memory is shared where it can be."""
     number, shared, shape = request.param
