@@ -1,31 +1,13 @@
-"""Shared types, and the files: recordings, results, other people's frames."""
+"""Shared types, and the files: recordings, results, other people's frames.
 
-from mirrorskin.io.atomic import check_output
-from mirrorskin.io.calibration.file import open_calibration, save_calibration, update_calibration
-from mirrorskin.io.calibration.fit import check_camera
-from mirrorskin.io.calibration.source import Calibrated
-from mirrorskin.io.calibration.types import (
-    Calibration,
-    CameraId,
-    Gel,
-    Lens,
-    Precession,
-    References,
-    WallResponse,
-)
-from mirrorskin.io.describe import describe
-from mirrorskin.io.export.mesh import Mesh, surface_mesh
-from mirrorskin.io.export.result import check_export, export_result
-from mirrorskin.io.export.table import save_table
-from mirrorskin.io.frames import open_frames
-from mirrorskin.io.heights import open_heights
-from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
-from mirrorskin.io.recorder import Recorder
-from mirrorskin.io.recording import Recording, Steps, open_recording
-from mirrorskin.io.region import Region, part_of
-from mirrorskin.io.result import open_result, save_result
-from mirrorskin.io.streaming import StreamRecorder
-from mirrorskin.io.turns import of_turn
+Only the types are loaded at once; everything else when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from mirrorskin.io.types import (
     FRAME_DTYPES,
     MOTIONS,
@@ -41,7 +23,35 @@ from mirrorskin.io.types import (
     Truth,
     pixel_axes,
 )
-from mirrorskin.io.writing import COMPRESSIONS, Compression
+
+if TYPE_CHECKING:
+    from mirrorskin.io.atomic import check_output
+    from mirrorskin.io.calibration.file import open_calibration, save_calibration, update_calibration
+    from mirrorskin.io.calibration.fit import check_camera
+    from mirrorskin.io.calibration.source import Calibrated
+    from mirrorskin.io.calibration.types import (
+        Calibration,
+        CameraId,
+        Gel,
+        Lens,
+        Precession,
+        References,
+        WallResponse,
+    )
+    from mirrorskin.io.description import describe
+    from mirrorskin.io.export.mesh import Mesh, surface_mesh
+    from mirrorskin.io.export.result import check_export, export_result
+    from mirrorskin.io.export.table import save_table
+    from mirrorskin.io.frames import open_frames
+    from mirrorskin.io.heights import open_heights
+    from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
+    from mirrorskin.io.recorder import Recorder
+    from mirrorskin.io.recording import Recording, Steps, open_recording
+    from mirrorskin.io.region import Region, part_of
+    from mirrorskin.io.result import open_result, save_result
+    from mirrorskin.io.streaming import StreamRecorder
+    from mirrorskin.io.turns import of_turn
+    from mirrorskin.io.writing import COMPRESSIONS, Compression
 
 __all__ = [
     "COMPRESSIONS",
@@ -95,3 +105,49 @@ __all__ = [
     "surface_mesh",
     "update_calibration",
 ]
+
+_MODULES = {
+    "atomic": ("check_output",),
+    "calibration.file": ("open_calibration", "save_calibration", "update_calibration"),
+    "calibration.fit": ("check_camera",),
+    "calibration.source": ("Calibrated",),
+    "calibration.types": (
+        "Calibration",
+        "CameraId",
+        "Gel",
+        "Lens",
+        "Precession",
+        "References",
+        "WallResponse",
+    ),
+    "description": ("describe",),
+    "export.mesh": ("Mesh", "surface_mesh"),
+    "export.result": ("check_export", "export_result"),
+    "export.table": ("save_table",),
+    "frames": ("open_frames",),
+    "heights": ("open_heights",),
+    "positions": ("Positions", "check_phase", "check_stroke", "check_travel"),
+    "recorder": ("Recorder",),
+    "recording": ("Recording", "Steps", "open_recording"),
+    "region": ("Region", "part_of"),
+    "result": ("open_result", "save_result"),
+    "streaming": ("StreamRecorder",),
+    "turns": ("of_turn",),
+    "writing": ("COMPRESSIONS", "Compression"),
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Load what is not a type from its module (PEP 562)."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

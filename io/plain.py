@@ -35,7 +35,7 @@ class _Plainly(AbstractContextManager[None]):
         self._what, self._remedy = what, remedy
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any, /) -> None:
-        if isinstance(error, _ERRORS):
+        if isinstance(error, _ERRORS) and not isinstance(error, InputError):
             what = self._what if isinstance(self._what, str) else self._what()
             remedy = self._remedy and f"; {self._remedy}"
             raise InputError(f"{what}: {reason(error)}{remedy}") from error

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import h5py
-import hdf5plugin
 
 from mirrorskin.io.plain import plainly
 from mirrorskin.io.types import InputError
@@ -15,9 +14,6 @@ if TYPE_CHECKING:
     from mirrorskin.io.hdf5 import Hdf5File
 
 _VIRTUAL_DEEP = 4
-
-# Importing hdf5plugin is what registers bitshuffle, blosc and the others with HDF5.
-PLUGIN_FILTERS = hdf5plugin.FILTERS
 
 
 def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
@@ -79,6 +75,8 @@ def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
 
 def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) -> None:
     filters = _filters(dataset)
+    if not all(h5py.h5z.filter_avail(code) for code, _ in filters):
+        import hdf5plugin  # noqa: F401  # which registers bitshuffle, blosc and others with HDF5
     for code, name in filters:
         if not h5py.h5z.filter_avail(code):
             raise InputError(

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 ProcessValue = str | int | float | bool
 
 
-class InputError(Exception):
+class InputError(ValueError):
     """What the user gave cannot be used; the message is one line that says why and what to do."""
 
     exit_code = 2

@@ -6,7 +6,6 @@ from datetime import UTC, datetime
 from typing import Any, Literal, get_args
 
 import h5py
-import hdf5plugin
 
 from mirrorskin.io.layout import MARK, SERIES, STACK
 from mirrorskin.io.plain import legible
@@ -32,14 +31,17 @@ def check_compression(compression: str) -> None:
 
 def packing(compression: Compression) -> dict[str, Any]:
     """Return what to create a dataset with so that it is packed."""
-    packings: dict[Compression, dict[str, Any]] = {
-        "raw": {},
-        "bitshuffle": {**hdf5plugin.Bitshuffle(cname="lz4")},
-        "blosc": {**hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE)},
-        "gzip": {"compression": "gzip", "compression_opts": 1, "shuffle": True},
-        "lzf": {"compression": "lzf", "shuffle": True},
-    }
-    return packings[compression]
+    if compression == "raw":
+        return {}
+    if compression == "gzip":
+        return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    if compression == "lzf":
+        return {"compression": "lzf", "shuffle": True}
+    import hdf5plugin  # registers its filters with HDF5
+
+    if compression == "bitshuffle":
+        return {**hdf5plugin.Bitshuffle(cname="lz4")}
+    return {**hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE)}
 
 
 def write_header(file: h5py.File, header: Header) -> None:

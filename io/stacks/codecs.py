@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
@@ -226,6 +225,8 @@ def _check(found: int, needed: int) -> None:
 
 
 def _plugin(name: str) -> str:
+    import hdf5plugin
+
     return str(Path(hdf5plugin.PLUGIN_PATH) / f"libh5{name}.so")
 
 
