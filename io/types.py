@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    import xarray
+
     from mirrorskin.io.calibration.types import Calibration
 
 Motion = Literal["vertical", "axial", "horizontal", "twist"]
@@ -211,7 +213,7 @@ class Truth:
     slip: NDArray[np.uint8] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Result:
     """The maps of a reconstruction; one that was not computed is None.
 
@@ -278,6 +280,33 @@ class Result:
         """Return the maps that were computed, by name."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in NO_MAPS}
         return {name: value for name, value in values.items() if value is not None}
+
+    def __repr__(self) -> str:
+        from mirrorskin.io.notebook import as_text
+
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        from mirrorskin.io.notebook import as_html
+
+        return as_html(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the maps as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
+
+        Standard deviations stand beside the values as variables of their own (``height_sigma``,
+        ``normal_sigma``); the process becomes the dataset's attributes. It needs the package xarray:
+        ``pip install 'mirrorskin[xarray]'``.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> float(result.to_xarray().height.sel(x=1, y=0))
+        0.0
+        """
+        from mirrorskin.io.notebook import as_xarray
+
+        return as_xarray(self)
 
 
 NO_MAPS = ("offset_unknown", "x", "y", "process", "calibration")

@@ -1,0 +1,104 @@
+"""How a result shows itself: as text, in a notebook, and as an xarray dataset."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.result import UNITS
+from mirrorskin.io.types import Result
+
+if TYPE_CHECKING:
+    import xarray
+
+_PICTURE = 480  # pixels that the longer side of a picture has at most
+
+
+def as_text(result: Result) -> str:
+    """Return the maps of a result with their shape, unit and range, a line each."""
+    lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
+    return "\n".join([f"Result{_origin(result)}", *(f"  {line}" for line in lines)])
+
+
+def as_html(result: Result) -> str:
+    """Return a table of the maps, and a picture of the height, or else of the zenith."""
+    rows = "".join(
+        "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
+        for row in _rows(result)
+    )
+    shown = next((name for name in ("height", "zenith", "modulation") if name in result.maps()), None)
+    picture = "" if shown is None else _picture(shown, result.maps()[shown])
+    title = f"<p><b>Result</b>{escape(_origin(result))}</p>"
+    return f"{title}<div style='display:flex;gap:2em'>{picture}<table>{rows}</table></div>"
+
+
+def as_xarray(result: Result) -> xarray.Dataset:
+    """Return the maps as an `xarray.Dataset`; see `Result.to_xarray`."""
+    import xarray
+
+    maps = result.maps()
+    lead = ("turn",) if _of_turns(result) else ()
+    dimensions = {
+        name: (*lead, "y", "x", "vector") if name == "normals" else (*lead, "y", "x") for name in maps
+    }
+    data: dict[str, Any] = {
+        name: (dimensions[name], values, {"units": UNITS[name]} if name in UNITS else {})
+        for name, values in maps.items()
+    }
+    if result.offset_unknown is not None:
+        data["offset_unknown"] = ("piece", result.offset_unknown)
+    coordinates: dict[str, Any] = {
+        name: (name, values, {"units": "mm"})
+        for name, values in (("x", result.x), ("y", result.y))
+        if values is not None
+    }
+    if "normals" in maps:
+        coordinates["vector"] = ["x", "y", "z"]
+    return xarray.Dataset(data, coordinates, attrs=dict(result.process))
+
+
+def _rows(result: Result) -> list[tuple[str, str, str]]:
+    """Return name, shape, and unit with range of each map."""
+    rows = []
+    for name, values in result.maps().items():
+        shape = " x ".join(map(str, values.shape))
+        known = values[np.isfinite(values)] if values.dtype.kind == "f" else values.ravel()
+        span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
+        share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
+        unit = f" {UNITS[name]}" if name in UNITS and known.size else ""
+        rows.append((name, shape, f"{span}{unit}{share}"))
+    return rows
+
+
+def _origin(result: Result) -> str:
+    source = result.process.get("source")
+    return f" of {source}" if source else ""
+
+
+def _of_turns(result: Result) -> bool:
+    return any(values.ndim == (4 if name == "normals" else 3) for name, values in result.maps().items())
+
+
+def _picture(name: str, values: NDArray[Any]) -> str:
+    """Return a map, or its last turn, in colours from dark (low) to light (high); unknown is clear."""
+    import cv2
+
+    flat = values.reshape(-1, *values.shape[-2:])[-1].astype(np.float64)
+    step = max(1, -(-max(flat.shape) // _PICTURE))
+    flat = flat[::step, ::step]
+    known = np.isfinite(flat)
+    if not known.any():
+        return ""
+    low, high = np.percentile(flat[known], (1, 99))
+    grey = np.clip((np.where(known, flat, low) - low) / (high - low or 1.0), 0, 1)
+    colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    picture = np.dstack([colours, 255 * known.astype(np.uint8)])
+    data = base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
+    unit = f" {UNITS[name]}" if name in UNITS else ""
+    caption = f"{name}, {low:.4g} to {high:.4g}{unit}"
+    image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
