@@ -24,6 +24,7 @@ from mirrorskin.kernels.array import Array, Lent, Operand, pinned
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.shape import BESIDE, CORE
+from mirrorskin.kernels.signature import Signature, read_signatures
 
 DeviceKind = Literal["gpu", "cpu", "other"]
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
@@ -125,7 +126,7 @@ class Device:
             cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
             for _ in range(2)
         )
-        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._programs: dict[tuple[str, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
@@ -227,18 +228,19 @@ class Device:
 
     def _make_kernel(self, file: str, name: str, options: tuple[str, ...]) -> Kernel:
         try:
-            return Kernel(self, name, cl.Kernel(self._program(file, options), name), self.shape.group)
+            program, signatures = self._program(file, options)
+            return Kernel(self, name, cl.Kernel(program, name), signatures[name], self.shape.group)
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
 
-    def _program(self, file: str, options: tuple[str, ...]) -> cl.Program:
+    def _program(self, file: str, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
         with self._lock:
             if (file, options) not in self._programs:
                 self._programs[file, options] = self._build(file, options)
             return self._programs[file, options]
 
-    def _build(self, file: str, options: tuple[str, ...]) -> cl.Program:
+    def _build(self, file: str, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
         source = resources.files("mirrorskin.kernels").joinpath(f"{file}.cl").read_text(encoding="utf-8")
         start = time.perf_counter()
         try:
@@ -246,32 +248,52 @@ class Device:
         except cl.RuntimeError as error:
             raise DeviceError(_explain_build(f"{file}.cl", source, str(error), self.info)) from error
         self.profile.add("compile", file, time.perf_counter() - start)
-        return program
+        defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
+        return program, read_signatures(source, defines)
 
 
 class Kernel:
     """A compiled kernel, ready to run over so many items."""
 
-    def __init__(self, device: Device, name: str, kernel: cl.Kernel, group: int) -> None:
+    def __init__(
+        self, device: Device, name: str, kernel: cl.Kernel, signature: Signature, group: int
+    ) -> None:
         self.name = name
         self._device = device
         self._kernel = kernel
+        self._signature = signature
         self._group = group
 
-    def __call__(self, items: int, *args: Operand | np.generic, moved: int, first: int = 0) -> None:
+    def __call__(
+        self,
+        items: int,
+        /,
+        *args: Operand | np.generic,
+        moved: int,
+        first_item: int = 0,
+        **arguments: Operand | float | np.generic | None,
+    ) -> None:
         """Put one run on the device's queue.
 
         Parameters
         ----------
         items : int
             Work-items needed; more may start, so the kernel checks its bounds.
-        *args : Array or NumPy scalar
-            The kernel's arguments in order; arrays belong to the device by now.
         moved : int
             Bytes that it must read and write, for the profile.
-        first : int
+        first_item : int
             Number of the first item, for work that is done in parts.
+        **arguments : Array, BorrowedBuffer, number or None
+            The kernel's arguments by their names in the source. Numbers are converted to the types there;
+            None is a null pointer.
+
+        Raises
+        ------
+        TypeError
+            An argument is missing, unknown, or no number where one is needed.
         """
+        if not args:
+            args = self._in_order(arguments)
         group = self._group
         size = -(-items // group) * group
         values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
@@ -279,13 +301,34 @@ class Kernel:
         copies = [array.arrived for array in arrays if array.arrived is not None]
         try:
             event = self._kernel(
-                self._device.queue, (size,), (group,), *values, global_offset=(first,), wait_for=copies
+                self._device.queue, (size,), (group,), *values, global_offset=(first_item,), wait_for=copies
             )
         except cl.Error as error:
             raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
         for array in arrays:
             array.used = event
         self._device.profile.watch("kernel", self.name, event, moved)
+
+    def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
+        """Return arguments in the source's order, numbers in its types."""
+        names = [name for name, _ in self._signature]
+        if arguments.keys() != set(names):
+            missing = [name for name in names if name not in arguments]
+            unknown = [name for name in arguments if name not in names]
+            raise TypeError(f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {names}")
+        values = []
+        for name, convert in self._signature:
+            value = arguments[name]
+            if convert is None:
+                if not (value is None or isinstance(value, Operand)):
+                    raise TypeError(f"{self.name}: {name} takes an array of the device, not {value!r}")
+            else:
+                try:
+                    value = convert(value)
+                except (TypeError, OverflowError) as error:
+                    raise TypeError(f"{self.name}: {name} cannot be {value!r}: {error}") from error
+            values.append(value)
+        return tuple(values)
 
 
 class _ThreadKernels(threading.local):

@@ -174,5 +174,5 @@ class EdgeDrawing:
         kernel, part = self._device.kernel("edges", name, **macros), -(-items // parts)
         for first in range(0, items, part):
             count = min(part, items - first)
-            kernel(count, *values, moved=moved * count // items, first=first)
+            kernel(count, *values, moved=moved * count // items, first_item=first)
             yield

@@ -10,6 +10,7 @@ from mirrorskin.kernels import array, pocl
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
+from mirrorskin.kernels.signature import read_signatures
 
 MACROS = {"LANES": 16, "WORDS": 64, "STRIDE": 1}
 
@@ -67,6 +68,51 @@ def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
     assert not device.profile.records()
 
 
+def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
+    numbers = device.given("numbers", np.ones((8, 16), np.float32))
+    kernel = device.kernel("limits", "multiply_all", LANES=16, WORDS=8, STRIDE=1)
+    kernel(1, summand=np.float64(0.5), factor=2, numbers=numbers, steps=np.int64(1), count=8, moved=0)
+    assert np.all(numbers.download() == 2.5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            {"words": None, "size": 1},
+            r"missing: \['count'\]; unknown: \['size'\]; it takes",
+        ),
+        ({"words": 1, "count": 1}, "words takes an array"),
+        ({"words": None, "count": 0.5}, "count cannot be 0.5"),
+        ({"words": None, "count": 2**31}, "count cannot be 2147483648"),
+    ],
+)
+def test_wrong_arguments_are_defects(device, wrong, message):
+    with pytest.raises(TypeError, match=f"^copy_all: .*{message}"):
+        device.kernel("limits", "copy_all", **MACROS)(1, moved=0, **wrong)
+
+
+def test_signatures_follow_the_preprocessor():
+    source = """
+    #define MAP __global const float *restrict  // one map
+    #if BITS == 8 && !defined(WIDE)
+    #define EXTRA MAP extra,
+    #elif 1
+    #define EXTRA
+    #endif
+    __kernel void one(MAP map, EXTRA const FRAME top
+    #ifdef TAIL
+        , const long tail
+    #endif
+    ) { }
+    """
+    names = [
+        [name for name, _ in read_signatures(source, {"FRAME": "uchar", **more})["one"]]
+        for more in ({"BITS": "8"}, {"BITS": "8", "WIDE": "1", "TAIL": "1"})
+    ]
+    assert names == [["map", "extra", "top"], ["map", "top", "tail"]]
+
+
 def test_a_parked_array_keeps_its_content(device):
     array = device.array("numbers", (3, 5), np.float32)
     array.host[:] = np.arange(15).reshape(3, 5)
@@ -120,7 +166,7 @@ def test_the_profile_tells_what_was_run(device):
     words = device.array("words", (128, 16), np.uint32)
     words.upload()
     for _ in range(3):
-        device.kernel("limits", "copy_all", **MACROS)(1, words, np.int32(64), moved=8192)
+        device.kernel("limits", "copy_all", **MACROS)(1, words=words, count=64, moved=8192)
     words.download()
     records = {(record.kind, record.name): record for record in device.profile.records()}
     kernel = records["kernel", "copy_all"]
@@ -138,7 +184,7 @@ def test_the_profile_stays_bounded(device):
     array.upload()
     kernel = device.kernel("limits", "copy_all", **MACROS)
     for _ in range(2500):
-        kernel(1, array, np.int32(0), moved=1)
+        kernel(1, words=array, count=0, moved=1)
     assert len(device.profile._pending) < 1024
     runs = {record.name: record.runs for record in device.profile.records()}
     assert runs["copy_all"] == 2500
