@@ -50,7 +50,7 @@ def suite(
 ) -> None:
     """Time the kernels and whole paths against the limits and against others; check their accuracy."""
     from mirrorskin import bench
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.kernels.device import open_device
 
     if context.invoked_subcommand is not None:

@@ -57,7 +57,7 @@ def command(
 def _drain(recorder: StreamRecorder) -> None:
     import numpy as np
 
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
 
     with recorder, progress("capturing", recorder.shape[0]) as show:
         room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)

@@ -30,12 +30,11 @@ def command(
 ) -> None:
     """Fit mean, cosine and sine of the phase to each pixel's brightness."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import save_and_tell
-    from mirrorskin.cli.positions import given
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress, save_and_tell
     from mirrorskin.cli.quantity import memory as bytes_of
+    from mirrorskin.cli.stack import stack_options
 
-    known = given(
+    known = stack_options(
         motion=options.MotionName.axial,
         phase_step=phase_step,
         phases=phases,

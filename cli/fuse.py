@@ -10,7 +10,7 @@ import typer
 from mirrorskin.cli import options
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.positions import Given
+    from mirrorskin.cli.stack import StackOptions
     from mirrorskin.io import Motion, Recording
 
 
@@ -49,13 +49,12 @@ def command(
 ) -> None:
     """Make one surface of a press and a rotation."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import save_and_tell
-    from mirrorskin.cli.positions import given
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress, save_and_tell
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
+    from mirrorskin.cli.stack import stack_options
 
-    known = given(
+    known = stack_options(
         travel_step=travel_step,
         travel_start=travel_start,
         phase_step=phase_step,
@@ -88,7 +87,7 @@ def command(
     save_and_tell(result, target, device, as_json)
 
 
-def _open(path: Path, place: Motion, dataset: str | None, known: Given, limit: int) -> Recording:
+def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:
     """Open a recording; of another's file, its place on the command line tells the motion."""
     from mirrorskin import io
     from mirrorskin.io.hdf5 import Hdf5File

@@ -26,11 +26,11 @@ def command(
 ) -> None:
     """Make a recording of a video or pictures."""
     from mirrorskin import io
-    from mirrorskin.cli.positions import given
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
+    from mirrorskin.cli.stack import stack_options
 
     io.check_output(output, frames, phases)
-    known = given(
+    known = stack_options(
         travel_step=travel_step,
         travel_start=travel_start,
         phase_step=phase_step,

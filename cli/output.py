@@ -1,11 +1,13 @@
-"""What commands print."""
+"""What commands print: lines, tables, JSON, and a progress bar."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,3 +94,17 @@ def tell_what_is_missing(name: str, process: Mapping[str, object], remedies: Map
     if gel and gel != _NO_GEL:
         what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
         typer.echo(f"{name}: heights {what}", err=True)
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar on a terminal, none in a pipe; yields a function that takes how much is done."""
+    if not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.update(task, completed=done)

@@ -118,13 +118,12 @@ def command(
 ) -> None:
     """Reconstruct heights from a press, or normals and heights from a rotation."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
-    from mirrorskin.cli.positions import given
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress, save_and_tell, tell_what_is_missing
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
+    from mirrorskin.cli.stack import stack_options
 
-    known = given(
+    known = stack_options(
         motion=motion,
         travel_step=travel_step,
         travel_start=travel_start,

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mirrorskin.cli.options import MotionName
-from mirrorskin.cli.positions import Given, given
 from mirrorskin.cli.quantity import angle, per_angle
+from mirrorskin.cli.stack import StackOptions, stack_options
 from mirrorskin.engine import EVENTS
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.press.vertical import METHODS
@@ -47,7 +47,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
         _table(said.get(name, {}), f"{path}: [{name}]", readers) for name, readers in _TABLES.items()
     )
     opening: dict[str, Any] = {"dataset": stack.pop("dataset")} if "dataset" in stack else {}
-    known = given(**stack, where=f"{path}: [stack] ")
+    known = stack_options(**stack, where=f"{path}: [stack] ")
     _check_stack(known, f"{path}: [stack]")
     _check_press(press, f"{path}: [press]")
     return Plan(opening | known, press, rotation, memory_limit)
@@ -65,7 +65,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is no TOML: {error}; mend it") from error
 
 
-def _check_stack(known: Given, where: str) -> None:
+def _check_stack(known: StackOptions, where: str) -> None:
     """Refuse what no stack can have, before every recording fails for it."""
     if "tilt" in known:
         _check_tilt(known["tilt"], f"{where} tilt")

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mirrorskin.cli import options, sensor
-from mirrorskin.cli.movements import DEFAULTS, FRAMES_MAX
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.twin import Movement
+
+# The options that each motion has, and what they are if they are not given.
+DEFAULTS: dict[options.MotionName, dict[str, str]] = {
+    options.MotionName.vertical: {"travel-step": "0.1mm", "travel-start": "0.1mm", "compliance": "0mm/N"},
+    options.MotionName.axial: {
+        "press": "1mm",
+        "tilt": "2.5deg",
+        "phase-step": "45deg",
+        "pivot": "0mm,0mm,0mm",
+    },
+    options.MotionName.horizontal: {"press": "1mm", "displacement-step": "0.01mm,0mm"},
+    options.MotionName.twist: {"press": "1mm", "twist-step": "0.2deg"},
+}
+FRAMES_MAX = 10**7
+_FRAMES = 30
 
 
 class FrameType(StrEnum):
@@ -132,8 +151,7 @@ def command(
     import numpy as np
 
     from mirrorskin import hw, io
-    from mirrorskin.cli.movements import make_movement
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths
     from mirrorskin.hw.twin import Body, Camera
 
@@ -190,3 +208,50 @@ def command(
     ):
         recorder.drain(show)
     typer.echo(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}")
+
+
+def make_movement(
+    motion: options.MotionName, frames: int | None, release: bool, given: Mapping[str, str | None]
+) -> Movement:
+    """Return the twin's movement that options describe; those not given have the values of ``DEFAULTS``."""
+    import numpy as np
+
+    from mirrorskin import io
+    from mirrorskin.cli.quantity import angle, compliance, length, vector
+    from mirrorskin.hw import twin
+
+    own = DEFAULTS[motion]
+    foreign = [f"--{name}" for name, value in given.items() if value is not None and name not in own]
+    if release and motion != options.MotionName.vertical:
+        foreign.append("--release")
+    if foreign:
+        raise io.InputError(
+            f"{foreign[0]} says nothing of a motion that is {motion.value}: leave it out, or choose another"
+        )
+    words = own | {name: value for name, value in given.items() if value is not None}
+    count = frames or _FRAMES
+    if motion == options.MotionName.vertical:
+        step, start = (length(words[name], f"--{name}") for name in ("travel-step", "travel-start"))
+        down = io.Steps(step, start).positions(count)
+        travel = np.concatenate([down, down[-2::-1]]) if release else down
+        return twin.Vertical(travel, compliance=compliance(words["compliance"], "--compliance"))
+    press = length(words["press"], "--press")
+    if motion == options.MotionName.axial:
+        step = angle(words["phase-step"], "--phase-step")
+        x, y, z = vector(words["pivot"], 3, "--pivot")
+        tilt = angle(words["tilt"], "--tilt")
+        return twin.Axial(io.Steps(step).positions(frames or _frames_of_a_turn(step)), tilt, press, (x, y, z))
+    if motion == options.MotionName.horizontal:
+        along = vector(words["displacement-step"], 2, "--displacement-step")
+        return twin.Horizontal(np.stack([io.Steps(one).positions(count) for one in along], axis=1), press)
+    step = angle(words["twist-step"], "--twist-step")
+    return twin.Twist(io.Steps(step).positions(count), press)
+
+
+def _frames_of_a_turn(step: float) -> int:
+    from mirrorskin import io
+
+    # Steps so small that the division overflows are too many as well.
+    if 0 < abs(step) < math.tau / FRAMES_MAX:
+        raise io.InputError(f"a turn by this --phase-step is more than {FRAMES_MAX} frames: give --frames")
+    return max(1, round(math.tau / abs(step))) if step else _FRAMES

@@ -48,8 +48,8 @@ def command(
 ) -> None:
     """Learn when the sheet turns light and how far the stage gives way, from presses of a ball."""
     from mirrorskin import io
-    from mirrorskin.cli.positions import given
     from mirrorskin.cli.quantity import length
+    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.calibration.elastic import fit_gel
     from mirrorskin.io.calibration.sizes import size_facts
 
@@ -63,7 +63,7 @@ def command(
     if rig is not None:
         plans = _places(rig, places, press, travel_start, travel_step)
         paths, travel_step, travel_start = taking.take(rig, output, plans, settle), None, None
-    told = given(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
+    told = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
     told = with_scale(told, known)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
@@ -96,7 +96,7 @@ def _places(
 def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
     """Find when the ball turned pixels light, by the references that are known so far."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.ball.onset import ball_onset
     from mirrorskin.engine.press.elastic import LEARNED_AT
 

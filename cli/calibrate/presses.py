@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.positions import Given
+    from mirrorskin.cli.stack import StackOptions
     from mirrorskin.io import Calibration, CameraId, Source
 
 
@@ -29,7 +29,7 @@ def check_call(paths: Sequence[Path], rig: Path | None, **asked: str | None) -> 
             raise InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
 
 
-def with_scale(told: Given, known: Calibration | None) -> Given:
+def with_scale(told: StackOptions, known: Calibration | None) -> StackOptions:
     """Return what recordings are opened with, and the pixel size of the calibration's scale, if it has one.
 
     Raises

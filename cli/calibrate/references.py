@@ -133,7 +133,7 @@ def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[takin
 def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tuple[Measured, CameraId]:
     """Measure references, and tell of which camera."""
     from mirrorskin import io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.references.measure import measure_references
 
     with ExitStack() as opening:

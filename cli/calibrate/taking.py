@@ -159,7 +159,7 @@ def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
 
     frames = place.frames if place.plan.in_steps else None
     scan = scans.make_scan(rig, place.plan, settle if place.plan.in_steps else None, frames)

@@ -14,7 +14,7 @@ from mirrorskin.cli.calibrate import taking
 from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.positions import Given
+    from mirrorskin.cli.stack import StackOptions
     from mirrorskin.engine.calibration.shown import Shown
     from mirrorskin.engine.calibration.tilt.fit import Study
     from mirrorskin.engine.calibration.tilt.turned import BallTurn, PlateTurn
@@ -58,8 +58,8 @@ def command(
 ) -> None:
     """Find half-angle, phase offset, direction, ellipticity and pivot of the rotation, with their errors."""
     from mirrorskin import io
-    from mirrorskin.cli.positions import given
     from mirrorskin.cli.quantity import length
+    from mirrorskin.cli.stack import stack_options
     from mirrorskin.io.calibration.sizes import size_facts
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
@@ -67,7 +67,7 @@ def command(
     check_call(paths if rig else [*paths, *flats, *wedges], rig, press=press, tilt=tilt, settle=settle)
     io.check_output(output, *paths, *flats, *wedges, rig)
     known = io.open_calibration(output) if output.exists() else None
-    told = given(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
+    told = stack_options(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
         plan = taking.turn_plan(press, tilt, phase_step, "0.5mm")
         paths, told = taking.take(rig, output, taking.at_each("tilt", taking.BALL, places, plan), settle), {}
@@ -97,7 +97,7 @@ def _scale(gain: str | None, offset: float | None) -> Mapping[str, Any]:
     return {name: np.asarray(value, np.float64) for name, value in given.items() if value is not None}
 
 
-def _camera(paths: Sequence[Path], known: Calibration | None, output: Path, told: Given) -> CameraId:
+def _camera(paths: Sequence[Path], known: Calibration | None, output: Path, told: StackOptions) -> CameraId:
     """Return the camera that all recordings are of, if it is that of the calibration."""
     from mirrorskin import io
 
@@ -132,7 +132,7 @@ def _shown(source: Source, known: Calibration | None, scale: Mapping[str, Any]) 
 
 
 def _turns(
-    flats: Sequence[Path], wedges: Sequence[Path], balls: Sequence[Path], radius: float, told: Given
+    flats: Sequence[Path], wedges: Sequence[Path], balls: Sequence[Path], radius: float, told: StackOptions
 ) -> Iterator[BallTurn | PlateTurn]:
     """Read one recording after the other."""
     from mirrorskin import io
@@ -147,7 +147,7 @@ def _turns(
 
 
 def _study(turns: Iterator[BallTurn | PlateTurn], count: int, shown: Shown) -> Study:
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.tilt.fit import study_precession
 
     with progress("looking", count) as show:

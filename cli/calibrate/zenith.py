@@ -61,8 +61,8 @@ def command(
 ) -> None:
     """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
     from mirrorskin import io
-    from mirrorskin.cli.positions import given
     from mirrorskin.cli.quantity import length
+    from mirrorskin.cli.stack import stack_options
 
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
@@ -74,7 +74,7 @@ def command(
         plan = taking.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
         balls = taking.at_each("zenith", taking.BALL, places, plan)
         paths, tilt, phase_step = taking.take(rig, output, balls, settle), None, None
-    told = with_scale(given(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size), known)
+    told = with_scale(stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size), known)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
         cameras = [camera_of(source) for source in sources]
@@ -92,7 +92,7 @@ def _fit(
     pattern: str,
     body: tuple[float, float],
 ) -> WallResponse:
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.wall.zenith import fit_zenith
 
     with progress("fitting", len(sources)) as show:

@@ -20,7 +20,7 @@ def lab_camera() -> Camera:
 def record(twin: hw.Twin, path: Path, doing: str) -> io.Truth:
     """Record all frames of a twin, with a bar that says what it is doing; return the truth."""
     from mirrorskin import io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
 
     with (
         io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,

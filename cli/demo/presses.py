@@ -141,7 +141,7 @@ def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | No
 def _reconstruct(base: Path, sensor: Sensor, device: str | None) -> dict[str, io.Result]:
     """Reconstruct from the recording; of the paper's own sensor by eq. 4 as well."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
 
     methods = {"eq. 4": False, "sub-frame": True} if sensor == PAPERS else {"sub-frame": True}
     results = {}

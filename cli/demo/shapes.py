@@ -79,7 +79,7 @@ def run(folder: Path, device: str | None) -> Outcomes:
 def _fuse(folder: Path, device: str | None) -> io.Result:
     """Fuse the press and the rotation on the sphere, and keep the result."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.progress import progress
+    from mirrorskin.cli.output import progress
 
     with (
         io.open_recording(folder / f"{_PRESS}.h5") as vertical,

@@ -9,8 +9,8 @@ import sys
 import numpy as np
 import pytest
 
-from mirrorskin.cli.movements import DEFAULTS, FRAMES_MAX, make_movement
 from mirrorskin.cli.options import MotionName
+from mirrorskin.cli.simulate import DEFAULTS, FRAMES_MAX, make_movement
 from mirrorskin.hw.twin import Axial, Horizontal, Twist, Vertical
 from mirrorskin.io import InputError
 
@@ -111,7 +111,5 @@ def test_an_option_that_cannot_be_read_is_named(motion, name):
 
 
 def test_the_defaults_can_be_told_without_importing_anything_heavy():
-    code = (
-        "import sys, mirrorskin.cli.movements; sys.exit(bool({'numpy', 'pint', 'h5py'} & set(sys.modules)))"
-    )
+    code = "import sys, mirrorskin.cli.simulate; sys.exit(bool({'numpy', 'pint', 'h5py'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

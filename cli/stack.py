@@ -1,0 +1,150 @@
+"""What the command line says of a stack of frames: positions, pixel size, which part of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
+
+from mirrorskin.cli.options import MotionName
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Motion, Positions, Region
+    from mirrorskin.io.types import Floats
+
+
+class StackOptions(TypedDict, total=False):
+    """The keywords of ``io.open_recording`` that describe a stack; those not given are missing."""
+
+    motion: Motion
+    travel: Positions
+    phase: Positions
+    tilt: float
+    pixel_size: tuple[float, float]
+    region: Region
+    frames: tuple[int, int | None]
+
+
+def stack_options(
+    *,
+    motion: MotionName | None = None,
+    travel_step: str | None = None,
+    travel_start: str | None = None,
+    phase_step: str | None = None,
+    phases: Path | None = None,
+    tilt: str | None = None,
+    pixel_size: str | None = None,
+    region: str | None = None,
+    frames: str | None = None,
+    where: str = "--",
+) -> StackOptions:
+    """Convert options to numbers, mm and radians; messages put ``where`` before an option's name."""
+    from mirrorskin.cli.quantity import angle, lengths
+
+    options = StackOptions()
+    if motion is not None:
+        options["motion"] = motion.value
+    options |= _travel(travel_step, travel_start, where) | _phase(phase_step, phases, where)
+    if tilt is not None:
+        options["tilt"] = angle(tilt, f"{where}tilt")
+    if pixel_size is not None:
+        options["pixel_size"] = lengths(pixel_size, f"{where}pixel-size")
+    if region is not None:
+        options["region"] = region_of(region, f"{where}region")
+    if frames is not None:
+        options["frames"] = frame_range(frames, f"{where}frames")
+    return options
+
+
+def _travel(step: str | None, start: str | None, where: str) -> StackOptions:
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.io import InputError, Steps
+
+    if step is not None:
+        first = length(start or "0mm", f"{where}travel-start")
+        return {"travel": Steps(length(step, f"{where}travel-step"), first)}
+    if start is not None:
+        other = f"{where.rpartition(' ')[2]}travel-step"
+        raise InputError(f"{where}travel-start without {other} says nothing: give both")
+    return {}
+
+
+def _phase(step: str | None, phases: Path | None, where: str) -> StackOptions:
+    from mirrorskin.cli.quantity import angle
+    from mirrorskin.io import InputError, Steps
+
+    if step is not None and phases is not None:
+        raise InputError("--phase-step and --phases both tell the phases: give one of them")
+    if step is not None:
+        return {"phase": Steps(angle(step, f"{where}phase-step"))}
+    return {} if phases is None else {"phase": read_phases(phases)}
+
+
+def region_of(text: str, option: str = "") -> Region:
+    """Return a rectangle of the picture, as in ``100,50,640x480``: first column and row, columns and rows."""
+    from mirrorskin.io import InputError, Region
+
+    found = Region.read("".join(text.split()))
+    if found is None:
+        raise InputError(
+            f"{option} {text}: the first column and row, and how many of each, are needed;"
+            " write e.g. 100,50,640x480"
+        )
+    return found
+
+
+def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
+    """Return a range of frames, as in ``10:200``: the first and the one after the last, None for the end."""
+    from mirrorskin.io import InputError
+
+    match = re.fullmatch(r"([0-9]{0,9}):([0-9]{0,9})", "".join(text.split()))
+    start, stop = (int(one) if one else None for one in match.groups()) if match else (None, 0)
+    if stop is not None and stop <= (start or 0):
+        raise InputError(
+            f"{option} {text}: the first frame, from 0, and a later one that is left out are needed;"
+            " write e.g. 10:200, or 10: for all from 10 on"
+        )
+    return start or 0, stop
+
+
+@dataclass(frozen=True, slots=True)
+class ListedPhases:
+    """The phases that a file lists, one a frame, radians; see ``io.Positions``."""
+
+    path: Path
+    radians: tuple[float, ...]
+
+    def positions(self, count: int) -> Floats:
+        """Return the phases of ``count`` frames; InputError if the file lists another number."""
+        import numpy as np
+
+        from mirrorskin.io import InputError
+
+        if len(self.radians) != count:
+            raise InputError(
+                f"{self.path} lists {len(self.radians)} phases for {count} frames: one a frame is needed"
+            )
+        return np.array(self.radians)
+
+
+def read_phases(path: Path) -> ListedPhases:
+    """Read angles with their units, one a line or several between blanks; ``#`` begins a comment."""
+    from mirrorskin.cli.quantity import angle
+    from mirrorskin.io import InputError
+
+    remedy = "write one angle a frame in it, such as 178.1deg"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; {remedy}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is no text: {remedy}") from error
+    radians = tuple(
+        angle(word, f"{path}, line {number}:")
+        for number, line in enumerate(lines, 1)
+        for word in line.partition("#")[0].split()
+    )
+    if not radians:
+        raise InputError(f"{path} lists no phases: {remedy}")
+    return ListedPhases(path, radians)
