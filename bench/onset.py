@@ -18,8 +18,7 @@ from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_frames, check_heights
 from mirrorskin.bench.stacks import LEVELS, StackName, fill, noise_of, references
 from mirrorskin.engine import OnsetSearch
-from mirrorskin.engine.noise import estimate_noise, thin_out
-from mirrorskin.engine.press.references import reference_maps
+from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError

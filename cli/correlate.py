@@ -29,10 +29,11 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Fit mean, cosine and sine of the phase to each pixel's brightness."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
     from mirrorskin.cli.output import progress, save_and_tell
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.stack import stack_options
+    from mirrorskin.engine.rotation.axial import correlate_source
 
     known = stack_options(
         motion=options.MotionName.axial,
@@ -47,5 +48,5 @@ def command(
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
         io.check_output(target, stack, phases)
         with progress("correlating", source.shape[0]) as show:
-            result = engine.correlate_source(source, memory_limit=limit, device=device, progress=show)
+            result = correlate_source(source, memory_limit=limit, device=device, progress=show)
     save_and_tell(result, target, device, as_json)

@@ -58,9 +58,10 @@ def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDAr
     """Cut a result between two points, or across its apex, into the columns of a table."""
     import numpy as np
 
-    from mirrorskin import engine, io
+    from mirrorskin import io
+    from mirrorskin.engine.measure.section import section
 
-    cut = engine.section(result, *(ends or ()))
+    cut = section(result, *(ends or ()))
     if not np.isfinite(cut.height).any():
         raise io.InputError("no height is known along the section: choose other points, or leave it out")
     known = {"sigma": result.height_sigma, "filled": result.filled}

@@ -48,11 +48,13 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Make one surface of a press and a rotation."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
     from mirrorskin.cli.output import progress, save_and_tell
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
     from mirrorskin.cli.stack import stack_options
+    from mirrorskin.engine.fusion import frames_to_read, fuse_sources
+    from mirrorskin.engine.reconstruction import calibrated
 
     known = stack_options(
         travel_step=travel_step,
@@ -73,10 +75,10 @@ def command(
     ):
         io.check_output(target, vertical, axial, phases, calibration)
         told = None if calibration is None else io.open_calibration(calibration)
-        with progress("fusing", engine.frames_to_read(pressed, turned, register)) as show:
-            result = engine.fuse_sources(
-                engine.calibrated(pressed, told),
-                engine.calibrated(turned, told),
+        with progress("fusing", frames_to_read(pressed, turned, register)) as show:
+            result = fuse_sources(
+                calibrated(pressed, told),
+                calibrated(turned, told),
                 rotation={name: value for name, value in rotation.items() if value is not None},
                 register=register,
                 robust=robust,

@@ -22,11 +22,12 @@ _UNTOLD = "none: "  # how a result's process says that a map is missing, before 
 
 def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool) -> None:
     """Write a result and say in a line what it holds, or in JSON how it came about as well."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
+    from mirrorskin.engine.summary import summarise
     from mirrorskin.kernels.device import open_device
 
     io.save_result(result, path)
-    summary, pieces = engine.summarise(result), _pieces(result)
+    summary, pieces = summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records()
         told = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}

@@ -165,14 +165,15 @@ def command(
 
 def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) -> Source:
     """Return a recording as it is with the calibration that is given, or that it carries."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
+    from mirrorskin.engine.reconstruction import calibrated
 
-    calibrated = engine.calibrated(source, path)
-    if isinstance(calibrated, io.Calibrated) and calibrated.whole.lens is not None and pixel_size is not None:
+    found = calibrated(source, path)
+    if isinstance(found, io.Calibrated) and found.whole.lens is not None and pixel_size is not None:
         raise io.InputError(
-            f"{calibrated.whole.name} tells the pixel size, and so does --pixel-size: leave that out"
+            f"{found.whole.name} tells the pixel size, and so does --pixel-size: leave that out"
         )
-    return calibrated
+    return found
 
 
 def _refuse_foreign(context: typer.Context, recording: Path, motion: str) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 from mirrorskin.cli.options import MotionName
 from mirrorskin.cli.quantity import angle, per_angle
 from mirrorskin.cli.stack import StackOptions, stack_options
-from mirrorskin.engine import EVENTS
 from mirrorskin.engine.batch.plan import Plan
-from mirrorskin.engine.press.vertical import METHODS
+from mirrorskin.engine.press.onset import EVENTS
+from mirrorskin.engine.press.press import METHODS
 from mirrorskin.engine.rotation.launch import NORMAL_METHODS
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError

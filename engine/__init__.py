@@ -1,84 +1,87 @@
-"""The estimators: what turns frames into maps."""
+"""The estimators: what turns frames into maps, and maps into numbers.
 
-from mirrorskin.engine.calibrated import calibrated
-from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.fusion import frames_to_read, fuse, fuse_sources
-from mirrorskin.engine.integration.integrate import integrate
-from mirrorskin.engine.integration.live import Integrator
-from mirrorskin.engine.integration.surface import Surface
-from mirrorskin.engine.measure.measure import FormName, Measures, measure
-from mirrorskin.engine.measure.plane import Plane, fit_plane
-from mirrorskin.engine.measure.quantity import Quantity
-from mirrorskin.engine.measure.section import Section, section
-from mirrorskin.engine.measure.sphere import Sphere, fit_sphere
-from mirrorskin.engine.measure.steps import Step, step_height
-from mirrorskin.engine.measure.texture import Roughness, roughness
-from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
-from mirrorskin.engine.press.holes import fill_holes
-from mirrorskin.engine.press.onset import OnsetSearch, find_onset
-from mirrorskin.engine.press.search import EVENTS, Event, Onset
-from mirrorskin.engine.press.vertical import PressMethod, reconstruct_press
-from mirrorskin.engine.reconstruct import reconstruct
-from mirrorskin.engine.rotation.axial import correlate_source, reconstruct_rotation
-from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
-from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.launch import NormalMethod
-from mirrorskin.engine.rotation.normals import NormalEstimator, Normals, estimate_normals
-from mirrorskin.engine.rotation.registration import Registered
-from mirrorskin.engine.score import AngleScore, ContactScore, EdgeScore, HeightScore, Score, score
-from mirrorskin.engine.summary import Summary, summarise
+The names below are the public face; each is imported from its module when it is first used.
+Everything else is imported from its module, such as `mirrorskin.engine.live`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.errors import NotConverged
+    from mirrorskin.engine.fusion import fuse
+    from mirrorskin.engine.integration.integrate import integrate
+    from mirrorskin.engine.integration.live import Integrator
+    from mirrorskin.engine.integration.surface import Surface
+    from mirrorskin.engine.measure.measure import Measures
+    from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
+    from mirrorskin.engine.press.holes import fill_holes
+    from mirrorskin.engine.press.onset import Onset, OnsetSearch, find_onset
+    from mirrorskin.engine.reconstruction import reconstruct
+    from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
+    from mirrorskin.engine.rotation.edges import find_edges
+    from mirrorskin.engine.rotation.normals import NormalEstimator, Normals, estimate_normals
+    from mirrorskin.engine.score import Score
+
+_HOMES = {
+    "errors": ("NotConverged",),
+    "fusion": ("fuse",),
+    "integration.integrate": ("integrate",),
+    "integration.live": ("Integrator",),
+    "integration.surface": ("Surface",),
+    "measure.measure": ("Measures", "measure"),
+    "press.changepoint": ("ChangePointSearch", "find_change_point"),
+    "press.holes": ("fill_holes",),
+    "press.onset": ("Onset", "OnsetSearch", "find_onset"),
+    "reconstruction": ("reconstruct",),
+    "rotation.correlation": ("Correlation", "Correlator", "correlate"),
+    "rotation.edges": ("find_edges",),
+    "rotation.normals": ("NormalEstimator", "Normals", "estimate_normals"),
+    "score": ("Score", "score"),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
-    "EVENTS",
-    "AngleScore",
     "ChangePointSearch",
-    "ContactScore",
     "Correlation",
     "Correlator",
-    "EdgeScore",
-    "Event",
-    "FormName",
-    "HeightScore",
     "Integrator",
     "Measures",
     "NormalEstimator",
-    "NormalMethod",
     "Normals",
     "NotConverged",
     "Onset",
     "OnsetSearch",
-    "Plane",
-    "PressMethod",
-    "Quantity",
-    "Registered",
-    "Roughness",
     "Score",
-    "Section",
-    "Sphere",
-    "Step",
-    "Summary",
     "Surface",
-    "calibrated",
     "correlate",
-    "correlate_source",
     "estimate_normals",
     "fill_holes",
     "find_change_point",
     "find_edges",
     "find_onset",
-    "fit_plane",
-    "fit_sphere",
-    "frames_to_read",
     "fuse",
-    "fuse_sources",
     "integrate",
     "measure",
     "reconstruct",
-    "reconstruct_press",
-    "reconstruct_rotation",
-    "roughness",
     "score",
-    "section",
-    "step_height",
-    "summarise",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value  # looked up once, and in the place of a module of that name
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))
+
+
+# Until these packages are renamed: a module of a function's name would take its place.
+from mirrorskin.engine.measure.measure import measure  # noqa: E402
+from mirrorskin.engine.score import score  # noqa: E402

@@ -9,18 +9,18 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT
-from mirrorskin.engine.calibrated import calibrated, on_the_sheet
-from mirrorskin.engine.feed import Progress
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.joint import Joint, Known
 from mirrorskin.engine.nearest import with_nearest
-from mirrorskin.engine.press.vertical import reconstruct_press
+from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import sign
+from mirrorskin.engine.reconstruction import calibrated, undistorted
 from mirrorskin.engine.rotation.axial import Rotation, estimate_rotation, maps_of
 from mirrorskin.engine.rotation.relief import tell_integration
 from mirrorskin.engine.rotation.response import response_of
 from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
+from mirrorskin.engine.streaming import Progress
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 
@@ -224,7 +224,7 @@ def fuse_sources(
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
     together = _put_together(heights, found, surface)
-    return on_the_sheet(replace(together, process=process, calibration=turned.calibration), axial)
+    return undistorted(replace(together, process=process, calibration=turned.calibration), axial)
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:

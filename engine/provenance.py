@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.version import signature
 from mirrorskin.io import Calibrated, InputError, ProcessValue, Recording, Result, Source, pixel_axes
 from mirrorskin.kernels.device import Device
 
 Floats = NDArray[np.float64]
+
+
+@functools.cache
+def program_version() -> str:
+    """Return the version of the installed package; to look it up takes a millisecond, so only once."""
+    return version("mirrorskin")
+
+
+def signature() -> dict[str, str]:
+    """Return what everything that is made says of its maker: program, version and date."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"program": "mirrorskin", "version": program_version(), "date": date}
 
 
 def sign(result: Result, source: Source, device: Device, process: dict[str, ProcessValue]) -> Result:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine import summarise
+from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Mesh, Result, of_turn, surface_mesh
 from mirrorskin.io.export.mesh import normals_around
 from mirrorskin.view.colours import FILLED_RGB, Colours, height_colours, span

@@ -25,7 +25,7 @@ from mirrorskin.bench.paths.whole import PATH, ROUNDS, to_new_results, to_result
 from mirrorskin.bench.results import Case, Row, Target
 from mirrorskin.bench.stacks import fill, references
 from mirrorskin.engine import Onset, OnsetSearch
-from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.kernels.device import Device
 
 KERNEL, IN_MEMORY = f"{OURS}, onset kernel in memory", f"{OURS}, onset kernel and maps in memory"

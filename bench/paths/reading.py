@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.bench.ours import OURS
-from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Recording
 
 READ, H5PY = f"{OURS}, frames read", "h5py, frames read"

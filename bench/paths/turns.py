@@ -24,7 +24,7 @@ from mirrorskin.bench.paths.whole import PATH, ROUNDS, to_new_results, to_result
 from mirrorskin.bench.results import Case, Row, Target
 from mirrorskin.bench.turns import SCALES, STEPS, TILT, fill, phases
 from mirrorskin.engine import Correlation, Correlator, NormalEstimator, Normals
-from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.kernels.device import Device
 
 KERNEL = f"{OURS}, kernels and maps in memory"

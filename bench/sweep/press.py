@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.stacks import LEVELS, fill, noise_of, references
 from mirrorskin.bench.sweep.sweep import FRAME_TYPES, Family, Job, Shape, agree, run_kernel
 from mirrorskin.engine import ChangePointSearch, Onset, OnsetSearch
-from mirrorskin.engine.press.references import reference_maps, reference_pair
+from mirrorskin.engine.frames import reference_maps, reference_pair
 from mirrorskin.io import Block
 from mirrorskin.kernels import changepoint, onset
 from mirrorskin.kernels.changepoint import DECIDED, SLOTS, UNIT

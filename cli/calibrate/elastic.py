@@ -95,23 +95,22 @@ def _places(
 
 def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
     """Find when the ball turned pixels light, by the references that are known so far."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.ball.onset import ball_onset
     from mirrorskin.engine.press.elastic import LEARNED_AT
+    from mirrorskin.engine.press.press import reconstruct_press
 
     if source.motion != "vertical":
         raise io.InputError(f"{source.name} is of {source.motion} motion: give presses of a ball")
     plain = source if known is None else io.Calibrated(source, replace(known, gel=None))
     with progress("pressing", source.shape[0]) as show:
-        result = engine.reconstruct_press(
-            plain, threshold=LEARNED_AT, fill=False, device=device, progress=show
-        )
+        result = reconstruct_press(plain, threshold=LEARNED_AT, fill=False, device=device, progress=show)
     return ball_onset(result, plain, radius)
 
 
 def _process(paths: Sequence[Path], ball: str, sheet: str, learned: LearnedGel) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.version import signature
+    from mirrorskin.engine.provenance import signature
 
     return {
         **signature(),

@@ -185,7 +185,7 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
 def _process(
     measured: Measured, darks: Sequence[Path], brights: Sequence[Path], rolled: bool
 ) -> Mapping[str, ProcessValue]:
-    from mirrorskin.engine.version import signature
+    from mirrorskin.engine.provenance import signature
 
     told: dict[str, ProcessValue] = {
         **signature(),

@@ -109,7 +109,7 @@ def _picture(path: Path) -> tuple[NDArray[Any], str, Any]:
 
 
 def _process(fit: LensFit, board: Board, paths: Sequence[Path]) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.version import signature
+    from mirrorskin.engine.provenance import signature
 
     return {
         **signature(),

@@ -164,7 +164,7 @@ def _study(turns: Iterator[BallTurn | PlateTurn], count: int, shown: Shown) -> S
 def _process(
     study: Study, ball: str, balls: Sequence[Path], flats: Sequence[Path], wedges: Sequence[Path]
 ) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.version import signature
+    from mirrorskin.engine.provenance import signature
 
     told: dict[str, ProcessValue] = {
         **signature(),

@@ -129,7 +129,7 @@ def _precession(known: Calibration, source: Source) -> Precession | None:
 
 
 def _process(paths: Sequence[Path], ball: str, body: tuple[float, float]) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.version import signature
+    from mirrorskin.engine.provenance import signature
 
     return {
         **signature(),

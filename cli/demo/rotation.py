@@ -14,7 +14,8 @@ from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
     from mirrorskin import io
-    from mirrorskin.engine import NormalMethod, Score
+    from mirrorskin.engine import Score
+    from mirrorskin.engine.rotation.launch import NormalMethod
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
     from mirrorskin import io
-    from mirrorskin.engine import HeightScore
+    from mirrorskin.engine.score import HeightScore
 
 _PRESS, _ROTATION = "fig5-conform-ideal", "fig10a"
 _HEAD = ["experiment", "heights from", "answered", "median", "RMS", "99 %", "filled", "RMS there", "apex"]
@@ -78,15 +78,16 @@ def run(folder: Path, device: str | None) -> Outcomes:
 
 def _fuse(folder: Path, device: str | None) -> io.Result:
     """Fuse the press and the rotation on the sphere, and keep the result."""
-    from mirrorskin import engine, io
+    from mirrorskin import io
     from mirrorskin.cli.output import progress
+    from mirrorskin.engine.fusion import frames_to_read, fuse_sources
 
     with (
         io.open_recording(folder / f"{_PRESS}.h5") as vertical,
         io.open_recording(folder / f"{_ROTATION}.h5") as axial,
-        progress("fusing", engine.frames_to_read(vertical, axial, register=True)) as show,
+        progress("fusing", frames_to_read(vertical, axial, register=True)) as show,
     ):
-        result = engine.fuse_sources(vertical, axial, device=device, progress=show)
+        result = fuse_sources(vertical, axial, device=device, progress=show)
     io.save_result(result, folder / "fused-result.h5")
     return result
 

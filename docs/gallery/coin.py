@@ -8,6 +8,8 @@ goes a cross-section.
 import numpy as np
 
 from mirrorskin import engine, hw
+from mirrorskin.engine.measure.section import section
+from mirrorskin.engine.summary import summarise
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.view.result import figures_of
 
@@ -19,12 +21,12 @@ press = hw.Twin(
     camera=Camera(electrons=40),
 )
 result = engine.reconstruct(press)
-print(engine.summarise(result))
+print(summarise(result))
 
 error = engine.score(result, press.truth).height
 print(f"RMS error {error.rms:.4f} mm where slopes were seen; a step at best: {0.02 / np.sqrt(12):.4f} mm")
 
-cut = engine.section(result, (-11.5, 0.0), (11.5, 0.0))
+cut = section(result, (-11.5, 0.0), (11.5, 0.0))
 print(f"along {cut.distance[-1]:.1f} mm: from {np.nanmin(cut.height):.3f} to {np.nanmax(cut.height):.3f} mm")
 
 figures = figures_of(result, name="a 5 yen coin", section=((-11.5, 0.0), (11.5, 0.0)))

@@ -8,6 +8,7 @@ press closes, and the ball's radius comes out.
 import numpy as np
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.fusion import fuse_sources
 from mirrorskin.hw.twin import Axial, Camera, Vertical
 from mirrorskin.view.result import figures_of
 
@@ -18,7 +19,7 @@ turn = hw.Twin(
     pattern="linear",
     **ball,
 )
-result = engine.fuse_sources(press, turn)
+result = fuse_sources(press, turn)
 
 error = engine.score(result, press.truth).height
 print(f"RMS error {1000 * error.rms:.1f} um at {error.answered} pixels")

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 
 from mirrorskin import engine, io
+from mirrorskin.engine.summary import summarise
 from mirrorskin.view.result import figures_of
 
 # Somebody's file: sixteen frames, 0.1 mm apart, of a cone whose sides fall off by 0.4 mm per mm.
@@ -29,7 +30,7 @@ with io.open_recording(
     pixel_size=(0.05, 0.05),
 ) as recording:
     result = engine.reconstruct(recording, dark=300, bright=9000)
-print(engine.summarise(result))
+print(summarise(result))
 print(f"RMS error {np.sqrt(np.nanmean((result.height - height) ** 2)):.3f} mm")
 
 io.save_result(result, "heights.h5")  # NeXus: silx, h5web and NeXpy plot it unasked

@@ -9,6 +9,7 @@ which only a simulation knows.
 import numpy as np
 
 from mirrorskin import engine, hw
+from mirrorskin.engine.summary import summarise
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.view.result import figures_of
 
@@ -20,7 +21,7 @@ press = hw.Twin(
     camera=Camera(electrons=40),  # per grey level: shot noise
 )
 result = engine.reconstruct(press)
-print(engine.summarise(result))
+print(summarise(result))
 
 error = engine.score(result, press.truth).height
 print(f"mean error {error.mean:+.3f} mm, RMS {error.rms:.3f} mm, at {error.answered} pixels")

@@ -26,7 +26,7 @@ from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.place import Place, do_at, look_around
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.batch.work import Outcome
-from mirrorskin.engine.version import program_version
+from mirrorskin.engine.provenance import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.plain import plainly

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.bands import MEMORY_LIMIT
-from mirrorskin.engine.press.vertical import reconstruct_press
+from mirrorskin.engine.press.press import reconstruct_press
+from mirrorskin.engine.provenance import program_version
 from mirrorskin.engine.rotation.axial import reconstruct_rotation
-from mirrorskin.engine.version import program_version
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Motion, Result
 
 # These change how a result is made, not what it says.
@@ -35,8 +35,7 @@ class Plan:
     opening : mapping
         Keywords of `mirrorskin.io.open_recording`, for all recordings.
     press, rotation : mapping
-        Keywords of `mirrorskin.engine.reconstruct_press` and `mirrorskin.engine.reconstruct_rotation`, for
-        those of vertical and of axial motion.
+        Keywords of `mirrorskin.engine.reconstruct` for those of vertical and of axial motion.
     memory_limit : int
         Bytes of host memory for frames on the move, of each device.
     """

@@ -11,9 +11,9 @@ from mirrorskin import io
 from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.feed import Progress
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruct import reconstruct
+from mirrorskin.engine.reconstruction import reconstruct
+from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, ProcessValue, Recording
 from mirrorskin.io.plain import plainly

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from mirrorskin.engine.calibration.ball.scene import BallView, ball_view
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruct import reconstruct
+from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels.device import Device
 

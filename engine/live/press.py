@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.calibrated import on_the_sheet
 from mirrorskin.engine.live.types import Update
 from mirrorskin.engine.press.onset import OnsetSearch
-from mirrorskin.engine.press.vertical import finish_press
+from mirrorskin.engine.press.press import finish_press
 from mirrorskin.engine.provenance import sign, told_level
+from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
@@ -140,7 +140,7 @@ class LivePress:
         travel = np.concatenate(self._travel)
         result, done = finish_press(onset, self._source, travel, "onset", self._threshold, self._fill)
         signed = sign(result, self._source, self.device, process | done | {"live": True})
-        return on_the_sheet(signed, self._source)
+        return undistorted(signed, self._source)
 
     def _reset(self) -> None:
         self._frames, self._time = 0, math.nan

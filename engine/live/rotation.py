@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.calibrated import on_the_sheet
 from mirrorskin.engine.integration.follow import Follower
 from mirrorskin.engine.live.edges import SpareEdges
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.types import Update
 from mirrorskin.engine.provenance import naming, sign, told, told_level
+from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.rotation.axial import Rotation, maps_of
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator
 from mirrorskin.engine.rotation.edges import find_edges
@@ -248,7 +248,7 @@ class LiveRotation:
         return self._signed(replace(result, **maps), process | relief.process)
 
     def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
-        return on_the_sheet(sign(result, self._source, self.device, process), self._source)
+        return undistorted(sign(result, self._source, self.device, process), self._source)
 
     @property
     def _frames_to(self) -> NormalWindow | Correlator:

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT, Band, Staged, join_rows
-from mirrorskin.engine.press.references import reference_pair
-from mirrorskin.engine.press.search import Event, Onset, Search, check_stack
-from mirrorskin.engine.samples import travel_pairs
+from mirrorskin.engine.frames import reference_pair, travel_pairs
+from mirrorskin.engine.press.onset import Event, Onset, Search, check_stack
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, join_rows
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT

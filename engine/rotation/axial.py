@@ -9,8 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT
-from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.provenance import naming, sign, told, told_level
 from mirrorskin.engine.rotation.correlation import Correlator
 from mirrorskin.engine.rotation.launch import NORMAL_METHODS, NormalMethod
@@ -18,6 +16,8 @@ from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.relief import find_relief
 from mirrorskin.engine.rotation.response import response_of
 from mirrorskin.engine.rotation.run import Run
+from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device, open_device
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT
+from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.phases import check_phases, check_weights
 from mirrorskin.engine.rotation.sums import TurnSums, WindowSums
-from mirrorskin.engine.samples import check_dtype, check_frames
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import Device, open_device

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from mirrorskin.engine.noise import QUANTUM
+from mirrorskin.engine.frames import QUANTUM
 from mirrorskin.engine.rotation.phases import Doubles, basis
 from mirrorskin.io import InputError
 

@@ -10,8 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.bands import Band, Planes
-from mirrorskin.engine.noise import thinning
+from mirrorskin.engine.frames import thinning
 from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
 from mirrorskin.engine.rotation.fits import TurnFit
 from mirrorskin.engine.rotation.phases import Doubles
@@ -19,6 +18,7 @@ from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import Scale
 from mirrorskin.engine.rotation.tilt import estimate_tilt
 from mirrorskin.engine.rotation.turns import LONGEST
+from mirrorskin.engine.tiling import Band, Planes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device
@@ -221,7 +221,7 @@ def settle(
     Parameters
     ----------
     samples : ndarray, (N, n)
-        Of each so-manieth pixel of a frame; see ``mirrorskin.engine.noise.thinning``.
+        Of each so-manieth pixel of a frame; see ``mirrorskin.engine.frames.thinning``.
     shape : (int, int)
         Rows and columns of a frame.
     phase, weights, matrix

@@ -9,8 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT, Band, cut_into_bands
-from mirrorskin.engine.noise import thin_out, thinning
+from mirrorskin.engine.frames import check_frames, thin_out, thinning
 from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.fits import TurnFit, fit_of
 from mirrorskin.engine.rotation.launch import MAPS, NormalMethod, Samples, settle
@@ -18,7 +17,7 @@ from mirrorskin.engine.rotation.options import NormalOptions, set_up
 from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
-from mirrorskin.engine.samples import check_frames
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.device import Device
 

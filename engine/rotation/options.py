@@ -8,12 +8,12 @@ from typing import Any, Required, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.engine.frames import check_dtype
 from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.launch import NORMAL_METHODS, NormalLaunch, NormalMethod
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import Scale, make_scale
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.samples import check_dtype
 from mirrorskin.io import Header, InputError
 from mirrorskin.kernels.device import Device, open_device
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.samples import check_dtype
+from mirrorskin.engine.frames import check_dtype
 from mirrorskin.io import Block, Header, InputError, Motion, Source, check_phase, pixel_axes
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device, open_device

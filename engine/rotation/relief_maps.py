@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from mirrorskin.engine.frames import SAMPLES
 from mirrorskin.engine.integration.inputs import LEAST, MOST
-from mirrorskin.engine.noise import SAMPLES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.rotation.edges import find_edges
@@ -22,6 +21,7 @@ from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, first_response
 from mirrorskin.engine.rotation.standing import standing_heights
 from mirrorskin.engine.rotation.turns import LONGEST, longest_turn
+from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Header, ProcessValue, Source, WallResponse
 from mirrorskin.kernels.device import Device
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band, Planes, Staged, cut_into_bands
 from mirrorskin.engine.rotation.phases import Doubles, basis
+from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW

@@ -8,8 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.engine.bands import Band
-from mirrorskin.engine.noise import thinning
+from mirrorskin.engine.frames import check_frames, thinning
 from mirrorskin.engine.rotation.correlation import Correlation, tell_wave
 from mirrorskin.engine.rotation.fit_noise import CountNoise
 from mirrorskin.engine.rotation.fits import TurnFit, fit_of
@@ -18,7 +17,7 @@ from mirrorskin.engine.rotation.normals import Normals, tell_normals
 from mirrorskin.engine.rotation.options import NormalOptions, set_up
 from mirrorskin.engine.rotation.phases import check_phases
 from mirrorskin.engine.rotation.sums import WindowSums
-from mirrorskin.engine.samples import check_frames
+from mirrorskin.engine.tiling import Band
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.correlation import WINDOW

@@ -12,6 +12,7 @@ from commands import run
 from stacks import record
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.fusion import fuse_sources
 from mirrorskin.hw.twin import Axial, Camera, Vertical
 
 SHAPE, PIXEL = (44, 48), 0.25
@@ -125,7 +126,7 @@ def test_json_tells_the_engine_s_surface_and_where_it_came_from():
     assert told["process"]["vertical_source"].endswith("press.h5")
     assert told["process"]["axial_source"].endswith("turn.h5")
     with io.open_recording("press.h5") as vertical, io.open_recording("turn.h5") as axial:
-        expected = engine.fuse_sources(vertical, axial)
+        expected = fuse_sources(vertical, axial)
     np.testing.assert_array_equal(result.height, expected.height)
     np.testing.assert_array_equal(result.filled, expected.filled)
 

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from stacks import MadeUp, record
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.fusion import frames_to_read, fuse_sources
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
 
 NAN = np.float32(np.nan)
@@ -110,7 +111,7 @@ def test_a_ball_by_equation_10_is_right_within_3_micrometres(setup):
 def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot):
     shape, pixel = (150, 150), 0.05
     turned = rotation(shape, pixel, pivot)
-    result = engine.fuse_sources(press(shape, pixel), turned)
+    result = fuse_sources(press(shape, pixel), turned)
     sure = result.contact > 0
     assert sure.sum() > 12_000
     error = (result.height - turned.truth.height)[sure]
@@ -124,7 +125,7 @@ def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot
 def test_the_crater_that_both_leave_is_filled_and_marked():
     shape, pixel = (110, 110), 0.05
     turned = rotation(shape, pixel, body=Body())
-    result = engine.fuse_sources(press(shape, pixel, depth=2.0), turned)
+    result = fuse_sources(press(shape, pixel, depth=2.0), turned)
     zenith, filled = np.degrees(turned.truth.zenith), result.filled > 0
     assert filled[zenith < 10].all()
     assert not filled[zenith > 12].any()
@@ -418,7 +419,7 @@ SMALL, PIXEL = (50, 50), 0.1
 
 @cache
 def fused(**options):
-    return engine.fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
+    return fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
 
 
 def test_a_result_of_both_has_the_maps_of_both():
@@ -455,7 +456,7 @@ def test_recordings_are_told_by_their_hashes(tmp_path):
         for name, source in (("down.h5", press(SMALL, PIXEL)), ("round.h5", rotation(SMALL, PIXEL)))
     ]
     with io.open_recording(paths[0]) as down, io.open_recording(paths[1]) as turn:
-        result = engine.fuse_sources(down, turn)
+        result = fuse_sources(down, turn)
         hashes = down.fingerprint(), turn.fingerprint()
     assert (
         result.process["vertical_source_fingerprint"],
@@ -478,7 +479,7 @@ def test_options_reach_the_press_and_the_rotation():
 
 
 def fused_with(**options):
-    return engine.fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
+    return fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
 
 
 def test_frames_may_stay_as_they_were_seen():
@@ -486,8 +487,8 @@ def test_frames_may_stay_as_they_were_seen():
     turned = rotation(SMALL, PIXEL)
     turned.header = header
     with pytest.raises(io.InputError, match="does not say its press"):
-        engine.fuse_sources(press(SMALL, PIXEL), turned)
-    result = engine.fuse_sources(press(SMALL, PIXEL), turned, register=False)
+        fuse_sources(press(SMALL, PIXEL), turned)
+    result = fuse_sources(press(SMALL, PIXEL), turned, register=False)
     assert result.process["heights"] == "none"
     assert "registrations" not in result.process
     assert not np.array_equal(result.normals, fused().normals, equal_nan=True)
@@ -497,9 +498,9 @@ def test_progress_is_told_to_the_last_frame():
     for register, most in ((True, 30 + 3 * 8), (False, 30 + 8)):
         done = []
         down, turn = press(SMALL, PIXEL), rotation(SMALL, PIXEL)
-        engine.fuse_sources(down, turn, register=register, progress=done.append)
+        fuse_sources(down, turn, register=register, progress=done.append)
         assert done == sorted(done)
-        assert done[-1] == engine.frames_to_read(down, turn, register) == most
+        assert done[-1] == frames_to_read(down, turn, register) == most
 
 
 def test_what_cannot_be_read_twice_is_registered_once():
@@ -507,7 +508,7 @@ def test_what_cannot_be_read_twice_is_registered_once():
     frames = np.empty(turned.shape, turned.dtype)
     turned.read(frames)
     live = MadeUp(frames, turned.header, phase=np.array(EIGHTHS))
-    result = engine.fuse_sources(press(SMALL, PIXEL), live)
+    result = fuse_sources(press(SMALL, PIXEL), live)
     assert result.process["registrations"] == 1
     sure = result.contact > 0
     assert rms((result.height - turned.truth.height)[sure]) < 0.01
@@ -548,7 +549,7 @@ UNFIT = {
 def test_sources_that_do_not_fit_are_refused_in_one_line(case):
     vertical, axial, line = UNFIT[case]
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.fuse_sources(vertical, axial)
+        fuse_sources(vertical, axial)
     assert "\n" not in str(caught.value)
 
 
@@ -560,7 +561,7 @@ def test_turns_are_not_fused_one_by_one():
 def test_a_press_that_touched_nothing_has_no_height_to_fuse():
     dark = MadeUp(np.full((4, *SMALL), 20, np.uint8), DOWN.header, travel=np.arange(4.0))
     with pytest.raises(io.InputError, match="made up: no pixel turned light"):
-        engine.fuse_sources(dark, rotation(SMALL, PIXEL))
+        fuse_sources(dark, rotation(SMALL, PIXEL))
 
 
 def test_other_regions_of_one_size_are_refused(tmp_path):
@@ -572,4 +573,4 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
         io.open_recording(turn, region=regions[1]) as axial,
         pytest.raises(io.InputError, match="regions from column 5, row 0 and regions from column 5, row 2"),
     ):
-        engine.fuse_sources(vertical, axial)
+        fuse_sources(vertical, axial)

@@ -10,6 +10,7 @@ from fused_ball import judge, pressed, turned, within
 from stacks import ball
 
 from mirrorskin import engine
+from mirrorskin.engine.fusion import fuse_sources
 
 SHAPE, PIXEL = (121, 125), 0.07
 TWIN, TWIN_PIXEL = (101, 105), 0.072
@@ -47,7 +48,7 @@ def test_sigma_of_the_fused_ball_is_of_the_error_s_size():
 @pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.25)], ids=["sheet", "apex"])
 def test_the_ball_is_true_on_the_twins_frames(pivot):
     sources = fused_ball.twins(TWIN, TWIN_PIXEL, 0.1, 20, pivot=pivot)
-    told = judge(engine.fuse_sources(*sources).height, 38, TWIN_PIXEL)
+    told = judge(fuse_sources(*sources).height, 38, TWIN_PIXEL)
     assert told.answered >= 0.99
     assert told.rms <= 0.010
     assert told.apex <= 0.010

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.noise import SAMPLES, estimate_noise, thin_out
+from mirrorskin.engine.frames import SAMPLES, estimate_noise, thin_out
 
 RANDOM = np.random.default_rng(0)
 

@@ -7,6 +7,7 @@ import pytest
 from rotations import direction
 
 from mirrorskin import engine, io
+from mirrorskin.engine.summary import summarise
 
 NAN = np.float32(np.nan)
 
@@ -49,7 +50,7 @@ def test_no_answer_at_all_is_scored_too():
     assert score.answered == 0
     assert score.coverage == 0
     assert np.isnan([score.rms, score.mean, score.chi_square]).all()
-    assert str(engine.summarise(io.Result(height=height))) == "no height at any of 4 pixels"
+    assert str(summarise(io.Result(height=height))) == "no height at any of 4 pixels"
 
 
 def test_what_cannot_be_compared_is_refused():
@@ -72,7 +73,7 @@ def test_the_far_end_is_the_99th_percentile():
     assert score.p99 == pytest.approx(100)
     assert score.chi_square == pytest.approx(1)
     assert np.isnan(score.coverage)
-    summary = engine.summarise(io.Result(height=height))
+    summary = summarise(io.Result(height=height))
     assert (summary.lowest, summary.highest, summary.answered) == (1, 101, 101)
 
 
@@ -288,7 +289,7 @@ ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
     ],
 )
 def test_a_result_in_one_line(maps, line):
-    assert str(engine.summarise(io.Result(**maps))) == line
+    assert str(summarise(io.Result(**maps))) == line
 
 
 def test_undistorted_maps_are_not_of_the_truth_s_pixels():

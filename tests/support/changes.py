@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.press.references import reference_pair
-from mirrorskin.engine.press.search import Onset
+from mirrorskin.engine.frames import reference_pair
+from mirrorskin.engine.press.onset import Onset
 from mirrorskin.kernels import changepoint as reference
 
 EVIDENCE = 12

@@ -258,6 +258,7 @@ def robust() -> Iterator[Row]:
 def fusion() -> Iterator[Row]:
     """Fuse the ball, of data of eq. 10 and of the twin's frames."""
     from mirrorskin import engine
+    from mirrorskin.engine.fusion import fuse_sources
 
     shape, pixel = (401, 400), 0.021
     for name in ("uint8", "uint8, noisy", "uint16"):
@@ -269,7 +270,7 @@ def fusion() -> Iterator[Row]:
     for pivot in (0.0, 1.25, 40.0):
         for step, count in ((0.1, 20), (0.01, 160)):
             sources = fused_ball.twins(shape, pixel, step, count, pivot=(0.0, 0.0, pivot))
-            found = engine.fuse_sources(*sources)
+            found = fuse_sources(*sources)
             name = f"twin, steps {step} mm, pivot {pivot:g} mm up"
             yield from _verdict(name, found, 38, pixel, 0.010)
 

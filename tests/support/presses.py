@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.press.references import reference_maps
-from mirrorskin.engine.press.search import Onset
+from mirrorskin.engine.frames import reference_maps
+from mirrorskin.engine.press.onset import Onset
 from mirrorskin.kernels import onset as reference
 from mirrorskin.kernels.shape import CORE
 

@@ -57,7 +57,8 @@ def errors_on_the_twin(dtype, noise, method, registered):
 
     The error is NaN where there is no answer, or one that is told to be out of contact.
     """
-    from mirrorskin.engine import Registered, estimate_normals
+    from mirrorskin.engine import estimate_normals
+    from mirrorskin.engine.rotation.registration import Registered
 
     twin = turn(dtype, noise)
     truth, header = twin.truth, twin.header

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine import summarise
+from mirrorskin.engine.summary import summarise
 from mirrorskin.io import Result
 from mirrorskin.view.report.numbers import numbers_of, sentence
 from mirrorskin.view.report.pictures import Ends, pictures_of

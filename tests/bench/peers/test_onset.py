@@ -5,7 +5,7 @@ import pytest
 from presses import SPEC, first_run, numpy_onset, random_press
 
 from mirrorskin.bench.peers.onset import References, find_peers
-from mirrorskin.engine.press.references import reference_maps
+from mirrorskin.engine.frames import reference_maps
 from mirrorskin.kernels.onset import onset_levels
 
 FOUND, ABSENT = find_peers()

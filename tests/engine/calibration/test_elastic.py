@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from contact_theory import sphere
 
-from mirrorskin import engine, io
+from mirrorskin import io
 from mirrorskin.engine.calibration.ball.contact import sphere_slope, sphere_travel
 from mirrorskin.engine.calibration.ball.onset import BallOnset, ball_onset, ball_pixels
 from mirrorskin.engine.calibration.elastic import fit_gel
 from mirrorskin.engine.press.elastic import correct_onset
+from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical, visible_zenith
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.io import InputError, Result
@@ -30,7 +31,7 @@ def pressed(diameter, seed, pixels=56, optics="cylinder"):
         optics=optics,
         camera=Camera(noise=1.5, seed=seed, gain_deviation=0.05),
     )
-    return twin, engine.reconstruct_press(twin, fill=False)
+    return twin, reconstruct_press(twin, fill=False)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,9 @@ import pytest
 from height_maps import cap, places
 from scipy import ndimage
 
-from mirrorskin import engine, io
+from mirrorskin import io
+from mirrorskin.engine.measure.plane import fit_plane
+from mirrorskin.engine.measure.sphere import fit_sphere
 
 SHAPE, SIZE = (39, 51), (0.11, 0.13)
 NAN = np.nan
@@ -39,7 +41,7 @@ def noise(shape, kind, rng):
 
 
 def test_a_plane_is_found_exactly():
-    found = engine.fit_plane(leaning(), *axes())
+    found = fit_plane(leaning(), *axes())
     assert found.tilt.value == pytest.approx(np.degrees(np.arctan(0.5)))
     assert found.azimuth.value == pytest.approx(np.degrees(np.arctan2(0.4, -0.3)))  # downhill
     assert found.offset.value == pytest.approx(2.0)
@@ -51,14 +53,14 @@ def test_a_plane_is_found_exactly():
 def test_distances_from_a_plane_are_at_right_angles_to_it():
     height = leaning()
     height[5, 7] += 0.02
-    found = engine.fit_plane(height, *axes())
+    found = fit_plane(height, *axes())
     assert found.outliers == 1
     assert found.residual[5, 7] == pytest.approx(0.02 * np.cos(np.arctan(0.5)))
     assert np.count_nonzero(abs(found.residual) > 1e-9) == 1
 
 
 def test_a_level_plane_falls_nowhere():
-    found = engine.fit_plane(np.full(SHAPE, 3.0), *axes())
+    found = fit_plane(np.full(SHAPE, 3.0), *axes())
     assert (found.tilt.value, found.offset.value) == pytest.approx((0, 3))
     assert found.azimuth.sigma > 100
 
@@ -71,7 +73,7 @@ def test_a_sphere_is_found_exactly(zenith, side, size):
     size = tuple(width * one / 20 for one in size)
     centre = 0.1 * width, -0.05 * width, 0.25
     height = side * cap(SHAPE, size, 5.0, width, centre)
-    found = engine.fit_sphere(height, *axes(SHAPE, size))
+    found = fit_sphere(height, *axes(SHAPE, size))
     assert found.hollow == (side < 0)
     assert found.radius.value == pytest.approx(5.0, rel=1e-7)
     assert (found.x.value, found.y.value) == pytest.approx(centre[:2])
@@ -85,7 +87,7 @@ def test_holes_and_heights_without_a_sigma_do_not_count():
     sigma = np.full(SHAPE, 0.001)
     height[20:25, 30:35] = NAN
     height[10, 10:40], sigma[10, 10:40] = 7.0, NAN
-    found = engine.fit_sphere(height, *axes(), sigma)
+    found = fit_sphere(height, *axes(), sigma)
     assert found.radius.value == pytest.approx(5.0)
     assert np.isnan(found.residual[10, 10:40]).all()
 
@@ -93,7 +95,7 @@ def test_holes_and_heights_without_a_sigma_do_not_count():
 def test_a_few_outliers_do_not_count():
     height = cap(SHAPE, SIZE, 5.0, 2.5) + np.random.default_rng(1).normal(0, 0.001, SHAPE)
     height[20, 18:30] -= 0.3
-    found = engine.fit_sphere(height, *axes(), np.full(SHAPE, 0.001))
+    found = fit_sphere(height, *axes(), np.full(SHAPE, 0.001))
     assert found.outliers == 12
     assert abs(found.radius.value - 5) < 3 * found.radius.sigma < 0.01
     assert found.rms.value > 10  # outliers are part of what was measured
@@ -105,7 +107,7 @@ def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
     assert 0.08 < rim.sum() / np.isfinite(height).sum() < 0.12
     height[rim] -= 0.7
     sigma = np.where(rim, 0.0003, 0.001)  # and they claim to be surer than others
-    found = engine.fit_sphere(height, *axes(), sigma)
+    found = fit_sphere(height, *axes(), sigma)
     assert found.outliers == rim.sum()
     assert abs(found.radius.value - 5) < 3 * found.radius.sigma < 0.02
 
@@ -113,14 +115,14 @@ def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
 def test_what_is_a_quarter_of_the_surface_is_no_outlier():
     height = np.zeros(SHAPE)
     height[:10] = 1.0
-    assert engine.fit_plane(height, *axes()).outliers == 0
+    assert fit_plane(height, *axes()).outliers == 0
 
 
 def test_surer_heights_count_more():
     height = np.zeros(SHAPE)
     height[:, 30:] = 0.01 * (places(SHAPE, SIZE)[0] + 5)[:, 30:]
     sigma = np.where(height > 0, 0.1, 0.03)
-    equal, weighted = (engine.fit_plane(height, *axes(), one) for one in (None, sigma))
+    equal, weighted = (fit_plane(height, *axes(), one) for one in (None, sigma))
     assert weighted.tilt.value < 0.8 * equal.tilt.value
 
 
@@ -131,15 +133,15 @@ def test_surer_heights_count_more():
 def test_pixels_in_one_line_make_no_form(height):
     at = io.pixel_axes(height.shape, (0.1, 0.1))
     with pytest.raises(io.InputError, match="no plane fits"):
-        engine.fit_plane(height, *at)
+        fit_plane(height, *at)
     with pytest.raises(io.InputError, match="no sphere fits"):
-        engine.fit_sphere(height, *at)
+        fit_sphere(height, *at)
 
 
 @pytest.mark.parametrize("height", [np.zeros((9, 9)), leaning(), np.full((3, 3), NAN)])
 def test_what_is_flat_or_nothing_makes_no_sphere(height):
     with pytest.raises(io.InputError, match="no sphere fits"):
-        engine.fit_sphere(height, *io.pixel_axes(height.shape, (0.1, 0.1)))
+        fit_sphere(height, *io.pixel_axes(height.shape, (0.1, 0.1)))
 
 
 @pytest.mark.parametrize("kind", ["white", "alike", "integrated"])
@@ -150,8 +152,8 @@ def test_uncertainties_cover_what_went_wrong(kind):
     pulls = []
     for _ in range(30):
         error = 0.001 * noise(SHAPE, kind, rng)
-        sphere = engine.fit_sphere(ball + error, *axes(), sigma)
-        flat = engine.fit_plane(plane + error, *axes(), sigma)
+        sphere = fit_sphere(ball + error, *axes(), sigma)
+        flat = fit_plane(plane + error, *axes(), sigma)
         tilt = np.degrees(np.arctan(np.hypot(0.1, 0.05)))
         told = (sphere.radius, 5), (sphere.x, 0), (sphere.top, 0), (flat.tilt, tilt), (flat.offset, 0)
         pulls.append([(one.value - true) / one.sigma for one, true in told])
@@ -165,8 +167,8 @@ def test_uncertainties_cover_what_went_wrong(kind):
 def test_all_heights_may_be_wrong_together():
     error = 1e-4 * np.random.default_rng(12).standard_normal(SHAPE)
     sigma = np.full(SHAPE, 0.02)
-    flat = engine.fit_plane(leaning() + error, *axes(), sigma)
-    ball = engine.fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma)
+    flat = fit_plane(leaning() + error, *axes(), sigma)
+    ball = fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma)
     assert min(one.sigma for one in (flat.offset, ball.top, ball.z)) >= 0.02
 
 
@@ -176,11 +178,11 @@ def test_birges_ratio_is_that_of_errors_to_what_is_claimed(claimed):
     sigma = np.full(SHAPE, 0.001 * claimed)
     error = 0.001 * rng.standard_normal(SHAPE)
     for found in (
-        engine.fit_plane(leaning() + error, *axes(), sigma),
-        engine.fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma),
+        fit_plane(leaning() + error, *axes(), sigma),
+        fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma),
     ):
         assert found.birge == pytest.approx(1 / claimed, rel=0.05)
-    assert np.isnan(engine.fit_plane(leaning() + error, *axes()).birge)
+    assert np.isnan(fit_plane(leaning() + error, *axes()).birge)
 
 
 def test_errors_that_are_alike_make_a_radius_less_sure():
@@ -188,10 +190,7 @@ def test_errors_that_are_alike_make_a_radius_less_sure():
     ball = cap(SHAPE, SIZE, 5.0, 2.5)
     sigmas = [
         np.median(
-            [
-                engine.fit_sphere(ball + 0.001 * noise(SHAPE, kind, rng), *axes()).radius.sigma
-                for _ in range(9)
-            ]
+            [fit_sphere(ball + 0.001 * noise(SHAPE, kind, rng), *axes()).radius.sigma for _ in range(9)]
         )
         for kind in ("white", "alike")
     ]
@@ -200,6 +199,6 @@ def test_errors_that_are_alike_make_a_radius_less_sure():
 
 def test_no_uncertainty_is_told_of_as_many_pixels_as_parameters():
     height = np.array([[0.0, 0.1], [0.2, NAN]])
-    found = engine.fit_plane(height, *io.pixel_axes((2, 2), (0.1, 0.1)))
+    found = fit_plane(height, *io.pixel_axes((2, 2), (0.1, 0.1)))
     assert np.isnan(found.tilt.sigma)
     assert found.tilt.value == pytest.approx(np.degrees(np.arctan(np.hypot(1, 2))))

@@ -7,6 +7,8 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
+from mirrorskin.engine.measure.plane import fit_plane
+from mirrorskin.engine.measure.sphere import fit_sphere
 
 NAN = np.nan
 SHAPE, SIZE = (211, 207), (0.03, 0.03)
@@ -230,8 +232,8 @@ def test_what_a_wrong_pixel_size_does_to_a_form_is_within_its_uncertainty(power,
 
 def fit(height, x, y, form):
     if form == "sphere":
-        return engine.fit_sphere(height, x, y).radius.value
-    return engine.fit_plane(height, x, y).tilt.value
+        return fit_sphere(height, x, y).radius.value
+    return fit_plane(height, x, y).tilt.value
 
 
 def test_a_section_compares_no_heights_of_pieces_that_lie_nobody_knows_how_high():

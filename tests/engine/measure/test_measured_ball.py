@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
+from mirrorskin.engine.fusion import fuse_sources
+from mirrorskin.engine.measure.sphere import fit_sphere
 
 
 @pytest.fixture(scope="module")
 def fused():
     """What the engine makes of 8 bits, noise, and a wall as the demo has them."""
     press, turn = fused_ball.twins((61, 61), 0.2, 0.1, 30, noise=1.0)
-    return engine.fuse_sources(press, turn)
+    return fuse_sources(press, turn)
 
 
 def test_the_radius_of_a_fused_ball_is_covered_by_its_uncertainty(fused):
@@ -26,7 +28,7 @@ def test_the_radius_of_a_fused_ball_is_covered_by_its_uncertainty(fused):
 def test_of_the_press_alone_the_radius_is_less_sure_but_covered(fused):
     press, _ = fused_ball.twins((61, 61), 0.2, 0.1, 30, noise=1.0)
     result = engine.reconstruct(press)
-    sphere = engine.fit_sphere(
+    sphere = fit_sphere(
         np.where(result.filled, np.nan, result.height), result.x, result.y, result.height_sigma
     )
     assert abs(sphere.radius.value - 5) < 2 * sphere.radius.sigma

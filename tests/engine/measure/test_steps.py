@@ -5,6 +5,8 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
+from mirrorskin.engine.measure.section import section
+from mirrorskin.engine.measure.steps import step_height
 
 SHAPE, SIZE = (41, 121), (0.05, 0.05)
 NAN = np.nan
@@ -18,14 +20,14 @@ def stair(rise=0.2, lean=0.0, ramp=0.0, at=0.31):
 
 
 def across(height, **more):
-    return engine.section(result_of(height, SIZE, **more), (-2.5, 0.0), (2.5, 0.0))
+    return section(result_of(height, SIZE, **more), (-2.5, 0.0), (2.5, 0.0))
 
 
 @pytest.mark.parametrize("rise", [0.2, -0.013])
 @pytest.mark.parametrize("ramp", [0.0, 0.3])
 @pytest.mark.parametrize("lean", [0.0, 0.2])
 def test_a_step_has_its_height_at_right_angles_to_its_levels(rise, ramp, lean):
-    found = engine.step_height(across(stair(rise, lean, ramp)))
+    found = step_height(across(stair(rise, lean, ramp)))
     assert found.height.value == pytest.approx(rise, rel=1e-3)
     assert found.slope.value == pytest.approx(np.degrees(lean), abs=1e-3)
     assert abs(found.place.value - 2.81) < 0.03 + ramp / 2
@@ -33,9 +35,9 @@ def test_a_step_has_its_height_at_right_angles_to_its_levels(rise, ramp, lean):
 
 def test_a_step_down_is_negative_and_one_the_other_way_is_up():
     height = stair(-0.1)
-    assert engine.step_height(across(height)).height.value == pytest.approx(-0.1)
-    back = engine.section(result_of(height, SIZE), (2.5, 0.0), (-2.5, 0.0))
-    assert engine.step_height(back).height.value == pytest.approx(0.1)
+    assert step_height(across(height)).height.value == pytest.approx(-0.1)
+    back = section(result_of(height, SIZE), (2.5, 0.0), (-2.5, 0.0))
+    assert step_height(back).height.value == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("alike", [False, True])
@@ -45,7 +47,7 @@ def test_the_uncertainty_of_a_step_covers_what_went_wrong(alike):
     for _ in range(100):
         error = rng.standard_normal(SHAPE[1] + 8)
         error = np.convolve(error, np.ones(9) / 3, "valid") if alike else error[:-8]
-        found = engine.step_height(across(stair() + 0.002 * error)).height
+        found = step_height(across(stair() + 0.002 * error)).height
         pulls.append((found.value - 0.2) / found.sigma)
     assert np.mean(np.abs(pulls) < 2) > 0.88
     assert np.sqrt(np.mean(np.square(pulls))) > 0.5
@@ -56,16 +58,16 @@ def test_filled_heights_and_holes_are_no_part_of_a_step():
     filled = np.zeros(SHAPE, np.uint8)
     height[:, 30:50] = NAN
     height[:, 80:90], filled[:, 80:90] = 5.0, 1
-    assert engine.step_height(across(height, filled=filled)).height.value == pytest.approx(0.2)
+    assert step_height(across(height, filled=filled)).height.value == pytest.approx(0.2)
 
 
 def test_what_is_no_step_is_refused():
     with pytest.raises(io.InputError, match="a smooth curve fits it better"):
-        engine.step_height(across(cap(SHAPE, SIZE, 5.0, 3.0)))
+        step_height(across(cap(SHAPE, SIZE, 5.0, 3.0)))
     with pytest.raises(io.InputError, match="at least 8 measured samples"):
-        engine.step_height(across(np.where(places(SHAPE, SIZE)[0] < -2.19, 1.0, NAN)))
+        step_height(across(np.where(places(SHAPE, SIZE)[0] < -2.19, 1.0, NAN)))
     with pytest.raises(io.InputError, match="no pixel size"):
-        engine.step_height(engine.section(result_of(stair(), x=None, y=None)))
+        step_height(section(result_of(stair(), x=None, y=None)))
 
 
 def measured(height, ends, **more):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from height_maps import places
 
-from mirrorskin import engine, io
+from mirrorskin import io
+from mirrorskin.engine.measure.texture import roughness
 
 NAN = np.nan
 
@@ -17,9 +18,9 @@ def grating(shape=(120, 161), size=(0.02, 0.03), length=0.4, amplitude=0.005):
 
 def test_a_cosine_grating_has_its_closed_form():
     # 8 whole waves of 20 pixels.
-    found = engine.roughness(grating((31, 160)), (0.02, 0.03))
+    found = roughness(grating((31, 160)), (0.02, 0.03))
     assert found.sa.value == pytest.approx(5 * 2 / np.pi, rel=5e-3)  # 20 samples a wave
-    fine = engine.roughness(grating((31, 1600), (0.002, 0.03)), (0.002, 0.03))
+    fine = roughness(grating((31, 1600), (0.002, 0.03)), (0.002, 0.03))
     assert fine.sa.value == pytest.approx(5 * 2 / np.pi, rel=1e-3)
     assert fine.sq.value == pytest.approx(5 / np.sqrt(2), rel=1e-3)
     assert fine.sz.value == pytest.approx(10, rel=1e-3)
@@ -30,7 +31,7 @@ def test_a_cosine_grating_has_its_closed_form():
 def test_two_levels_have_their_closed_form():
     height = np.zeros((10, 20))
     height[:, :5] = 0.004  # a quarter of it: 3 um above the mean, the rest 1 below
-    found = engine.roughness(height, (1.0, 1.0))
+    found = roughness(height, (1.0, 1.0))
     assert (found.sa.value, found.sq.value, found.sz.value) == pytest.approx((1.5, np.sqrt(3), 4))
 
 
@@ -38,7 +39,7 @@ def test_holes_do_not_count():
     height = grating()
     holed = height.copy()
     holed[::3] = NAN
-    whole, part = (engine.roughness(one, (0.02, 0.03)) for one in (height, holed))
+    whole, part = (roughness(one, (0.02, 0.03)) for one in (height, holed))
     assert part.sq.value == pytest.approx(whole.sq.value)
     assert part.pixels == 80 * 161
 
@@ -51,7 +52,7 @@ def test_the_filter_passes_what_the_standard_says(share, upright):
     if upright:
         height, size = np.ascontiguousarray(height.T), (0.02, 0.02)
     cutoff = 0.4 / share
-    found = engine.roughness(height, size, cutoff=cutoff)
+    found = roughness(height, size, cutoff=cutoff)
     passed = 1 - np.exp(-np.log(2) / share**2)
     assert found.sz.value == pytest.approx(10 * passed, rel=2e-3)
     assert 0 < found.left_out < height.size / 2
@@ -60,20 +61,20 @@ def test_the_filter_passes_what_the_standard_says(share, upright):
 def test_the_filter_takes_sizes_along_x_and_y_for_what_they_are():
     x, y = places((151, 401), (0.01, 0.04))
     for wave in (x, y):
-        found = engine.roughness(0.005 * np.cos(2 * np.pi * wave / 0.8), (0.01, 0.04), cutoff=0.8)
+        found = roughness(0.005 * np.cos(2 * np.pi * wave / 0.8), (0.01, 0.04), cutoff=0.8)
         assert found.sz.value == pytest.approx(5, rel=5e-3)
 
 
 def test_a_long_bend_is_no_roughness_at_a_cutoff():
     x, _ = places((200, 200), (0.02, 0.02))
-    found = engine.roughness(grating((200, 200), (0.02, 0.02), 0.1) + 0.01 * x**2, (0.02, 0.02), cutoff=0.4)
+    found = roughness(grating((200, 200), (0.02, 0.02), 0.1) + 0.01 * x**2, (0.02, 0.02), cutoff=0.4)
     assert found.sq.value == pytest.approx(5 / np.sqrt(2), rel=0.01)
 
 
 def test_a_hole_is_not_taken_for_a_height():
     height = 7.0 + grating()
     height[60, 80] = NAN
-    found = engine.roughness(height, (0.02, 0.03), cutoff=0.8)
+    found = roughness(height, (0.02, 0.03), cutoff=0.8)
     assert found.sz.value < 12
 
 
@@ -82,7 +83,7 @@ def test_noise_changes_sq_by_no_more_than_its_uncertainty():
     height = grating()
     for error in (0.001 * rng.standard_normal(height.shape), 0.2 * height):
         sigma = np.full(height.shape, np.sqrt(np.mean(error**2)))
-        true, found = (engine.roughness(one, (0.02, 0.03), sigma=sigma) for one in (height, height + error))
+        true, found = (roughness(one, (0.02, 0.03), sigma=sigma) for one in (height, height + error))
         for name in ("sa", "sq", "sz"):
             one, other = getattr(found, name), getattr(true, name)
             assert abs(one.value - other.value) <= 2 * one.sigma
@@ -91,7 +92,7 @@ def test_noise_changes_sq_by_no_more_than_its_uncertainty():
 
 def test_the_noise_of_a_flat_surface_is_told():
     error = 0.001 * np.random.default_rng(6).standard_normal((200, 200))
-    found = engine.roughness(error, (0.1, 0.1), sigma=np.full(error.shape, 0.001))
+    found = roughness(error, (0.1, 0.1), sigma=np.full(error.shape, 0.001))
     assert found.sq.value == pytest.approx(found.noise.value, rel=0.02)
     assert found.sz.value == pytest.approx(2 * found.sz.sigma, rel=0.3)
     assert str(found.quantities()["Sq of noise"]) == "1 µm"
@@ -100,7 +101,7 @@ def test_the_noise_of_a_flat_surface_is_told():
 def test_a_peak_is_no_surer_than_its_own_pixel():
     height, sigma = np.zeros((20, 20)), np.full((20, 20), 1e-5)
     height[3, 4], sigma[3, 4] = 0.01, 4e-5
-    found = engine.roughness(height, (0.1, 0.1), sigma=sigma)
+    found = roughness(height, (0.1, 0.1), sigma=sigma)
     assert found.unsure == 0
     assert found.sz.sigma > 0.04
     assert found.sz.value == pytest.approx(10)
@@ -111,24 +112,24 @@ def test_pixels_that_are_far_less_sure_are_left_out_if_they_are_few(share, left_
     height, sigma = grating((30, 100), (0.02, 0.03)), np.full((30, 100), 1e-4)
     few = slice(0, round(30 * share))
     height[few], sigma[few] = height[few] + 0.5, 0.1
-    found = engine.roughness(height, (0.02, 0.03), sigma=sigma)
+    found = roughness(height, (0.02, 0.03), sigma=sigma)
     assert (found.sz.value < 11) == left_out
     assert found.unsure == (300 if left_out else 0)
     assert found.pixels == 3000 - found.unsure
 
 
 def test_all_equal_heights_are_not_rough():
-    found = engine.roughness(np.full((5, 7), 2.5), (0.1, 0.1))
+    found = roughness(np.full((5, 7), 2.5), (0.1, 0.1))
     assert (found.sa.value, found.sq.value, found.sz.value) == (0, 0, 0)
     assert "Sq of noise" not in found.quantities()
-    assert engine.roughness([[1.0]], (0.1, 0.1), sigma=[[0.1]]).sz.value == 0
+    assert roughness([[1.0]], (0.1, 0.1), sigma=[[0.1]]).sz.value == 0
 
 
 def test_what_has_no_roughness_is_refused():
     with pytest.raises(io.InputError, match="no height"):
-        engine.roughness(np.full((3, 3), NAN), (0.1, 0.1))
+        roughness(np.full((3, 3), NAN), (0.1, 0.1))
     with pytest.raises(io.InputError, match="shorter than two pixels"):
-        engine.roughness(np.zeros((30, 30)), (0.1, 0.2), cutoff=0.3)
+        roughness(np.zeros((30, 30)), (0.1, 0.2), cutoff=0.3)
     for cutoff in (5.0, 1e6):
         with pytest.raises(io.InputError, match="too long for this surface"):
-            engine.roughness(np.zeros((30, 30)), (0.1, 0.1), cutoff=cutoff)
+            roughness(np.zeros((30, 30)), (0.1, 0.1), cutoff=cutoff)

@@ -8,6 +8,7 @@ import pytest
 from stacks import MadeUp, ball, record
 
 from mirrorskin import engine, io
+from mirrorskin.engine.press.press import PressMethod
 
 DOWN = 0.1 * np.arange(1, 31)
 STROKE = np.concatenate([DOWN, DOWN[::-1]])  # rests for two frames at its greatest travel
@@ -25,7 +26,7 @@ def used(result):
     return result.process["event"], result.process["first_frame"], result.process["frames"]
 
 
-@pytest.mark.parametrize("method", get_args(engine.PressMethod))
+@pytest.mark.parametrize("method", get_args(PressMethod))
 def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
     source = twin()
     frames, header = frames_of(source), source.header
@@ -41,7 +42,7 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
             assert used(result) == (event, part.start, 31)
 
 
-@pytest.mark.parametrize("method", get_args(engine.PressMethod))
+@pytest.mark.parametrize("method", get_args(PressMethod))
 @pytest.mark.parametrize("noise", [0.0, 1.5, 6.0])
 def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method, noise):
     source = twin(noise=noise)
@@ -80,7 +81,7 @@ def test_a_body_that_rests_may_be_asked_for_either(event):
     assert set(np.unique(result.status)) == {2, 3}
 
 
-@pytest.mark.parametrize("method", get_args(engine.PressMethod))
+@pytest.mark.parametrize("method", get_args(PressMethod))
 @pytest.mark.parametrize(
     ("travel", "event", "words"),
     [

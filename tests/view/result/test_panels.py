@@ -6,7 +6,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from shown import ball, colours_at, rendered
 
-from mirrorskin import engine, io
+from mirrorskin import io
+from mirrorskin.engine.measure.section import section
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
 from mirrorskin.view.result.classes import draw_edges, draw_status
 from mirrorskin.view.result.height import draw_height
@@ -44,7 +45,7 @@ def along(shape=(20, 60), pixel_size=(0.1, 0.1), span=1.0):
 
 
 def cut_of(result, *ends):
-    return sheet_of(result), engine.section(result, *ends)
+    return sheet_of(result), section(result, *ends)
 
 
 def test_the_height_lies_as_the_picture_does():
@@ -107,7 +108,7 @@ def test_notes_tell_what_colours_mean_and_what_a_level_is_worth():
 
 def test_the_line_of_a_section_runs_from_a_to_b():
     ends = (-1.0, -0.9), (0.5, 0.7)
-    axes = panel_of(draw_height, ball(), engine.section(ball(), *ends))
+    axes = panel_of(draw_height, ball(), section(ball(), *ends))
     _, line = axes.lines
     np.testing.assert_allclose(line.get_xydata(), ends)
     letters = {text.get_text(): text.xy for text in axes.texts if text.get_text() in ("A", "B")}
@@ -127,7 +128,7 @@ def test_the_line_of_a_section_runs_from_a_to_b():
     ids=["short", "backwards", "upright", "across", "across backwards"],
 )
 def test_a_and_b_stand_beyond_the_ends_but_within_the_picture(ends, sides):
-    axes = panel_of(draw_height, ball(), engine.section(ball(), *ends))
+    axes = panel_of(draw_height, ball(), section(ball(), *ends))
     letters = {text.get_text(): text.get_ha() for text in axes.texts}
     assert (letters["A"], letters["B"]) == sides  # the side of a letter that is at the end
 
@@ -188,7 +189,7 @@ def test_a_section_without_errors_or_holes_tells_of_neither():
 
 
 def test_a_section_across_nothing_but_a_hole_is_empty():
-    cut = engine.section(ball(), (1.0, 1.3), (1.5, 1.3))
+    cut = section(ball(), (1.0, 1.3), (1.5, 1.3))
     assert not np.isfinite(cut.height).any()
     axes = panel_of(draw_section, ball(), cut)
     assert not axes.lines

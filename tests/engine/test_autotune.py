@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mirrorskin.engine import OnsetSearch
-from mirrorskin.engine.press import fitting
+from mirrorskin.engine import OnsetSearch, autotune
 from mirrorskin.engine.press.onset import _trial
 from mirrorskin.io import Block
 from mirrorskin.kernels.errors import DeviceError
@@ -22,8 +21,8 @@ def fake_device():
 def memory(monkeypatch):
     """Stand in for the cache folder."""
     kept = {}
-    monkeypatch.setattr(fitting, "recall", lambda topic, key: kept.get((topic, key)))
-    monkeypatch.setattr(fitting, "keep", lambda topic, key, answer: kept.__setitem__((topic, key), answer))
+    monkeypatch.setattr(autotune, "recall", lambda topic, key: kept.get((topic, key)))
+    monkeypatch.setattr(autotune, "keep", lambda topic, key, answer: kept.__setitem__((topic, key), answer))
     return kept
 
 
@@ -31,7 +30,7 @@ def memory(monkeypatch):
 def clock(monkeypatch):
     """Let runs take the time they say."""
     now = SimpleNamespace(seconds=0.0)
-    monkeypatch.setattr(fitting, "time", SimpleNamespace(perf_counter=lambda: now.seconds))
+    monkeypatch.setattr(autotune, "time", SimpleNamespace(perf_counter=lambda: now.seconds))
     return now
 
 
@@ -57,7 +56,7 @@ def test_the_fastest_shape_is_taken_and_remembered(memory, clock, seconds, best)
     prepare, prepared = trial(clock, seconds)
     first, second = fake_device(), fake_device()
     for device in (first, first, second):
-        fitting.fit(device, prepare)
+        autotune.fit(device, prepare)
         assert device.shape is best
         assert device.measured
     assert len(prepared) == 2
@@ -65,20 +64,20 @@ def test_the_fastest_shape_is_taken_and_remembered(memory, clock, seconds, best)
 
 def test_another_driver_is_measured_anew(memory, clock):
     prepare, prepared = trial(clock, {CORE: 1, BESIDE: 2})
-    fitting.fit(fake_device(), prepare)
+    autotune.fit(fake_device(), prepare)
     other = fake_device()
     other.info.driver = "2"
-    fitting.fit(other, prepare)
+    autotune.fit(other, prepare)
     assert len(prepared) == 4
 
 
 def test_what_is_remembered_wrongly_is_measured_anew(memory, clock):
     prepare, _ = trial(clock, {CORE: 2, BESIDE: 1})
-    fitting.fit(fake_device(), prepare)
+    autotune.fit(fake_device(), prepare)
     for nonsense in ("", "7", "-1", "a shape"):
         memory.update(dict.fromkeys(memory, nonsense))
         device = fake_device()
-        fitting.fit(device, prepare)
+        autotune.fit(device, prepare)
         assert device.shape is BESIDE
 
 
@@ -87,7 +86,7 @@ def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
     device = fake_device()
     for _ in range(2):
         with pytest.raises(DeviceError, match="no kernel with 4 lanes"):
-            fitting.fit(device, prepare)
+            autotune.fit(device, prepare)
     assert not memory
 
 

@@ -9,14 +9,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.bands import MEMORY_LIMIT
-from mirrorskin.engine.calibrated import gel_of
-from mirrorskin.engine.feed import Progress, feed
 from mirrorskin.engine.press.changepoint import ChangePointSearch
 from mirrorskin.engine.press.holes import fill_holes
-from mirrorskin.engine.press.onset import OnsetSearch
-from mirrorskin.engine.press.search import Event, Onset
+from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch
 from mirrorskin.engine.provenance import sign, told_level
+from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Calibrated, InputError, ProcessValue, Result, Source
 from mirrorskin.kernels.device import Device
 
@@ -151,7 +149,7 @@ def finish_press(
     if isinstance(source, Calibrated):
         from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
 
-        result, done["gel"] = correct_press(result, source, travel, threshold, gel_of(source))
+        result, done["gel"] = correct_press(result, source, travel, threshold, source.calibration.gel)
     if fill:
         result, done["fill"] = _fill_press(result, source, travel, event)
     return result, done

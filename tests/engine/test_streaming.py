@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.feed import feed
+from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Header, InputError
 
 

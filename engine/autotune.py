@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from mirrorskin.engine.version import program_version
+from mirrorskin.engine.provenance import program_version
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.remember import keep, recall
