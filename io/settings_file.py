@@ -1,0 +1,191 @@
+"""TOML files that people write, checked against a model: a `msgspec.Struct` with a field for each key."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+
+from mirrorskin.io.types import InputError
+
+_Model = TypeVar("_Model", bound=msgspec.Struct)
+_LONGEST = 40  # letters of a value that a message quotes
+
+
+def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
+    """Read a file of TOML.
+
+    A table is a field whose type is a `msgspec.Struct`. What a key may be is its type: a number with bounds,
+    a text, a choice (`Literal`), a list; ``msgspec.Meta`` gives the bounds, says in words what is needed
+    (``description``) and how it may look (``examples``). A ``__post_init__`` that raises ValueError checks
+    what belongs together. Numbers are finite.
+
+    Parameters
+    ----------
+    path : str or Path
+    model : type
+        Of the whole file.
+    page : str
+        What describes the file, for messages: ``"docs/batch.md"``.
+
+    Returns
+    -------
+    model
+        What is not in the file has its default.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is no TOML, or has a key or a value that the model does not allow; the
+        message names the file, the key and the remedy.
+
+    Examples
+    --------
+    >>> from typing import Annotated
+    >>> import msgspec
+    >>> Length = Annotated[float, msgspec.Meta(gt=0, description="a length above 0, in mm,", examples=[0.5])]
+    >>> class Stage(msgspec.Struct):
+    ...     press: Length
+    >>> class Rig(msgspec.Struct):
+    ...     stage: Stage
+    >>> load_toml("rig.toml", Rig, "docs/rig.md").stage.press  # doctest: +SKIP
+    2.0
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            tables = tomllib.load(file)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; write it as {page} describes") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text: write it in TOML, as {page} describes") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not TOML: {error}; correct it there") from error
+    return _table(tables, model, str(path), "")
+
+
+def quote(value: Any) -> str:
+    """Write a value as TOML does, near enough to be recognised in a message."""
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, bool):
+        return str(value).lower()
+    try:
+        text = f'"{value}"' if isinstance(value, str) else str(value)
+    except ValueError:  # a whole number of thousands of digits
+        return "too large a number"
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def _table(values: Any, model: type[_Model], where: str, name: str) -> _Model:
+    if not isinstance(values, dict):
+        raise InputError(
+            f"{where}: {name} is {quote(values)}: write [{name}] alone in a line, and its keys below"
+        )
+    fields = {field.encode_name: field for field in msgspec.structs.fields(model)}
+    for key in values:
+        if key not in fields:
+            raise InputError(f"{where}: {_dotted(name, key)} is not known: {_suggest(key, list(fields))}")
+    found: dict[str, Any] = {}
+    for key, field in fields.items():
+        kind, dotted = field.type, _dotted(name, key)
+        table = next((one for one in _within(kind) if _is_model(one)), None)
+        if key not in values and field.required:
+            missing = f"table [{dotted}]" if table else f"{key} = {_example(kind)} in [{name}]"
+            raise InputError(f"{where}: {dotted} is missing: add {missing}")
+        if key in values and table:
+            found[field.name] = _table(values[key], table, where, dotted)
+        elif key in values:
+            found[field.name] = _value(values[key], kind, f"{where}: {dotted}", key)
+    try:
+        return model(**found)
+    except ValueError as error:
+        raise InputError(f"{where}: {f'[{name}] ' if name else ''}{error}") from error
+
+
+def _value(value: Any, kind: Any, where: str, key: str) -> Any:
+    try:
+        if not _is_finite(value):
+            raise OverflowError("a number that is not finite")
+        return _convert(value, kind)
+    except (msgspec.ValidationError, OverflowError) as error:
+        needed, example = _needed(kind), f"{key} = {_example(kind)}"
+        raise InputError(f"{where} is {quote(value)}: {needed} is needed; write e.g. {example}") from error
+
+
+def _convert(value: Any, kind: Any) -> Any:
+    """Convert to the first of a union that fits: msgspec 0.22 crashes if a tuple and a bound are in one."""
+    inner = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if get_origin(inner) not in (Union, UnionType):
+        return msgspec.convert(value, kind)
+    problems = []
+    for one in get_args(inner):
+        try:
+            return _convert(value, one)
+        except msgspec.ValidationError as error:
+            problems.append(error)
+    raise problems[0]
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _within(kind: Any) -> Iterator[Any]:
+    """Yield a type and those that it is a union of, without what annotates them."""
+    if get_origin(kind) is Annotated:
+        kind = get_args(kind)[0]
+    yield kind
+    if get_origin(kind) is not Literal and not _is_model(kind):
+        for one in get_args(kind):
+            yield from _within(one)
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def _meta(kind: Any) -> msgspec.Meta | None:
+    """Return the outermost annotation that says something in words."""
+    if get_origin(kind) is Annotated:
+        for one in kind.__metadata__:
+            if isinstance(one, msgspec.Meta) and one.description:
+                return one
+    inner = () if get_origin(kind) is Literal else get_args(kind)
+    return next((found for one in inner if (found := _meta(one)) is not None), None)
+
+
+def _choices(kind: Any) -> tuple[Any, ...]:
+    found = next((one for one in _within(kind) if get_origin(one) is Literal), None)
+    return (True, False) if found is None else get_args(found)
+
+
+def _needed(kind: Any) -> str:
+    meta = _meta(kind)
+    if meta is not None:
+        return str(meta.description)
+    return f"one of {', '.join(map(quote, _choices(kind)))}"
+
+
+def _example(kind: Any) -> str:
+    meta = _meta(kind)
+    return quote(meta.examples[0] if meta is not None and meta.examples else _choices(kind)[0])
+
+
+def _dotted(table: str, key: str) -> str:
+    shown = key if key.isprintable() and key else repr(key)
+    return f"{table}.{shown}" if table else shown
+
+
+def _suggest(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key.lower(), known, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
