@@ -27,8 +27,7 @@ from mirrorskin.io.types import (
 if TYPE_CHECKING:
     from mirrorskin.io.atomic import check_output
     from mirrorskin.io.calibration.file import open_calibration, save_calibration, update_calibration
-    from mirrorskin.io.calibration.fit import check_camera
-    from mirrorskin.io.calibration.source import Calibrated
+    from mirrorskin.io.calibration.source import Calibrated, check_camera
     from mirrorskin.io.calibration.types import (
         Calibration,
         CameraId,
@@ -109,8 +108,7 @@ __all__ = [
 _MODULES = {
     "atomic": ("check_output",),
     "calibration.file": ("open_calibration", "save_calibration", "update_calibration"),
-    "calibration.fit": ("check_camera",),
-    "calibration.source": ("Calibrated",),
+    "calibration.source": ("Calibrated", "check_camera"),
     "calibration.types": (
         "Calibration",
         "CameraId",

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.calibration.file import open_calibration
-from mirrorskin.io.calibration.layout import MARK as CALIBRATION_MARK
+from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
+from mirrorskin.io.calibration.file import open_calibration, words_of
 from mirrorskin.io.calibration.types import GROUPS, Calibration
-from mirrorskin.io.calibration.words import words_of
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, TRUTH_UNITS
 from mirrorskin.io.recording import Recording, open_recording

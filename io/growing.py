@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.calibration.layout import CARRIED, size_of, write_calibration
+from mirrorskin.io.calibration.file import CARRIED, size_of, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.columns import Column, Marks
 from mirrorskin.io.layout import DROPPED, LIVE, SERIES, STATE, UNDER_WAY, USED

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
-from mirrorskin.io.calibration.layout import CARRIED, write_calibration
+from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import SERIES, TRUTH, TRUTH_UNITS
 from mirrorskin.io.passing import Passing

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.calibration.reading import carried_by
+from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import MAKE_ROOM, new_file, new_hdf5
-from mirrorskin.io.calibration.layout import CARRIED, datasets_of, groups_of
-from mirrorskin.io.calibration.reading import carried_by
+from mirrorskin.io.calibration.file import CARRIED, carried_by, datasets_of, groups_of
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.mould import Mould
 from mirrorskin.io.parts import Part, parts_of_process, read_process, write_part

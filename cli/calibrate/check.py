@@ -29,7 +29,7 @@ def command(
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.check import check_ball
     from mirrorskin.view import check_drawing
-    from mirrorskin.view.calibration.check import check_figure
+    from mirrorskin.view.calibration import check_figure
 
     if picture is not None:
         check_drawing()

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
+from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.calibrate.inputs import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.calibration.ball.onset import BallOnset
-    from mirrorskin.engine.calibration.elastic import LearnedGel
+    from mirrorskin.engine.calibration.gel import BallOnset, LearnedGel
     from mirrorskin.io import Calibration, ProcessValue, Source
 
 _STEP, _PRESS = "0.03mm", "1.2mm"
@@ -36,13 +35,13 @@ def command(
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
     pixel_size: options.PixelSize = None,
-    rig: taking.OptionalRig = None,
+    rig: inputs.OptionalRig = None,
     places: Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")] = 1,
     press: Annotated[
         str | None,
         typer.Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {_PRESS}."),
     ] = None,
-    settle: taking.Settle = None,
+    settle: inputs.Settle = None,
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
@@ -50,8 +49,8 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.quantity import length
     from mirrorskin.cli.stack import stack_options
-    from mirrorskin.engine.calibration.elastic import fit_gel
-    from mirrorskin.io.calibration.sizes import size_facts
+    from mirrorskin.engine.calibration.gel import fit_gel
+    from mirrorskin.io.calibration.source import size_facts
 
     paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
@@ -62,7 +61,7 @@ def command(
     known = io.open_calibration(output) if output.exists() else None
     if rig is not None:
         plans = _places(rig, places, press, travel_start, travel_step)
-        paths, travel_step, travel_start = taking.take(rig, output, plans, settle), None, None
+        paths, travel_step, travel_start = inputs.take(rig, output, plans, settle), None, None
     told = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
     told = with_scale(told, known)
     with ExitStack() as opening:
@@ -78,7 +77,7 @@ def command(
 
 def _places(
     rig: Path, places: int, press: str | None, start: str | None, step: str | None
-) -> list[taking.Place]:
+) -> list[inputs.Place]:
     """Say how the recordings are taken."""
     from mirrorskin.cli.quantity import length
     from mirrorskin.hw.rig.plans import VerticalPlan
@@ -88,7 +87,7 @@ def _places(
         length(press or _PRESS, "--press"),
         step=length(step or _STEP, "--travel-step"),
     )
-    return taking.at_each(
+    return inputs.at_each(
         "elastic", "put the ball at place {} of {}, near the middle of the field", places, plan
     )
 
@@ -97,7 +96,7 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
     """Find when the ball turned pixels light, by the references that are known so far."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
-    from mirrorskin.engine.calibration.ball.onset import ball_onset
+    from mirrorskin.engine.calibration.gel import ball_onset
     from mirrorskin.engine.press.elastic import LEARNED_AT
     from mirrorskin.engine.press.press import reconstruct_press
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import taking
+from mirrorskin.cli.calibrate import inputs
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mirrorskin.engine.calibration.references.measure import LevelReport, Measured
+    from mirrorskin.engine.calibration.references import LevelReport, Measured
     from mirrorskin.io import CameraId, ProcessValue, References, Source
 
 _FRAMES = 64
@@ -54,7 +54,7 @@ def command(
         float | None,
         typer.Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1."),
     ] = None,
-    rig: taking.OptionalRig = None,
+    rig: inputs.OptionalRig = None,
     frames: Annotated[
         int, typer.Option(min=2, help="With --rig: of each level, or of the ball at each place.")
     ] = _FRAMES,
@@ -72,9 +72,9 @@ def command(
     _check_call(darks, brights, noise, rig, rolled, press)
     io.check_output(output, *darks, *brights, rig)
     if rig is not None:
-        darks = darks or taking.take(rig, output, [_still("dark", rig, frames)])
+        darks = darks or inputs.take(rig, output, [_still("dark", rig, frames)])
         balls = _balls(rig, places, frames, press) if rolled else [_still("bright", rig, frames)]
-        brights = brights or taking.take(rig, output, balls)
+        brights = brights or inputs.take(rig, output, balls)
     measured, camera = _measure(darks, brights, rolled)
     for number in range(2, _ROUNDS + 1):
         missing = _missing(measured, noise, rig is None or rolled)
@@ -82,7 +82,7 @@ def command(
             break
         more = {name: _still(name, rig, count, number) for name, count in missing.items()}
         for name, place in more.items():
-            (darks if name == "dark" else brights).extend(taking.take(rig, output, [place]))
+            (darks if name == "dark" else brights).extend(inputs.take(rig, output, [place]))
         measured, camera = _measure(darks, brights, rolled)
     _missing(measured, noise, True)
     io.update_calibration(output, measured.references, camera, _process(measured, darks, brights, rolled))
@@ -112,20 +112,20 @@ def _check_call(
         raise InputError("--press is missing: say how far the body is lowered on the ball, as in --press 2mm")
 
 
-def _still(name: str, rig: Path, frames: int, number: int = 1) -> taking.Place:
+def _still(name: str, rig: Path, frames: int, number: int = 1) -> inputs.Place:
     """Say how a level is taken, of half the frames at each of two places that are all but one."""
     file = name if number == 1 else f"{name}-{number}"
-    return taking.Place(file, _PROMPTS[name], taking.still_plan(rig), max(1, -(-frames // 2)))
+    return inputs.Place(file, _PROMPTS[name], inputs.still_plan(rig), max(1, -(-frames // 2)))
 
 
-def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[taking.Place]:
+def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[inputs.Place]:
     from mirrorskin.cli.quantity import length
 
-    plan = taking.still_plan(rig, length(press or "", "--press"))
+    plan = inputs.still_plan(rig, length(press or "", "--press"))
     prompt = "put the ball at place {} of {}, all over the field"
     each = max(1, -(-frames // 2))
     return [
-        taking.Place(f"bright-{number}", prompt.format(number, places), plan, each)
+        inputs.Place(f"bright-{number}", prompt.format(number, places), plan, each)
         for number in range(1, places + 1)
     ]
 
@@ -134,7 +134,7 @@ def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tu
     """Measure references, and tell of which camera."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
-    from mirrorskin.engine.calibration.references.measure import measure_references
+    from mirrorskin.engine.calibration.references import measure_references
 
     with ExitStack() as opening:
         low, high = ([opening.enter_context(_open(path)) for path in paths] for paths in (darks, brights))

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.boards import BoardText, board_of
+from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.calibrate.board import BoardText, board_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mirrorskin.engine.calibration.lens.board import Board
-    from mirrorskin.engine.calibration.lens.fit import LensFit
+    from mirrorskin.engine.calibration.board import Board
+    from mirrorskin.engine.calibration.lens import LensFit
     from mirrorskin.io import Calibration, CameraId, ProcessValue
 
     Pictures = list[tuple[str, NDArray[Any]]]
@@ -35,7 +35,7 @@ def command(
             help="Of the board, flat on the sheet, at several places and turned.",
         ),
     ] = None,
-    rig: taking.OptionalRig = None,
+    rig: inputs.OptionalRig = None,
     places: Annotated[int, typer.Option(min=1, help="With --rig: of the board.")] = _PLACES,
     as_json: options.Json = False,
 ) -> None:
@@ -44,14 +44,14 @@ def command(
     One picture is enough where the board fills it; with several, the board need not.
     """
     from mirrorskin import io
-    from mirrorskin.engine.calibration.lens.fit import calibrate_lens
+    from mirrorskin.engine.calibration.lens import calibrate_lens
 
     kind, given = board_of(board), list(pictures or [])
     if not given and rig is None:
         raise io.InputError("no picture of a board is given: name some, or take them with --rig RIG.toml")
     io.check_output(output, *given, rig)
     if rig is not None:
-        given += taking.take(rig, output, _plan(rig, places))
+        given += inputs.take(rig, output, _plan(rig, places))
     taken, camera = _read(given, output)
     fit = calibrate_lens(taken, kind)
     after = io.update_calibration(output, fit.lens, camera, _process(fit, kind, given))
@@ -61,7 +61,7 @@ def command(
 
 def _warn(calibration: Calibration, pixel_size: tuple[float, float]) -> None:
     """Say which parts the new scale has made useless."""
-    from mirrorskin.io.calibration.sizes import outdated
+    from mirrorskin.io.calibration.source import outdated
     from mirrorskin.io.calibration.types import GROUPS
 
     parts = [GROUPS[part] for part, _ in outdated(calibration, pixel_size)]
@@ -69,12 +69,12 @@ def _warn(calibration: Calibration, pixel_size: tuple[float, float]) -> None:
         typer.echo(f"learn {', '.join(parts)} again: made with another pixel size", err=True)
 
 
-def _plan(rig: Path, places: int) -> list[taking.Place]:
+def _plan(rig: Path, places: int) -> list[inputs.Place]:
     """Say where the board is to lie, with the body lifted."""
     prompt = (
         "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the corners"
     )
-    return taking.at_each("board", prompt, places, taking.still_plan(rig), _SHOTS)
+    return inputs.at_each("board", prompt, places, inputs.still_plan(rig), _SHOTS)
 
 
 def _read(paths: Sequence[Path], output: Path) -> tuple[Pictures, CameraId]:
@@ -97,7 +97,7 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[Pictures, CameraId]:
 def _picture(path: Path) -> tuple[NDArray[Any], str, Any]:
     """Read a picture, or the mean of a recording and what that says of its camera."""
     from mirrorskin import io
-    from mirrorskin.engine.calibration.lens.stills import mean_of_still
+    from mirrorskin.engine.calibration.board import mean_of_still
     from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
 
     if path.is_dir() or path.suffix.lower() in (".avi", ".mp4"):

@@ -12,7 +12,7 @@ import typer
 from mirrorskin.cli import options
 
 if TYPE_CHECKING:
-    from mirrorskin.view.calibration.table import Row
+    from mirrorskin.view.calibration_table import Row
 
 _HEAD = "part", "what", "value", "standard error", "unit"
 _NUMBERS = "value", "standard error"
@@ -32,8 +32,8 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import print_json
     from mirrorskin.view import check_drawing
-    from mirrorskin.view.calibration.figures import calibration_figures
-    from mirrorskin.view.calibration.table import calibration_table
+    from mirrorskin.view.calibration import calibration_figures
+    from mirrorskin.view.calibration_table import calibration_table
 
     if output is not None:
         check_drawing()

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
+from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.calibrate.inputs import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
-    from mirrorskin.engine.calibration.shown import Shown
-    from mirrorskin.engine.calibration.tilt.fit import Study
-    from mirrorskin.engine.calibration.tilt.turned import BallTurn, PlateTurn
+    from mirrorskin.engine.calibration.brightness import Shown
+    from mirrorskin.engine.calibration.tilt import Study
+    from mirrorskin.engine.calibration.tilt_tracks import BallTurn, PlateTurn
     from mirrorskin.io import Calibration, CameraId, Precession, ProcessValue, Source
 
 _TRIFLE = math.radians(0.1)  # of azimuth, or of the mean lean, that is not worth a line
@@ -45,22 +45,22 @@ def command(
     pixel_size: options.PixelSize = None,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
-    rig: taking.OptionalRig = None,
+    rig: inputs.OptionalRig = None,
     places: Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")] = 5,
     press: Annotated[
         str | None, typer.Option(metavar="LENGTH", help="With --rig: how far the body is lowered: 0.5mm.")
     ] = None,
     tilt: Annotated[
-        str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {taking.TILT}.")
+        str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {inputs.TILT}.")
     ] = None,
-    settle: taking.Settle = None,
+    settle: inputs.Settle = None,
     as_json: options.Json = False,
 ) -> None:
     """Find half-angle, phase offset, direction, ellipticity and pivot of the rotation, with their errors."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import length
     from mirrorskin.cli.stack import stack_options
-    from mirrorskin.io.calibration.sizes import size_facts
+    from mirrorskin.io.calibration.source import size_facts
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
     radius = length(ball, "--ball") / 2
@@ -69,8 +69,8 @@ def command(
     known = io.open_calibration(output) if output.exists() else None
     told = stack_options(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
-        plan = taking.turn_plan(press, tilt, phase_step, "0.5mm")
-        paths, told = taking.take(rig, output, taking.at_each("tilt", taking.BALL, places, plan), settle), {}
+        plan = inputs.turn_plan(press, tilt, phase_step, "0.5mm")
+        paths, told = inputs.take(rig, output, inputs.at_each("tilt", inputs.BALL, places, plan), settle), {}
     told = with_scale(told, known)
     every = [*flats, *wedges, *paths]
     camera = _camera(every, known, output, told)
@@ -112,9 +112,9 @@ def _shown(source: Source, known: Calibration | None, scale: Mapping[str, Any]) 
     """Return the response: of the calibration, else the one that is linear in the zenith."""
     from dataclasses import replace
 
-    from mirrorskin.engine.calibration.shown import LinearShown, WallShown
+    from mirrorskin.engine.calibration.brightness import LinearShown, WallShown
     from mirrorskin.io import InputError
-    from mirrorskin.io.calibration.sizes import check_sizes
+    from mirrorskin.io.calibration.source import check_sizes
 
     header, shape = source.header, source.shape[1:]
     dark, bright = header.dark, header.bright
@@ -136,7 +136,7 @@ def _turns(
 ) -> Iterator[BallTurn | PlateTurn]:
     """Read one recording after the other."""
     from mirrorskin import io
-    from mirrorskin.engine.calibration.tilt.turned import read_ball, read_plate
+    from mirrorskin.engine.calibration.tilt_tracks import read_ball, read_plate
 
     for path in [*flats, *wedges]:
         with io.open_recording(path, **told) as source:
@@ -148,7 +148,7 @@ def _turns(
 
 def _study(turns: Iterator[BallTurn | PlateTurn], count: int, shown: Shown) -> Study:
     from mirrorskin.cli.output import progress
-    from mirrorskin.engine.calibration.tilt.fit import study_precession
+    from mirrorskin.engine.calibration.tilt import study_precession
 
     with progress("looking", count) as show:
 

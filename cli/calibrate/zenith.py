@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import taking
-from mirrorskin.cli.calibrate.presses import camera_of, check_call, one_camera, with_scale
+from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.calibrate.inputs import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, ProcessValue, Source, WallResponse
@@ -50,13 +50,13 @@ def command(
     tilt: options.Tilt = None,
     phase_step: options.PhaseStep = None,
     pixel_size: options.PixelSize = None,
-    rig: taking.OptionalRig = None,
+    rig: inputs.OptionalRig = None,
     places: Annotated[int, typer.Option(min=5, help="With --rig: of the ball.")] = 9,
     press: Annotated[
         str | None,
         typer.Option(metavar="LENGTH", help="With --rig: how far the body is lowered: 0.4mm for 4 mm."),
     ] = None,
-    settle: taking.Settle = None,
+    settle: inputs.Settle = None,
     as_json: options.Json = False,
 ) -> None:
     """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
@@ -71,9 +71,9 @@ def command(
     io.check_output(output, *paths, rig)
     known = io.open_calibration(output) if output.exists() else None
     if rig is not None:
-        plan = taking.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
-        balls = taking.at_each("zenith", taking.BALL, places, plan)
-        paths, tilt, phase_step = taking.take(rig, output, balls, settle), None, None
+        plan = inputs.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
+        balls = inputs.at_each("zenith", inputs.BALL, places, plan)
+        paths, tilt, phase_step = inputs.take(rig, output, balls, settle), None, None
     told = with_scale(stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size), known)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
@@ -93,7 +93,7 @@ def _fit(
     body: tuple[float, float],
 ) -> WallResponse:
     from mirrorskin.cli.output import progress
-    from mirrorskin.engine.calibration.wall.zenith import fit_zenith
+    from mirrorskin.engine.calibration.wall import fit_zenith
 
     with progress("fitting", len(sources)) as show:
         return fit_zenith(
@@ -109,7 +109,7 @@ def _fit(
 
 def _size(source: Source) -> dict[str, ProcessValue]:
     """Return what is kept of the pixel size that the wall was measured with."""
-    from mirrorskin.io.calibration.sizes import size_facts
+    from mirrorskin.io.calibration.source import size_facts
 
     size = source.header.pixel_size
     return {} if size is None else dict(size_facts(size))
@@ -117,7 +117,7 @@ def _size(source: Source) -> dict[str, ProcessValue]:
 
 def _precession(known: Calibration, source: Source) -> Precession | None:
     """Return the precession that is known, unless its pivot was measured with another pixel size."""
-    from mirrorskin.io.calibration.sizes import outdated
+    from mirrorskin.io.calibration.source import outdated
 
     size = source.header.pixel_size
     if known.precession is None or size is None or not list(outdated(known, size, ["precession"])):

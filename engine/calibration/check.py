@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import least_squares
 
-from mirrorskin.engine.calibration.ball.scene import BallView, ball_view
+from mirrorskin.engine.calibration.ball import BallView, ball_view
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse

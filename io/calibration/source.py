@@ -1,9 +1,9 @@
-"""A source as it is with a calibration."""
+"""Which pixel size a part of a calibration was made with, and whether it is still that."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, cast
@@ -11,11 +11,161 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.calibration.fit import check_camera, cropped
-from mirrorskin.io.calibration.sizes import check_sizes
-from mirrorskin.io.calibration.types import Calibration, CameraId, Precession
+from mirrorskin.io.calibration.types import GROUPS, Calibration, CameraId, Part, Precession, stored
 from mirrorskin.io.region import Region
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, Source
+
+SIZED = ("zenith", "precession", "gel")
+"""The parts whose lengths come from the size of a pixel."""
+
+_SAME = 1e-3
+"""Share by which pixel sizes may differ: less than a calibration's lengths are known to."""
+
+Size = tuple[float, float]
+
+
+def size_facts(pixel_size: Size) -> dict[str, float]:
+    """Return what a part's process keeps of the pixel size that it was made with, mm along x and y."""
+    return {f"pixel_size_{axis}": float(size) for axis, size in zip("xy", pixel_size, strict=True)}
+
+
+def differ(one: Size, other: Size) -> bool:
+    """Tell whether two pixel sizes differ so much that lengths of both cannot be used together."""
+    return not all(abs(left - right) <= _SAME * right for left, right in zip(one, other, strict=True))
+
+
+def outdated(
+    calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
+) -> Iterator[tuple[str, Size]]:
+    """Yield the parts that were made with another pixel size, and which; of some that is not known.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixel_size : (float, float)
+        As it is known now, mm along x and y.
+    parts : iterable of str
+        Which are looked at, by the names of a calibration's attributes.
+    """
+    there = calibration.parts()
+    for part in parts:
+        told = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
+        if part not in there or not all(isinstance(one, float | int) for one in told):
+            continue
+        x, y = (float(one) for one in told if one is not None)
+        if differ((x, y), pixel_size):
+            yield part, (x, y)
+
+
+def check_sizes(
+    calibration: Calibration, pixel_size: Size | None, what: str, parts: Iterable[str] = SIZED
+) -> None:
+    """Refuse parts that were made with another pixel size than the one that is known now.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixel_size : (float, float) or None
+        Millimetres along x and y; without it, nothing is refused.
+    what : str
+        What is to be read with it, for the message where the calibration has no scale.
+    parts : iterable of str
+        Which are needed, by the names of a calibration's attributes.
+
+    Raises
+    ------
+    InputError
+        Lengths of two scales would be mixed.
+    """
+    if pixel_size is None:
+        return
+    for part, before in outdated(calibration, pixel_size, parts):
+        says = f"{what} says" if calibration.lens is None else "the scale now says"
+        raise InputError(
+            f"{calibration.name or 'the calibration'}: calibrate {GROUPS[part]} again: it was made with"
+            f" pixels of {_words(before)}, {says} {_words(pixel_size)}"
+        )
+
+
+def _words(size: Size) -> str:
+    x, y = (f"{one:.5g}" for one in size)
+    return f"{x} mm" if x == y else f"{x} x {y} mm"
+
+
+AGAIN = "calibrate again, or give that camera's"
+
+
+def check_camera(calibration: Calibration, camera: CameraId, what: str, remedy: str = AGAIN) -> None:
+    """Refuse a calibration of another camera.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    camera : CameraId
+        That it is to be used for; one without a name may be any.
+    what : str
+        What to call that in the message.
+    remedy : str, optional
+        The end of the message.
+
+    Raises
+    ------
+    InputError
+        Name, size of the picture or type of its samples differ.
+    """
+    ways = list(_differences(calibration.camera, camera))
+    if ways:
+        mine = " and ".join(way[0] for way in ways)
+        its = " and ".join(way[1] for way in ways)
+        raise InputError(f"{calibration.name or 'the calibration'} is of {mine}, {what} of {its}: {remedy}")
+
+
+def cropped(calibration: Calibration, region: Region, pixel_size: tuple[float, float] | None) -> Calibration:
+    """Return what is left of a calibration for a part of its camera's picture.
+
+    Maps are cut; places are told from the part's centre.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the whole picture.
+    region : Region
+    pixel_size : (float, float) or None
+        Millimetres; without it, places stay as they are.
+    """
+    picture = calibration.camera.shape
+    if region == Region.whole(picture):
+        return calibration
+    right, up = region.centre(picture, pixel_size) if pixel_size else (0.0, 0.0)
+    parts: dict[str, Any] = {
+        name: _cut(part, region, right, up) for name, part in calibration.parts().items()
+    }
+    return replace(calibration, camera=replace(calibration.camera, shape=region.shape), **parts)
+
+
+def _differences(mine: CameraId, its: CameraId) -> Iterator[tuple[str, str]]:
+    """Yield what the two say of something in which they differ."""
+    if mine.name and its.name and mine.name != its.name:
+        yield f"the camera {mine.name!r}", f"{its.name!r}"
+    if tuple(mine.shape) != tuple(its.shape):
+        yield f"{mine.shape[1]} x {mine.shape[0]} pixels", f"{its.shape[1]} x {its.shape[0]}"
+    if np.dtype(mine.dtype) != np.dtype(its.dtype):
+        yield f"{np.dtype(mine.dtype).name} samples", np.dtype(its.dtype).name
+
+
+def _cut(part: Part, region: Region, right: float, up: float) -> Part:
+    """Cut a part's maps, and tell its places from a centre that lies so far off."""
+    changed: dict[str, Any] = {}
+    for name, how in stored(part).items():
+        value = getattr(part, name)
+        if value is None:
+            continue
+        if how.is_map:
+            changed[name] = np.ascontiguousarray(value[region.slices])
+        elif how.place:
+            changed[name] = (value[0] - right, value[1] - up, *value[2:])
+    return replace(part, **changed)
+
 
 _SAME_TILT = 1.25
 """By what factor a rotation's half-angle may differ from the one that was calibrated."""

@@ -5,8 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.engine.lens_model import picture_places
-from mirrorskin.engine.undistort import undistort
+from mirrorskin.engine.undistort import picture_places, undistort
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
 
 SIZES = [(1, 1), (1, 9), (7, 11), (33, 20)]

@@ -28,12 +28,8 @@ from calibration_scenes import (
 from calibration_scorer import Judge, Score, Surface
 
 from mirrorskin import engine, io
-from mirrorskin.engine.calibration import elastic, shown
-from mirrorskin.engine.calibration.ball.onset import ball_onset
-from mirrorskin.engine.calibration.references import measure as references
-from mirrorskin.engine.calibration.tilt import fit as tilt
-from mirrorskin.engine.calibration.tilt import turned
-from mirrorskin.engine.calibration.wall import zenith
+from mirrorskin.engine.calibration import brightness, gel, references, tilt, tilt_tracks, wall
+from mirrorskin.engine.calibration.gel import ball_onset
 from mirrorskin.engine.rotation import axial
 from mirrorskin.engine.rotation.normals import Normals
 
@@ -82,17 +78,17 @@ def calibrate(lab: Lab, apart: float = APART, every: int = 1) -> io.Calibration:
     """
     taken = references.take_references(lab.flat(0.0, FLATS, 900), lab.flat(1.0, FLATS, 901))
     presses = nine_balls(lab, apart, 1)
-    response = zenith.fit_zenith(presses, BALL / 2, references=taken)
+    response = wall.fit_zenith(presses, BALL / 2, references=taken)
     pixel = lab.pixel_size, lab.pixel_size
-    light = shown.WallShown.of_pixels(response, taken.dark, taken.bright, lab.shape, pixel)
+    light = brightness.WallShown.of_pixels(response, taken.dark, taken.bright, lab.shape, pixel)
     precession = tilt.fit_precession((_again(press) for press in presses[::every]), light)
     camera = io.CameraId("", lab.shape, np.dtype("uint8"))
     return io.Calibration(camera, taken, None, response, precession)
 
 
-def _again(press: Frames) -> turned.BallTurn:
+def _again(press: Frames) -> tilt_tracks.BallTurn:
     press.rewind()
-    return turned.read_ball(press, BALL / 2)
+    return tilt_tracks.read_ball(press, BALL / 2)
 
 
 def as_designed(lab: Lab, calibration: io.Calibration) -> tuple[io.Calibration, dict[str, Any]]:
@@ -199,13 +195,13 @@ def rows_of_the_gel(cache: Path) -> Iterator[Row]:
     plain = io.Calibration(io.CameraId("", lab.shape, np.dtype("uint8")), taken)
     learned = lab.pressed(scorer.ball(BALL), TRAVEL, 1, COMPLIANCE)
     onset = engine.reconstruct(learned, calibration=plain, fill=False)
-    gel = elastic.fit_gel([ball_onset(onset, learned, BALL / 2)]).gel
+    found = gel.fit_gel([ball_onset(onset, learned, BALL / 2)]).gel
     x, y = scorer.pixel_grid(lab.shape, lab.pixel_size)
     for take, size in enumerate((6.0, 10.0), 2):
         press = lab.pressed(scorer.ball(size), TRAVEL, take, COMPLIANCE)
         true = scorer.ball(size).height(x, y)
         maps = []
-        for calibration in (plain, replace(plain, gel=gel)):
+        for calibration in (plain, replace(plain, gel=found)):
             press.rewind()
             maps.append(engine.reconstruct(press, calibration=calibration, fill=False).height)
         where = np.isfinite(true) & np.isfinite(maps).all(axis=0)

@@ -8,13 +8,15 @@ import pytest
 from calibrations import a_calibration, a_lens, a_precession, a_response
 
 from mirrorskin import io
-from mirrorskin.view.calibration.figures import calibration_figures
-from mirrorskin.view.calibration.gel import draw_gel
-from mirrorskin.view.calibration.lens import draw_lens
-from mirrorskin.view.calibration.references import draw_references
-from mirrorskin.view.calibration.table import Row, calibration_table
-from mirrorskin.view.calibration.tilt import draw_precession
-from mirrorskin.view.calibration.zenith import draw_response
+from mirrorskin.view.calibration import (
+    calibration_figures,
+    draw_gel,
+    draw_lens,
+    draw_precession,
+    draw_references,
+    draw_response,
+)
+from mirrorskin.view.calibration_table import Row, calibration_table
 
 
 def titled(axes, start):

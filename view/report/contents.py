@@ -111,7 +111,7 @@ def _calibration_of(result: Result) -> list[tuple[str, ...]]:
     """Return the table of the calibration that a result carries, if there is one."""
     if result.calibration is None:
         return []
-    from mirrorskin.view.calibration.table import calibration_table
+    from mirrorskin.view.calibration_table import calibration_table
 
     return [row.cells() for row in calibration_table(result.calibration)]
 

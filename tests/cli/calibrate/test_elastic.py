@@ -9,8 +9,8 @@ from commands import run
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import taking
-from mirrorskin.engine.calibration import elastic
+from mirrorskin.cli.calibrate import inputs
+from mirrorskin.engine.calibration import gel as gel_module
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.twin import Axial, Camera, Sphere, Twin, Vertical
 
@@ -51,10 +51,10 @@ def quick(monkeypatch):
         assert sheet == 0.05
         sigma = {"threshold": 0.003, "compliance": 0.01, "travel_zero": 0.002}
         gel = io.Gel(0.21, 0.02, travel_zero=0.01, error=0.004, sigma=sigma)
-        places = (elastic.BallPlace(0.0, 0.0, 0.01, len(presses[0].travel)),)
-        return elastic.LearnedGel(gel, places, ("curvature",))
+        places = (gel_module.BallPlace(0.0, 0.0, 0.01, len(presses[0].travel)),)
+        return gel_module.LearnedGel(gel, places, ("curvature",))
 
-    monkeypatch.setattr(elastic, "fit_gel", fit)
+    monkeypatch.setattr(gel_module, "fit_gel", fit)
 
 
 def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
@@ -110,7 +110,7 @@ def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
         asked.extend(places)
         raise io.InputError("stop here")
 
-    monkeypatch.setattr(taking, "take", take)
+    monkeypatch.setattr(inputs, "take", take)
     Path("rig.toml").touch()
     words = ["--rig", "rig.toml", "--places", "2", "--press", "0.9mm", "--travel-step", "0.05mm"]
     ended = run("calibrate", "elastic", "--ball", "4mm", "-o", "cal.h5", *words)

@@ -10,7 +10,7 @@ from reference_frames import expose, pixels, rolled, source
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import taking
+from mirrorskin.cli.calibrate import inputs
 
 SHAPE = (21, 33)
 NOISE = 1.5
@@ -142,8 +142,8 @@ def test_a_rig_is_asked_for_the_dark_and_for_the_ball_at_each_place(scene, tmp_p
         asked.extend(places)
         return [scene / ("dark.h5" if place.name == "dark" else "ball.h5") for place in places]
 
-    monkeypatch.setattr(taking, "take", take)
-    monkeypatch.setattr(taking, "still_plan", lambda rig, travel=None: travel)
+    monkeypatch.setattr(inputs, "take", take)
+    monkeypatch.setattr(inputs, "still_plan", lambda rig, travel=None: travel)
     words = ("--rig", "rig.toml", "--rolled", "--press", "1.5mm", "--places", "3", "--frames", "7")
     ended = run("calibrate", "references", "-o", tmp_path / "cal.h5", *words)
     assert ended.code == 0, ended.said

@@ -14,10 +14,10 @@ from stacks import MadeUp, record
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import board, scale
-from mirrorskin.cli.calibrate.boards import board_of
-from mirrorskin.engine.calibration.lens.board import Charuco, Dots, paint_board
-from mirrorskin.engine.calibration.lens.fit import calibrate_lens
-from mirrorskin.io.calibration.sizes import size_facts
+from mirrorskin.cli.calibrate.board import board_of
+from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
+from mirrorskin.engine.calibration.lens import calibrate_lens
+from mirrorskin.io.calibration.source import size_facts
 
 CHARUCO = "charuco:7x5:2mm:1.5mm"
 TO = ["--board", CHARUCO, "-o", "cal.h5"]

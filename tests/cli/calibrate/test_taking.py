@@ -12,7 +12,7 @@ from served_rig import served_rig
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import taking
+from mirrorskin.cli.calibrate import inputs
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 
@@ -37,10 +37,10 @@ def test_each_place_is_asked_for_and_becomes_a_recording_beside_the_calibration(
 ):
     enter(2)
     places = [
-        taking.Place("dark", "take everything off", taking.still_plan(rig_file), frames=3),
-        taking.Place("ball-1", "put the ball at place 1 of 1", AxialPlan(0.5, 0.04, 1.0, np.pi / 2)),
+        inputs.Place("dark", "take everything off", inputs.still_plan(rig_file), frames=3),
+        inputs.Place("ball-1", "put the ball at place 1 of 1", AxialPlan(0.5, 0.04, 1.0, np.pi / 2)),
     ]
-    dark, ball = taking.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
+    dark, ball = inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
     said = capsys.readouterr().err
     assert said.splitlines() == [
         "take everything off, then press Enter",
@@ -85,9 +85,9 @@ def test_references_are_taken_until_their_noise_is_as_stated(rig_file, tmp_path,
 def test_nothing_moves_for_a_plan_beyond_the_rig(rig_file, tmp_path, enter, monkeypatch):
     monkeypatch.setattr(rigs, "open_rig", None)
     enter(1)
-    places = [taking.Place("ball", "put the ball in place", VerticalPlan(8.0, 9.0, 1.0))]
+    places = [inputs.Place("ball", "put the ball in place", VerticalPlan(8.0, 9.0, 1.0))]
     with pytest.raises(io.InputError, match="beyond the axis"):
-        taking.take(rig_file, tmp_path / "cal.h5", places)
+        inputs.take(rig_file, tmp_path / "cal.h5", places)
 
 
 def _record_flat_field(path):

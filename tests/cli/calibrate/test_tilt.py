@@ -12,7 +12,7 @@ from leaning_turns import EIGHTHS, Ball, Flat, pictures
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import taking
+from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.calibrate.tilt import _spoils
 from mirrorskin.hw.rig.plans import AxialPlan
 from mirrorskin.hw.twin import Axial, Body, Twin
@@ -172,7 +172,7 @@ def test_a_rig_is_asked_for_balls_at_several_places(monkeypatch):
         asked.extend(places)
         return [calibration.with_name("ball.h5")]
 
-    monkeypatch.setattr(taking, "take", take)
+    monkeypatch.setattr(inputs, "take", take)
     words = ("--rig", "rig.toml", "--press", "0.45mm", "--tilt", "2deg", "--places", "3", "--flat", "flat.h5")
     ended = tilt(*words)
 

@@ -10,8 +10,8 @@ from rotations import TILT
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.wall import zenith
-from mirrorskin.io.calibration.sizes import size_facts
+from mirrorskin.engine.calibration import wall
+from mirrorskin.io.calibration.source import size_facts
 
 SHAPE = (5, 7)
 PHASE = np.arange(8) * np.pi / 4
@@ -40,7 +40,7 @@ def fitted(monkeypatch):
         options["progress"](len(presses))
         return response()
 
-    monkeypatch.setattr(zenith, "fit_zenith", fit_zenith)
+    monkeypatch.setattr(wall, "fit_zenith", fit_zenith)
     return told
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from poses import leaning
 
-from mirrorskin.engine.calibration.ball.scene import BallView, ball_view, moved, rotations
+from mirrorskin.engine.calibration.ball import BallView, ball_view, moved, rotations
 
 RADIUS, DEPTH = 2.0, 0.6
 CENTRE = (1.0, -0.5, DEPTH - RADIUS)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from leaning_turns import EIGHTHS, Ball, circle, pictures
 
-from mirrorskin.engine.calibration.ball.scene import moved
-from mirrorskin.engine.calibration.ball.search import find_ball, follow_ball, smooth_turn
+from mirrorskin.engine.calibration.ball import find_ball, follow_ball, moved, smooth_turn
 from mirrorskin.hw.twin import Camera
 from mirrorskin.io import InputError
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from calibration_scenes import Lab, press_for
 
+from mirrorskin.engine.calibration import wall
 from mirrorskin.engine.calibration.check import check_ball
-from mirrorskin.engine.calibration.wall import zenith
 
 # What the recordings tell of the movement is wrong by so much.
 LAB = Lab(
@@ -33,7 +33,7 @@ THINGS = (
 @pytest.fixture(scope="module")
 def calibration():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(zenith, "_SAMPLES", 24_000)
+        patch.setattr(wall, "_SAMPLES", 24_000)
         return report.calibrate(LAB, apart=2.6, every=2)
 
 

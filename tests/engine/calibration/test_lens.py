@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mirrorskin.engine.calibration.lens.board import Charuco, Dots, paint_board
-from mirrorskin.engine.calibration.lens.fit import calibrate_lens, fit_lens, locate_marks
-from mirrorskin.engine.calibration.lens.marks import Marks
-from mirrorskin.engine.calibration.lens.symmetry import centre_marks
-from mirrorskin.engine.lens_model import picture_places
+from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
+from mirrorskin.engine.calibration.lens import calibrate_lens, fit_lens, locate_marks
+from mirrorskin.engine.calibration.marks import Marks, centre_marks
+from mirrorskin.engine.undistort import picture_places
 from mirrorskin.io import InputError
 
 CHARUCO, DOTS = Charuco(7, 5, 2.0, 1.5), Dots(11, 9, 1.0)

@@ -5,13 +5,13 @@ import pytest
 from reference_frames import expose
 from scipy.stats import norm
 
-from mirrorskin.engine.calibration.references.levels import (
+from mirrorskin.engine.calibration.levels import (
+    Moments,
     level_above,
     level_below,
     pool_variance,
     rounding_error,
 )
-from mirrorskin.engine.calibration.references.moments import Moments
 
 SHAPE = (61, 83)
 

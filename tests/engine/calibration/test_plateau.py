@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference_frames import rolled
 
-from mirrorskin.engine.calibration.references.plateau import find_plateau
+from mirrorskin.engine.calibration.levels import find_plateau
 
 PIXELS = (1, 4000)
 

@@ -5,8 +5,8 @@ import pytest
 from reference_frames import SCALES, TOPS, expose, pixels, rolled, source
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.references import measure as module
-from mirrorskin.engine.calibration.references.measure import measure_references, scale_top, take_references
+from mirrorskin.engine.calibration import references as module
+from mirrorskin.engine.calibration.references import measure_references, scale_top, take_references
 
 DTYPES = ["uint8", "uint16", "float32"]
 NOISE = 1.5

@@ -7,13 +7,24 @@ import pytest
 from leaning_turns import EIGHTHS, Ball, Flat, circle, pictures
 from poses import leaning
 
-from mirrorskin.engine.calibration.ball.scene import moved
-from mirrorskin.engine.calibration.ball.search import Followed
-from mirrorskin.engine.calibration.shown import LinearShown, WallShown
-from mirrorskin.engine.calibration.tilt.fit import fit_precession, study_precession, study_tracks
-from mirrorskin.engine.calibration.tilt.model import BallTrack, PlateTrack
-from mirrorskin.engine.calibration.tilt.tracks import Tilts, track_ball, track_plate
-from mirrorskin.engine.calibration.tilt.turned import BallTurn, PlateTurn, read_ball, read_plate
+from mirrorskin.engine.calibration.ball import Followed, moved
+from mirrorskin.engine.calibration.brightness import LinearShown, WallShown
+from mirrorskin.engine.calibration.tilt import (
+    BallTrack,
+    PlateTrack,
+    fit_precession,
+    study_precession,
+    study_tracks,
+)
+from mirrorskin.engine.calibration.tilt_tracks import (
+    BallTurn,
+    PlateTurn,
+    Tilts,
+    read_ball,
+    read_plate,
+    track_ball,
+    track_plate,
+)
 from mirrorskin.hw.twin import Axial, Body, Camera, Twin
 from mirrorskin.io import Header, InputError, Precession, WallResponse
 

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mirrorskin.engine.calibration.wall import curve
+from mirrorskin.engine.calibration.wall_model import (
+    CURVE_COEFFICIENTS,
+    curve_from_steps,
+    curve_means,
+    curve_roughness,
+    curve_values,
+)
 
 
 def gamma_coefficients(exponent):
     share = np.linspace(0, 1, 400)
     width = 1e-6
-    basis = curve.means(share - width, share + width)[1:-1]
+    basis = curve_means(share - width, share + width)[1:-1]
     return np.linalg.lstsq(basis, share[1:-1] ** exponent, rcond=None)[0]
 
 
@@ -20,15 +26,15 @@ def gamma_coefficients(exponent):
 def test_a_curve_of_steps_from_0_up_never_turns_back(rising):
     rng = np.random.default_rng(3)
     for _ in range(20):
-        steps = rng.exponential(size=curve.COEFFICIENTS) * (rng.random(curve.COEFFICIENTS) < 0.6)
-        light = curve.values(curve.from_steps(rising) @ steps, np.linspace(0, 1, 500))
+        steps = rng.exponential(size=CURVE_COEFFICIENTS) * (rng.random(CURVE_COEFFICIENTS) < 0.6)
+        light = curve_values(curve_from_steps(rising) @ steps, np.linspace(0, 1, 500))
         changes = np.diff(light) * (1 if rising else -1)
         assert (changes >= -1e-12).all()
         assert light.min() >= 0
 
 
 def test_a_curve_ends_at_the_ends_of_the_wall():
-    light = curve.values(np.ones(curve.COEFFICIENTS), [-0.1, -1e-9, 0, 0.5, 1, 1 + 1e-9])
+    light = curve_values(np.ones(CURVE_COEFFICIENTS), [-0.1, -1e-9, 0, 0.5, 1, 1 + 1e-9])
     np.testing.assert_allclose(light, [0, 0, 1, 1, 1, 0])
 
 
@@ -36,27 +42,27 @@ def test_a_curve_ends_at_the_ends_of_the_wall():
     ("low", "high"), [(0.2, 0.3), (-0.2, 0.1), (0.93, 1.4), (-1, 2), (1.1, 1.2), (0.5, 0.51)]
 )
 def test_means_over_intervals_are_those_of_quadrature(low, high):
-    coefficients = np.random.default_rng(5).random(curve.COEFFICIENTS)
+    coefficients = np.random.default_rng(5).random(CURVE_COEFFICIENTS)
     inside = sorted(
         {max(low, 0), *(knot for knot in np.linspace(0, 1, 9) if low < knot < high), min(high, 1)}
     )
     whole = sum(
-        quad(lambda share: float(curve.values(coefficients, share)), first, second)[0]
+        quad(lambda share: float(curve_values(coefficients, share)), first, second)[0]
         for first, second in itertools.pairwise(inside)
         if second > first
     )
-    found = curve.means([low], [high]) @ coefficients
+    found = curve_means([low], [high]) @ coefficients
     assert found[0] == pytest.approx(whole / (high - low), abs=1e-8)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.2, 1 / 2.2])
 def test_a_printed_gamma_is_such_a_curve(exponent):
     share = np.linspace(0.05, 1, 300)
-    light = curve.values(gamma_coefficients(exponent), share)
+    light = curve_values(gamma_coefficients(exponent), share)
     np.testing.assert_allclose(light, share**exponent, atol=6e-3 if exponent < 1 else 3e-4)
 
 
 def test_a_parabola_is_not_rough_and_a_step_is():
     parabola = gamma_coefficients(2.0)
-    assert np.abs(curve.roughness() @ parabola)[2:-2].max() < 1e-6
-    assert np.abs(curve.roughness() @ (np.arange(curve.COEFFICIENTS) > 5)).max() > 1
+    assert np.abs(curve_roughness() @ parabola)[2:-2].max() < 1e-6
+    assert np.abs(curve_roughness() @ (np.arange(CURVE_COEFFICIENTS) > 5)).max() > 1

@@ -5,15 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.calibration.ball.scene import BallView, ball_view
-from mirrorskin.engine.calibration.wall import curve
-from mirrorskin.engine.calibration.wall.fit import Prior, fit_wall, start_curve
-from mirrorskin.engine.calibration.wall.model import (
+from mirrorskin.engine.calibration.ball import BallView, ball_view
+from mirrorskin.engine.calibration.wall_fit import Prior, fit_wall, start_curve
+from mirrorskin.engine.calibration.wall_model import (
+    CURVE_COEFFICIENTS,
     SCALES,
     SENSOR,
     STEPS,
     Met,
     Samples,
+    curve_from_steps,
+    curve_values,
     down,
     light_of,
     linearise,
@@ -47,7 +49,7 @@ TRUE = {
 CENTRES = np.array(
     [[0.1, 0.2, -1.0], [3.8, 3.5, -1.1], [-3.7, 3.6, -0.9], [3.4, -3.9, -1.05], [-3.8, -3.5, -1.0]]
 )
-STEEP = np.full(curve.COEFFICIENTS, 0.1)
+STEEP = np.full(CURVE_COEFFICIENTS, 0.1)
 PHASE = np.arange(8) * np.pi / 4
 LEAN = math.radians(2.5) * np.stack([np.cos(PHASE), np.sin(PHASE)], axis=1)
 
@@ -90,12 +92,12 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
     z = rng.uniform(0, 1, 500)
     zenith, azimuth = np.radians(rng.uniform(15, 42, 500)), rng.uniform(-np.pi, np.pi, 500)
     normal = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
-    coefficients = curve.from_steps(True) @ STEEP
+    coefficients = curve_from_steps(True) @ STEEP
     found = light_of(Met(*(from_axis + z * lean), z, down(lean), normal), named, coefficients)
 
     whole = math.atan2(TRUE["rim"], TRUE["radius"])
     q = np.linspace(0.0, math.tan(whole / 2), 400)
-    light = curve.values(coefficients, 1 - 2 * np.arctan(q) / whole)
+    light = curve_values(coefficients, 1 - 2 * np.arctan(q) / whole)
     powers = np.polynomial.Polynomial.fit(q, light, 11).convert().coef
     wall, within = wall_light(
         np.stack([*from_axis, z, *lean]),
@@ -112,7 +114,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
 def test_what_is_beyond_the_wall_is_dark():
     level = Met(*np.zeros((3, 1)), np.array([[0.0], [0.0], [-1.0]]), np.array([[0.0], [0.0], [1.0]]))
     steep = level._replace(normal=np.array([[math.sin(0.9)], [0.0], [math.cos(0.9)]]))
-    coefficients = np.ones(curve.COEFFICIENTS)
+    coefficients = np.ones(CURVE_COEFFICIENTS)
     assert light_of(level, TRUE, coefficients)[0] == 0
     assert light_of(steep, TRUE, coefficients)[0] == 0
 
@@ -135,7 +137,7 @@ def test_slopes_are_those_of_differences():
 def known(sigma_share=1.0):
     mean = true_parameters()
     sigma = np.concatenate(
-        [[SCALES[name] for name in SENSOR], np.full(curve.COEFFICIENTS, np.inf), np.full(CENTRES.size, 0.5)]
+        [[SCALES[name] for name in SENSOR], np.full(CURVE_COEFFICIENTS, np.inf), np.full(CENTRES.size, 0.5)]
     )
     return Prior(mean, sigma_share * sigma)
 
@@ -154,8 +156,8 @@ def test_a_fit_finds_the_curve_and_where_the_wall_stands():
     assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.8
     assert abs(off[0]) < 0.3
     assert np.std(fit.residuals) == pytest.approx(2e-3, rel=0.1)
-    fitted = curve.values(curve.from_steps(True) @ fit.parameters[STEPS], np.linspace(0.1, 0.95, 40))
-    true = curve.values(curve.from_steps(True) @ STEEP, np.linspace(0.1, 0.95, 40))
+    fitted = curve_values(curve_from_steps(True) @ fit.parameters[STEPS], np.linspace(0.1, 0.95, 40))
+    true = curve_values(curve_from_steps(True) @ STEEP, np.linspace(0.1, 0.95, 40))
     np.testing.assert_allclose(fitted, true, atol=0.02)
 
 

@@ -7,13 +7,20 @@ import pytest
 from calibration_scenes import Frames
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.wall import curve
-from mirrorskin.engine.calibration.wall.fit import Prior
-from mirrorskin.engine.calibration.wall.model import SENSOR, Met, Samples, down, light_of, look, predict
-from mirrorskin.engine.calibration.wall.response import make_response
-from mirrorskin.engine.calibration.wall.samples import BallPress, join
-from mirrorskin.engine.calibration.wall.touch import fit_touch
-from mirrorskin.engine.calibration.wall.window import threshold_zenith
+from mirrorskin.engine.calibration.wall import BallPress, join
+from mirrorskin.engine.calibration.wall_fit import Prior, fit_touch
+from mirrorskin.engine.calibration.wall_model import (
+    CURVE_COEFFICIENTS,
+    SENSOR,
+    Met,
+    Samples,
+    curve_means,
+    down,
+    light_of,
+    look,
+    predict,
+)
+from mirrorskin.engine.calibration.wall_response import make_response, threshold_zenith
 from mirrorskin.kernels.response import wall_light
 
 NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
@@ -40,7 +47,7 @@ PICTURE = Frames("place-1", np.zeros((1, 12, 12), np.uint8), io.Header("axial", 
 
 def coefficients_of(exponent):
     share = np.linspace(0, 1, 400)
-    basis = curve.means(share - 1e-6, share + 1e-6)[1:-1]
+    basis = curve_means(share - 1e-6, share + 1e-6)[1:-1]
     return np.maximum.accumulate(
         np.maximum(np.linalg.lstsq(basis, share[1:-1] ** exponent, rcond=None)[0], 0)
     )
@@ -74,7 +81,7 @@ def some_presses(coefficients, balls=(2.0,) * 5, touched=1.0, each=720):
 
 def nominal(uniform=False):
     mean, sigma = np.array([NOMINAL[name] for name in SENSOR]).T
-    steps, free = np.zeros(curve.COEFFICIENTS), np.full(curve.COEFFICIENTS, np.inf)
+    steps, free = np.zeros(CURVE_COEFFICIENTS), np.full(CURVE_COEFFICIENTS, np.inf)
     if uniform:
         steps[0], free[1:] = 1.0, 0.0
     start = (CENTRES + OFF).ravel()
@@ -135,7 +142,7 @@ def test_a_gel_that_leaves_the_ball_early_teaches_nothing_wrong():
 
 
 def test_a_uniform_wall_tells_where_light_begins():
-    response = respond(some_presses(np.full(curve.COEFFICIENTS, 0.95), each=480), uniform=True)
+    response = respond(some_presses(np.full(CURVE_COEFFICIENTS, 0.95), each=480), uniform=True)
     assert response.curve == pytest.approx([0.95], abs=0.01)
     assert np.isnan(response.azimuth_sigma).all()
     assert np.nanmax(np.degrees(response.zenith_sigma)) < 0.2
@@ -145,7 +152,7 @@ def test_a_uniform_wall_tells_where_light_begins():
 
 def test_a_wall_without_a_print_is_told_from_one_with():
     with pytest.raises(io.InputError, match="give --pattern uniform"):
-        respond(some_presses(np.full(curve.COEFFICIENTS, 0.95), each=400))
+        respond(some_presses(np.full(CURVE_COEFFICIENTS, 0.95), each=400))
 
 
 def test_a_press_of_another_ball_is_named():

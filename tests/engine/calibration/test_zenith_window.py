@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.calibration.wall.window import full_light, threshold_zenith
+from mirrorskin.engine.calibration.wall_response import full_light, threshold_zenith
 from mirrorskin.hw.twin import Body, visible_zenith
 from mirrorskin.io import WallResponse
 

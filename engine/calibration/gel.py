@@ -1,22 +1,195 @@
-"""What a gel does, learned from balls: when it turns pixels light, and how far the stage gives way."""
+"""How the gel gives way, learned from presses of a ball of known size."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import optimize
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, optimize
 
-from mirrorskin.engine.calibration.ball.contact import sphere_slope, sphere_travel
-from mirrorskin.engine.calibration.ball.onset import BallOnset
+from mirrorskin.engine.integration.inputs import check_pixel_size
 from mirrorskin.engine.press.elastic import threshold_at
-from mirrorskin.io import Gel, InputError
+from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 
 Doubles = NDArray[np.float64]
+
+_NODES = 24
+_THINNEST = 1e-3  # radii of the ball: the depth of a mirror on the very surface
+
+
+def sphere_travel(touch: ArrayLike, radius: float, compliance: float = 0.0) -> Doubles:
+    """Return how far a ball must be pressed for a touch of some radius, mm.
+
+    The depth is ``a artanh(a / R)``, and the force over Young's modulus ``4/3 ((a^2 + R^2) artanh(a / R) -
+    a R)``, by which the stage gives way as well (Sneddon, Int. J. Eng. Sci. 3, 1965, 47-57, at Poisson ratio
+    0.5).
+
+    Parameters
+    ----------
+    touch : array_like
+        Radius of the touch a, mm, below the ball's.
+    radius : float
+        Of the ball R, mm.
+    compliance : float
+        Of the stage, 1/mm; see `Gel`.
+    """
+    a = np.asarray(touch, np.float64)
+    steep = np.arctanh(a / radius)
+    return np.asarray(a * steep + compliance * 4 / 3 * ((a**2 + radius**2) * steep - a * radius))
+
+
+def sphere_slope(distance: ArrayLike, touch: ArrayLike, radius: float, sheet: float = 0.0) -> Doubles:
+    """Return how steep the mirror is under a ball and around it.
+
+    A ball's press is one of flat punches of growing radius x, each pressed on by g'(x) dx, g(x) = x
+    artanh(x / R). Of a punch pressed by 1 the harmonic continuation of the surface's displacement to the
+    depth z is ::
+
+        U = 2 / pi arcsin(2 x / (sqrt((r - x)^2 + z^2) + sqrt((r + x)^2 + z^2)))
+
+    and the displacement of an incompressible body is U - z dU/dz (Johnson, Contact Mechanics, 1985, 3.8).
+
+    Parameters
+    ----------
+    distance : array_like, (n,)
+        From the ball's axis r, mm.
+    touch : array_like, (n,)
+        Radius of the touch a, mm, below the ball's.
+    radius : float
+        Of the ball R, mm.
+    sheet : float
+        How deep the mirror lies below the surface z, mm.
+    """
+    r, a = np.broadcast_arrays(np.asarray(distance, np.float64), np.asarray(touch, np.float64))
+    depth = max(sheet, _THINNEST * radius)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    share, weights = (nodes + 1) / 2, weights / 2
+    near, rest = np.minimum(r, a)[..., np.newaxis], np.maximum(a - r, 0.0)[..., np.newaxis]
+    # Punches about as wide as the place is far make its slope: nodes crowd there.
+    x = np.concatenate([near - near * share**2, near + rest * share**2], axis=-1)
+    width = np.concatenate([2 * near * share * weights, 2 * rest * share * weights], axis=-1)
+    part = x / radius
+    pressed = width * (np.arctanh(part) + part / (1 - part**2))
+    delay = depth / 2
+    below, here, above = (_punch_slope(r[..., np.newaxis], x, depth + step) for step in (delay, 0.0, -delay))
+    return np.asarray(np.sum(pressed * (here - depth * (below - above) / (2 * delay)), axis=-1))
+
+
+def _punch_slope(r: Doubles, x: Doubles, z: float) -> Doubles:
+    """Return -dU/dr of a punch of radius x, 1/mm."""
+    inner, outer = np.hypot(r - x, z), np.hypot(r + x, z)
+    mean = (inner + outer) / 2
+    rise = ((r - x) / inner + (r + x) / outer) / 2
+    return np.asarray(2 / np.pi * x * rise / (mean * np.sqrt(np.maximum(mean**2 - x**2, 0.0))))
+
+
+_LIT, _DARK = 1, 2  # of an onset's status
+_RIM = 0.1  # square of a rim pixel's error, by its circumference
+_MOST = 600  # pixels of a press that are looked at
+_FEWEST = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallOnset:
+    """When a ball pressed into the sheet turned pixels light.
+
+    Attributes
+    ----------
+    travel : ndarray, (n,), float64
+        At the onset of each pixel that turned light, mm.
+    sigma : ndarray, (n,), float64
+        Its standard deviation, mm.
+    x, y : ndarray, (n,), float64
+        The pixel's place, mm.
+    radius : float
+        Of the ball, mm.
+    inner, inner_sigma : float
+        Radius of the ball's dark top, mm, and its standard error; NaN where it was not seen whole.
+    """
+
+    travel: Doubles
+    sigma: Doubles
+    x: Doubles
+    y: Doubles
+    radius: float
+    inner: float = math.nan
+    inner_sigma: float = math.nan
+
+
+def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
+    """Take from the reconstruction of a ball's press, not corrected, when its pixels turned light.
+
+    Parameters
+    ----------
+    result : Result
+        With height, its sigma and status.
+    source : Source
+        Which tells the pixels' size.
+    radius : float
+        Of the ball, mm.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        It is no press, has no pixel size, or less than 50 pixels turned light.
+    """
+    if result.status is None or result.height is None or result.height_sigma is None:
+        raise InputError(f"{source.name} is no press: give a vertical recording of a ball")
+    if source.header.pixel_size is None:
+        raise InputError(f"{source.name} has no pixel size: calibrate the scale first, or give --pixel-size")
+    return ball_pixels(
+        result.height, result.height_sigma, result.status, source.header.pixel_size, radius, source.name
+    )
+
+
+def ball_pixels(
+    height: ArrayLike,
+    sigma: ArrayLike,
+    status: ArrayLike,
+    pixel_size: ArrayLike,
+    radius: float,
+    name: str = "the press",
+) -> BallOnset:
+    """Take from maps of a ball's press, as ``find_onset`` gives them, when its pixels turned light.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Less than 50 pixels turned light, or the radius cannot be.
+    """
+    if not (math.isfinite(radius) and radius > 0):
+        raise InputError(f"a ball of radius {radius:g} mm cannot be: give one above 0")
+    heights, sigmas = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
+    lit = np.flatnonzero((np.asarray(status) == _LIT) & np.isfinite(heights))
+    if len(lit) < _FEWEST:
+        raise InputError(
+            f"{name}: {len(lit)} pixels turned light, too few to learn from: press the ball deeper"
+        )
+    some = lit[:: math.ceil(len(lit) / _MOST)]
+    size = check_pixel_size(pixel_size)
+    x, y = np.meshgrid(*pixel_axes(heights.shape, size))
+    parts = (-heights, np.broadcast_to(sigmas, heights.shape), x, y)
+    travel, spread, across, up = (part.ravel()[some].astype(np.float64) for part in parts)
+    return BallOnset(travel, spread, across, up, radius, *_dark_top(np.asarray(status), size))
+
+
+def _dark_top(status: NDArray[Any], size: tuple[float, float]) -> tuple[float, float]:
+    """Return the radius of the largest dark patch that light surrounds, and its standard error, mm."""
+    lit = ndimage.binary_closing(np.pad(status == _LIT, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
+    patches, count = ndimage.label(ndimage.binary_fill_holes(lit) & ~lit)
+    if count == 0:
+        return math.nan, math.nan
+    largest = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
+    area = float(np.count_nonzero(largest & (status == _DARK))) * size[0] * size[1]
+    radius = math.sqrt(area / math.pi)
+    # The rim falls at random within a pixel, in as many places as it has pixels.
+    pixel = max(size)
+    return radius, pixel * math.sqrt(_RIM * pixel / max(radius, pixel))
+
 
 _INDEPENDENT = 200  # pixels of a press that err each for itself: neighbours err alike
 _AROUND = 24  # directions in which a dark top's rim is looked at

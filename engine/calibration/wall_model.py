@@ -1,7 +1,7 @@
-"""What pixels see of balls under the lit wall, and how that changes with what is to be found out.
+"""How much light a printed pattern lets through, as a monotone curve, and what scatter makes of it.
 
-The formula is that of `mirrorskin.kernels.response`, but for the scatter: here a ray is spread evenly over
-the angles that the sheet's flakes turn it by, and what passes over the rim or below the rest plane is dark.
+The place on the wall is told by a share u: 0 at the rim and 1 at the rest plane, evenly in the elevation at
+which the sheet's centre sees it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,77 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
 
-from mirrorskin.engine.calibration.ball.scene import rotations
-from mirrorskin.engine.calibration.wall import curve
+from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.kernels.response import reflect, way_to_wall
 
 Doubles = NDArray[np.float64]
+
+_PIECES = 8  # a gamma of 2.2 is met within 2e-4 of full light
+_CUBIC = 3
+CURVE_COEFFICIENTS = _PIECES + _CUBIC
+"""Of a curve, which is a cubic spline with evenly spaced knots on 0 to 1, and 0 beyond."""
+
+_KNOTS = np.pad(np.linspace(0, 1, _PIECES + 1), _CUBIC, "edge")
+
+
+def curve_values(coefficients: ArrayLike, share: ArrayLike) -> Doubles:
+    """Return the curve at shares u, (n,); 0 outside 0 to 1."""
+    share = np.asarray(share, np.float64)
+    spline = BSpline(_KNOTS, np.asarray(coefficients, np.float64), _CUBIC)
+    return np.where((share >= 0) & (share <= 1), spline(np.clip(share, 0, 1)), 0.0)
+
+
+def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
+    """Return the matrix that makes of coefficients the curve's means over intervals, (n, CURVE_COEFFICIENTS).
+
+    With G, the antiderivative, they are ``(G(high) - G(low)) / (high - low)``: what a mirror shows that
+    spreads each ray evenly over the interval.
+
+    Parameters
+    ----------
+    low, high : array_like, (n,)
+        Ends of the intervals, low < high, which may lie outside 0 to 1.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    grown = _antiderivatives(np.clip(high, 0, 1)) - _antiderivatives(np.clip(low, 0, 1))
+    return np.asarray(grown / (high - low)[:, np.newaxis])
+
+
+def curve_from_steps(rising: bool) -> Doubles:
+    """Return the square matrix that makes coefficients of steps.
+
+    The first step is the lower end of the curve; if the others are at least 0, the coefficients never turn
+    back, and so neither does the curve.
+
+    Parameters
+    ----------
+    rising : bool
+        Whether light grows from the rim down to the rest plane.
+    """
+    matrix = np.tril(np.ones((CURVE_COEFFICIENTS, CURVE_COEFFICIENTS)))
+    return matrix if rising else matrix[::-1]
+
+
+def curve_roughness() -> Doubles:
+    """Return the matrix of the coefficients' third differences, which are 0 for a parabola."""
+    return np.diff(np.eye(CURVE_COEFFICIENTS), 3, axis=0)
+
+
+def _antiderivatives(share: Doubles) -> Doubles:
+    """Return the antiderivative of each basis function, (n, CURVE_COEFFICIENTS).
+
+    That of a cubic spline of coefficients c is a spline of fourth degree, whose coefficients are the running
+    sums of c_i (t[i+4] - t[i]) / 4 (de Boor, A Practical Guide to Splines, chapter X).
+    """
+    order = _CUBIC + 1
+    widths = (_KNOTS[order:] - _KNOTS[:-order]) / order
+    sums = np.vstack([np.zeros(CURVE_COEFFICIENTS), np.tril(np.tile(widths, (CURVE_COEFFICIENTS, 1)))])
+    basis = BSpline.design_matrix(share, np.pad(_KNOTS, 1, "edge"), order)
+    return np.asarray(basis @ sums)
+
 
 SENSOR = (
     *("radius", "rim", "axis_x", "axis_y", "sight_0", "sight_2", "scatter"),
@@ -26,7 +90,7 @@ SENSOR = (
 )
 """Parameters of the sensor, in their order in a fit; the curve's steps and the balls' centres follow."""
 
-STEPS = slice(len(SENSOR), len(SENSOR) + curve.COEFFICIENTS)
+STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 """Where the curve's steps are among the parameters; the balls' centres, x, y and z each, follow."""
 
 _BENT = len(SENSOR) - 7  # parameters that change which way a ray goes, and not only its light
@@ -52,7 +116,7 @@ class Samples:
     press : ndarray, (poses,), intp
         Press that each frame belongs to.
     lean : ndarray, (poses, 2), float64
-        Of the body in each frame, radians; see `mirrorskin.engine.calibration.ball.scene.rotations`.
+        Of the body in each frame, radians; see `mirrorskin.engine.calibration.ball.rotations`.
     ball : float
         Radius of the ball, mm.
     """
@@ -161,14 +225,14 @@ def light_of(met: Met, named: Mapping[str, float], coefficients: Doubles) -> Dou
     """Return the light of mirrors, (N,): shares of each pixel's own full light."""
     wall = reach_wall(met, named)
     return np.asarray(
-        _factor(met, wall, named) * (np.einsum("nk,k->n", curve.means(wall.low, wall.high), coefficients))
+        _factor(met, wall, named) * (np.einsum("nk,k->n", curve_means(wall.low, wall.high), coefficients))
     )
 
 
 def predict(samples: Samples, parameters: Doubles, rising: bool) -> Doubles:
     """Return the light that samples should have, (N,)."""
     named, steps, centres = split(parameters)
-    return light_of(meet_balls(samples, named, centres), named, curve.from_steps(rising) @ steps)
+    return light_of(meet_balls(samples, named, centres), named, curve_from_steps(rising) @ steps)
 
 
 def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doubles, Doubles]:
@@ -179,11 +243,11 @@ def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doub
     named, steps, centres = split(parameters)
     met = meet_balls(samples, named, centres)
     wall = reach_wall(met, named)
-    basis, coefficients = curve.means(wall.low, wall.high), curve.from_steps(rising) @ steps
+    basis, coefficients = curve_means(wall.low, wall.high), curve_from_steps(rising) @ steps
     level, factor = np.einsum("nk,k->n", basis, coefficients), _factor(met, wall, named)
     per_width = factor / (wall.high - wall.low)
-    by_high = per_width * (curve.values(coefficients, wall.high) - level)
-    by_low = per_width * (level - curve.values(coefficients, wall.low))
+    by_high = per_width * (curve_values(coefficients, wall.high) - level)
+    by_low = per_width * (level - curve_values(coefficients, wall.low))
 
     def change(step: float, bent: Mapping[str, float], there: Met) -> Doubles:
         other = reach_wall(there, bent)
@@ -200,7 +264,7 @@ def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doub
     lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
     slopes[:, _BENT : _BENT + 2] = (factor * level / lamp * wall.azimuth).T
     slopes[:, _BENT + 2 : STEPS.start] = (lamp * level * shade_terms(met, named["radius"])).T
-    slopes[:, STEPS] = factor[:, np.newaxis] * np.einsum("nk,ks->ns", basis, curve.from_steps(rising))
+    slopes[:, STEPS] = factor[:, np.newaxis] * np.einsum("nk,ks->ns", basis, curve_from_steps(rising))
     own = STEPS.stop + 3 * samples.press[samples.pose]
     for axis, moved in enumerate(_SMALL * np.eye(3)):
         there = meet_balls(samples, named, centres + moved)

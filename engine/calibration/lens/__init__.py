@@ -1,1 +1,0 @@
-"""Millimetres per pixel and the lens from pictures of a board."""

@@ -1,1 +1,0 @@
-"""Dark and bright references from recordings, with their errors, and the pixels that are defective."""

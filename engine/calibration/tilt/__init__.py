@@ -1,1 +1,0 @@
-"""How the body goes round, and about what, from where balls seem to be."""

@@ -1,1 +1,0 @@
-"""Brightness by place and normal, from presses of a ball."""

@@ -1,1 +1,0 @@
-"""Pictures of a calibration, part by part."""
