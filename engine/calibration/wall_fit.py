@@ -1,17 +1,18 @@
-"""Where the lit wall stands and what is printed on it, fitted to the light of balls."""
+"""The lit wall's place and print, fitted to the light of balls; and the samples of that light."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.optimize import lsq_linear, nnls
 
-from mirrorskin.engine.calibration.ball import moved
-from mirrorskin.engine.calibration.wall import BallPress
+from mirrorskin.engine.calibration.ball import find_ball, moved
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
@@ -20,13 +21,244 @@ from mirrorskin.engine.calibration.wall_model import (
     curve_from_steps,
     curve_roughness,
     linearise,
-    meet_balls,
     predict,
-    split,
 )
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
 
 Doubles = NDArray[np.float64]
+
+_STEEPEST = math.radians(50.0)  # zenith on the ball up to which samples are taken
+_BEYOND = 1.35  # times the outline of the light up to which they are, too
+_PLACE = 1.0  # mm by which the picture alone may misplace a ball
+_DEPTH = 0.2  # mm by which a travel that was told may be off from how deep the ball is pressed
+_LEAST = 20  # samples of a frame
+_FRAMES = 16  # of a recording that are held at most
+_CLIPPED = 64  # samples at one value of the form 2^n - 1 from which on it is the camera's end
+_FAR = 30.0  # mm of the pivot where nothing is told of it
+_NEAR = 3.0  # mm by which a pivot may be off that was told, not calibrated
+_OFFSET = math.radians(2.0)  # by which a phase may be off that was calibrated
+_ANY = math.radians(45.0)  # by which it may be off that a recording tells
+_DOUBT = 0.02  # of these, by which calibrated ones may be off at least
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallPress:
+    """An axial recording of a ball, read.
+
+    Attributes
+    ----------
+    name : str
+        Of its source.
+    light : ndarray, (M,), float64
+    place : ndarray, (2, M), float64
+        Of each sample's pixel on the rest plane, mm.
+    frame : ndarray, (M,), intp
+    lean : ndarray, (T, 2), float64
+        Radians, of each frame.
+    centre : ndarray, (3,), float64
+        Of the ball in the mean pose, mm: where the picture has it, as deep as the recording says if that can
+        be.
+    centre_sigma : ndarray, (3,), float64
+        By how much that may be off, mm.
+    outline : float
+        Radius of the circle in which light is seen, mm.
+    pivot : (float, float, float)
+        What is known of the pivot, mm.
+    """
+
+    name: str
+    light: Doubles
+    place: Doubles
+    frame: NDArray[np.intp]
+    lean: Doubles
+    centre: Doubles
+    centre_sigma: Doubles
+    outline: float
+    pivot: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Pivot:
+    """What the body turns about, mm, and the standard errors of that and of the phases' zero."""
+
+    place: tuple[float, float, float]
+    sigma: tuple[float, ...]
+    phase_sigma: float
+
+
+def read_press(
+    source: Source,
+    ball: float,
+    references: References | None,
+    precession: Precession | None,
+    count: int,
+) -> BallPress:
+    """Read a recording once, find the ball, and keep some samples of its neighbourhood.
+
+    Parameters
+    ----------
+    source : Source
+        An axial recording; its frames are held while the ball is looked for.
+    ball : float
+        Radius, mm.
+    references : References, optional
+        Else those of the source's header.
+    precession : Precession, optional
+        Else a circle of the header's tilt.
+    count : int
+        Samples to keep, about.
+
+    Raises
+    ------
+    InputError
+        The recording is of another motion, lacks what is needed, or shows no ball.
+    """
+    levels, pixel_size = _levels(source, references), _pixel_size(source)
+    pivot = pivot_of(source, precession).place
+    frames, phase = _read(source)
+    lean = _circle(source, phase) if precession is None else precession.lean(phase)
+    try:
+        found = find_ball(frames, phase, pixel_size, ball)
+    except InputError as error:
+        raise InputError(f"{source.name}: {error}") from None
+    centre, sigma = np.array([found.x, found.y, found.depth - ball]), np.full(3, _PLACE)
+    outline = math.sqrt(max(ball**2 - centre[2] ** 2, 1e-6))
+    press = source.header.press
+    if press is not None and abs(press - found.depth) < _PLACE:
+        centre[2], sigma[2] = press - ball, _DEPTH
+    reach = min(ball * math.sin(_STEEPEST), _BEYOND * outline)
+    places = np.stack([axis.ravel() for axis in np.meshgrid(*pixel_axes(frames.shape[1:], pixel_size))])
+    chosen = _choose(frames, levels, places, moved(centre, lean, pivot), reach, count)
+    total = sum(map(len, chosen))
+    if total < _LEAST * len(frames):
+        raise InputError(
+            f"{source.name}: only {total} samples of the ball have references and are not at the ends of the"
+            " camera's range: expose less, or take the references anew"
+        )
+    dark, bright = (level.ravel() for level in levels)
+    light = [
+        (frame.ravel()[some] - dark[some]) / (bright[some] - dark[some])
+        for frame, some in zip(frames, chosen, strict=True)
+    ]
+    frame_of = np.repeat(np.arange(len(frames)), [len(some) for some in chosen])
+    place = places[:, np.concatenate(chosen)]
+    return BallPress(source.name, np.concatenate(light), place, frame_of, lean, centre, sigma, outline, pivot)
+
+
+def _choose(
+    frames: NDArray[Any],
+    levels: tuple[Doubles, Doubles],
+    places: Doubles,
+    middle: Doubles,
+    reach: float,
+    count: int,
+) -> list[NDArray[np.intp]]:
+    """Return the numbers of some pixels of each frame about the ball's middle that can be used."""
+    span = (levels[1] - levels[0]).ravel()
+    usable = np.isfinite(span) & (span > 0)
+    clipped = _ends(frames)
+    generator = np.random.default_rng(0)  # the same samples in every run
+    chosen = []
+    for frame, (x, y, _) in zip(frames.reshape(len(frames), -1), middle, strict=True):
+        near = usable & ((places[0] - x) ** 2 + (places[1] - y) ** 2 <= reach**2)
+        inside = np.flatnonzero(near & np.isfinite(frame) & ~np.isin(frame, clipped))
+        some = generator.choice(inside, min(max(1, count // len(frames)), len(inside)), replace=False)
+        chosen.append(np.sort(some))
+    return chosen
+
+
+def pivot_of(source: Source, precession: Precession | None) -> Pivot:
+    """Return what is known of the pivot: of the calibration, else of the recording, else not much."""
+    if precession is not None and np.isfinite(precession.pivot).all():
+        sigma = tuple(_error(precession, f"pivot_{axis}", _NEAR) for axis in "xyz")
+        return Pivot(precession.pivot, sigma, _error(precession, "phase_offset", _OFFSET))
+    offset = _ANY if precession is None else _error(precession, "phase_offset", _OFFSET)
+    pivot = source.header.pivot
+    if pivot is None:
+        return Pivot((0.0, 0.0, 0.0), (_FAR,) * 3, offset)
+    return Pivot(pivot, (_NEAR,) * 3, offset)
+
+
+def _error(precession: Precession, name: str, unknown: float) -> float:
+    """Return a standard error that a calibration tells, and not quite to the letter."""
+    told = precession.sigma.get(name, math.nan)
+    return math.hypot(told, _DOUBT * unknown) if math.isfinite(told) else unknown
+
+
+def join(presses: Sequence[BallPress], ball: float) -> Samples:
+    """Return the samples of all presses."""
+    frames = np.array([len(press.lean) for press in presses])
+    first = np.cumsum(frames) - frames
+    return Samples(
+        np.concatenate([press.light for press in presses]),
+        np.concatenate([press.place for press in presses], axis=1),
+        np.concatenate([press.frame + start for press, start in zip(presses, first, strict=True)]),
+        np.repeat(np.arange(len(presses)), frames),
+        np.concatenate([press.lean for press in presses]),
+        ball,
+    )
+
+
+def _levels(source: Source, references: References | None) -> tuple[Doubles, Doubles]:
+    header = source.header
+    dark, bright = header.dark, header.bright
+    if references is not None:
+        dark, bright = references.dark, references.bright
+    if dark is None or bright is None:
+        raise InputError(
+            f"{source.name}: there are no dark and bright references: make them first with"
+            " 'mirrorskin calibrate references'"
+        )
+    if dark.shape != source.shape[1:] or bright.shape != source.shape[1:]:
+        raise InputError(
+            f"{source.name}: frames of {source.shape[1:]} pixels do not fit references of {dark.shape}:"
+            " take both with the same region of the camera"
+        )
+    return np.asarray(dark, np.float64), np.asarray(bright, np.float64)
+
+
+def _pixel_size(source: Source) -> tuple[float, float]:
+    if source.header.pixel_size is None:
+        raise InputError(f"{source.name}: its pixel size is not told: give it, as in --pixel-size 0.03mm")
+    return source.header.pixel_size
+
+
+def _circle(source: Source, phase: Doubles) -> Doubles:
+    if source.header.tilt is None:
+        raise InputError(f"{source.name}: the tilt of its rotation is not told: give it, as in --tilt 2.5deg")
+    return source.header.tilt * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+
+
+def _read(source: Source) -> tuple[NDArray[Any], Doubles]:
+    """Return the frames and their phases; evenly spread ones of a recording of many."""
+    if source.motion != "axial":
+        raise InputError(f"{source.name}: its motion is {source.motion}: take an axial one of the ball")
+    if source.rewindable:
+        source.rewind()
+    total = source.shape[0]
+    wanted = np.unique(np.linspace(0, total - 1, min(total, _FRAMES)).round().astype(np.intp))
+    frames, phase = np.empty((len(wanted), *source.shape[1:]), source.dtype), np.zeros(len(wanted))
+    room, kept = np.empty((min(total, _FRAMES), *source.shape[1:]), source.dtype), 0
+    while (block := source.read(room)) is not None:
+        if block.phase is None:
+            raise InputError(f"{source.name}: its phases are not told: give --phase-step, as in 45deg")
+        for number in range(len(block.frames)):
+            if kept < len(wanted) and block.index + number >= wanted[kept]:
+                frames[kept], phase[kept] = block.frames[number], block.phase[number]
+                kept += 1
+    return frames[:kept], phase[:kept]
+
+
+def _ends(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return the counts at which samples may be clipped: 0, and the most that so many bits can tell."""
+    if frames.dtype.kind == "f":
+        return np.empty(0, frames.dtype)
+    most = int(frames.max())
+    ends = [0, int(np.iinfo(frames.dtype).max)]
+    if most & (most + 1) == 0 and np.count_nonzero(frames == most) >= _CLIPPED:
+        ends.append(most)
+    return np.array(ends, frames.dtype)
+
 
 _OUTLIER = 3.0  # times the noise beyond which a sample counts less
 _ROUGH = 0.05  # of full light: third differences of the curve's coefficients that are likely
@@ -212,190 +444,3 @@ class _Problem:
 def _weight(left: Doubles) -> Doubles:
     """Return how much samples count by how far they are off, in standard deviations."""
     return np.asarray(1 / (1 + (left / _OUTLIER) ** 2))
-
-
-Mask = NDArray[np.bool_]
-Numbers = NDArray[np.intp]
-
-_FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
-_SETTLES = {_FEW: 1e-4, _MANY: 3e-6}  # change of the sum of squares at which these end, as a share
-_COARSE = 0.1  # of full light: noise that the first fit reckons with, so that it finds its way
-_QUIET = 1e-3  # of full light, which the model may always be off
-_INNER = 0.7  # of the light's outline, within which the ball is surely touched
-_RING = 0.05  # of the outline: width of the rings by which that grows
-_AT_ONCE = 2  # rings that are tried at a time
-_SETTLED = 1.2  # times the usual spread that a ring may show
-_ASIDE = 0.3  # times the usual spread that its median may be off
-_CHANCE = 4.0  # over the root of the ring's samples, by which it may be more by chance
-_BAD = 2.0  # times the other presses' noise that one may show
-_STRAIN = 1.5  # standard deviations, root mean square, by which the sensor may be unlikely
-_TOUCHED = 0.02  # mm above the rest plane
-_MODEST = 0.01  # of full light: noise that such a fit reckons with
-_LEAST = 30  # samples that a ring is judged by
-_BINS = 6  # of brightness, in which noise is told
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Touch:
-    """A fit, the samples of touched places that went into it, and their noise, (n,), as shares of light."""
-
-    fit: WallFit
-    samples: Samples
-    noise: Doubles
-
-
-def fit_touch(samples: Samples, presses: Sequence[BallPress], prior: Prior) -> Touch:
-    """Fit the wall to samples where the sheet lies on the ball.
-
-    From well within the light's outline on, each press grows by rings as long as these can be fitted as well
-    as those within: a gel leaves the ball earlier than a sheet that takes any shape. Where a ring could not,
-    the one before it is left out as well.
-
-    Raises
-    ------
-    InputError
-        A press does not fit to the others.
-    """
-    rings = _Rings(samples, presses)
-    taken = np.full(len(presses), round(_INNER / _RING))
-    fit = _begin(samples[_some(rings.within(taken), _FEW)], prior)
-    prior = Prior(prior.mean, prior.sigma, fit.rising)
-    noise = _noise(samples, fit, rings.within(taken))
-    touch, off = _refit(samples, noise, rings.within(taken), prior, fit, _FEW)
-    noise = _noise(samples, touch.fit, rings.within(taken))
-    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
-    grows = np.ones(len(presses), bool)
-    while grows.any():
-        touch, off = _refit(samples, noise, rings.within(taken + _AT_ONCE * grows), prior, touch.fit, _FEW)
-        for press in np.flatnonzero(grows):
-            own = (rings.press == press) & np.isfinite(off)
-            taken[press], grows[press] = _grow(off[own], rings.number[own], int(taken[press]))
-    touch, off = _refit(samples, noise, rings.within(taken), prior, touch.fit, _MANY)
-    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
-    return touch
-
-
-class _Rings:
-    """In which ring about where its ball was found each sample lies, and of which press it is."""
-
-    def __init__(self, samples: Samples, presses: Sequence[BallPress]) -> None:
-        middle = np.concatenate([moved(press.centre, press.lean, press.pivot) for press in presses])
-        self.press: Numbers = samples.press[samples.pose]
-        outline = np.array([press.outline for press in presses])[self.press]
-        away = np.hypot(*(samples.place - middle[samples.pose, :2].T)) / outline
-        self.number: Numbers = np.floor(away / _RING).astype(np.intp)
-
-    def within(self, rings: Numbers) -> Mask:
-        """Return which samples lie within so many rings of their press."""
-        return np.asarray(self.number < rings[self.press])
-
-
-def _begin(samples: Samples, prior: Prior) -> WallFit:
-    """Return a first fit, from the nominal sensor and the curve that goes best with it."""
-    start, rising = prior.mean, prior.rising
-    if prior.sigma[STEPS].all():
-        start, rising = start_curve(samples, start)
-    return fit_wall(samples, Prior(prior.mean, prior.sigma, rising), start, _COARSE, 1e-4)
-
-
-def _refit(
-    samples: Samples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
-) -> tuple[Touch, Doubles]:
-    """Fit once more, to at most so many of the touched samples that are chosen.
-
-    Returns it, and by how many standard deviations all samples are off, NaN where the sheet does not touch.
-    """
-    named, _, centres = split(fit.parameters)
-    touched = meet_balls(samples, named, centres).z >= _TOUCHED
-    chosen = _some(inside & touched, count)
-    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _SETTLES[count])
-    off = (samples.light - predict(samples, fit.parameters, fit.rising)) / noise
-    return Touch(fit, samples[chosen], noise[chosen]), np.where(touched, off, np.nan)
-
-
-def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
-    """Return how many rings of a press can be fitted, and whether there may be more.
-
-    ``off`` is by how many standard deviations its samples are off, and ``ring`` their ring.
-    """
-    usual = max(1.0, _scale(off[ring < taken]))
-    if not np.isfinite(usual):
-        return taken, False
-    for number in range(taken, taken + _AT_ONCE):
-        own = off[ring == number]
-        if len(own) < _LEAST:
-            return number, False
-        chance = _CHANCE / np.sqrt(len(own))
-        if _scale(own) / usual > _SETTLED + chance or abs(np.median(own)) / usual > _ASIDE + chance:
-            return number - 1, False
-    return taken + _AT_ONCE, True
-
-
-def _noise(samples: Samples, fit: WallFit, inside: Mask) -> Doubles:
-    """Return the noise of all samples, (N,), from what is left of some: its square is linear in the light.
-
-    The medians of some bins of brightness tell it.
-    """
-    light = predict(samples, fit.parameters, fit.rising)
-    left = samples.light - light
-    order = np.flatnonzero(inside)[np.argsort(light[inside])]
-    bins = np.array_split(order, _BINS)
-    level = np.array([np.median(light[part]) for part in bins])
-    square = np.array([_scale(left[part]) ** 2 for part in bins])
-    slope, offset = np.polyfit(level, square, 1) if np.ptp(level) > 0 else (0.0, float(square.mean()))
-    least = 0.25 * float(np.median(square)) + _QUIET**2
-    return np.asarray(np.sqrt(np.maximum(offset + slope * light, least)))
-
-
-def _scale(off: Doubles) -> float:
-    """Return the root mean square of normal values, told by the median of their sizes; inf of none."""
-    return 1.4826 * float(np.median(np.abs(off))) if len(off) else np.inf
-
-
-def _some(mask: Mask, count: int) -> Numbers:
-    """Return the numbers of at most so many of the chosen samples, evenly spread."""
-    chosen = np.flatnonzero(mask)
-    return chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(np.intp)]
-
-
-def _check_presses(
-    touch: Touch, off: Doubles, rings: _Rings, presses: Sequence[BallPress], prior: Prior
-) -> None:
-    """Raise where a press does not fit to the others.
-
-    Its samples are off by more than those of the others; or all of them are explained, but by a sensor that
-    cannot be, and without it by a likely one.
-    """
-    known = np.isfinite(off)
-    scales = np.array([_scale(off[known & (rings.press == number)]) for number in range(len(presses))])
-    worst = int(np.argmax(scales))
-    if scales[worst] > _BAD * max(1.0, float(np.median(scales))):
-        raise InputError(_misfit(presses[worst].name))
-    if _strain(touch.fit, prior) > _STRAIN:
-        strains = [_strain(_without(touch, prior, number), prior) for number in range(len(presses))]
-        least = int(np.argmin(strains))
-        if strains[least] < _STRAIN:
-            raise InputError(_misfit(presses[least].name))
-        raise InputError(
-            "the presses go together with no likely sensor: check the ball's diameter, pixel size, and the"
-            " body's radius and height"
-        )
-
-
-def _without(touch: Touch, prior: Prior, press: int) -> WallFit:
-    """Return the fit without a press."""
-    samples = touch.samples
-    others = _some(samples.press[samples.pose] != press, _FEW)
-    start = prior.mean.copy()
-    start[STEPS] = touch.fit.parameters[STEPS]
-    return fit_wall(samples[others], prior, start, np.maximum(touch.noise[others], _MODEST), _SETTLES[_FEW])
-
-
-def _strain(fit: WallFit, prior: Prior) -> float:
-    """Return by how many standard deviations a sensor is off what was known before, root mean square."""
-    off = (fit.parameters - prior.mean) / np.where(prior.sigma > 0, prior.sigma, np.inf)
-    return float(np.sqrt(np.mean(off[: STEPS.start] ** 2)))
-
-
-def _misfit(name: str) -> str:
-    return f"{name}: its ball does not fit to the other presses: leave it out or take it again"

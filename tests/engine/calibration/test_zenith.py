@@ -9,7 +9,8 @@ from calibration_scenes import Frames
 from wall_presses import BODY, DISTANCE, SHAPE, wall_presses
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.wall import fit_zenith, pivot_of, read_press
+from mirrorskin.engine.calibration.wall import fit_zenith
+from mirrorskin.engine.calibration.wall_fit import pivot_of, read_press
 from mirrorskin.hw.twin.optics import Wall, make_pattern
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.view import View

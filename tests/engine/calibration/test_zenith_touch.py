@@ -7,8 +7,8 @@ import pytest
 from calibration_scenes import Frames
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.wall import BallPress, join
-from mirrorskin.engine.calibration.wall_fit import Prior, fit_touch
+from mirrorskin.engine.calibration.wall import fit_touch
+from mirrorskin.engine.calibration.wall_fit import BallPress, Prior, join
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
