@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 from mirrorskin.engine.provenance import program_version
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.remember import keep, recall
-from mirrorskin.kernels.shape import SHAPES, Shape
+from mirrorskin.kernels.layout import LAYOUTS, Layout
 
 Run = Callable[[], None]
 
@@ -35,29 +35,29 @@ def fit(device: Device, prepare: Callable[[Device], Run]) -> None:
         The trial runs in no shape.
     """
     with _lock:
-        if device.measured:
+        if device.tuned:
             return
         info = device.info
-        circumstances = info.title, info.driver, info.compute_units, SHAPES, program_version()
+        circumstances = info.title, info.driver, info.compute_units, LAYOUTS, program_version()
         known = recall("shape", circumstances)
-        device.measured = True
-        if known is not None and known.isdecimal() and int(known) < len(SHAPES):
-            device.shape = SHAPES[int(known)]
+        device.tuned = True
+        if known is not None and known.isdecimal() and int(known) < len(LAYOUTS):
+            device.layout = LAYOUTS[int(known)]
             return
         try:
-            device.shape = _fastest(device, prepare)
+            device.layout = _fastest(device, prepare)
         except DeviceError:
-            device.measured = False
+            device.tuned = False
             raise
-        keep("shape", circumstances, str(SHAPES.index(device.shape)))
-        _log.info("%s is fastest with %s", info.title, device.shape)
+        keep("shape", circumstances, str(LAYOUTS.index(device.layout)))
+        _log.info("%s is fastest with %s", info.title, device.layout)
 
 
-def _fastest(device: Device, prepare: Callable[[Device], Run]) -> Shape:
-    seconds: dict[Shape, float] = {}
+def _fastest(device: Device, prepare: Callable[[Device], Run]) -> Layout:
+    seconds: dict[Layout, float] = {}
     problem = None
-    for shape in SHAPES:
-        device.shape = shape
+    for shape in LAYOUTS:
+        device.layout = shape
         try:
             seconds[shape] = _time(prepare(device))
         except DeviceError as error:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels.array import Array, Lent, Operand
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
@@ -35,7 +35,7 @@ class Staged:
 
     Attributes
     ----------
-    array : Array or Lent, (n, rows, W)
+    array : Array or BorrowedBuffer, (n, rows, W)
     frames : slice
         Which of the frames these are.
     aligned : bool
@@ -90,7 +90,7 @@ class Band:
         self.maps = {name: self._make(name) for name in maps}
         self.frames = _longest(device, length, least, shape, dtype)
         self._other = _second(device, self.frames)
-        self._lent: Lent | None = None
+        self._lent: BorrowedBuffer | None = None
         self._alone = True
         self._resident = False
 
@@ -157,10 +157,10 @@ class Band:
         else:
             yield from self._copy(frames)
 
-    def _borrow(self, lent: Lent) -> Iterator[Staged]:
+    def _borrow(self, lent: BorrowedBuffer) -> Iterator[Staged]:
         """Work on frames where they lie."""
         before, self._lent = self._lent, lent
-        aligned = self._whole_words and lent.host.ctypes.data % (4 * self._device.shape.lanes) == 0
+        aligned = self._whole_words and lent.host.ctypes.data % (4 * self._device.layout.lanes) == 0
         yield Staged(lent, slice(0, len(lent.host)), aligned)
         # It waits for its kernels: when more frames are read, only these here can still be under way.
         del before
@@ -192,7 +192,7 @@ class Band:
     @property
     def _whole_words(self) -> bool:
         """Whether each frame is as long as some words."""
-        return bool(self.pixels * self.frames.host.itemsize % (4 * self._device.shape.lanes) == 0)
+        return bool(self.pixels * self.frames.host.itemsize % (4 * self._device.layout.lanes) == 0)
 
     def _make(self, name: str) -> Array:
         kind = self._kinds[name]

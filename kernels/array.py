@@ -190,7 +190,7 @@ class Array:
                 cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
 
 
-class Lent:
+class BorrowedBuffer:
     """Memory of another owner's that kernels read in place; it stays referred to until they are done.
 
     Attributes
@@ -215,7 +215,7 @@ class Lent:
             self.used.wait()
 
 
-Operand = Array | Lent
+Operand = Array | BorrowedBuffer
 """What a kernel can be given besides numbers."""
 
 

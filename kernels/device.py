@@ -20,10 +20,10 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import pocl
-from mirrorskin.kernels.array import Array, Lent, Operand, pinned
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, pinned
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
+from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 from mirrorskin.kernels.profile import Profile
-from mirrorskin.kernels.shape import BESIDE, CORE
 from mirrorskin.kernels.signature import Signature, read_signatures
 
 DeviceKind = Literal["gpu", "cpu", "other"]
@@ -107,10 +107,10 @@ class Device:
         What was run on it so far.
     max_allocation : int
         Bytes that one array may take.
-    shape : Shape
-        How work is cut for it: a guess, until someone has measured what suits it.
-    measured : bool
-        Whether someone has.
+    layout : Layout
+        How work is cut for it; a guess by its kind until it was tuned.
+    tuned : bool
+        Whether the layout was measured.
     """
 
     def __init__(self, device: cl.Device) -> None:
@@ -119,8 +119,8 @@ class Device:
             pocl.verify()
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
-        self.shape = CORE if self.info.kind == "cpu" else BESIDE
-        self.measured = False
+        self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
+        self.tuned = False
         self.context = cl.Context([device])
         self.queue, self.copies = (
             cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
@@ -171,7 +171,7 @@ class Device:
         array.upload()
         return array
 
-    def lend(self, name: str, values: NDArray[Any]) -> Lent | None:
+    def lend(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
         """Let kernels read memory of another owner's in place; the device must share the host's memory.
 
         Some devices refuse memory that only may be read, such as a file's. Then it returns None.
@@ -185,7 +185,7 @@ class Device:
             write to it as long as it is lent.
         """
         try:
-            return Lent(self, name, values)
+            return BorrowedBuffer(self, name, values)
         except cl.Error as error:
             _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
             return None
@@ -208,16 +208,16 @@ class Device:
         file, name : str
             The file in ``mirrorskin.kernels`` without its ending, and the function in it.
         **defines : str or int
-            Macros to set; ``LANES``, ``WORDS`` and ``TILE`` are those of the device's shape otherwise.
+            Macros to set; ``LANES``, ``WORDS`` and ``TILE`` are those of the device's layout otherwise.
 
         Raises
         ------
         DeviceError
             It does not compile; the message quotes the line.
         """
-        made, key = self._kernels.made, (file, name, self.shape, *defines.items())
+        made, key = self._kernels.made, (file, name, self.layout, *defines.items())
         if key not in made:
-            cut = {"LANES": self.shape.lanes, "WORDS": self.shape.words, "TILE": self.shape.tile}
+            cut = {"LANES": self.layout.lanes, "WORDS": self.layout.words, "TILE": self.layout.tile}
             options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
             made[key] = self._make_kernel(file, name, options)
         return made[key]
@@ -229,7 +229,7 @@ class Device:
     def _make_kernel(self, file: str, name: str, options: tuple[str, ...]) -> Kernel:
         try:
             program, signatures = self._program(file, options)
-            return Kernel(self, name, cl.Kernel(program, name), signatures[name], self.shape.group)
+            return Kernel(self, name, cl.Kernel(program, name), signatures[name], self.layout.group)
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error

@@ -19,8 +19,8 @@ from pathlib import Path
 import platformdirs
 
 from mirrorskin.kernels import linker, processor
+from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.remember import keep, recall
 
 _log = logging.getLogger("mirrorskin.kernels")
 

@@ -9,7 +9,7 @@ import pytest
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device, list_devices
-from mirrorskin.kernels.shape import BESIDE, CORE
+from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
 # The processes that tests start, a hundred of them, need not each compile all modules anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -20,13 +20,13 @@ FOUND = list_devices()
 if not FOUND:
     raise RuntimeError("no OpenCL device found: the tests need one; 'make test' brings PoCL")
 
-# Any device can be given work in either shape; and one that shares the host's memory can also be treated as
+# Any device can be given work in either layout; and one that shares the host's memory can also be treated as
 # one that does not.
-SHAPES = {"core": CORE, "beside": BESIDE}
+LAYOUTS = {"cpu": CPU_LAYOUT, "gpu": GPU_LAYOUT}
 WAYS = [
-    (number, shared, shape)
+    (number, shared, layout)
     for number, info in enumerate(FOUND)
-    for shared, shape in [(info.shares_memory, "core"), (False, "beside")]
+    for shared, layout in [(info.shares_memory, "cpu"), (False, "gpu")]
 ]
 
 
@@ -41,18 +41,20 @@ def pytest_collection_modifyitems(items):
             item.add_marker("device")
 
 
-def _way(number, shared, shape):
-    name = f"{FOUND[number].kind}{number}-{'shared' if shared else 'copied'}-{shape}"
-    return pytest.param((number, shared, shape), id=name, marks=[pytest.mark.slow] if shape != "core" else [])
+def _way(number, shared, layout):
+    name = f"{FOUND[number].kind}{number}-{'shared' if shared else 'copied'}-{layout}"
+    return pytest.param(
+        (number, shared, layout), id=name, marks=[pytest.mark.slow] if layout != "cpu" else []
+    )
 
 
 @pytest.fixture(scope="session", params=[_way(*way) for way in WAYS])
 def device(request):
-    """Every OpenCL device, in either shape of work; memory is shared where it can be."""
-    number, shared, shape = request.param
+    """Every OpenCL device, in either layout; memory is shared where it can be."""
+    number, shared, layout = request.param
     opened = Device(device_layer._find()[number])
     opened.info = dataclasses.replace(opened.info, shares_memory=shared)
-    opened.shape, opened.measured = SHAPES[shape], True
+    opened.layout, opened.tuned = LAYOUTS[layout], True
     return opened
 
 

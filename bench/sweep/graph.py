@@ -110,14 +110,14 @@ def _make_bilateral(device: Device, shape: Shape, _kind: str, _: int) -> dict[st
     maps = _graph(shape)
     arrays = {name: device.given(name, values, values.dtype) for name, values in maps.items()}
     pixels, size = shape[0] * shape[1], (np.float32(PIXEL), np.float32(PIXEL))
-    pieces = shape[0] * -(-shape[1] // min(device.shape.tile, _PIECE))
+    pieces = shape[0] * -(-shape[1] // min(device.layout.tile, _PIECE))
     arrays["sums"] = device.given("sums", np.zeros(pieces))
     jobs = {}
     for name, (wanted, numbers, outputs, each, operations) in _PASSES.items():
         given = [arrays[one] for one in wanted.split()]
         values = [np.float32(_NUMBERS[one]) if one in _NUMBERS else size[0] for one in numbers.split()]
         out = [arrays[one] for one in outputs.split()]
-        items = -(-pixels // device.shape.tile) if name == "step" else pieces
+        items = -(-pixels // device.layout.tile) if name == "step" else pieces
         launch = _launcher(device, name, shape, items, [*given, *values, *out], each * pixels)
         check = _checker(name, maps, arrays, launch)
         jobs[f"bilateral_{name}"] = Job(

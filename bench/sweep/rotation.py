@@ -252,7 +252,7 @@ def _resample(device: Device, maps: dict[str, Array], frame: NDArray[Any]) -> No
     rows, columns = frame.shape
     top = {"TOP": int(np.iinfo(frame.dtype).max)} if frame.dtype.kind == "u" else {}
     macros: dict[str, str | int] = {"FRAME": C_TYPES[frame.dtype.name], "LEVELS": 0, **top}
-    items, sizes = rows * -(-columns // device.shape.tile), (np.int32(rows), np.int32(columns))
+    items, sizes = rows * -(-columns // device.layout.tile), (np.int32(rows), np.int32(columns))
     for name, wanted, each in (
         ("registration_admit", "frame offset gain padded", frame.itemsize + 4),
         ("registration_resample", "padded height shift offset gain registered noise", 28),

@@ -65,7 +65,7 @@ def _transform(length: int) -> int:
 def _refer_rectangle(source: NDArray[np.float32], device: Device) -> NDArray[np.float64]:
     """Return the heights of a full picture by the reference, along the lines that the device takes."""
     shape = source.shape[0], source.shape[1]
-    along = are_rows_easier(shape, side_by_side=device.shape.tile == 1)
+    along = are_rows_easier(shape, side_by_side=device.layout.tile == 1)
     picture = source if along else source.T
     lines, length = picture.shape
     plan = make_plan(length)
@@ -118,9 +118,9 @@ def _pass(device: Device, levels: list[Level], maps: Maps, arrays: dict[str, Arr
     if between:
         sizes = fine.base, fine.stride, coarse.base, coarse.rows, coarse.stride
     numbers = {"smooth": [_OMEGA], "prolong": [1.0]}.get(name, [])
-    width = WIDTH if device.shape.tile > 1 else 1
+    width = WIDTH if device.layout.tile > 1 else 1
     kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=0, PART=part_of(device), WIDTH=width)
-    items = coarse.rows if between else -(-fine.nodes // device.shape.tile)
+    items = coarse.rows if between else -(-fine.nodes // device.layout.tile)
     values: list[Any] = [
         *map(np.int32, sizes),
         *map(np.float32, numbers),

@@ -37,7 +37,7 @@ def _make_wall(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Jo
     def launch() -> None:
         kernel = device.kernel("wall", "wall_light", TABLE=1, GAP=0, LAMPS=0, OBLIQUE=0)
         counts, reals = np.array(sizes, np.int32), np.array(numbers, np.float32)
-        kernel(-(-pixels // device.shape.tile), *counts, *arrays, *reals, light, moved=moved)
+        kernel(-(-pixels // device.layout.tile), *counts, *arrays, *reals, light, moved=moved)
 
     def check() -> None:
         launch()
@@ -78,7 +78,7 @@ def _make_exposure(device: Device, shape: Shape, kind: str, _: int) -> dict[str,
         )
         keys = np.int32(quarter), np.uint64(5), np.uint64(9)
         numbers = (np.float32(one) for one in reals)
-        kernel(-(-quarter // device.shape.tile), *arrays, *keys, *numbers, counts, moved=moved)
+        kernel(-(-quarter // device.layout.tile), *arrays, *keys, *numbers, counts, moved=moved)
 
     def check() -> None:
         launch()

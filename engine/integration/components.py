@@ -160,7 +160,7 @@ class Settler:
 
     def _settle(self, relief: Array, plane: Plane, offsets: Array, height: Array) -> None:
         rows, columns = self._room.shape
-        items = rows * -(-columns // min(self._device.shape.tile, _CHUNK))
+        items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
         self._run("components_settle", items, relief, plane, [offsets, height])
 
     @property

@@ -39,7 +39,7 @@ class Cycle:
     def __init__(self, hierarchy: Hierarchy) -> None:
         self._h = hierarchy
         self._nodes = 0
-        self._one_pass = hierarchy.device.shape.tile > 1
+        self._one_pass = hierarchy.device.layout.tile > 1
         bands = -(-hierarchy.levels[0].rows // 2 // _BAND) + 1
         width = hierarchy.levels[0].stride + 2 * _MARGIN
         size = bands * _LINES * width if self._one_pass else 1
@@ -233,7 +233,7 @@ class Cycle:
     def _plain(self, name: str, number: int, *args: Array | np.generic) -> None:
         """Run a pass over a level's picture."""
         level = self._h.levels[number]
-        items = -(-level.nodes // self._h.device.shape.tile)
+        items = -(-level.nodes // self._h.device.layout.tile)
         self._h.kernel(name)(items, *place(level), *args, moved=20 * level.nodes)
 
     def _each(self, name: str, number: int, *args: Array) -> None:

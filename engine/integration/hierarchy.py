@@ -133,7 +133,7 @@ class Hierarchy:
 
     def kernel(self, name: str) -> Kernel:
         """Return a pass."""
-        width = WIDTH if self.device.shape.tile > 1 else 1
+        width = WIDTH if self.device.layout.tile > 1 else 1
         macros = {"ANCHORED": int(self.anchored), "PART": part_of(self.device), "WIDTH": width}
         return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
@@ -181,7 +181,7 @@ class Hierarchy:
             self.run_odd("invert", rows.graph, self.anchor, self.inverse)
 
     def _invert_level(self, level: Level) -> None:
-        items = -(-level.nodes // self.device.shape.tile)
+        items = -(-level.nodes // self.device.layout.tile)
         moved = 12 * level.nodes
         self.kernel("invert")(items, *place(level), *self.graph, self.inverse, moved=moved)
 
@@ -189,7 +189,7 @@ class Hierarchy:
         """Run a pass over odd nodes, a multiple of `WIDTH`, as if they were rows of a picture."""
         if odd.count:
             level = Level(odd.at - WIDTH, odd.count // WIDTH, WIDTH, WIDTH)
-            items = -(-level.nodes // self.device.shape.tile)
+            items = -(-level.nodes // self.device.layout.tile)
             self.kernel(name)(items, *place(level), *args, moved=12 * odd.count)
 
     def run_odd(self, name: str, rows: Rows, *args: Array | np.generic) -> None:
@@ -294,7 +294,7 @@ class Hierarchy:
 
 def part_of(device: Device) -> int:
     """Return how many nodes a part of a sum has."""
-    return 4096 if device.shape.tile > 1 else 64
+    return 4096 if device.layout.tile > 1 else 64
 
 
 def place(level: Level) -> tuple[np.int32, np.int32, np.int32]:

@@ -232,7 +232,7 @@ class LinkRoom:
 
     def _items(self, name: str) -> int:
         """Return how many work-items a kernel takes; see there."""
-        (rows, columns), tile = self.shape, self.device.shape.tile
+        (rows, columns), tile = self.shape, self.device.layout.tile
         strip = _STRIP if tile >= _CHUNK and name in ("links_flags", "links_join", "links_misfit") else 1
         return -(-rows // strip) * -(-columns // min(tile, _CHUNK))
 

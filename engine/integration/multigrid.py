@@ -145,7 +145,7 @@ class Multigrid:
         h, cycle, level = self._hierarchy, self._cycle, self._hierarchy.levels[0]
         h.follow(links, deep=deep)
         h.admit(links.source, cycle.full_b)
-        items = -(-level.nodes // self._device.shape.tile)
+        items = -(-level.nodes // self._device.layout.tile)
         rest = cycle.full_b, self._x, cycle.b
         h.kernel("residual")(items, *place(level), *h.graph, *rest, moved=20 * level.nodes)
         self._products = cycle.launch()
@@ -186,7 +186,7 @@ class Multigrid:
         """Find what the heights leave over; return its square."""
         h, cycle = self._hierarchy, self._cycle
         level = h.levels[0]
-        items = -(-level.nodes // self._device.shape.tile)
+        items = -(-level.nodes // self._device.layout.tile)
         rest = cycle.full_b, self._x, cycle.b
         h.kernel("residual")(items, *place(level), *h.graph, *rest, moved=20 * level.nodes)
         return self._dot(cycle.b, cycle.b)

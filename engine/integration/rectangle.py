@@ -50,7 +50,7 @@ class Rectangle:
         self, shape: tuple[int, int], pixel_size: tuple[float, float], device: Device, scale: float = 1.0
     ) -> None:
         self._device = device
-        self._lanes = _LANES if device.shape.tile > 1 else 1
+        self._lanes = _LANES if device.layout.tile > 1 else 1
         self._is_along = are_rows_easier(shape, side_by_side=self._lanes == 1)
         self._lines, length = shape if self._is_along else shape[::-1]
         weights = scale / pixel_size[0] ** 2, scale / pixel_size[1] ** 2

@@ -258,7 +258,7 @@ class _Bound:
         rooms = [self._room(name) for name in names]
         self._shares, self._links, self._source = rooms[:2], rooms[2:6], rooms[6]
         rows, columns = self._shape
-        self._pieces = rows * -(-columns // min(self._device.shape.tile, 256))
+        self._pieces = rows * -(-columns // min(self._device.layout.tile, 256))
         self._sums = self._room("sums", (self._pieces,))
 
     def share(self, k: float, relief: Array) -> float:
@@ -305,7 +305,7 @@ class _Bound:
     def step(self, relief: Array, change: Array, part: float = 1.0) -> Array:
         """Return a relief changed by so much of a change."""
         found = self._room("relief")
-        items = -(-self.flags.size // self._device.shape.tile)
+        items = -(-self.flags.size // self._device.layout.tile)
         self._run("step", items, relief, change, np.float32(part), found)
         return found
 

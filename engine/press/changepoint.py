@@ -289,7 +289,7 @@ class ChangePointSearch(Search):
         return np.float32(_EVIDENCE * (self._noise.value or 0.0) ** 2)
 
     def _items(self, band: Band) -> int:
-        return int(-(-band.pixels // self.device.shape.tile))
+        return int(-(-band.pixels // self.device.layout.tile))
 
     def _kernel(self, name: str) -> Kernel:
         top = {} if self._dtype.kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}

@@ -335,7 +335,7 @@ class OnsetSearch(Search):
         maps = sum(value.host.nbytes for value in values if isinstance(value, Operand))
         moved = frames * band.pixels * self._dtype.itemsize or maps
         kernel = self.device.kernel("onset", name, **self._macros, ALIGNED=int(aligned))
-        shape = self.device.shape
+        shape = self.device.layout
         words = band.stride * self._dtype.itemsize // (4 * shape.lanes)
         kernel(-(-words // shape.words), *values, moved=moved)
 

@@ -145,7 +145,7 @@ class EdgeDrawing:
         }
         limits = LIMITS.jump, LIMITS.bend, LIMITS.sure, LIMITS.quiet, LIMITS.floor, LIMITS.lowest
         rows, columns = self._shape
-        run = min(self._device.shape.tile, 64)
+        run = min(self._device.layout.tile, 64)
         found = "doubt", "strength", "ways"
         items, fewer = rows * -(-columns // run), -(-parts // _SHORTER)
         jumps = cells, *self._tables[chosen], *limits, *found
@@ -156,7 +156,7 @@ class EdgeDrawing:
     @property
     def _tiles(self) -> int:
         rows, columns = self._shape
-        return int(-(-rows * columns // self._device.shape.tile))
+        return int(-(-rows * columns // self._device.layout.tile))
 
     def _room(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
         array = self._device.array(name, shape, dtype)

@@ -43,7 +43,7 @@ class Samples:
 
     Attributes
     ----------
-    stack : Array or Lent
+    stack : Array or BorrowedBuffer
     start : int
         Frame of the turn's first one.
     count : int
@@ -151,7 +151,7 @@ class NormalLaunch:
         bare : bool
             Whether to leave out the maps of the wave: mean, cosine, sine and residual.
         """
-        shape, count = self._device.shape, samples.count
+        shape, count = self._device.layout, samples.count
         lanes = min(_LANES, shape.lanes)
         integer = self._dtype.kind == "u"
         kernel = self._device.kernel(

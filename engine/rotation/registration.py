@@ -276,7 +276,7 @@ class _Maps:
         self._device, self._macros = device, _macros(dtype, levels=offset.size > 1)
         self._macros |= {"CURVED": 1} if curved else {}
         self._sizes = np.int32(rows), np.int32(columns)
-        self._items = rows * -(-columns // device.shape.tile)
+        self._items = rows * -(-columns // device.layout.tile)
         padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
         self._padded = device.given("padded", padding)
         self._height, self._offset = device.given("height", height), device.given("offset", offset)
@@ -299,7 +299,7 @@ class _Maps:
             kernel = self._device.kernel("registration", "registration_mend", **self._macros)
             count = len(self._places.host)
             kernel(
-                -(-count // self._device.shape.tile),
+                -(-count // self._device.layout.tile),
                 np.int32(count),
                 self._places,
                 self._padded,

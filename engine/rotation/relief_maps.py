@@ -51,12 +51,12 @@ class SlopeMaps:
         pixels = rows * columns
         given = normals["vectors"], normals["sigma"], normals["contact"]
         slopes, weights = (to["dz_dx"], to["dz_dy"]), (to["weight_x"], to["weight_y"])
-        width = 8 if device.shape.tile > 1 else 1
+        width = 8 if device.layout.tile > 1 else 1
         find, weigh = (device.kernel("slopes", f"slopes_{name}", WIDTH=width) for name in ("find", "weigh"))
         least = np.float32(math.sin(tilt) ** 2)
-        items = -(-pixels // device.shape.tile)
+        items = -(-pixels // device.layout.tile)
         find(items, np.int32(pixels), least, *given, *slopes, *self._parts, moved=33 * pixels)
-        tile = device.shape.tile
+        tile = device.layout.tile
         strip = _STRIP if tile >= _CHUNK else 1
         items = -(-rows // strip) * -(-columns // min(tile, _CHUNK))
         for _ in range(2 if math.isnan(self.typical) else 1):

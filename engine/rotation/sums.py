@@ -77,7 +77,7 @@ class Sums:
             else:
                 values.append(np.int32(argument) if isinstance(argument, int) else argument)
         kernel = self._device.kernel("correlation", name, **self._macros)
-        kernel(-(-band.pixels // self._device.shape.tile), *values, moved=moved * band.pixels)
+        kernel(-(-band.pixels // self._device.layout.tile), *values, moved=moved * band.pixels)
 
     def _answer(
         self, name: str, known: Callable[[Band], Sequence[str | int | Array | np.generic]], moved: int

@@ -197,7 +197,7 @@ class Sensor:
         keys = np.int32(quarter), np.uint64(int(frame) % _WORD), np.uint64(camera.seed)
         amounts = np.float32(camera.noise), np.float32(1 / camera.electrons), np.float32(camera.top)
         moved = self._pixels * (len(maps) * 4 + self.dtype.itemsize)
-        expose(-(-quarter // self.device.shape.tile), *maps, *keys, *amounts, self._counts, moved=moved)
+        expose(-(-quarter // self.device.layout.tile), *maps, *keys, *amounts, self._counts, moved=moved)
 
 
 def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:

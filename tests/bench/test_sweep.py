@@ -21,7 +21,7 @@ PIXELS = 37 * 61
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 def test_every_work_does_what_its_reference_says(device, family):
-    types = family.types if device.shape.tile > 1 else family.types[-1:]
+    types = family.types if device.layout.tile > 1 else family.types[-1:]
     for kind in types:
         for job in family.make(device, (11, 37), kind, 16).values():
             job.check()

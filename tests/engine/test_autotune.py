@@ -9,12 +9,12 @@ from mirrorskin.engine import OnsetSearch, autotune
 from mirrorskin.engine.press.onset import _trial
 from mirrorskin.io import Block
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.shape import BESIDE, CORE
+from mirrorskin.kernels.layout import GPU_LAYOUT, CPU_LAYOUT
 
 
 def fake_device():
     info = SimpleNamespace(title="Fake: device", driver="1", compute_units=2)
-    return SimpleNamespace(info=info, shape=CORE, measured=False)
+    return SimpleNamespace(info=info, layout=CPU_LAYOUT, tuned=False)
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def trial(clock, seconds):
     prepared = []
 
     def prepare(device):
-        takes = seconds[device.shape]
-        prepared.append(device.shape)
+        takes = seconds[device.layout]
+        prepared.append(device.layout)
         if takes is None:
-            raise DeviceError(f"no kernel with {device.shape.lanes} lanes")
+            raise DeviceError(f"no kernel with {device.layout.lanes} lanes")
         return lambda: setattr(clock, "seconds", clock.seconds + takes)
 
     return prepare, prepared
@@ -50,20 +50,24 @@ def trial(clock, seconds):
 
 @pytest.mark.parametrize(
     ("seconds", "best"),
-    [({CORE: 1, BESIDE: 2}, CORE), ({CORE: 2, BESIDE: 1}, BESIDE), ({CORE: None, BESIDE: 9}, BESIDE)],
+    [
+        ({CPU_LAYOUT: 1, GPU_LAYOUT: 2}, CPU_LAYOUT),
+        ({CPU_LAYOUT: 2, GPU_LAYOUT: 1}, GPU_LAYOUT),
+        ({CPU_LAYOUT: None, GPU_LAYOUT: 9}, GPU_LAYOUT),
+    ],
 )
 def test_the_fastest_shape_is_taken_and_remembered(memory, clock, seconds, best):
     prepare, prepared = trial(clock, seconds)
     first, second = fake_device(), fake_device()
     for device in (first, first, second):
         autotune.fit(device, prepare)
-        assert device.shape is best
-        assert device.measured
+        assert device.layout is best
+        assert device.tuned
     assert len(prepared) == 2
 
 
 def test_another_driver_is_measured_anew(memory, clock):
-    prepare, prepared = trial(clock, {CORE: 1, BESIDE: 2})
+    prepare, prepared = trial(clock, {CPU_LAYOUT: 1, GPU_LAYOUT: 2})
     autotune.fit(fake_device(), prepare)
     other = fake_device()
     other.info.driver = "2"
@@ -72,17 +76,17 @@ def test_another_driver_is_measured_anew(memory, clock):
 
 
 def test_what_is_remembered_wrongly_is_measured_anew(memory, clock):
-    prepare, _ = trial(clock, {CORE: 2, BESIDE: 1})
+    prepare, _ = trial(clock, {CPU_LAYOUT: 2, GPU_LAYOUT: 1})
     autotune.fit(fake_device(), prepare)
     for nonsense in ("", "7", "-1", "a shape"):
         memory.update(dict.fromkeys(memory, nonsense))
         device = fake_device()
         autotune.fit(device, prepare)
-        assert device.shape is BESIDE
+        assert device.layout is GPU_LAYOUT
 
 
 def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
-    prepare, _ = trial(clock, {CORE: None, BESIDE: None})
+    prepare, _ = trial(clock, {CPU_LAYOUT: None, GPU_LAYOUT: None})
     device = fake_device()
     for _ in range(2):
         with pytest.raises(DeviceError, match="no kernel with 4 lanes"):
@@ -91,8 +95,8 @@ def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
 
 
 def test_the_trial_runs_in_every_shape(device, monkeypatch):
-    for shape in (CORE, BESIDE):
-        monkeypatch.setattr(device, "shape", shape)
+    for shape in (CPU_LAYOUT, GPU_LAYOUT):
+        monkeypatch.setattr(device, "layout", shape)
         device.profile.clear()
         _trial(device)()
         assert "onset_scan" in [record.name for record in device.profile.records()]
@@ -102,8 +106,8 @@ def test_the_trial_runs_in_every_shape(device, monkeypatch):
 def test_both_shapes_give_the_same(device, monkeypatch, dtype):
     frames = np.random.default_rng(0).integers(0, 256, (70, 13, 29)).astype(dtype)
     found = []
-    for shape in (CORE, BESIDE):
-        monkeypatch.setattr(device, "shape", shape)
+    for shape in (CPU_LAYOUT, GPU_LAYOUT):
+        monkeypatch.setattr(device, "layout", shape)
         search = OnsetSearch((13, 29), dtype, dark=10, bright=200, noise=8.0, device=device)
         search.push(Block(frames, 0, travel=np.arange(70.0)))
         found.append(search.result())

@@ -133,7 +133,7 @@ def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
     def refuse(*_):
         raise cl.LogicError("create_buffer", cl.status_code.INVALID_HOST_PTR, "read only")
 
-    monkeypatch.setattr(device_layer, "Lent", refuse)
+    monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
     search.push(Block(lent(FRAMES, 64), 0, travel=TRAVEL, lent=True))
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))

@@ -20,7 +20,7 @@ from mirrorskin.hw.twin.optics.wall import Wall
 from mirrorskin.hw.twin.sheet import Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.shape import CORE
+from mirrorskin.kernels.layout import CPU_LAYOUT
 
 Map = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def compare(chamber: rays.Chamber, pattern: str, distance: float, device: Device
 @pytest.mark.parametrize("chamber", CHAMBERS)
 def test_a_mirror_shows_the_wall_where_its_ray_ends(chamber: str, pattern: str, device: Device) -> None:
     # Each shape of work sees half of all combinations, because a kernel is compiled for each.
-    number = [*CHAMBERS].index(chamber) + [*PATTERNS].index(pattern) + (device.shape is CORE)
+    number = [*CHAMBERS].index(chamber) + [*PATTERNS].index(pattern) + (device.layout is CPU_LAYOUT)
     compare(CHAMBERS[chamber], pattern, [np.inf, 120.0][number % 2], device)
 
 

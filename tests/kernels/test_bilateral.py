@@ -38,9 +38,9 @@ def run(device, name, shape, arguments, outputs, known=1):
         array.upload()
         return array
 
-    chunk = min(device.shape.tile, 256)
+    chunk = min(device.layout.tile, 256)
     pieces = shape[0] * -(-shape[1] // chunk)
-    items = -(-shape[0] * shape[1] // device.shape.tile) if name == "step" else pieces
+    items = -(-shape[0] * shape[1] // device.layout.tile) if name == "step" else pieces
     made = [put(np.full(shape, np.nan) if one is None else one) for one in outputs]
     if name == "shares":
         made.append(put(np.full(pieces, np.nan)))

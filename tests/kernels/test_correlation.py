@@ -60,7 +60,7 @@ def launch(device: Device, name: str, pixels: int, arguments: list[Any], wide: i
             values.append(np.int32(argument) if isinstance(argument, int) else argument)
     bits = 8 * np.dtype(dtype).itemsize
     kernel = device.kernel("correlation", name, FRAME=C_TYPES[dtype], BITS=bits, WIDE=wide)
-    kernel(-(-pixels // device.shape.tile), *values, moved=1)
+    kernel(-(-pixels // device.layout.tile), *values, moved=1)
     return [array.download().copy() for array in arrays]
 
 

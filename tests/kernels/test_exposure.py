@@ -35,7 +35,7 @@ def expose(device: Device, maps: list[NDArray[np.float32]], dtype: str, **how: f
     keys = np.int32(quarter), np.uint64(given["frame"]), np.uint64(given["seed"])
     amounts = [np.float32(given[name]) for name in ("read", "grain", "top")]
     kernel = device.kernel("exposure", "expose", FRAME=C_TYPES[dtype], **modes)
-    kernel(-(-quarter // device.shape.tile), *arrays, *keys, *amounts, counts, moved=counts.host.nbytes)
+    kernel(-(-quarter // device.layout.tile), *arrays, *keys, *amounts, counts, moved=counts.host.nbytes)
     return counts.download().copy()
 
 

@@ -101,7 +101,7 @@ def items_of(name, device):
     if name.endswith("odd"):
         return ROWS
     nodes = FINE[1] * FINE[2]
-    return -(-nodes // (64 if name in SUMS else device.shape.tile))
+    return -(-nodes // (64 if name in SUMS else device.layout.tile))
 
 
 @pytest.mark.parametrize("anchored", [True, False], ids=["anchored", "free"])
@@ -120,7 +120,7 @@ def test_a_pass_does_what_its_reference_says(device, name, anchored):
     getattr(multigrid, f"multigrid_{name}")(
         *sizes, *(arrays[a] if isinstance(a, str) else a for a in arguments)
     )
-    width = 8 if device.shape.tile > 1 else 1
+    width = 8 if device.layout.tile > 1 else 1
     part = 64 if name in SUMS else part_of(device)  # as the engine has it, so that it is compiled once
     kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=int(anchored), PART=part, WIDTH=width)
     scalars = [np.int32(size) for size in sizes]

@@ -100,12 +100,12 @@ class Answers:
         if method == "paper":
             arguments += [*turn.spread.astype(np.float32)]
         kernel, lanes = self.kernel(method, turn)
-        kernel(-(-self.pixels // (lanes * self.device.shape.words)), *arguments, moved=1)
+        kernel(-(-self.pixels // (lanes * self.device.layout.words)), *arguments, moved=1)
         return self
 
     def kernel(self, method, turn):
         dtype, count = turn.frames.dtype, len(turn.frames)
-        lanes = min(8, self.device.shape.lanes)
+        lanes = min(8, self.device.layout.lanes)
         return self.device.kernel(
             "normals",
             f"normals_{method}",

@@ -84,7 +84,7 @@ def run(device, sheet, places, rays, table, gap, scatter, fade, lamps):
     sizes = sheet.shape[1], len(rays), len(table) - 2, table.shape[1] - 2
     numbers = RADIUS, RIM, gap, INDEX, scatter, fade, *lamps
     device.kernel("wall", "wall_light", **macros)(
-        -(-sheet.shape[1] // device.shape.tile),
+        -(-sheet.shape[1] // device.layout.tile),
         *(np.int32(size) for size in sizes),
         *arrays,
         *(np.float32(number) for number in numbers),

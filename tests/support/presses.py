@@ -7,7 +7,7 @@ import numpy as np
 from mirrorskin.engine.frames import reference_maps
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.kernels import onset as reference
-from mirrorskin.kernels.shape import CORE
+from mirrorskin.kernels.layout import CPU_LAYOUT
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
 
@@ -33,7 +33,7 @@ def looks_between(device, dtype, hold):
     A kernel of its own is compiled for each, which takes longer than the test. So each shape of work is given
     half of the combinations, in which any two values meet.
     """
-    return (sorted(SPEC).index(dtype) + hold // 2 + (device.shape is CORE)) % 2 == 0
+    return (sorted(SPEC).index(dtype) + hold // 2 + (device.layout is CPU_LAYOUT)) % 2 == 0
 
 
 def numpy_onset(

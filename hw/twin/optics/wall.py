@@ -103,7 +103,7 @@ class Wall:
         )
         maps = self._sheet, self._places
         self._device.kernel("wall", "wall_light", **self._macros)(
-            -(-pixels // self._device.shape.tile),
+            -(-pixels // self._device.layout.tile),
             *(np.int32(size) for size in sizes),
             *maps,
             self._rays,

@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.links import Links
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.shape import BESIDE, CORE
+from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
 SHAPES = [(45, 70), (1, 33), (29, 1), (3, 5), (2, 2), (64, 48)]
 
@@ -164,10 +164,10 @@ def test_weights_of_any_size_are_solved(device):
 def test_half_cycles_in_one_pass_do_what_single_passes_do(kind, anchored):
     graph = graphs.pixel_graph(kind, (150, 270), anchored)
     answers = []
-    for shape in (CORE, BESIDE):
+    for shape in (CPU_LAYOUT, GPU_LAYOUT):
         device = Device(device_layer._find()[0])
         device.info = dataclasses.replace(device.info, shares_memory=False)
-        device.shape, device.measured = shape, True
+        device.layout, device.tuned = shape, True
         links = links_of(device, graph)
         hierarchy = Hierarchy(graph.right.shape, anchored, device)
         hierarchy.build(links)

@@ -14,7 +14,7 @@ from presses import (
 
 from mirrorskin.engine import OnsetSearch, find_onset
 from mirrorskin.io import Block, InputError
-from mirrorskin.kernels.shape import CORE
+from mirrorskin.kernels.layout import CPU_LAYOUT
 
 DTYPES = sorted(SPEC)
 ODD, EVEN = (33, 61), (32, 64)  # pixels: a frame of the latter is whole words
@@ -419,7 +419,7 @@ def test_a_saturated_sample_below_its_level_is_not_taken_for_dark(device):
 @pytest.mark.parametrize(("number", "hold"), list(enumerate([31, 32, 33, 64, 100])))
 def test_long_runs_are_counted_over_spans_and_cuts(device, number, hold):
     """Runs of about `hold` light frames, broken now and then: where they begin and end is chance."""
-    dtype = DTYPES[(number + (device.shape is CORE)) % 3]  # a kernel for each of them all takes long to build
+    dtype = DTYPES[(number + (device.layout is CPU_LAYOUT)) % 3]  # not a kernel for each
     generator = np.random.default_rng([hold, DTYPES.index(dtype)])
     dark, bright = SPEC[dtype]
     share = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 64))

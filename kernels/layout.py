@@ -1,0 +1,32 @@
+"""How a kernel's work is cut: long loops for the cores of a CPU, or small items for the lanes of a GPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How much one work-item does; all but the group are macros of the kernels.
+
+    Attributes
+    ----------
+    lanes : int
+        32-bit lanes of a word, which a kernel loads at once.
+    words : int
+        Words of one work-item.
+    tile : int
+        Pixels of one work-item, in kernels that take them one by one.
+    group : int
+        Work-items of a work-group.
+    """
+
+    lanes: int
+    words: int
+    tile: int
+    group: int
+
+
+CPU_LAYOUT = Layout(lanes=16, words=128, tile=1024, group=1)
+GPU_LAYOUT = Layout(lanes=4, words=1, tile=1, group=128)
+LAYOUTS = (CPU_LAYOUT, GPU_LAYOUT)

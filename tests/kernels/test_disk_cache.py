@@ -1,0 +1,32 @@
+"""What is kept in the user's cache folder."""
+
+import logging
+
+import pytest
+
+from mirrorskin.kernels import disk_cache
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_cache.platformdirs, "user_cache_path", lambda *_: tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+def test_answers_are_kept_by_topic_and_circumstances(folder):
+    assert disk_cache.recall("ld", (1, "a")) is None
+    disk_cache.keep("ld", (1, "a"), "system")
+    disk_cache.keep("ld", (1, "b"), "other")
+    disk_cache.keep("shape", (1, "a"), "0")
+    assert disk_cache.recall("ld", (1, "a")) == "system"
+    assert disk_cache.recall("ld", (1, "b")) == "other"
+    assert disk_cache.recall("shape", (1, "a")) == "0"
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_a_folder_that_cannot_be_written_is_no_failure(folder, caplog):
+    folder.write_text("a file where the folder should be")
+    with caplog.at_level(logging.INFO):
+        disk_cache.keep("ld", 1, "system")
+    assert "found out again" in caplog.text
+    assert disk_cache.recall("ld", 1) is None
