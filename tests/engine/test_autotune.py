@@ -9,7 +9,7 @@ from mirrorskin.engine import OnsetSearch, autotune
 from mirrorskin.engine.press.onset import _trial
 from mirrorskin.io import Block
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.layout import GPU_LAYOUT, CPU_LAYOUT
+from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
 
 def fake_device():
