@@ -1,0 +1,7 @@
+"""All cases: the estimators' from Python, and the commands'."""
+
+import command_cases  # noqa: F401
+import engine_cases  # noqa: F401
+from golden import CASES
+
+__all__ = ["CASES"]

@@ -1,0 +1,754 @@
+"""The estimators, called as users of Python do; names of arguments and of answers stand here only."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from golden import Answer, Tolerance, case
+from scenes import (
+    EIGHTHS,
+    LEVELS,
+    PIXEL,
+    TILT,
+    UNEVEN,
+    counted,
+    dome,
+    level_maps,
+    pick,
+    places,
+    press,
+    ridge,
+    turn,
+)
+
+from mirrorskin import engine, io
+
+HEIGHT: Tolerance = (1e-4, 1e-5)  # mm: single precision, and what solvers leave
+SOLVED: Tolerance = (0.0, 1e-4)  # mm: the integration's own tolerance
+SIGMA: Tolerance = (1e-2, 1e-7)
+FITTED: Tolerance = (1e-5, 1e-7)  # what least squares in double precision settle at
+NORMAL: Tolerance = (1e-5, 2e-6)  # of unit vectors in single precision
+
+
+def onset_maps(found: engine.Onset) -> Answer:
+    """Return what a search for an onset tells."""
+    return {
+        "height": found.height,
+        "sigma": found.sigma,
+        "status": found.status,
+        "frame": found.frame,
+        "noise": found.noise,
+    }
+
+
+def wave_maps(found: engine.Correlation) -> Answer:
+    """Return what a correlation tells."""
+    return {
+        "mean": found.mean,
+        "cosine": found.cosine,
+        "sine": found.sine,
+        "residual": found.residual,
+        "frames": found.frames,
+        "modulation": found.modulation,
+        "azimuth": found.azimuth,
+    }
+
+
+def normal_maps(found: engine.Normals) -> Answer:
+    """Return what an estimate of normals tells."""
+    return {
+        "vectors": found.vectors,
+        "sigma": found.sigma,
+        "contact": found.contact,
+        "mean": found.mean,
+        "cosine": found.cosine,
+        "sine": found.sine,
+        "residual": found.residual,
+        "numbers": np.array([found.noise, found.shot, found.tilt]),
+        "counts": np.array([found.turns, found.frames]),
+        "zenith": found.zenith,
+    }
+
+
+def surface_maps(found: engine.Surface) -> Answer:
+    """Return what an integration tells; how many rounds it took is its own affair."""
+    return {
+        "height": found.height,
+        "sigma": found.sigma,
+        "component": found.component,
+        "offset_unknown": found.offset_unknown,
+        "filled": found.filled,
+        "edges": found.edges,
+        "converged": found.converged,
+        "method": found.method,
+        "invalid": found.invalid,
+    }
+
+
+def result_maps(found: io.Result) -> Answer:
+    """Return what a reconstruction tells, and with what it was made."""
+    known = {"process": dict(found.process), "offset_unknown": found.offset_unknown}
+    return {**found.maps(), "x": found.x, "y": found.y, **known}
+
+
+def named(**parts: Answer) -> dict[str, Any]:
+    """Return the answers of several calls as one."""
+    return {f"{part}.{name}": value for part, maps in parts.items() for name, value in maps.items()}
+
+
+def blocks(frames: Any, cuts: list[int], **series: Any) -> list[io.Block]:
+    """Cut frames into blocks of these lengths, the last of which takes the rest."""
+    ends = [0, *np.cumsum(cuts).tolist(), len(frames)]
+    return [
+        io.Block(frames[a:b], a, **{name: values[a:b] for name, values in series.items()})
+        for a, b in pairwise(ends)
+    ]
+
+
+class Source:
+    """A source of given frames, which can be read again."""
+
+    rewindable = True
+    name = "made up"
+
+    def __init__(self, frames: Any, header: io.Header, **series: Any) -> None:
+        self.frames, self.header, self.motion, self.series = frames, header, header.motion, series
+        self.shape, self.dtype, self.next = frames.shape, frames.dtype, 0
+        self.__dict__.update(series)
+
+    def rewind(self) -> None:
+        self.next = 0
+
+    def read(self, out: Any = None, /) -> io.Block | None:
+        part = slice(self.next, min(self.next + (1 if out is None else len(out)), len(self.frames)))
+        if part.start == part.stop:
+            return None
+        self.next = part.stop
+        return io.Block(
+            self.frames[part], part.start, **{name: values[part] for name, values in self.series.items()}
+        )
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
+# A press.
+
+
+def onset_of(dtype: str, **options: Any) -> Answer:
+    """Find the onset with the levels of each pixel."""
+    frames, travel = press(dtype)
+    dark, bright = level_maps(dtype, frames.shape[1:])
+    return onset_maps(engine.find_onset(frames, travel, dark=dark, bright=bright, **options))
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_uint8() -> Answer:
+    return onset_of("uint8")
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_uint16() -> Answer:
+    return onset_of("uint16")
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_float32() -> Answer:
+    return onset_of("float32")
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_with_one_level_for_all() -> Answer:
+    frames, travel = press("uint8", (48, 64), 24)
+    dark, bright = LEVELS["uint8"]
+    wide = engine.find_onset(frames, travel, dark=dark, bright=bright)
+    bright_only = engine.find_onset(frames, travel, bright=bright)
+    return named(both=onset_maps(wide), bright=onset_maps(bright_only))
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_as_printed() -> Answer:
+    return onset_of("uint8", subframe=False)
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_options() -> Answer:
+    return named(
+        hold=onset_of("uint8", hold=4),
+        once=onset_of("uint16", hold=1),
+        threshold=onset_of("uint8", threshold=0.3, noise=2.5),
+    )
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_of_a_release() -> Answer:
+    answers = {}
+    for dtype in LEVELS:
+        frames, travel = press(dtype, seed=4)
+        low, high = level_maps(dtype, frames.shape[1:])
+        back = np.ascontiguousarray(frames[::-1])
+        answers[dtype] = onset_maps(
+            engine.find_onset(back, travel[::-1], dark=low, bright=high, event="release")
+        )
+    return named(**answers)
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_of_missing_samples() -> Answer:
+    frames, travel = press("float32", seed=5)
+    frames[pick(frames.shape, 0.002, 6)] = np.nan
+    dark, bright = LEVELS["float32"]
+    return onset_maps(engine.find_onset(frames, travel, dark=dark, bright=bright))
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_onset_block_by_block() -> Answer:
+    frames, travel = press("uint8")
+    dark, bright = level_maps("uint8", frames.shape[1:])
+    search = engine.OnsetSearch(frames.shape[1:], frames.dtype, dark=dark, bright=bright)
+    for block in blocks(frames, [1, 1, 3, 2, 7], travel=travel):
+        search.push(block)
+    return onset_maps(search.result())
+
+
+def change_of(dtype: str, **options: Any) -> Answer:
+    """Find the change-point of a press."""
+    frames, travel = press(dtype, seed=8)
+    return onset_maps(engine.find_change_point(frames, travel, **options))
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_change_point_of_known_levels() -> Answer:
+    known = {
+        dtype: dict(zip(("dark", "bright"), level_maps(dtype, (37, 53)), strict=True)) for dtype in LEVELS
+    }
+    return named(**{dtype: change_of(dtype, **levels) for dtype, levels in known.items()})
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_change_point_of_unknown_levels() -> Answer:
+    return named(**{dtype: change_of(dtype) for dtype in LEVELS})
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_change_point_of_a_release() -> Answer:
+    frames, travel = press("uint8", seed=9)
+    back, up = np.ascontiguousarray(frames[::-1]), travel[::-1]
+    dark, bright = LEVELS["uint8"]
+    return named(
+        known=onset_maps(engine.find_change_point(back, up, dark=dark, bright=bright, event="release")),
+        unknown=onset_maps(engine.find_change_point(back, up, hold=3, event="release")),
+    )
+
+
+@case(height=HEIGHT, sigma=HEIGHT)
+def find_change_point_block_by_block() -> Answer:
+    frames, travel = press("uint16", seed=8)
+    search = engine.ChangePointSearch(frames.shape[1:], frames.dtype)
+    cut = blocks(frames, [2, 1, 6, 1], travel=travel)
+    for block in cut:
+        search.push(block)
+    search.rewind()
+    for block in cut:
+        search.push(block)
+    return onset_maps(search.result())
+
+
+@case(HEIGHT)
+def fill_holes() -> Answer:
+    height = dome((41, 56))[0]
+    x, y = places((41, 56))
+    holes = (np.hypot(x - 0.3, y) < 0.25) | (np.hypot(x + 0.6, y + 0.4) < 0.12)
+    sigma = np.where(holes, np.nan, 0.003)
+    known = np.where(holes, np.nan, height)
+    filled, where = engine.fill_holes(known, sigma, PIXEL)
+    deep, there = engine.fill_holes(known, sigma, PIXEL, deepest=-0.6, steepest=0.1)
+    return {"filled": filled, "where": where, "deep": deep, "deep_where": there}
+
+
+def press_source(dtype: str = "uint8", **known: Any) -> Source:
+    """Return a press as a source with all that a header knows."""
+    frames, travel = press(dtype, (48, 64), 24)
+    dark, bright = (np.full((48, 64), level, np.float32) for level in LEVELS[dtype])
+    header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab", **known)
+    return Source(frames, header, travel=travel)
+
+
+@case(HEIGHT, process=FITTED)
+def reconstruct_a_press() -> Answer:
+    return named(
+        threshold=result_maps(engine.reconstruct(press_source())),
+        change=result_maps(engine.reconstruct(press_source("uint16"), method="change-point", fill=False)),
+    )
+
+
+@case(HEIGHT, process=FITTED)
+def reconstruct_a_press_with_a_gel() -> Answer:
+    shape, travel = (40, 46), np.arange(0.0, 1.2, 0.05)
+    x, y = places(shape, (0.12, 0.12))
+    starts = 0.12 * (x**2 + y**2) - 0.02  # a pixel some way off turns light before it is touched
+    starts[np.hypot(x, y) < 0.45] = 9.0
+    frames = counted(np.clip((travel[:, None, None] - starts) / 0.05 + 0.5, 0, 1), "uint8")
+    dark, bright = (np.full(shape, level, np.float32) for level in LEVELS["uint8"])
+    header = io.Header("vertical", pixel_size=(0.12, 0.12), dark=dark, bright=bright, camera="lab")
+    gel = io.Gel(threshold=0.2, compliance=0.02, curvature=0.05, error=0.004)
+    calibration = io.Calibration(io.CameraId("lab", shape, np.dtype("uint8")), gel=gel)
+    return result_maps(engine.reconstruct(Source(frames, header, travel=travel), calibration, noise=1.0))
+
+
+# A rotation.
+
+
+@case()
+def correlate_even_phases() -> Answer:
+    return named(**{d: wave_maps(engine.correlate(turn(d)[0], EIGHTHS)) for d in LEVELS})
+
+
+@case()
+def correlate_uneven_phases() -> Answer:
+    return named(**{d: wave_maps(engine.correlate(turn(d, phase=UNEVEN)[0], UNEVEN)) for d in LEVELS})
+
+
+@case()
+def correlate_weights_and_missing_samples() -> Answer:
+    frames = turn("float32", phase=UNEVEN)[0]
+    frames[pick(frames.shape, 0.002, 3)] = np.nan
+    return wave_maps(engine.correlate(frames, UNEVEN, weights=[1, 1, 0, 2, 1, 0.5, 1, 1]))
+
+
+def long_turn(dtype: str) -> tuple[Any, Any]:
+    """Return frames of three uneven turns, and their phases."""
+    phase = np.arange(24) * np.pi / 4 + np.random.default_rng(5).normal(0, 0.05, 24)
+    return turn(dtype, (33, 47), phase)[0], phase
+
+
+@case()
+def correlate_block_by_block() -> Answer:
+    answers = {}
+    for dtype in LEVELS:
+        frames, phase = long_turn(dtype)
+        correlator = engine.Correlator(frames.shape[1:], frames.dtype)
+        for block in blocks(frames, [3, 1, 8, 5], phase=phase):
+            correlator.push(block)
+        answers[dtype] = wave_maps(correlator.result())
+    return named(**answers)
+
+
+@case()
+def correlate_a_sliding_window() -> Answer:
+    answers = {}
+    for dtype in LEVELS:
+        frames, phase = long_turn(dtype)
+        correlator = engine.Correlator(frames.shape[1:], frames.dtype, window=10)
+        for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
+            correlator.push(block)
+            answers[f"{dtype}_{number}"] = wave_maps(correlator.result())
+    return named(**answers)
+
+
+def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> Answer:
+    """Estimate the dome's normals."""
+    made = {name: options.pop(name) for name in ("noise_of", "lost", "shape") if name in options}
+    made = {"noise": made.pop("noise_of", 1.0), **made}
+    frames, gain, offset = turn(dtype, phase=phase, **made)
+    return normal_maps(engine.estimate_normals(frames, phase, TILT, gain, offset, **options))
+
+
+ROTATION = {"vectors": NORMAL, "sigma": (1e-4, 1e-7), "zenith": NORMAL}
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_exactly() -> Answer:
+    return named(**{dtype: normals_of(dtype) for dtype in LEVELS}, wide=normals_of(shape=(48, 64)))
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_of_uneven_phases() -> Answer:
+    return named(**{dtype: normals_of(dtype, UNEVEN) for dtype in LEVELS})
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_as_printed() -> Answer:
+    return named(
+        even=normals_of("uint8", method="paper"), uneven=normals_of("uint16", UNEVEN, method="paper")
+    )
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_of_noise_and_clipped_samples() -> Answer:
+    return named(
+        noisy=normals_of("uint8", noise_of=4.0),
+        told=normals_of("uint8", noise=1.5),
+        clipped=normals_of("uint16", low=400.0, high=1400.0),
+        weighed=normals_of("uint16", weights=[1, 1, 0.5, 1, 1, 0, 1, 1]),
+    )
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_where_contact_is_lost() -> Answer:
+    return normals_of("uint8", lost=True, shape=(48, 64))
+
+
+@case(FITTED, **ROTATION, numbers=(1e-4, 1e-7))
+def estimate_normals_and_the_tilt() -> Answer:
+    frames, gain, offset = turn("uint16")
+    return normal_maps(engine.estimate_normals(frames, EIGHTHS, None, gain, offset))
+
+
+@case(FITTED, **ROTATION)
+def estimate_normals_block_by_block() -> Answer:
+    frames, phase = long_turn("uint16")
+    answers = {}
+    for per_turn in (False, True):
+        estimator = engine.NormalEstimator(
+            frames.shape[1:], frames.dtype, tilt=TILT, gain=3400.0, offset=150.0, per_turn=per_turn
+        )
+        for block in blocks(frames, [5, 1, 9, 3], phase=phase):
+            estimator.push(block)
+        answers["each" if per_turn else "mean"] = normal_maps(estimator.result())
+    return named(**answers)
+
+
+def facets(shape: tuple[int, int]) -> tuple[Any, Any, Any]:
+    """Return normals of a roof in a field with a hole, their errors, and contact."""
+    along_x, along_y = ridge(shape)
+    vectors = np.stack([-along_x, -along_y, np.ones(shape)], axis=-1)
+    vectors += np.random.default_rng(2).normal(0, 0.01, vectors.shape)
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    x, y = places(shape)
+    contact = (np.hypot(x - 0.4, y - 0.3) > 0.3).astype(np.uint8)
+    vectors[contact == 0] = np.nan
+    sigma = np.where(contact == 1, 0.014, np.nan)
+    return vectors.astype(np.float32), sigma.astype(np.float32), contact
+
+
+@case()
+def find_edges() -> Answer:
+    return {f"edges_{h}x{w}": engine.find_edges(*facets((h, w))) for h, w in ((48, 64), (71, 53))}
+
+
+def turn_source(turns: int = 1, dtype: str = "uint16", **known: Any) -> Source:
+    """Return a rotation as a source with all that a header knows."""
+    phase = np.arange(8 * turns) * np.pi / 4
+    frames, gain, offset = turn(dtype, (40, 52), phase, lost=True)
+    scale = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset)}
+    header = io.Header("axial", pixel_size=PIXEL, tilt=TILT, press=1.0, camera="lab", **scale, **known)
+    return Source(frames, header, phase=phase)
+
+
+RECONSTRUCTED = {
+    "height": SOLVED,
+    "height_sigma": SIGMA,
+    "normals": NORMAL,
+    "zenith": NORMAL,
+    "azimuth": (1e-5, 1e-4),
+    "normal_sigma": (1e-4, 1e-7),
+    "process": (1e-3, 1e-6),
+}
+
+
+@case(FITTED, **RECONSTRUCTED)
+def reconstruct_a_rotation() -> Answer:
+    return result_maps(engine.reconstruct(turn_source()))
+
+
+@case(FITTED, **RECONSTRUCTED)
+def reconstruct_a_rotation_robustly() -> Answer:
+    return result_maps(engine.reconstruct(turn_source(), robust=True))
+
+
+@case(FITTED, **RECONSTRUCTED)
+def reconstruct_each_turn() -> Answer:
+    return result_maps(engine.reconstruct(turn_source(2), per_turn=True))
+
+
+@case(FITTED, **RECONSTRUCTED)
+def reconstruct_a_rotation_with_other_options() -> Answer:
+    return named(
+        paper=result_maps(engine.reconstruct(turn_source(), method="paper")),
+        tilt=result_maps(engine.reconstruct(turn_source(), tilt="estimate")),
+    )
+
+
+@case(FITTED, **RECONSTRUCTED)
+def reconstruct_a_registered_rotation() -> Answer:
+    heights = dome((40, 52))[0].astype(np.float32)
+    return result_maps(engine.reconstruct(turn_source(pivot=(0.4, -0.3, 5.0)), heights=heights))
+
+
+@case((1e-5, 1e-5))
+def registered_frames() -> Answer:
+    heights = dome((40, 52))[0].astype(np.float32)
+    source = engine.Registered(turn_source(dtype="float32", pivot=(0.4, -0.3, 5.0)), heights)
+    out = np.empty(source.shape, source.dtype)
+    parts = []
+    while (block := source.read(out)) is not None:
+        parts.append(block.frames.copy())
+    return {"frames": np.concatenate(parts)}
+
+
+@case(FITTED)
+def correlate_a_source() -> Answer:
+    return result_maps(engine.correlate_source(turn_source(2)))
+
+
+# Surfaces.
+
+
+def integrated(shape: tuple[int, int], **options: Any) -> Answer:
+    """Integrate the dome's slopes, with noise."""
+    _, along_x, along_y = dome(shape)
+    random = np.random.default_rng(3)
+    along_x, along_y = (slope + random.normal(0, 0.01, shape) for slope in (along_x, along_y))
+    return surface_maps(engine.integrate(along_x, along_y, PIXEL, **options))
+
+
+SURFACE = {"height": SOLVED, "sigma": SIGMA}
+
+
+def disc(shape: tuple[int, int]) -> Any:
+    """Return pixels in two pieces."""
+    x, y = places(shape)
+    return (np.hypot(x, y) < 0.9) | (x > 1.1)
+
+
+def cut(shape: tuple[int, int]) -> Any:
+    """Return a line of edges that ends in the picture."""
+    x, y = places(shape)
+    return (np.abs(x + 0.3 * y - 0.2) < 0.03) & (y > -0.6)
+
+
+def some_heights(shape: tuple[int, int]) -> Any:
+    """Return heights that are known here and there."""
+    return np.where(pick(shape, 0.05, 11), dome(shape)[0] - 1.0, np.nan)
+
+
+@case(**SURFACE)
+def integrate_rectangles() -> Answer:
+    sizes = ((48, 64), (37, 53), (64, 31))
+    plain = {f"size_{h}x{w}": integrated((h, w)) for h, w in sizes}
+    return named(**plain, bare=integrated((48, 64), sigma=False))
+
+
+@case(**SURFACE)
+def integrate_masks() -> Answer:
+    answers = {f"size_{h}x{w}": integrated((h, w), mask=disc((h, w))) for h, w in ((48, 64), (41, 57))}
+    return named(**answers, bare=integrated((41, 57), mask=disc((41, 57)), sigma=False))
+
+
+@case(**SURFACE)
+def integrate_weights() -> Answer:
+    weights = np.random.default_rng(4).uniform(10, 1000, (41, 57))
+    return named(
+        alone=integrated((41, 57), weights=weights),
+        masked=integrated((41, 57), weights=weights, mask=disc((41, 57))),
+    )
+
+
+@case(**SURFACE)
+def integrate_cuts() -> Answer:
+    return integrated((43, 58), edges=cut((43, 58)), mask=disc((43, 58)))
+
+
+@case(**SURFACE)
+def integrate_known_heights() -> Answer:
+    shape = (40, 54)
+    weights = np.where(pick(shape, 0.5, 12), 4e4, 1e4)
+    slopes = np.full(shape, 1e4)
+    return named(
+        alone=integrated(shape, heights=some_heights(shape)),
+        weighed=integrated(
+            shape, weights=slopes, heights=some_heights(shape), height_weights=weights, mask=disc(shape)
+        ),
+    )
+
+
+@case(**SURFACE)
+def integrate_missing_slopes() -> Answer:
+    shape = (39, 50)
+    along_x, along_y = dome(shape)[1:]
+    along_x = np.where(pick(shape, 0.03, 13), np.nan, along_x)
+    return surface_maps(engine.integrate(along_x, along_y, PIXEL))
+
+
+@case(**SURFACE)
+def integrate_robustly() -> Answer:
+    shape = (44, 60)
+    along_x, along_y = ridge(shape)
+    x, y = places(shape)
+    along_x = along_x + np.where((np.abs(x - 0.5) < 0.03) & (y > 0), 5.0, 0.0)
+    return named(
+        ridge=surface_maps(engine.integrate(along_x, along_y, PIXEL, robust=True)),
+        bare=surface_maps(engine.integrate(along_x, along_y, PIXEL, robust=True, k=4.0, sigma=False)),
+        dome=integrated((37, 49), robust=True, mask=disc((37, 49))),
+    )
+
+
+@case(**SURFACE)
+def integrate_live() -> Answer:
+    shape, answers = (42, 55), {}
+    integrator = engine.Integrator(shape, PIXEL)
+    for number in range(3):
+        along_x, along_y = dome(shape, 0.2 + 0.05 * number)[1:]
+        mask = disc(shape) if number else np.ones(shape, bool)
+        answers[f"frame_{number}"] = surface_maps(
+            integrator.integrate(along_x, along_y, mask=mask, tolerance=1e-5)
+        )
+    return named(**answers)
+
+
+@case(**SURFACE)
+def fuse() -> Answer:
+    shape = (40, 52)
+    frames, gain, offset = turn("uint16", shape)
+    normals = engine.estimate_normals(frames, EIGHTHS, TILT, gain, offset)
+    travel = np.arange(0.0, 1.0, 0.05)
+    x, y = places(shape)
+    starts = np.where(np.hypot(x, y) < 0.3, 9.0, -dome(shape)[0])
+    counts = counted((travel[:, None, None] > starts).astype(float), "uint8")
+    onset = engine.find_onset(counts, travel, *LEVELS["uint8"], noise=1.0)
+    return named(
+        whole=surface_maps(engine.fuse(onset, normals, PIXEL)),
+        masked=surface_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),
+        robust=surface_maps(engine.fuse(onset, normals, PIXEL, robust=True)),
+    )
+
+
+@case(FITTED, **RECONSTRUCTED)
+def fuse_sources() -> Answer:
+    shape, travel = (40, 52), np.arange(0.0, 1.0, 0.05)
+    starts = -dome(shape)[0]
+    frames = counted(np.clip((travel[:, None, None] - starts) / 0.04 + 0.5, 0, 1), "uint8")
+    dark, bright = (np.full(shape, level, np.float32) for level in LEVELS["uint8"])
+    header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab")
+    down = Source(frames, header, travel=travel)
+    return result_maps(engine.fuse_sources(down, turn_source(pivot=(0.4, -0.3, 5.0)), press={"noise": 1.0}))
+
+
+# Measures.
+
+
+def cap(shape: tuple[int, int] = (48, 64), radius: float = 4.0) -> io.Result:
+    """Return a ball's cap with noise, a scratch and a hole, as a result."""
+    x, y = places(shape)
+    random = np.random.default_rng(21)
+    height = np.sqrt(radius**2 - (x - 0.1) ** 2 - (y + 0.2) ** 2) - radius - 0.5
+    height = height + random.normal(0, 0.002, shape) + 0.003 * np.sin(20 * x)
+    height[5:8, 10:14] = np.nan
+    height[30, 20:40] -= 0.05
+    sigma = np.full(shape, 0.002, np.float32)
+    axis_x, axis_y = io.pixel_axes(shape, PIXEL)
+    return io.Result(height=height.astype(np.float32), height_sigma=sigma, x=axis_x, y=axis_y)
+
+
+def numbers(quantities: dict[str, engine.Quantity]) -> dict[str, list[Any]]:
+    """Return measured quantities as JSON."""
+    return {name: [float(one.value), float(one.sigma), one.unit] for name, one in quantities.items()}
+
+
+@case(FITTED)
+def fit_plane() -> Answer:
+    x, y = places((37, 53))
+    height = 0.1 * x - 0.05 * y + 0.3 + np.random.default_rng(2).normal(0, 0.003, x.shape)
+    height[pick(x.shape, 0.02, 5)] += 0.5
+    axis_x, axis_y = io.pixel_axes(x.shape, PIXEL)
+    found = engine.fit_plane(height, axis_x, axis_y, np.full(x.shape, 0.003))
+    bare = engine.fit_plane(height, axis_x, axis_y)
+    return {
+        "numbers": numbers(found.quantities()),
+        "residual": found.residual,
+        "outliers": found.outliers,
+        "birge": found.birge,
+        "bare": numbers(bare.quantities()),
+    }
+
+
+@case(FITTED)
+def fit_sphere() -> Answer:
+    known = cap()
+    found = engine.fit_sphere(known.height, known.x, known.y, known.height_sigma)
+    return {
+        "numbers": numbers(found.quantities()),
+        "residual": found.residual,
+        "outliers": found.outliers,
+        "hollow": found.hollow,
+        "birge": found.birge,
+    }
+
+
+@case(FITTED)
+def roughness() -> Answer:
+    x, y = places((45, 61))
+    residual = (
+        0.004 * np.sin(9 * x) + 0.002 * np.cos(7 * y) + np.random.default_rng(8).normal(0, 1e-3, x.shape)
+    )
+    residual[10:13, 20:23] = np.nan
+    plain = engine.roughness(residual, PIXEL)
+    fine = engine.roughness(residual, PIXEL, cutoff=0.8, sigma=np.full(x.shape, 1e-3))
+    counts = [[one.pixels, one.left_out, one.unsure] for one in (plain, fine)]
+    return {
+        "plain": numbers(plain.quantities()),
+        "fine": numbers(fine.quantities()),
+        "counts": np.array(counts),
+    }
+
+
+@case(FITTED)
+def section_and_step() -> Answer:
+    x, y = places((48, 64))
+    height = (
+        np.where(x + 0.2 * y > 0.1, 0.3, 0.0) + 0.02 * x + np.random.default_rng(4).normal(0, 0.002, x.shape)
+    )
+    axis_x, axis_y = io.pixel_axes((48, 64), PIXEL)
+    sigma = np.full((48, 64), 0.002, np.float32)
+    result = io.Result(height=height.astype(np.float32), height_sigma=sigma, x=axis_x, y=axis_y)
+    along = engine.section(result, (-1.2, 0.1), (1.3, -0.2))
+    across = engine.section(cap())
+    step = engine.step_height(along)
+    return {
+        "distance": along.distance,
+        "height": along.height,
+        "sigma": along.sigma,
+        "apex_x": across.x,
+        "apex_y": across.y,
+        "apex_height": across.height,
+        "step": numbers({"height": step.height, "place": step.place, "slope": step.slope}),
+    }
+
+
+@case(FITTED)
+def measure() -> Answer:
+    found = {
+        "all": engine.measure(cap()),
+        "sphere": engine.measure(cap(), form="sphere", cutoff=0.5, section=((-1.0, 0.0), (1.0, 0.3))),
+        "part": engine.measure(cap(), region=io.Region((10, 40), (5, 50)), form="plane"),
+    }
+    return {name: {**numbers(one.quantities), "notes": one.notes} for name, one in found.items()}
+
+
+@case(FITTED)
+def score() -> Answer:
+    shape = (40, 52)
+    height, along_x, along_y = dome(shape)
+    zenith = np.arctan(np.hypot(along_x, along_y)).astype(np.float32)
+    azimuth = np.arctan2(-along_y, -along_x).astype(np.float32)
+    contact = disc(shape).astype(np.uint8)
+    truth = io.Truth(height.astype(np.float32), zenith, azimuth, contact)
+    result = engine.reconstruct(turn_source())
+    return {"table": engine.score(result, truth).table()}
+
+
+@case()
+def summarise() -> Answer:
+    told = engine.summarise(engine.reconstruct(press_source()))
+    return {
+        "what": told.what,
+        "counts": np.array([told.pixels, told.answered, told.filled]),
+        "range": np.array([told.lowest, told.highest]),
+        "unit": told.unit,
+    }

@@ -1,0 +1,172 @@
+"""Frozen answers: what a case is, how its answers are kept, and how two of them differ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ANSWERS = Path(__file__).with_name("answers.npz")
+
+Answer = Mapping[str, Any]
+Tolerance = tuple[float, float]  # relative, absolute
+
+KERNEL: Tolerance = (1e-6, 1e-7)  # one pass over the frames: the last bits of a float32
+VOLATILE = (
+    "date",
+    "path",
+    "hash",
+    "sha256",
+    "version",
+    "device",
+    "driver",
+    "program",
+    "seconds",
+    "start_time",
+)
+"""Words in the names of what differs from run to run, or from machine to machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A call whose answers are frozen, and by how much its floats may differ; integers and texts may not."""
+
+    make: Callable[[], Answer]
+    tolerance: Tolerance
+    of: Mapping[str, Tolerance]
+
+    def within(self, array: str) -> Tolerance:
+        """Return the tolerance of one of its arrays, by the last word of its name."""
+        return self.of.get(array.split(".")[-1], self.tolerance)
+
+
+CASES: dict[str, Case] = {}
+
+
+def case(
+    tolerance: Tolerance = KERNEL, **of: Tolerance
+) -> Callable[[Callable[[], Answer]], Callable[[], Answer]]:
+    """Keep a function as the case of its name; it works in an empty folder that all cases share."""
+
+    def keep(make: Callable[[], Answer]) -> Callable[[], Answer]:
+        assert make.__name__ not in CASES
+        CASES[make.__name__] = Case(make, tolerance, of)
+        return make
+
+    return keep
+
+
+def tell(found: Any) -> NDArray[Any]:
+    """Return an answer as an array; what is neither array nor number becomes JSON."""
+    if isinstance(found, dict | list | str):
+        return np.array(json.dumps(steady(found), sort_keys=True))
+    return np.asarray(found)
+
+
+def steady(found: Any) -> Any:
+    """Return JSON without what differs from run to run."""
+    if isinstance(found, dict):
+        kept = {k: v for k, v in found.items() if not any(word in k.lower() for word in VOLATILE)}
+        return {name: steady(value) for name, value in kept.items()}
+    return [steady(one) for one in found] if isinstance(found, list) else found
+
+
+def answers(name: str) -> dict[str, NDArray[Any]]:
+    """Run a case, and return its arrays."""
+    return {key: tell(value) for key, value in CASES[name].make().items() if value is not None}
+
+
+def load() -> dict[str, dict[str, NDArray[Any]]]:
+    """Return the frozen answers of all cases."""
+    kept: dict[str, dict[str, NDArray[Any]]] = {}
+    if ANSWERS.exists():
+        with np.load(ANSWERS) as file:
+            for key in file.files:
+                name, array = key.split("/")
+                kept.setdefault(name, {})[array] = file[key]
+    return kept
+
+
+def save(kept: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+    """Freeze the answers of all cases."""
+    arrays = {f"{name}/{key}": kept[name][key] for name in sorted(kept) for key in sorted(kept[name])}
+    np.savez_compressed(ANSWERS, **arrays)
+
+
+def differences(
+    name: str, found: Mapping[str, NDArray[Any]], frozen: Mapping[str, NDArray[Any]]
+) -> dict[str, str]:
+    """Return what differs beyond the tolerance, in words, by array."""
+    wrong = dict.fromkeys(frozen.keys() - found.keys(), "is missing")
+    wrong |= dict.fromkeys(found.keys() - frozen.keys(), "is new")
+    for key in sorted(found.keys() & frozen.keys()):
+        same, words = compare(found[key], frozen[key], CASES[name].within(key))
+        if not same:
+            wrong[key] = words
+    return wrong
+
+
+def compare(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance) -> tuple[bool, str]:
+    """Tell whether two arrays are the same within a tolerance, and how they differ."""
+    if (found.dtype.kind, found.shape) != (frozen.dtype.kind, frozen.shape):
+        return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
+    if frozen.dtype.kind == "U":
+        return _compare_texts(str(found), str(frozen), within)
+    if found.dtype != frozen.dtype:
+        return False, f"{frozen.dtype} became {found.dtype}"
+    if frozen.dtype.kind != "f":
+        count = int(np.count_nonzero(found != frozen))
+        return count == 0, f"{count} of {frozen.size} differ" if count else "equal"
+    return _compare_floats(found.astype(float), frozen.astype(float), within)
+
+
+def _compare_floats(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance) -> tuple[bool, str]:
+    there = np.isfinite(frozen)
+    elsewhere = np.where(there, 0.0, frozen)
+    odd = int(
+        np.count_nonzero((there != np.isfinite(found)) | _differ(np.where(there, 0.0, found), elsewhere))
+    )
+    if odd:
+        return False, f"{odd} of {frozen.size} are no numbers in one of them only"
+    error = np.abs(found[there] - frozen[there])
+    if not error.any():
+        return True, "equal"
+    size = np.maximum(np.abs(frozen[there]), np.finfo(float).tiny)
+    same = bool(np.all(error <= within[1] + within[0] * size))
+    wrong = np.count_nonzero(error)
+    return same, f"{wrong} differ by up to {error.max():.2g}, relative {np.max(error / size):.2g}"
+
+
+def _differ(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+    return ~((one == other) | (np.isnan(one) & np.isnan(other)))
+
+
+def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, str]:
+    if found == frozen:
+        return True, "equal"
+    one, other = dict(_leaves(json.loads(found))), dict(_leaves(json.loads(frozen)))
+    wrong = [place for place in sorted(one.keys() | other.keys()) if not _alike(place, one, other, within)]
+    told = "; ".join(f"{place}: {other.get(place)!r} became {one.get(place)!r}" for place in wrong[:5])
+    return not wrong, told or "equal but for rounding"
+
+
+def _alike(place: str, one: dict[str, Any], other: dict[str, Any], within: Tolerance) -> bool:
+    if place not in one or place not in other:
+        return False
+    left, right = one[place], other[place]
+    if isinstance(left, float) and isinstance(right, float):
+        return abs(left - right) <= within[1] + within[0] * abs(right) or (left != left and right != right)
+    return bool(left == right and type(left) is type(right))
+
+
+def _leaves(found: Any, place: str = "") -> list[tuple[str, Any]]:
+    """Return every value of some JSON, and where it stands."""
+    if not isinstance(found, dict | list):
+        return [(place, found)]
+    parts = found.items() if isinstance(found, dict) else enumerate(found)
+    return [leaf for name, part in parts for leaf in _leaves(part, f"{place}.{name}" if place else str(name))]

@@ -1,0 +1,26 @@
+"""No answer has changed since it was frozen; ``compare.py`` says how, and freezes others."""
+
+from __future__ import annotations
+
+import golden
+import pytest
+from cases import CASES
+
+FROZEN = golden.load()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("golden")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_answers_are_as_they_were(name, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert name in FROZEN, "never frozen: python tests/golden/compare.py --freeze"
+    wrong = golden.differences(name, golden.answers(name), FROZEN[name])
+    assert not wrong
+
+
+def test_every_frozen_answer_has_a_case():
+    assert set(FROZEN) == set(CASES)
