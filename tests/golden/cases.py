@@ -1,5 +1,6 @@
 """All cases: the estimators' from Python, and the commands'."""
 
+import calibration_cases  # noqa: F401
 import command_cases  # noqa: F401
 import engine_cases  # noqa: F401
 from golden import CASES

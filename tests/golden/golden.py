@@ -18,16 +18,8 @@ Tolerance = tuple[float, float]  # relative, absolute
 
 KERNEL: Tolerance = (1e-6, 1e-7)  # one pass over the frames: the last bits of a float32
 VOLATILE = (
-    "date",
-    "path",
-    "hash",
-    "sha256",
-    "version",
-    "device",
-    "driver",
-    "program",
-    "seconds",
-    "start_time",
+    *("date", "path", "hash", "sha256", "fingerprint", "modified", "batch_parameters", "start", "seconds"),
+    *("version", "device", "driver", "program", "bytes", "integration_residual", "integration_iterations"),
 )
 """Words in the names of what differs from run to run, or from machine to machine."""
 
@@ -136,10 +128,11 @@ def _compare_floats(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance
     error = np.abs(found[there] - frozen[there])
     if not error.any():
         return True, "equal"
-    size = np.maximum(np.abs(frozen[there]), np.finfo(float).tiny)
+    size = np.abs(frozen[there])
     same = bool(np.all(error <= within[1] + within[0] * size))
-    wrong = np.count_nonzero(error)
-    return same, f"{wrong} differ by up to {error.max():.2g}, relative {np.max(error / size):.2g}"
+    known = size > np.finfo(np.float32).tiny
+    relative = np.max(error[known] / size[known], initial=0.0)
+    return same, f"{np.count_nonzero(error)} differ by up to {error.max():.2g}, relative {relative:.2g}"
 
 
 def _differ(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
@@ -158,10 +151,18 @@ def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, st
 def _alike(place: str, one: dict[str, Any], other: dict[str, Any], within: Tolerance) -> bool:
     if place not in one or place not in other:
         return False
-    left, right = one[place], other[place]
+    left, right = _number(one[place]), _number(other[place])
     if isinstance(left, float) and isinstance(right, float):
         return abs(left - right) <= within[1] + within[0] * abs(right) or (left != left and right != right)
     return bool(left == right and type(left) is type(right))
+
+
+def _number(value: Any) -> Any:
+    """Return the number that a text is, if it is one."""
+    try:
+        return float(value) if isinstance(value, str) and "." in value else value
+    except ValueError:
+        return value
 
 
 def _leaves(found: Any, place: str = "") -> list[tuple[str, Any]]:
