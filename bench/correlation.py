@@ -19,7 +19,7 @@ from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_correlation
 from mirrorskin.bench.turns import STEPS, fill, phases
 from mirrorskin.engine import Correlator
-from mirrorskin.engine.rotation.phases import basis
+from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError

@@ -33,7 +33,7 @@ def command(
     from mirrorskin.cli.output import progress, save_and_tell
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.stack import stack_options
-    from mirrorskin.engine.rotation.axial import correlate_source
+    from mirrorskin.engine.rotation.rotation import correlate_source
 
     known = stack_options(
         motion=options.MotionName.axial,

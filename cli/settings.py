@@ -15,7 +15,7 @@ from mirrorskin.cli.stack import StackOptions, stack_options
 from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.press.onset import EVENTS
 from mirrorskin.engine.press.press import METHODS
-from mirrorskin.engine.rotation.launch import NORMAL_METHODS
+from mirrorskin.engine.rotation.normals_kernel import NORMAL_METHODS
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError
 

@@ -15,10 +15,9 @@ from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import sign
 from mirrorskin.engine.reconstruction import calibrated, undistorted
-from mirrorskin.engine.rotation.axial import Rotation, estimate_rotation, maps_of
-from mirrorskin.engine.rotation.relief import tell_integration
-from mirrorskin.engine.rotation.response import response_of
-from mirrorskin.engine.rotation.slopes import Slopes, find_slopes
+from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, find_slopes
+from mirrorskin.engine.rotation.response import wall_response_of
+from mirrorskin.engine.rotation.rotation import Rotation, estimate_rotation, rotation_maps
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, ProcessValue, Result, Source
@@ -220,7 +219,7 @@ def fuse_sources(
     if progress:
         progress(frames_to_read(vertical, axial, register))
     turned = sign(Result(), axial, opened, found.process)
-    process = _both(heights.process, turned.process) | tell_integration([surface]) | {"heights": "none"}
+    process = _both(heights.process, turned.process) | describe_integration([surface]) | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
     together = _put_together(heights, found, surface)
@@ -268,7 +267,7 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
 
 def _check_rotation(axial: Source, rotation: Mapping[str, Any]) -> None:
     """Refuse a rotation that gives no normals, or not those of one picture."""
-    known = axial.header.zenith_gain is not None or response_of(axial) is not None
+    known = axial.header.zenith_gain is not None or wall_response_of(axial) is not None
     if not known and rotation.get("gain") is None:
         raise InputError(
             f"{axial.name} has no zenith gain, so no normals to fuse: give the gain, or a calibration"
@@ -288,7 +287,7 @@ def _put_together(heights: Result, rotation: Rotation, surface: Surface) -> Resu
     """Return the maps of a press, a rotation and the surface of both."""
     edges = rotation.edges if surface.edges is None else rotation.edges | surface.edges
     return replace(
-        maps_of(rotation),
+        rotation_maps(rotation),
         height=surface.height,
         height_sigma=surface.sigma,
         status=heights.status,

@@ -22,7 +22,7 @@ def reconstruct(
         anything.
     **options
         Those of `mirrorskin.engine.press.press.reconstruct_press` for a vertical motion, of
-        `mirrorskin.engine.rotation.axial.reconstruct_rotation` for an axial one.
+        `mirrorskin.engine.rotation.rotation.reconstruct_rotation` for an axial one.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def reconstruct(
 
         result = reconstruct_press(known, **options)
     elif source.motion == "axial":
-        from mirrorskin.engine.rotation.axial import reconstruct_rotation
+        from mirrorskin.engine.rotation.rotation import reconstruct_rotation
 
         result = reconstruct_rotation(known, **options)
     else:

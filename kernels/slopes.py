@@ -1,7 +1,7 @@
 """Slopes and their weights from normals: what ``slopes.cl`` computes, in NumPy with float64.
 
-`mirrorskin.engine.rotation.slopes.find_slopes` says why; this is the same for one turn of a known tilt, in
-two steps as kernels take them.
+`mirrorskin.engine.rotation.normals_to_height.find_slopes` says why; this is the same for one turn of a known
+tilt, in two steps as kernels take them.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ from mirrorskin.bench.peers.normals.odd import answer
 from mirrorskin.bench.sweep.sweep import FRAME_TYPES, MAPS_ONLY, Family, Job, Shape, agree, run_kernel
 from mirrorskin.bench.turns import STEPS, TILT, fill, phases
 from mirrorskin.engine import Correlator, NormalEstimator, find_edges
+from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.engine.rotation.edges import LIMITS
-from mirrorskin.engine.rotation.phases import basis
-from mirrorskin.engine.rotation.relief_maps import SlopeMaps
+from mirrorskin.engine.rotation.normals_to_height import SlopeKernels
 from mirrorskin.io import Block
 from mirrorskin.kernels import correlation, edges, registration, slopes
 from mirrorskin.kernels.array import Array
@@ -156,7 +156,7 @@ def _make_slopes(device: Device, shape: Shape, kind: str, _: int) -> dict[str, J
     to = {name: device.array(name, shape, np.float32) for name in ("dz_dx", "dz_dy", "weight_x", "weight_y")}
     for array in to.values():
         array.upload()
-    maps = SlopeMaps(device, shape)
+    maps = SlopeKernels(device, shape)
     maps.find(TILT, normals, to)  # which finds the typical weight
 
     def check() -> None:

@@ -15,7 +15,7 @@ from mirrorskin.cli.output import print_table
 if TYPE_CHECKING:
     from mirrorskin import io
     from mirrorskin.engine import Score
-    from mirrorskin.engine.rotation.launch import NormalMethod
+    from mirrorskin.engine.rotation.normals_kernel import NormalMethod
 
 
 @dataclass(frozen=True)

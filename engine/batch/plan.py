@@ -16,7 +16,7 @@ import numpy as np
 
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import program_version
-from mirrorskin.engine.rotation.axial import reconstruct_rotation
+from mirrorskin.engine.rotation.rotation import reconstruct_rotation
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Motion, Result
 

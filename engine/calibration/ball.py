@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.rotation.phases import basis, check_phases
+from mirrorskin.engine.rotation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
 
 Doubles = NDArray[np.float64]

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from mirrorskin.engine.calibration.ball import Followed, rotations, smooth_turn
 from mirrorskin.engine.calibration.brightness import LinearShown, Shown
 from mirrorskin.engine.calibration.tilt_tracks import BallTurn, PlateTurn, Tilts, track_ball, track_plate
-from mirrorskin.engine.rotation.phases import check_phases
+from mirrorskin.engine.rotation.design_matrix import check_phases
 from mirrorskin.io import InputError, Precession
 
 Doubles = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.rotation.edges import EdgeDrawing
-from mirrorskin.engine.rotation.window import NormalWindow
+from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.kernels.device import Device
 
 _PARTS = 24  # of the longest kernel

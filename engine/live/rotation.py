@@ -17,18 +17,16 @@ from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.types import Update
 from mirrorskin.engine.provenance import naming, sign, told, told_level
 from mirrorskin.engine.reconstruction import undistorted
-from mirrorskin.engine.rotation.axial import Rotation, maps_of
+from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator
+from mirrorskin.engine.rotation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.launch import NormalMethod
 from mirrorskin.engine.rotation.normals import Normals
-from mirrorskin.engine.rotation.options import options_of
-from mirrorskin.engine.rotation.relief import find_relief
-from mirrorskin.engine.rotation.relief_maps import SlopeMaps
-from mirrorskin.engine.rotation.response import first_response, response_of
-from mirrorskin.engine.rotation.standing import standing_heights
-from mirrorskin.engine.rotation.turns import LONGEST
-from mirrorskin.engine.rotation.window import NormalWindow
+from mirrorskin.engine.rotation.normals_kernel import NormalMethod, options_from
+from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, integrate_normals
+from mirrorskin.engine.rotation.normals_window import NormalWindow
+from mirrorskin.engine.rotation.response import initial_response, wall_response_of
+from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
 from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
@@ -122,8 +120,8 @@ class LiveRotation:
         self._method, self._header = method, header
         self._wave: Correlator | None = None
         self._normals: NormalWindow | None = None
-        wall = response_of(source)
-        self._response = None if wall is None else first_response(wall, source, header)
+        wall = wall_response_of(source)
+        self._response = None if wall is None else initial_response(wall, source, header)
         if header.zenith_gain is None and wall is None:
             self._wave = Correlator(shape, source.dtype, window=window, device=device)
             self.device = self._wave.device
@@ -132,14 +130,14 @@ class LiveRotation:
                 shape,
                 source.dtype,
                 window=window,
-                **options_of(header, method, noise, self._response, device),
+                **options_from(header, method, noise, self._response, device),
             )
             self.device = self._normals.device
         known = self._normals is not None
         self._edges = SpareEdges(self.device, shape) if edges and known else None
         self._slopes = self._heights = None
         if integrate and known and header.pixel_size is not None:
-            self._slopes = SlopeMaps(self.device, shape)
+            self._slopes = SlopeKernels(self.device, shape)
             self._heights = Follower(self.device, shape, header.pixel_size)
         self._reset()
 
@@ -236,13 +234,13 @@ class LiveRotation:
         normals = self._settled()
         edges = find_edges(normals.vectors, normals.sigma, normals.contact, device=self.device)
         systematic = None if self._response is None else self._response.sigma
-        result = maps_of(Rotation(normals, normals.sigma, edges, self.device, {}, systematic))
+        result = rotation_maps(Rotation(normals, normals.sigma, edges, self.device, {}, systematic))
         process |= self._tell(normals)
         if self._header.pixel_size is None:
             process["height"] = _NO_PIXEL_SIZE
             return self._signed(replace(result, **maps), process)
         with naming(self._source):
-            relief = find_relief(normals, normals.sigma, self._header.pixel_size, device=self.device)
+            relief = integrate_normals(normals, normals.sigma, self._header.pixel_size, device=self.device)
         maps |= {"height": relief.height, "height_sigma": relief.sigma, "component": relief.component}
         maps["offset_unknown"] = relief.offset_unknown
         return self._signed(replace(result, **maps), process | relief.process)
@@ -275,7 +273,7 @@ class LiveRotation:
             return normals
         assert self._normals is not None
         maps = normals.vectors, normals.contact, response.level(normals.mean)
-        self._normals.place(standing_heights(*maps, header.pixel_size, header.press, self.device))
+        self._normals.place(coarse_heights(*maps, header.pixel_size, header.press, self.device))
         return self.normals()
 
     def _follow(self, normals: NormalWindow) -> None:

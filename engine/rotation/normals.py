@@ -10,13 +10,25 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_frames, thin_out, thinning
-from mirrorskin.engine.rotation.fit_noise import CountNoise
-from mirrorskin.engine.rotation.fits import TurnFit, fit_of
-from mirrorskin.engine.rotation.launch import MAPS, NormalMethod, Samples, settle
-from mirrorskin.engine.rotation.options import NormalOptions, set_up
-from mirrorskin.engine.rotation.phases import Doubles, check_phases, check_weights
+from mirrorskin.engine.rotation.design_matrix import (
+    LONGEST,
+    Doubles,
+    TurnFit,
+    check_phases,
+    check_weights,
+    cut_into_turns,
+    turn_fit,
+)
+from mirrorskin.engine.rotation.normals_kernel import (
+    MAPS,
+    NormalMethod,
+    NormalOptions,
+    Samples,
+    set_up,
+    settle,
+)
+from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.engine.rotation.response import Response
-from mirrorskin.engine.rotation.turns import LONGEST, cut_into_turns
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.device import Device
@@ -310,7 +322,7 @@ class NormalEstimator:
         """Return the turns whose phases determine a normal, and, after the first that does, go all round."""
         told: list[tuple[slice, TurnFit]] = []
         for turn in turns:
-            fit = fit_of(self._phase[turn], self._weights[turn])
+            fit = turn_fit(self._phase[turn], self._weights[turn])
             if fit is not None and (fit.goes_round or not (self._turns or told)):
                 told.append((turn, fit))
         return told
@@ -361,7 +373,7 @@ class NormalEstimator:
 def tell_normals(
     maps: list[NDArray[Any]], noise: CountNoise, tilt: float, turns: int, frames: int
 ) -> Normals:
-    """Put together what a kernel left, as ``mirrorskin.engine.rotation.launch.MAPS`` lists it."""
+    """Put together what a kernel left, as ``mirrorskin.engine.rotation.normals_kernel.MAPS`` lists it."""
     vectors, sigma, contact, mean, cosine, sine, residual = maps
     some = thin_out(mean)
     known = some[np.isfinite(some)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Precession, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.normals_wall import Wall
@@ -123,7 +123,7 @@ class Response:
         return replace(self, planes=planes, wall=self.wall._replace(follows=follows))
 
 
-def response_of(source: Source) -> WallResponse | None:
+def wall_response_of(source: Source) -> WallResponse | None:
     """Return the response of a source's calibration, if it has one that tells zeniths."""
     known = source.calibration if isinstance(source, Calibrated) else None
     if known is None or known.zenith is None or known.zenith.pattern != "graded":
@@ -146,7 +146,7 @@ def _with_oval(wall: WallResponse, precession: Precession) -> WallResponse:
     return replace(wall, azimuth_sigma=sigma)
 
 
-def first_response(wall: WallResponse, source: Source, header: Header) -> Response:
+def initial_response(wall: WallResponse, source: Source, header: Header) -> Response:
     """Return the response for a source's pixels, the object taken to stand as high as half the press.
 
     Parameters

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.tilt import one_wave
 from mirrorskin.io import InputError
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mirrorskin.engine.rotation.fit_noise import CountNoise, whole
-from mirrorskin.engine.rotation.phases import Doubles, basis
+from mirrorskin.engine.rotation.design_matrix import Doubles, basis
+from mirrorskin.engine.rotation.residual_noise import CountNoise, whole
 from mirrorskin.io import InputError
 
 _STEEPEST = math.radians(30.0)  # no sheet follows a body that leans further
@@ -67,7 +67,7 @@ def estimate_tilt(
     phase, weights : ndarray, (N,), float64
         Radians, and weights above 0.
     matrix : ndarray, (3, N), float64
-        See `mirrorskin.engine.rotation.phases.fit_matrix`.
+        See `mirrorskin.engine.rotation.design_matrix.fit_matrix`.
     scale : ndarray, (4,) or (4, n), float64
         See `mirrorskin.engine.rotation.scale.Scale`.
     noise : CountNoise

@@ -9,7 +9,7 @@ from live_frames import PIXEL, Clock, blocks, paced, phases, press_header, turn_
 from mirrorskin.bench.turns import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
 from mirrorskin.engine.live import LiveRotation, choose_window, run
-from mirrorskin.engine.rotation.slopes import find_slopes
+from mirrorskin.engine.rotation.normals_to_height import find_slopes
 from mirrorskin.io import InputError, open_result, save_result
 
 SHAPE, WINDOW = (24, 40, 52), 8

@@ -6,7 +6,7 @@ from live_frames import blocks, phases, turn_frames
 
 from mirrorskin.bench.turns import SCALES, TILT
 from mirrorskin.engine import Correlator, correlate, estimate_normals
-from mirrorskin.engine.rotation.window import NormalWindow
+from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.io import InputError
 
 SHAPE, WINDOW = (21, 13, 29), 8

@@ -8,7 +8,7 @@ import rotations
 from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special, stats
 
-from mirrorskin.engine.rotation.phases import fit_matrix
+from mirrorskin.engine.rotation.design_matrix import fit_matrix
 from mirrorskin.kernels import normals
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.normals import Answer, Variance, contact_limits

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.relief_maps import SlopeMaps
-from mirrorskin.engine.rotation.slopes import find_slopes
+from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, find_slopes
 from mirrorskin.kernels import slopes
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (7, 5), (23, 37), (40, 300), (33, 520), (19, 128)]
@@ -28,7 +27,7 @@ def normals(shape):
 
 
 def on_device(device, vectors, sigma, contact):
-    maps = SlopeMaps(device, contact.shape)
+    maps = SlopeKernels(device, contact.shape)
     given = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
     to = {name: device.given(name, np.zeros(contact.shape)) for name in MAPS}
     maps.find(TILT, {name: device.given(name, *one) for name, one in given.items()}, to)

@@ -30,8 +30,8 @@ from calibration_scorer import Judge, Score, Surface
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import brightness, gel, references, tilt, tilt_tracks, wall
 from mirrorskin.engine.calibration.gel import ball_onset
-from mirrorskin.engine.rotation import axial
 from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.rotation import estimate_rotation
 
 APART = 3.9  # mm between the calibration's balls
 REACH = 10.0  # mm, that held-out objects go from the middle
@@ -104,7 +104,7 @@ def as_designed(lab: Lab, calibration: io.Calibration) -> tuple[io.Calibration, 
 def normals_of(frames: Frames, calibration: io.Calibration, **options: Any) -> Normals:
     """Return the normals of an object that was turned about, without the heights that fit them."""
     frames.rewind()
-    return axial.estimate_rotation(io.Calibrated(frames, calibration), **options).normals
+    return estimate_rotation(io.Calibrated(frames, calibration), **options).normals
 
 
 def field_scores(

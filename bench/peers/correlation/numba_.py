@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.peers import THREADS
 from mirrorskin.bench.peers.correlation.peer import Doubles, Peer, Wave
-from mirrorskin.engine.rotation.phases import basis
+from mirrorskin.engine.rotation.design_matrix import basis
 
 _TILE = 1024  # pixels
 _SUM, _COSINE, _SINE, _SQUARE, _FIRST, _ROOM = (_TILE * k for k in range(6))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.bench.peers.correlation.peer import Doubles, Peer, Wave
-from mirrorskin.engine.rotation.phases import basis, fit_matrix
+from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
 
 _SAMPLES = 65_536  # of a tile: more leave the cache, and BLAS would send its small products to threads
 _PIXELS = 16_384  # of a tile of one frame

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.peers import THREADS
 from mirrorskin.bench.peers.correlation.peer import Doubles, Peer, Wave
-from mirrorskin.engine.rotation.phases import basis, fit_matrix
+from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
 
 _SAMPLES = 2_097_152  # of a tile: smaller ones pay for calls, larger ones leave the cache
 

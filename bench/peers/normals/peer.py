@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.rotation.phases import fit_matrix
+from mirrorskin.engine.rotation.design_matrix import fit_matrix
 from mirrorskin.kernels.normals import Limits, contact_limits
 
 Doubles = NDArray[np.float64]

@@ -276,7 +276,7 @@ def test_the_surface_may_break_on_request(monkeypatch):
         broken[3, 4] = 1
         return replace(engine.integrate(*slopes, **options), edges=broken if asked[-1] else None)
 
-    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", listen)
+    monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", listen)
     whole, robust = reconstruct(), reconstruct(robust=True)
     assert asked == [False, True]
     assert whole.edges[3, 4] == 0
@@ -288,7 +288,7 @@ def test_heights_that_were_not_found_are_no_answer(monkeypatch):
     def fail(*slopes, **options):
         raise engine.NotConverged("100 iterations left a residual of 0.1")
 
-    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", fail)
+    monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", fail)
     with pytest.raises(engine.NotConverged, match="100 iterations"):
         reconstruct()
 
@@ -303,7 +303,7 @@ def test_heights_that_are_nearly_as_near_as_asked_are_told_at_once(monkeypatch, 
         found.append(replace(engine.integrate(*slopes, **options), converged=False, residual=residual))
         return found[-1]
 
-    monkeypatch.setattr("mirrorskin.engine.rotation.relief.integrate", miss)
+    monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", miss)
     if is_told:
         np.testing.assert_array_equal(reconstruct().height, found[0].height)
     else:

@@ -400,7 +400,7 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing() -> None:
 
 
 def test_more_frames_than_sums_hold_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mirrorskin.engine.rotation.sums._MOST", 12)
+    monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MOST", 12)
     correlator = Correlator(SHAPE, "uint8")
     push(correlator, swing("uint8", MEASURED), MEASURED)
     with pytest.raises(InputError, match="sums hold 12 frames"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.phases import basis, check_phases, fit_matrix
+from mirrorskin.engine.rotation.design_matrix import basis, check_phases, fit_matrix
 from mirrorskin.io import InputError
 
 MEASURED = np.deg2rad([178.1, 133.4, 91.0, 44.6, 1.9, 313.7, 268.8, 226.2])

@@ -10,7 +10,7 @@ from stacks import MadeUp
 from walls import PHASE, TILT
 
 from mirrorskin.engine.rotation.normals import estimate_normals
-from mirrorskin.engine.rotation.response import make_response, response_of, shade
+from mirrorskin.engine.rotation.response import make_response, shade, wall_response_of
 from mirrorskin.io import Calibrated, Calibration, CameraId, Header, InputError
 
 SHAPE = (8, 31)
@@ -142,14 +142,14 @@ def test_a_source_without_a_calibration_has_no_response():
     class Source:
         calibration = None
 
-    assert response_of(Source()) is None
+    assert wall_response_of(Source()) is None
 
 
 def known_of(**parts):
     """Return the response for a source whose calibration has a wall and other parts."""
     camera = CameraId("", SHAPE, np.dtype(np.float32))
     source = MadeUp(np.zeros((8, *SHAPE), np.float32), Header("axial"), phase=PHASE)
-    return response_of(Calibrated(source, Calibration(camera, zenith=walls.response(SHAPE), **parts)))
+    return wall_response_of(Calibrated(source, Calibration(camera, zenith=walls.response(SHAPE), **parts)))
 
 
 def test_an_ellipse_that_is_taken_for_a_circle_makes_azimuths_less_sure():

@@ -13,8 +13,8 @@ from rotations import EIGHTHS, TILT
 
 from mirrorskin import engine, hw, io
 from mirrorskin.engine.live import LiveRotation
-from mirrorskin.engine.rotation.first_turn import FirstTurn
 from mirrorskin.engine.rotation.registration import Registered, Sight
+from mirrorskin.engine.rotation.rotation import FirstTurn
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera
 from mirrorskin.hw.twin.movement import Axial

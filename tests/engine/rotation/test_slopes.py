@@ -8,7 +8,7 @@ import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
 from mirrorskin.engine import estimate_normals
-from mirrorskin.engine.rotation.slopes import find_slopes
+from mirrorskin.engine.rotation.normals_to_height import find_slopes
 
 ONE = np.ones((1, 1), np.float32)
 

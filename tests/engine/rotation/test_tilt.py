@@ -7,8 +7,8 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.rotation.fit_noise import CountNoise
-from mirrorskin.engine.rotation.phases import fit_matrix
+from mirrorskin.engine.rotation.design_matrix import fit_matrix
+from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave, zenith_seen
 from mirrorskin.io import InputError
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.turns import cut_into_turns, goes_round, longest_turn
+from mirrorskin.engine.rotation.design_matrix import cut_into_turns, goes_round, longest_turn
 
 EIGHTHS = np.arange(8) * np.pi / 4
 THREE = np.concatenate([EIGHTHS + turn * 2 * np.pi for turn in range(3)])

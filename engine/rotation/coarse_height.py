@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from mirrorskin.engine.integration.integrate import integrate
 from mirrorskin.engine.nearest import with_nearest
-from mirrorskin.engine.rotation.phases import Doubles
+from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.kernels.device import Device
 
 Mask = NDArray[np.bool_]
@@ -21,7 +21,7 @@ _FILLED = 0.03  # weight of a slope that was filled in
 _TOLERANCE = 1e-3
 
 
-def standing_heights(
+def coarse_heights(
     vectors: NDArray[np.float32],
     contact: NDArray[np.uint8],
     level: Mask,

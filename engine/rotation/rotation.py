@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
+from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.provenance import naming, sign, told, told_level
+from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlator
-from mirrorskin.engine.rotation.launch import NORMAL_METHODS, NormalMethod
-from mirrorskin.engine.rotation.normals import Normals
-from mirrorskin.engine.rotation.relief import find_relief
-from mirrorskin.engine.rotation.response import response_of
-from mirrorskin.engine.rotation.run import Run
+from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_turns, longest_turn
+from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
+from mirrorskin.engine.rotation.normals_kernel import NORMAL_METHODS, NormalMethod, options_from
+from mirrorskin.engine.rotation.normals_to_height import integrate_normals
+from mirrorskin.engine.rotation.registration import Registered, check_heights
+from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import Header, InputError, ProcessValue, Result, Source
+from mirrorskin.io import Block, Header, InputError, ProcessValue, Result, Source, WallResponse, check_phase
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
@@ -114,7 +119,7 @@ def reconstruct_rotation(
     mirrorskin.engine.NotConverged
         The heights that fit the normals were not found.
     """
-    if gain is None and source.header.zenith_gain is None and response_of(source) is None:
+    if gain is None and source.header.zenith_gain is None and wall_response_of(source) is None:
         check_method(source, method)
         _need_no_gain(source, per_turn, heights)
         return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
@@ -131,11 +136,11 @@ def reconstruct_rotation(
         device=device,
         progress=progress,
     )
-    result = maps_of(found)
+    result = rotation_maps(found)
     if source.header.pixel_size is None:
         return sign(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
     with naming(source):
-        relief = find_relief(
+        relief = integrate_normals(
             found.normals, found.white, source.header.pixel_size, robust=robust, device=found.device
         )
     result = replace(
@@ -166,7 +171,7 @@ def estimate_rotation(
     """Find the normals of a rotation whose zenith gain is known; see ``reconstruct_rotation``."""
     check_method(source, method)
     header = _believe(source, tilt, gain, offset)
-    wall = response_of(source) if gain is None else None
+    wall = wall_response_of(source) if gain is None else None
     run = Run(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
     if heights is not None and tilt == "estimate":
         raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
@@ -241,7 +246,7 @@ def correlate_source(
     return sign(result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN})
 
 
-def maps_of(rotation: Rotation) -> Result:
+def rotation_maps(rotation: Rotation) -> Result:
     """Put together what a rotation tells, but heights."""
     normals = rotation.normals
     return Result(
@@ -295,3 +300,232 @@ def _need_no_gain(source: Source, per_turn: bool, heights: ArrayLike | None) -> 
     if per_turn or heights is not None:
         asked = "turns of their own" if per_turn else "use for heights"
         raise InputError(f"{source.name} has no zenith gain, so no normals, and no {asked}: give the gain")
+
+
+_REACH = 5  # pixels across, of which a registered sample may be made
+_ROUNDS = 2  # in which it is found how high the object stands
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a run tells; see ``mirrorskin.engine.rotation.rotation.Rotation``."""
+
+    normals: Normals
+    white: NDArray[np.float32]
+    edges: NDArray[np.uint8]
+    systematic: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How a rotation is to be told.
+
+    Attributes
+    ----------
+    source : Source
+    header : Header
+        What to believe of it; a tilt of None is one to estimate.
+    device : Device
+    method, noise, per_turn, memory_limit, progress
+        As for ``reconstruct_rotation``.
+    """
+
+    source: Source
+    header: Header
+    device: Device
+    method: NormalMethod
+    noise: float | None
+    per_turn: bool
+    memory_limit: int
+    progress: Progress | None
+
+    def linear(self, heights: ArrayLike | None) -> Found:
+        """Tell the normals of pixels that are linear in the zenith; registered, if there are heights."""
+        frames: Source = self.source
+        if heights is not None:
+            frames = Registered(self.source, heights, self.device, self.header)
+        return self._told(frames, self._normals(frames, None, self.per_turn, self.progress))
+
+    def calibrated(
+        self, wall: WallResponse, heights: ArrayLike | None
+    ) -> tuple[Found, dict[str, ProcessValue]]:
+        """Tell the normals under a wall, and how.
+
+        Where a pixel looks depends on the height of what it sees. Heights that are not given are found in the
+        first turn; see `coarse_heights`. Frames are registered with them where the pivot is known.
+        """
+        response = initial_response(wall, self.source, self.header)
+        if heights is not None:
+            known = check_heights(heights, self.source.shape[1:])
+            how, stand = "given", with_nearest(known).astype(np.float64)
+        elif self.source.rewindable:
+            how, stand = "found in the first turn", self._stand(response)
+        else:
+            how, stand = "half the press: the source cannot be read twice", self._half_way()
+        frames, response = self._placed_at(self.source, response, stand)
+        found = self._told(frames, self._normals(frames, response, self.per_turn, self.progress))
+        process: dict[str, ProcessValue] = {
+            "zenith": "calibrated",
+            "zenith_error": wall.error,
+            "heights": how,
+            "registered": isinstance(frames, Registered),
+        }
+        return replace(found, systematic=response.sigma), process
+
+    def _stand(self, response: Response) -> Doubles:
+        """Find from the first turn how high the object is, less the press, (H, W), mm."""
+        pixel_size, press = self.header.pixel_size, self.header.press
+        assert pixel_size is not None
+        assert press is not None
+        turn, heights = FirstTurn(self.source), self._half_way()
+        for _ in range(_ROUNDS):
+            frames, response = self._placed_at(turn, response, heights)
+            normals = self._normals(frames, response, False, None)
+            maps = normals.vectors, normals.contact, response.level(normals.mean)
+            heights = coarse_heights(*maps, pixel_size, press, self.device) - press
+        return heights
+
+    def _half_way(self) -> Doubles:
+        """Return the height of an object of which nothing is known yet, less the press, (H, W), mm."""
+        assert self.header.press is not None
+        return np.full(self.source.shape[1:], -HALF_WAY * self.header.press)
+
+    def _placed_at(self, source: Source, response: Response, heights: Doubles) -> tuple[Source, Response]:
+        """Return frames that follow an object of known heights, mm, if they can, and the response to them."""
+        follows = self.header.pivot is not None and self.header.tilt is not None
+        assert self.header.press is not None
+        response = response.at(self.header.press + heights, follows)
+        if follows:
+            levels = self._levels(response)
+            return Registered(source, heights, self.device, levels, response.sight), response
+        return source, response
+
+    def _levels(self, response: Response) -> Header:
+        """Return the header with each pixel's counts without light, and for full light, as a scale."""
+        offset, per_count = response.planes[:2]
+        return replace(self.header, zenith_offset=offset, zenith_gain=1 / per_count)
+
+    def _normals(
+        self, frames: Source, response: Response | None, per_turn: bool, progress: Progress | None
+    ) -> Normals:
+        """Feed the frames through an estimator."""
+        size = math.prod(frames.shape) * frames.dtype.itemsize
+        with naming(self.source):
+            estimator = NormalEstimator(
+                frames.shape[1:],
+                frames.dtype,
+                longest=_longest_turn(frames),
+                per_turn=per_turn,
+                memory_limit=min(self.memory_limit, 2 * size),
+                **options_from(self.header, self.method, self.noise, response, self.device),
+            )
+            feed(frames, estimator, range(frames.shape[0]), progress)
+            return estimator.result()
+
+    def _told(self, frames: Source, normals: Normals) -> Found:
+        """Find the edges, and account for a registration."""
+        edges = _edges(normals, self.device)  # where contact ends, before that is moved inwards
+        white = normals.sigma
+        if isinstance(frames, Registered):
+            white = white if self.noise is not None else white / frames.noise_gain
+            normals = _mend(normals, frames.noise_gain, given=self.noise is not None)
+        return Found(normals, white, edges)
+
+
+def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
+    """Find the edges of each turn, or of their mean."""
+    maps = normals.vectors, normals.sigma, normals.contact
+    if normals.contact.ndim == 2:
+        return find_edges(*maps, device=device)
+    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
+
+
+def _longest_turn(source: Source) -> int:
+    """Return how many frames a turn may have: as many as they have, where that is known beforehand."""
+    phase: NDArray[np.float64] | None = getattr(source, "phase", None)
+    return LONGEST if phase is None else longest_turn(phase)
+
+
+def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Normals:
+    """Account for what interpolation did to a pixel's noise, and where it reached beyond the contact.
+
+    Noise that was told from the frames themselves knows of the former. Samples are made of 4 x 4, of which
+    two on either side may have lost contact.
+    """
+    reach = np.ones((1,) * (normals.contact.ndim - 2) + (_REACH, _REACH), bool)
+    lost = np.isfinite(normals.sigma) & (normals.contact == 0)
+    inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
+    sigma = normals.sigma * noise_gain if given else normals.sigma
+    return replace(normals, sigma=sigma, contact=inside)
+
+
+class FirstTurn:
+    """The frames of a source's first turn, as a source.
+
+    Parameters
+    ----------
+    source : Source
+        Of axial motion, which can be rewound. It is read up to the first frame of the second turn, and to 64
+        frames at most.
+
+    Attributes
+    ----------
+    name, header, motion, dtype
+        Those of the source.
+    shape : (int, int, int)
+    phase : ndarray, (T,), float64
+    rewindable : bool
+        True.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        A phase is missing, or the source cannot be read.
+    """
+
+    rewindable = True
+
+    def __init__(self, source: Source) -> None:
+        self.name, self.header, self.motion, self.dtype = (
+            source.name,
+            source.header,
+            source.motion,
+            source.dtype,
+        )
+        frames: list[NDArray[Any]] = []
+        phase = np.empty(0)
+        source.rewind()
+        while len(frames) < LONGEST and (block := source.read()) is not None:
+            phase = np.concatenate(
+                [phase, check_phase(block.phase, len(block.frames), f"{self.name}: phase")]
+            )
+            if len(cut_into_turns(phase)) > 1:
+                break
+            frames.extend(block.frames.copy())
+        self._frames = np.stack(frames) if frames else np.empty((0, *source.shape[1:]), source.dtype)
+        self.phase = phase[: len(frames)]
+        self.shape = self._frames.shape
+        self._next = 0
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self._next = 0
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames; see ``Source.read``."""
+        count = min(1 if out is None else len(out), self.shape[0] - self._next)
+        if count == 0:
+            return None
+        part = slice(self._next, self._next + count)
+        self._next = part.stop
+        block = Block(self._frames[part], part.start, phase=self.phase[part])
+        if out is None:
+            return block
+        out[:count] = block.frames
+        return replace(block, frames=out[:count])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass

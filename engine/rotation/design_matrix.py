@@ -1,6 +1,9 @@
-"""The phases of an axial rotation: whether they determine mean, cosine and sine, and how these follow."""
+"""The phases of a rotation: its turns, whether they determine mean, cosine and sine, and how these follow."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,3 +118,107 @@ def _count_different(phase: Doubles) -> int:
     turn = np.sort(np.mod(phase, 2 * np.pi))
     gaps = np.diff(turn, append=turn[0] + 2 * np.pi)
     return max(1, int(np.count_nonzero(gaps > _SAME)))
+
+
+LONGEST = 64
+"""Frames of one turn that are taken at most."""
+
+_WHOLE = 2 * np.pi - 1e-6  # a turn, but for the rounding of phases
+
+
+def cut_into_turns(phase: Doubles) -> list[slice]:
+    """Return the turns that are over, and the one that may go on.
+
+    A turn is over with the first frame that is a whole turn away from its own first. Phases that fall back
+    by more than half a turn are taken for going on, as those that are told modulo a turn.
+
+    Parameters
+    ----------
+    phase : ndarray, (N,), float64
+        Radians.
+
+    Returns
+    -------
+    list of slice
+        They meet, and the last one holds the last frame; none without frames.
+    """
+    if len(phase) == 0:
+        return []
+    steps = np.diff(phase)
+    forward = 1.0 if (np.median(steps) if len(steps) else 0.0) >= 0 else -1.0
+    steps = np.where(forward * steps < -np.pi, steps + forward * 2 * np.pi, steps)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    starts = [0]
+    for frame, angle in enumerate(way):
+        if abs(angle - way[starts[-1]]) >= _WHOLE:
+            starts.append(frame)
+    return [slice(start, stop) for start, stop in zip(starts, [*starts[1:], len(way)], strict=True)]
+
+
+def goes_round(phase: Doubles) -> bool:
+    """Tell whether no gap between phases is above half a turn."""
+    points = np.sort(np.mod(phase, 2 * np.pi))
+    return bool(np.max(np.diff(points, append=points[0] + 2 * np.pi)) <= np.pi + 1e-6)
+
+
+def longest_turn(phase: Doubles) -> int:
+    """Return the number of frames of the longest turn."""
+    return max((turn.stop - turn.start for turn in cut_into_turns(phase)), default=0)
+
+
+_DIGITS = 9  # of a phase in radians: what differs by less is the same phase, told after another turn
+_KEPT = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnFit:
+    """How a turn of N frames is fitted; two are the same if they are one object.
+
+    Attributes
+    ----------
+    matrix : ndarray, (3, N), float64
+        See `mirrorskin.engine.rotation.design_matrix.fit_matrix`.
+    table : ndarray, (6, N), float32
+        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
+    covariance : ndarray, (3, 3), float64
+        Of mean, cosine and sine, where samples of weight 1 have variance 1.
+    weighted : bool
+        Whether a frame has another weight than 1.
+    goes_round : bool
+        Whether no gap between phases is above half a turn.
+    """
+
+    matrix: Doubles
+    table: NDArray[np.float32]
+    covariance: Doubles
+    weighted: bool
+    goes_round: bool
+
+
+def turn_fit(phase: Doubles, weights: Doubles) -> TurnFit | None:
+    """Return how a turn is fitted, or None if its phases do not determine that.
+
+    Parameters
+    ----------
+    phase : ndarray, (N,), float64
+        Radians; they count modulo a turn, to 1e-9.
+    weights : ndarray, (N,), float64
+        Above 0.
+    """
+    return _fit_of(np.round(np.mod(phase, 2 * np.pi), _DIGITS).tobytes(), weights.tobytes())
+
+
+@lru_cache(_KEPT)
+def _fit_of(phases: bytes, weighing: bytes) -> TurnFit | None:
+    phase, weights = np.frombuffer(phases), np.frombuffer(weighing)
+    try:
+        matrix = fit_matrix(phase, weights)
+    except InputError:
+        return None
+    return TurnFit(
+        matrix,
+        np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *matrix]).astype(np.float32),
+        matrix @ (matrix / weights).T,
+        bool(np.any(weights != 1)),
+        goes_round(phase),
+    )

@@ -1,4 +1,4 @@
-"""How noisy a rotation is: told from what a fit of its waves leaves."""
+"""The noise of a rotation's samples, from the residuals of a fit of waves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mirrorskin.engine.frames import QUANTUM
-from mirrorskin.engine.rotation.phases import Doubles, basis
+from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError
 
 _FLOAT = 1e-6  # of the greatest count: the least noise that float frames are taken to have
@@ -43,7 +43,7 @@ class CountNoise:
         return np.sqrt(np.maximum(self.base + self.slope * np.asarray(level, np.float64), self.least))
 
 
-def noise_of_fit(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> CountNoise:
+def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> CountNoise:
     """Estimate the noise of samples from what waves of one and two a turn leave.
 
     Level surfaces show the second one; of fewer than 7 frames a turn it is taken for noise. Pixels are sorted

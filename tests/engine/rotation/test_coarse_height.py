@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.standing import standing_heights
+from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.kernels.device import open_device
 
 PIXEL = 0.05
@@ -22,7 +22,7 @@ def stand(slope, press, seen=True, contact=True):
         np.stack([-east, -north, np.ones_like(east)], axis=-1) / np.sqrt(1 + east**2 + north**2)[..., None]
     )
     vectors[~known] = np.nan
-    found = standing_heights(
+    found = coarse_heights(
         vectors.astype(np.float32),
         known.astype(np.uint8),
         zenith < LEVEL,
@@ -80,7 +80,7 @@ def test_all_pixels_have_a_height_within_the_press():
 def test_pictures_may_have_any_size(shape):
     vectors = np.zeros((*shape, 3), np.float32)
     vectors[...] = 0.5, 0.0, math.sqrt(0.75)
-    found = standing_heights(
+    found = coarse_heights(
         vectors, np.ones(shape, np.uint8), np.zeros(shape, bool), (PIXEL, PIXEL), 1.0, open_device()
     )
     assert found.shape == shape

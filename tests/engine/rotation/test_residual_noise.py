@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rotations import EIGHTHS, UNEVEN
 
-from mirrorskin.engine.rotation.fit_noise import CountNoise, noise_of_fit
+from mirrorskin.engine.rotation.residual_noise import CountNoise, residual_noise
 from mirrorskin.io import InputError
 
 PIXELS = 10_000
@@ -36,24 +36,24 @@ def samples_of(read, slope, *, phase=EIGHTHS, weights=None, second=0.0, dtype="f
 @pytest.mark.parametrize("phase", [FOUR, EIGHTHS[:5], EIGHTHS, UNEVEN, SIXTEEN])
 @pytest.mark.parametrize(("read", "slope"), [(1.5, 0.0), (1.0, 0.05), (0.0, 0.02), (0.01, 0.0)])
 def test_read_and_shot_noise_are_told_apart(read, slope, phase):
-    found = noise_of_fit(*samples_of(read, slope, phase=phase))
+    found = residual_noise(*samples_of(read, slope, phase=phase))
     np.testing.assert_allclose(found.at(LEVELS), line(read, slope), rtol=0.03)
     assert found.slope == pytest.approx(slope, rel=0.1, abs=1e-3 * read)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_rounding_is_noise(dtype):
-    found = noise_of_fit(*samples_of(1.0, 0.02, dtype=dtype))
+    found = residual_noise(*samples_of(1.0, 0.02, dtype=dtype))
     np.testing.assert_allclose(found.at(LEVELS), np.hypot(line(1.0, 0.02), 1 / np.sqrt(12)), rtol=0.03)
 
 
 def test_weights_are_inverse_variances():
-    found = noise_of_fit(*samples_of(1.0, 0.05, weights=[1, 2, 0.5, 4, 1, 0.1, 1, 3]))
+    found = residual_noise(*samples_of(1.0, 0.05, weights=[1, 2, 0.5, 4, 1, 0.1, 1, 3]))
     np.testing.assert_allclose(found.at(LEVELS), line(1.0, 0.05), rtol=0.03)
 
 
 def test_the_second_wave_of_a_level_surface_is_no_noise():
-    found = noise_of_fit(*samples_of(1.0, 0.0, second=5.0))
+    found = residual_noise(*samples_of(1.0, 0.0, second=5.0))
     np.testing.assert_allclose(found.at(LEVELS), 1.0, rtol=0.03)
 
 
@@ -62,7 +62,7 @@ def test_the_second_wave_of_a_level_surface_is_no_noise():
 def test_pixels_that_lose_contact_are_no_noise(read, slope, phase):
     samples, *known = samples_of(read, slope, phase=phase)
     samples[len(phase) // 2, ::10] = 12.0
-    found = noise_of_fit(samples, *known)
+    found = residual_noise(samples, *known)
     np.testing.assert_allclose(found.at(LEVELS), line(read, slope), rtol=0.05)
 
 
@@ -71,7 +71,7 @@ def test_a_brightness_at_which_most_lose_contact_does_not_bend_the_line():
     dark = samples.mean(axis=0) < 40
     samples[3, dark] += np.random.default_rng(1).uniform(-100, 100, dark.sum()).astype(np.float32)
     assert 0.05 < dark.mean() < 0.1
-    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), line(1.0, 0.05), rtol=0.1)
+    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), line(1.0, 0.05), rtol=0.1)
 
 
 def test_noise_does_not_fall_with_the_light():
@@ -79,22 +79,22 @@ def test_noise_does_not_fall_with_the_light():
     bright = samples.mean(axis=0) > 150
     mean = samples.mean(axis=0)
     samples[:, bright] = mean[bright] + 0.5 * (samples[:, bright] - mean[bright])
-    assert noise_of_fit(samples, *known).slope == 0.0
+    assert residual_noise(samples, *known).slope == 0.0
 
 
 def test_clipped_and_missing_samples_are_left_out():
     samples, *known = samples_of(1.0, 0.0, dtype="uint8")
     samples[::2, ::5], samples[::2, 1::5] = 255, 0
-    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
+    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
     samples, *known = samples_of(1.0, 0.0)
     samples[2, ::5], samples[2, 1::5] = np.nan, np.inf
-    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), 1.0, rtol=0.03)
+    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), 1.0, rtol=0.03)
 
 
 @pytest.mark.parametrize(("dtype", "floor"), [("uint8", 12**-0.5), ("uint16", 12**-0.5), ("float32", 77e-6)])
 @pytest.mark.parametrize("pixels", [1, 1000])
 def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor, pixels):
-    found = noise_of_fit(np.full((8, pixels), 77, dtype), np.array(EIGHTHS), np.ones(8))
+    found = residual_noise(np.full((8, pixels), 77, dtype), np.array(EIGHTHS), np.ones(8))
     np.testing.assert_allclose(found.at([0, 77, 1e5]), floor, rtol=1e-6)
     assert found.slope == 0
 
@@ -103,7 +103,7 @@ def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor, pixels)
     "samples", [np.zeros((8, 5), np.uint8), np.full((8, 5), np.nan, np.float32), np.zeros((8, 0), np.uint16)]
 )
 def test_where_nothing_will_be_answered_any_noise_will_do(samples):
-    found = noise_of_fit(samples, np.array(EIGHTHS), np.ones(8))
+    found = residual_noise(samples, np.array(EIGHTHS), np.ones(8))
     assert found.slope == 0
     assert 0 < found.at(100.0) < 0.3
 
@@ -112,21 +112,21 @@ def test_without_a_whole_pixel_noise_is_not_made_up():
     samples, *known = samples_of(1.0, 0.0, dtype="uint8")
     samples[np.arange(PIXELS) % 8, np.arange(PIXELS)] = 255
     with pytest.raises(InputError, match="too few samples are whole to tell the noise"):
-        noise_of_fit(samples, *known)
+        residual_noise(samples, *known)
 
 
 def test_a_frame_that_is_missing_or_clipped_throughout_is_left_out():
     samples, *known = samples_of(1.0, 0.0)
     samples[2] = np.nan
-    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), 1.0, rtol=0.03)
+    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), 1.0, rtol=0.03)
     samples, *known = samples_of(1.0, 0.0, dtype="uint8")
     samples[5] = 255
-    np.testing.assert_allclose(noise_of_fit(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
+    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), np.sqrt(13 / 12), rtol=0.03)
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 7, 300])
 def test_few_pixels_tell_roughly(pixels):
-    found = noise_of_fit(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
+    found = residual_noise(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
     assert 0.5 < found.at(100.0) < 1.6
     assert np.isfinite([found.base, found.slope, found.least]).all()
 
@@ -134,7 +134,7 @@ def test_few_pixels_tell_roughly(pixels):
 def test_three_frames_tell_no_noise():
     samples, phase, weights = samples_of(1.0, 0.0)
     with pytest.raises(InputError, match="3 frames a turn tell no noise: give the standard deviation"):
-        noise_of_fit(samples[:3], phase[:3], weights[:3])
+        residual_noise(samples[:3], phase[:3], weights[:3])
 
 
 def test_the_noise_at_a_level_is_that_of_the_line_but_not_below_the_least():

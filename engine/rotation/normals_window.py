@@ -1,4 +1,4 @@
-"""Normals of an endless rotation, from its last frames: the turn that has just been."""
+"""Normals of an endless rotation, from a window of its last frames."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_frames, thinning
-from mirrorskin.engine.rotation.correlation import Correlation, tell_wave
-from mirrorskin.engine.rotation.fit_noise import CountNoise
-from mirrorskin.engine.rotation.fits import TurnFit, fit_of
-from mirrorskin.engine.rotation.launch import MAPS, Samples, settle
+from mirrorskin.engine.rotation.correlation import Correlation, WindowSums, tell_wave
+from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn_fit
 from mirrorskin.engine.rotation.normals import Normals, tell_normals
-from mirrorskin.engine.rotation.options import NormalOptions, set_up
-from mirrorskin.engine.rotation.phases import check_phases
-from mirrorskin.engine.rotation.sums import WindowSums
+from mirrorskin.engine.rotation.normals_kernel import MAPS, NormalOptions, Samples, set_up, settle
+from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.engine.tiling import Band
 from mirrorskin.io import Block, InputError, check_phase
 from mirrorskin.kernels.array import Array
@@ -94,7 +91,7 @@ class NormalWindow:
 
     @property
     def bands(self) -> list[Band]:
-        """Where the maps are that ``estimate`` leaves; see ``mirrorskin.engine.rotation.launch.MAPS``."""
+        """Where the maps are that ``estimate`` leaves; see ``MAPS``."""
         return self._sums.bands
 
     def reset(self) -> None:
@@ -204,7 +201,7 @@ class NormalWindow:
     def _fit(self) -> TurnFit:
         """Return how the window's frames are fitted."""
         phase, weight = self._sums.seen()
-        fit = fit_of(phase, weight) if self.is_full else None
+        fit = turn_fit(phase, weight) if self.is_full else None
         if fit is None:
             check_phases(phase[weight > 0])  # says what is wrong
             raise InputError(f"{self.count} frames: a window of {self._window} is not full yet")
