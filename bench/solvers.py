@@ -14,9 +14,9 @@ from mirrorskin.bench.peers.integration.rectangle import divisors
 from mirrorskin.bench.peers.integration.system import as_map, assemble, centre
 from mirrorskin.bench.slopes import PIXEL
 from mirrorskin.bench.truth import Truth
-from mirrorskin.engine.integration.links import Links
-from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.rectangle import Rectangle
+from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels.device import Device
 
 SLOPES, SETUP, SOLVE = "from slopes", "set-up and solve", "solve only"

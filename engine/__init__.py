@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mirrorskin.engine.errors import NotConverged
     from mirrorskin.engine.fusion import fuse
-    from mirrorskin.engine.integration.integrate import integrate
-    from mirrorskin.engine.integration.live import Integrator
+    from mirrorskin.engine.integration.integration import Integrator, integrate
     from mirrorskin.engine.integration.surface import Surface
-    from mirrorskin.engine.measure.measure import Measures
+    from mirrorskin.engine.metrology.measures import Measures, measure
     from mirrorskin.engine.press.changepoint import ChangePointSearch, find_change_point
     from mirrorskin.engine.press.holes import fill_holes
     from mirrorskin.engine.press.onset import Onset, OnsetSearch, find_onset
@@ -23,15 +22,14 @@ if TYPE_CHECKING:
     from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
     from mirrorskin.engine.rotation.edges import find_edges
     from mirrorskin.engine.rotation.normals import NormalEstimator, Normals, estimate_normals
-    from mirrorskin.engine.score import Score
+    from mirrorskin.engine.scoring import Score, score
 
 _HOMES = {
     "errors": ("NotConverged",),
     "fusion": ("fuse",),
-    "integration.integrate": ("integrate",),
-    "integration.live": ("Integrator",),
+    "integration.integration": ("Integrator", "integrate"),
     "integration.surface": ("Surface",),
-    "measure.measure": ("Measures", "measure"),
+    "metrology.measures": ("Measures", "measure"),
     "press.changepoint": ("ChangePointSearch", "find_change_point"),
     "press.holes": ("fill_holes",),
     "press.onset": ("Onset", "OnsetSearch", "find_onset"),
@@ -39,7 +37,7 @@ _HOMES = {
     "rotation.correlation": ("Correlation", "Correlator", "correlate"),
     "rotation.edges": ("find_edges",),
     "rotation.normals": ("NormalEstimator", "Normals", "estimate_normals"),
-    "score": ("Score", "score"),
+    "scoring": ("Score", "score"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -80,8 +78,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
-
-
-# Until these packages are renamed: a module of a function's name would take its place.
-from mirrorskin.engine.measure.measure import measure  # noqa: E402
-from mirrorskin.engine.score import score  # noqa: E402

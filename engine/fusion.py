@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.fusion_solver import Joint, Known
 from mirrorskin.engine.integration.surface import Surface
-from mirrorskin.engine.joint import Joint, Known
 from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import sign

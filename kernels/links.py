@@ -137,7 +137,7 @@ def links_join(
     *,
     owned: bool = False,
 ) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-    """Return right, down, anchor and source of `mirrorskin.engine.integration.links.Links`, (H, W) each.
+    """Return right, down, anchor and source of `mirrorskin.engine.integration.graph.Links`, (H, W) each.
 
     The slope of a link is (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line, where links lead
     through all of them, else the mean of two; its weight is the harmonic mean of two pixels' weights.

@@ -14,7 +14,7 @@ The spectrum, (strips, padded, 16), has in the slots of strip s modes k = 8 s ..
 Mode ``length`` is 0; what slots with k beyond half the length hold means nothing.
 
 The kernels are told sizes besides, and go about the Fourier transforms by the tables of
-``mirrorskin.engine.integration.cosines``.
+``mirrorskin.engine.integration.rectangle``.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@ from mirrorskin.bench.harness import Work
 from mirrorskin.bench.slopes import PIXEL, noisy_slopes, random_cuts
 from mirrorskin.bench.sweep.scene import make_mask
 from mirrorskin.bench.sweep.sweep import MAPS_ONLY, Family, Job, Shape, agree, run_kernel
-from mirrorskin.engine.integration.components import Settler, find_components
-from mirrorskin.engine.integration.inputs import Inputs, check_inputs
-from mirrorskin.engine.integration.links import LEVEL, LinkRoom
+from mirrorskin.engine.integration.graph import LEVEL, LinkRoom, Settler, find_components
+from mirrorskin.engine.integration.validation import Inputs, check_inputs
 from mirrorskin.kernels import bilateral, components, links
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.bilateral import DOWN, RIGHT

@@ -15,12 +15,11 @@ from mirrorskin.bench.slopes import PIXEL, noisy_slopes
 from mirrorskin.bench.sweep.scene import make_mask
 from mirrorskin.bench.sweep.sweep import MAPS_ONLY, Family, Job, Shape, agree, run_kernel
 from mirrorskin.bench.truth import find_truth
-from mirrorskin.engine.integration.cosines import make_plan
+from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.hierarchy import WIDTH, part_of
 from mirrorskin.engine.integration.levels import Level, cut_levels
-from mirrorskin.engine.integration.links import Links
-from mirrorskin.engine.integration.multigrid import Multigrid
-from mirrorskin.engine.integration.rectangle import Rectangle, are_rows_easier, find_rates
+from mirrorskin.engine.integration.rectangle import Rectangle, are_rows_easier, find_rates, make_plan
+from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels import multigrid, rectangle
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device

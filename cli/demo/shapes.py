@@ -14,7 +14,7 @@ from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
     from mirrorskin import io
-    from mirrorskin.engine.score import HeightScore
+    from mirrorskin.engine.scoring import HeightScore
 
 _PRESS, _ROTATION = "fig5-conform-ideal", "fig10a"
 _HEAD = ["experiment", "heights from", "answered", "median", "RMS", "99 %", "filled", "RMS there", "apex"]

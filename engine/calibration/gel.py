@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, optimize
 
-from mirrorskin.engine.integration.inputs import check_pixel_size
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 

@@ -1,4 +1,4 @@
-"""The levels of a multigrid on a device: their links, and the tables of what is odd."""
+"""The levels of a multigrid on a device: their links, and the tables of split aggregates."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.levels import Level, cut_levels
-from mirrorskin.engine.integration.links import Links
-from mirrorskin.engine.integration.odd import (
+from mirrorskin.engine.integration.split_aggregates import (
     Ints,
     Lookup,
     Odd,

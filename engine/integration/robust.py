@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.inputs import Flags, Inputs
-from mirrorskin.engine.integration.links import Graph, Links
-from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.engine.integration.graph import Graph, Links
+from mirrorskin.engine.integration.validation import Flags, Inputs
+from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.bilateral import DOWN, RIGHT
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.integration.follow import Follower
+from mirrorskin.engine.integration.warm_start import Follower
 from mirrorskin.engine.live.edges import SpareEdges
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.types import Update

@@ -12,7 +12,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.integration.inputs import check_pixel_size
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.elastic_grid import Cells, Splines, cut_into_cells, touched
 from mirrorskin.engine.press.elastic_sweep import Seen, Watched, sweep
 from mirrorskin.engine.press.halfspace import HalfSpace

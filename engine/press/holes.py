@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.integration.inputs import check_pixel_size
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.kernels.device import Device

@@ -13,10 +13,9 @@ from scipy import ndimage
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.frames import SAMPLES
-from mirrorskin.engine.integration.inputs import LEAST, MOST
-from mirrorskin.engine.integration.integrate import integrate
-from mirrorskin.engine.integration.solver import explain
+from mirrorskin.engine.integration.integration import explain, integrate
 from mirrorskin.engine.integration.surface import Surface
+from mirrorskin.engine.integration.validation import LEAST, MOST
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.io import ProcessValue
 from mirrorskin.kernels.array import Array

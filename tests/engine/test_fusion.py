@@ -22,8 +22,8 @@ RADIUS = 5.0
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
     """Tell sigma from a few draws of noise, which is enough to hold it against errors, and much faster."""
-    monkeypatch.setattr("mirrorskin.engine.integration.spread.DRAWS", 6)
-    monkeypatch.setattr("mirrorskin.engine.integration.spread.WAVES", 4)
+    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.DRAWS", 6)
+    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.WAVES", 4)
 
 
 def press(shape, pixel, step=0.1, depth=3.0, **changes):
@@ -378,7 +378,7 @@ def test_the_surface_may_break_on_request(monkeypatch):
         asked.append(options["robust"])
         return engine.integrate(*slopes, **options)
 
-    monkeypatch.setattr("mirrorskin.engine.joint.integrate", listen)
+    monkeypatch.setattr("mirrorskin.engine.fusion_solver.integrate", listen)
     for robust in (False, True):
         engine.fuse(heights(true), directions(normals), 0.1, robust=robust)
     assert asked == [False, False, True, True]
@@ -388,7 +388,7 @@ def test_a_surface_that_was_not_found_is_no_answer(monkeypatch):
     def fail(*slopes, **options):
         raise engine.NotConverged("100 iterations left a residual of 0.1")
 
-    monkeypatch.setattr("mirrorskin.engine.joint.integrate", fail)
+    monkeypatch.setattr("mirrorskin.engine.fusion_solver.integrate", fail)
     with pytest.raises(engine.NotConverged, match="100 iterations"):
         engine.fuse(heights(plane()[0]), directions(plane()[1]), 0.1)
 

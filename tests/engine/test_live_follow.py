@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import integrate
-from mirrorskin.engine.integration.follow import MAPS, Follower
+from mirrorskin.engine.integration.warm_start import MAPS, Follower
 
 PIXEL = 0.1, 0.05
 

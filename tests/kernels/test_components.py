@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.components import Settler, find_components
-from mirrorskin.engine.integration.inputs import check_inputs
-from mirrorskin.engine.integration.links import LinkRoom
+from mirrorskin.engine.integration.graph import LinkRoom, Settler, find_components
+from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.kernels import components
 from mirrorskin.kernels.links import SLOPE
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.inputs import Inputs, check_inputs
-from mirrorskin.engine.integration.links import LinkRoom
+from mirrorskin.engine.integration.graph import LinkRoom
+from mirrorskin.engine.integration.validation import Inputs, check_inputs
 from mirrorskin.kernels import links
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.cosines import make_plan
-from mirrorskin.engine.integration.rectangle import Rectangle, find_rates
+from mirrorskin.engine.integration.rectangle import Rectangle, find_rates, make_plan
 from mirrorskin.kernels.rectangle import rectangle_columns, rectangle_heights, rectangle_modes
 
 # Lengths by their factors: none, 2 to 5, others that have a step of their own, and too large ones.

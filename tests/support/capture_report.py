@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
-from mirrorskin.engine.score import score
+from mirrorskin.engine.scoring import score
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.grbl import GrblStage

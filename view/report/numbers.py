@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.report.pictures import Ends
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.components import find_components
+from mirrorskin.engine.integration.graph import find_components
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 

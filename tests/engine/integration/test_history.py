@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
-from mirrorskin.engine.integration import integrate as call
+from mirrorskin.engine.integration import integration as call
 
 SHAPE = (40, 44)
 RANDOM = np.random.default_rng(0)

@@ -7,7 +7,7 @@ import pytest
 from slope_oracle import Problem, solve
 
 from mirrorskin import engine, io
-from mirrorskin.engine.integration import solver
+from mirrorskin.engine.integration import integration as solver
 
 SHAPE = 41, 53
 SIZE = 0.03, 0.04

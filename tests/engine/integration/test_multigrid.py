@@ -5,11 +5,10 @@ import graphs
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.cycle import Cycle
+from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.hierarchy import Hierarchy
 from mirrorskin.engine.integration.levels import cut_levels
-from mirrorskin.engine.integration.links import Links
-from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.engine.integration.vcycle import Cycle, Multigrid
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT

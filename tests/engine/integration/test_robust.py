@@ -9,9 +9,9 @@ import pytest
 from bilateral import Weighed
 
 from mirrorskin import engine
-from mirrorskin.engine.integration.inputs import check_inputs
-from mirrorskin.engine.integration.links import Graph, LinkRoom
+from mirrorskin.engine.integration.graph import Graph, LinkRoom
 from mirrorskin.engine.integration.robust import solve_robust
+from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.kernels.device import open_device
 
 

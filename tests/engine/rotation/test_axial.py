@@ -34,8 +34,8 @@ FLAT = np.full(SHAPE, -1.0, np.float32)  # as deep as the press: about a pivot i
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
     """Tell the heights' sigma from a few draws of noise: enough to hold it against errors, and faster."""
-    monkeypatch.setattr("mirrorskin.engine.integration.spread.DRAWS", 6)
-    monkeypatch.setattr("mirrorskin.engine.integration.spread.WAVES", 4)
+    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.DRAWS", 6)
+    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.WAVES", 4)
 
 
 @cache

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from shown import ball, colours_at, rendered
 
 from mirrorskin import io
-from mirrorskin.engine.measure.section import section
+from mirrorskin.engine.metrology.sections import section
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
 from mirrorskin.view.result.classes import draw_edges, draw_status
 from mirrorskin.view.result.height import draw_height

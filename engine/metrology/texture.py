@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from mirrorskin.engine.measure.cloud import far_less_sure, micrometres
-from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.engine.metrology.fitting import far_less_sure, micrometres
+from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]

@@ -9,16 +9,13 @@ from typing import Literal
 
 import numpy as np
 
-from mirrorskin.engine.measure.extent import areas, volume
-from mirrorskin.engine.measure.levels import border, levels
-from mirrorskin.engine.measure.patch import Patch, patch_of
-from mirrorskin.engine.measure.plane import Plane, fit_plane
-from mirrorskin.engine.measure.quantity import Quantity
-from mirrorskin.engine.measure.section import Point
-from mirrorskin.engine.measure.section import section as cut
-from mirrorskin.engine.measure.sphere import Sphere, fit_sphere
-from mirrorskin.engine.measure.steps import along, step_height
-from mirrorskin.engine.measure.texture import roughness
+from mirrorskin.engine.metrology.extent import areas, border, levels, volume
+from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
+from mirrorskin.engine.metrology.patch import Patch, patch_of
+from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology.sections import Point, along, step_height
+from mirrorskin.engine.metrology.sections import section as cut
+from mirrorskin.engine.metrology.texture import roughness
 from mirrorskin.io import InputError, Region, Result
 
 FormName = Literal["plane", "sphere", "none"]

@@ -6,7 +6,7 @@ import pytest
 
 from mirrorskin import engine
 from mirrorskin.engine.fusion import fuse_sources
-from mirrorskin.engine.measure.sphere import fit_sphere
+from mirrorskin.engine.metrology.forms import fit_sphere
 
 
 @pytest.fixture(scope="module")

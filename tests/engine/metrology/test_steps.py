@@ -5,8 +5,7 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
-from mirrorskin.engine.measure.section import section
-from mirrorskin.engine.measure.steps import step_height
+from mirrorskin.engine.metrology.sections import section, step_height
 
 SHAPE, SIZE = (41, 121), (0.05, 0.05)
 NAN = np.nan

@@ -22,9 +22,8 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from mirrorskin.engine.integration.components import Labels, Settler
-from mirrorskin.engine.integration.inputs import Floats, Inputs
-from mirrorskin.engine.integration.links import LEVEL, LinkRoom, Links
+from mirrorskin.engine.integration.graph import LEVEL, Labels, LinkRoom, Links, Settler
+from mirrorskin.engine.integration.validation import Floats, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.links import KNOWN, SLOPE
 

@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.integration.components import Settler, find_components
-from mirrorskin.engine.integration.inputs import Inputs, check_pixel_size
-from mirrorskin.engine.integration.links import LEVEL, LinkRoom, Links
-from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.engine.integration.graph import LEVEL, LinkRoom, Links, Settler, find_components
+from mirrorskin.engine.integration.validation import Inputs, check_pixel_size
+from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.measure.smooth import covariance
+from mirrorskin.engine.metrology.quantity import Quantity
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -215,3 +217,132 @@ def _shapes(points: Doubles, frame: Frame) -> list[Doubles]:
     x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
     xx, xy, yy = x * x, x * y, y * y
     return [xx, xy, yy, xx * x, xx * y, yy * x, yy * y]
+
+
+_UNSURE = 5.0  # times the median standard deviation, beyond which a height tells of its error alone
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The known points of a height map.
+
+    Attributes
+    ----------
+    points : ndarray, (3, n), float64
+        Millimetres.
+    sigma : ndarray, (n,), float64
+        Standard deviations of their heights, mm; all NaN where there are none.
+    where : ndarray, (H, W), bool
+        Which pixels they are.
+    """
+
+    points: Doubles
+    sigma: Doubles
+    where: Mask
+
+    @classmethod
+    def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> Cloud:
+        """Take a height map, with NaN where there is none, and where its pixels are; see `fit_plane`."""
+        z = np.asarray(height, np.float64)
+        where = np.isfinite(z)
+        if sigma is not None:
+            where &= np.isfinite(sigma)
+        across, up = np.meshgrid(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        points = np.stack([across[where], up[where], z[where]])
+        known = np.full(points.shape[1], np.nan) if sigma is None else np.asarray(sigma, np.float64)[where]
+        return cls(points, known, where)
+
+    @property
+    def common(self) -> float:
+        """Mean standard deviation, mm: by so much heights may be wrong together; 0 where it is not known."""
+        return float(np.nan_to_num(np.mean(self.sigma)))
+
+    def residual(self, distance: Doubles) -> tuple[Doubles, Quantity]:
+        """Return the points' distances from a form, (n,), mm, as a map, and their root mean square."""
+        residual = np.full(self.where.shape, np.nan)
+        residual[self.where] = distance
+        noise = np.sqrt(np.mean(self.sigma**2))
+        return residual, micrometres(float(np.sqrt(np.mean(distance**2))), float(noise))
+
+
+def far_less_sure(sigma: Doubles, known: Mask) -> Mask:
+    """Return the known pixels, (H, W), of more than five times the median sigma, if at most 15 % are.
+
+    What is highest and lowest of all would be their errors. If more are that unsure, all count.
+    """
+    unsure = known & (sigma > _UNSURE * np.median(sigma[known]))
+    return np.asarray(unsure & (np.count_nonzero(unsure) <= _FEW * np.count_nonzero(known)))
+
+
+def micrometres(value: float, sigma: float) -> Quantity:
+    """Return a quantity in micrometres of numbers in millimetres."""
+    return Quantity(1e3 * value, 1e3 * sigma, "µm")
+
+
+def degrees(value: float, sigma: float) -> Quantity:
+    """Return a quantity in degrees of numbers in radians."""
+    return Quantity(math.degrees(value), math.degrees(sigma), "deg")
+
+
+def spread(covariance: Doubles, *direction: float) -> float:
+    """Return the standard deviation of a linear combination of parameters."""
+    along = np.asarray(direction)
+    # Of parameters that nearly cancel, rounding may leave less than nothing.
+    return float(np.sqrt(np.maximum(along @ covariance @ along, 0)))
+
+
+_OVERSTATED = 0.1  # of the claimed variance, that may be missing because claims are not exact
+
+
+def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0) -> Doubles:
+    """Estimate the covariance of parameters that minimise a weighted sum of squares.
+
+    Parameters
+    ----------
+    gram : ndarray, (k + m + 1, k + m + 1), float64
+        Weighted sums over all residuals of the products of: the derivatives of a residual by the k
+        parameters, m smooth functions of its place, about as smooth as the derivatives, and the residual
+        itself, at the minimum. Weights are any multiple of the inverse variances.
+    parameters, count : int
+        How many parameters and residuals.
+    claimed : float
+        What the weighted sum of squares is expected to be, from standard deviations; 0 without these.
+
+    Returns
+    -------
+    ndarray, (k, k), float64
+        NaN where there are too few residuals to tell.
+    """
+    scale = np.sqrt(np.diag(gram))
+    lengths = np.where(scale > 0, scale, np.inf)
+    gram = gram / np.multiply.outer(lengths, lengths)
+    inverse = _inverse(gram[:parameters, :parameters])
+    across = gram[:parameters, parameters:]
+    # Of shapes and residuals, what the form leaves.
+    left = gram[parameters:, parameters:] - across.T @ inverse @ across
+    variance = scale[-1] ** 2 * _variance(left, count - parameters)
+    # Not by all: errors that are so smooth go more into one parameter than into another.
+    taken_in = max((1 - _OVERSTATED) * claimed - scale[-1] ** 2, 0.0) / max(parameters - 1, 1)
+    own = lengths[:parameters]
+    return np.asarray((variance + taken_in) * inverse / np.multiply.outer(own, own))
+
+
+def _inverse(normal: Doubles) -> Doubles:
+    """Invert normal equations, of columns of length 1; directions that nothing tells of are left out."""
+    lengths, directions = np.linalg.eigh(normal)
+    real = directions[:, lengths > _SINGULAR] / np.sqrt(lengths[lengths > _SINGULAR])
+    return np.asarray(real @ real.T)
+
+
+def _variance(left: Doubles, freedom: int) -> float:
+    """Return the variance of a smooth shape's amplitude, or of a pixel's error if that is larger."""
+    lengths, directions = np.linalg.eigh(left[:-1, :-1])
+    real = lengths > _ROUNDING
+    white = max(float(left[-1, -1]), 0.0)
+    free = min(int(np.count_nonzero(real)), freedom)
+    if free < 3:
+        return np.nan if freedom < 1 else white / freedom
+    power = (directions[:, real].T @ left[:-1, -1]) ** 2 / lengths[real]
+    # Of so few amplitudes the mean square is uncertain itself: the variance of Student's t.
+    smooth = float(np.sum(power)) / (free - 2)
+    return max(smooth, white / freedom)

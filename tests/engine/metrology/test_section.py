@@ -5,7 +5,7 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import io
-from mirrorskin.engine.measure.section import section
+from mirrorskin.engine.metrology.sections import section
 
 SIZE = (0.1, 0.25)
 SHAPE = (21, 33)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.integration.inputs import check_pixel_size
-from mirrorskin.engine.integration.integrate import integrate
+from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import Surface
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.interval import find_spread, look_inside
 from mirrorskin.engine.press.trend import find_trend

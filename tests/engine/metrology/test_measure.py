@@ -7,8 +7,7 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
-from mirrorskin.engine.measure.plane import fit_plane
-from mirrorskin.engine.measure.sphere import fit_sphere
+from mirrorskin.engine.metrology.forms import fit_plane, fit_sphere
 
 NAN = np.nan
 SHAPE, SIZE = (211, 207), (0.03, 0.03)
