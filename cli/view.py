@@ -111,9 +111,8 @@ def _show(
 ) -> None:
     """Draw what is asked for, into a window, a picture or a folder."""
     from mirrorskin import io
-    from mirrorskin.view.canvas import write_figure
+    from mirrorskin.view.canvas import has_screen, show_figure, write_figure
     from mirrorskin.view.result import figures_of, overview
-    from mirrorskin.view.window import has_screen, show_figure
 
     if output is None and has_screen():
         show_figure(overview(shown, name=name, section=ends, maps=maps), name)

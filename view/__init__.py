@@ -1,8 +1,6 @@
 """Pictures for people."""
 
 from mirrorskin.view.canvas import check_drawing
-from mirrorskin.view.truth.heights import height_figure
-from mirrorskin.view.truth.normals import normal_figure
-from mirrorskin.view.truth.surfaces import surface_figure
+from mirrorskin.view.truth import height_figure, normal_figure, surface_figure
 
 __all__ = ["check_drawing", "height_figure", "normal_figure", "surface_figure"]

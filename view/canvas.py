@@ -1,4 +1,4 @@
-"""What all figures share: a canvas, where a map lies on it and in what colours, and how it becomes a file."""
+"""What all figures share: a canvas, where a map lies on it, and how it becomes a file or a window."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,3 +167,34 @@ def round_length(length: float, up: bool = False) -> float:
     if up:
         return float(next(step for step in steps if step >= length * (1 - 1e-9)))
     return float(max(step for step in steps if step <= length * (1 + 1e-9)))
+
+
+_SCREEN = 1600, 900  # pixels that a window may take
+
+
+def has_screen() -> bool:
+    """Tell whether Matplotlib finds a way to open windows here; ``MPLBACKEND`` has its say."""
+    check_drawing()
+    import matplotlib
+    from matplotlib import pyplot
+    from matplotlib.backends.registry import BackendFilter, backend_registry
+
+    try:
+        pyplot.switch_backend(matplotlib.get_backend())
+    except ImportError:  # the one that was asked for cannot be here
+        return False
+    opens = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
+    return matplotlib.get_backend().lower() in opens
+
+
+def show_figure(figure: Figure, title: str) -> None:
+    """Show a figure in a window, until it is closed."""
+    from matplotlib import pyplot
+
+    def ready(*_: Any, **__: Any) -> Figure:
+        return figure
+
+    figure.set_dpi(min(figure.get_dpi(), *np.divide(_SCREEN, figure.get_size_inches())))
+    # pyplot makes a window only for what it makes itself.
+    pyplot.figure(num=title, FigureClass=cast("type[Figure]", ready))
+    pyplot.show()

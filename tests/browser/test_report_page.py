@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
-from mirrorskin.view.report import pictures, write_report
+from mirrorskin.view.report import contents, write_report
 from mirrorskin.view.report.words import PICTURES
 
 SHAPE = (61, 81)
@@ -63,7 +63,7 @@ def path(tmp_path_factory):
     """A page of a small result with all there is, under a name that means harm."""
     target = tmp_path_factory.mktemp("report") / "page.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "FINENESS", 130)
+        patch.setattr(contents, "FINENESS", 130)
         write_report(a_result(), target, name="<img src=x onerror=alert(1)>.h5")
     return target
 

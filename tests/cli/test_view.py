@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from mirrorskin import io
 from mirrorskin.cli import view as command
-from mirrorskin.view import space, viewer, window
+from mirrorskin.view import canvas, space, viewer
 from mirrorskin.view.result.figures import MAPS
 
 app = typer.Typer()
@@ -19,7 +19,7 @@ app.command()(command.command)
 @pytest.fixture
 def result(tmp_path, monkeypatch):
     """The path of a result, and no screen."""
-    monkeypatch.setattr(window, "has_screen", lambda: False)
+    monkeypatch.setattr(canvas, "has_screen", lambda: False)
     path = tmp_path / "ball.h5"
     io.save_result(ball(), path)
     return path
@@ -45,8 +45,8 @@ def test_without_a_screen_a_picture_lies_beside_the_result(result):
 
 def test_with_a_screen_all_is_in_one_window_and_nothing_is_written(result, monkeypatch):
     shown = []
-    monkeypatch.setattr(window, "has_screen", lambda: True)
-    monkeypatch.setattr(window, "show_figure", lambda figure, title: shown.append((figure, title)))
+    monkeypatch.setattr(canvas, "has_screen", lambda: True)
+    monkeypatch.setattr(canvas, "show_figure", lambda figure, title: shown.append((figure, title)))
     assert view(result).exit_code == 0
     ((figure, title),) = shown
     assert title == "ball.h5"

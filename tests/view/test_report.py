@@ -17,10 +17,9 @@ import pytest
 
 from mirrorskin import engine, io
 from mirrorskin.view import report
-from mirrorskin.view.report import contents, pictures
-from mirrorskin.view.report.grid import sample
-from mirrorskin.view.report.numbers import align
-from mirrorskin.view.report.surface import surface_data
+from mirrorskin.view.report import contents
+from mirrorskin.view.report.contents import align
+from mirrorskin.view.report.surface import sample, surface_data
 from mirrorskin.view.report.words import MAPS, PICTURES, told_process
 
 SHAPE = (23, 31)
@@ -105,7 +104,7 @@ def page(tmp_path_factory):
         cap(), status=np.ones(SHAPE, np.uint8), calibration=calibrations.a_calibration(name=HOSTILE)
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "FINENESS", 70)  # quick to draw
+        patch.setattr(contents, "FINENESS", 70)  # quick to draw
         return written(tmp_path_factory.mktemp("page"), result, name=f"{HOSTILE}.h5")
 
 
@@ -241,7 +240,7 @@ def test_heights_of_which_none_is_known_make_no_surface(tmp_path, quick):
 
 
 def test_a_result_without_heights_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "FINENESS", 70)
+    monkeypatch.setattr(contents, "FINENESS", 70)
     result = io.Result(
         azimuth=np.linspace(-3, 3, 35, dtype=np.float32).reshape(5, 7),
         modulation=np.ones((5, 7), np.float32),
@@ -380,8 +379,8 @@ def test_only_the_part_that_holds_heights_is_told():
 def test_pictures_of_noise_stay_small(monkeypatch):
     noise = np.random.default_rng(3).integers(0, 255, (200, 160, 3), np.uint8)
     for most, kind, size in ((100_000, "png", 160), (50_000, "webp", 160), (9_000, "webp", 80)):
-        monkeypatch.setattr(pictures, "MOST_BYTES", most)
-        packed, data = pictures.packed(noise)
+        monkeypatch.setattr(contents, "MOST_BYTES", most)
+        packed, data = contents.packed(noise)
         seen = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert (packed, seen.shape[1]) == (kind, size)
         assert len(data) <= most
@@ -394,12 +393,12 @@ def test_a_surface_of_a_million_pixels_stays_small():
     data = surface_data(io.Result(height=height, component=np.zeros(height.shape, np.int32)))
     surface = len(json.dumps(data))
     assert surface < 1e6
-    most_pictures = 7 * pictures.MOST_BYTES * 4 / 3
+    most_pictures = 7 * contents.MOST_BYTES * 4 / 3
     assert surface + most_pictures < 5e6 - 2e5  # of which all words take less
 
 
 def test_the_same_result_makes_the_same_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "FINENESS", 40)
+    monkeypatch.setattr(contents, "FINENESS", 40)
     small = io.Result(azimuth=np.arange(20, dtype=np.float32).reshape(4, 5))
     pages = []
     for name in ("first.html", "second.html"):

@@ -15,8 +15,7 @@ from mirrorskin.io import InputError, Result, of_turn
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.plain import plainly
 from mirrorskin.view.canvas import check_drawing
-from mirrorskin.view.report.contents import contents_of
-from mirrorskin.view.report.pictures import Ends
+from mirrorskin.view.report.contents import Ends, contents_of
 
 _SCRIPTS = ("grid.js", "scene.js", "view.js", "surface.js")
 

@@ -1,17 +1,17 @@
-"""What the page's script is told of a surface."""
+"""The surface that a report shows in space, of few enough samples for any browser; a hole stays a hole."""
 
 from __future__ import annotations
 
 import base64
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io import Result
+from mirrorskin.io import Result, pixel_axes
 from mirrorskin.io.types import Floats
 from mirrorskin.view.colours import FILLED_RGB, span
-from mirrorskin.view.report.grid import Grid, sample
 
 MOST_EXAGGERATED = 20
 """Times that heights are drawn larger than they are, at most."""
@@ -88,3 +88,124 @@ def _colours() -> list[list[float]]:
     from matplotlib import colormaps
 
     return [[round(part, 4) for part in colormaps[_MAP](k / (_STOPS - 1))[:3]] for k in range(_STOPS)]
+
+
+MOST = 400
+"""Samples along a side, at most."""
+
+Number = TypeVar("Number", bound=np.generic)
+
+_HOLE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Heights on a grid.
+
+    Attributes
+    ----------
+    x, y : ndarray, (n,) and (m,), float64
+        Of the samples, mm or pixels from the picture's centre; y runs up.
+    height : ndarray, (m, n), float64
+        Millimetres; NaN in a hole.
+    piece : ndarray, (m, n), int64
+        Number of the connected piece, from 0; -1 in a hole.
+    filled : ndarray, (m, n), bool
+        Where the height was not measured.
+    """
+
+    x: Floats
+    y: Floats
+    height: Floats
+    piece: NDArray[np.int64]
+    filled: NDArray[np.bool_]
+
+
+def sample(result: Result, most: int = MOST) -> Grid:
+    """Take means over blocks of pixels, as many as bring each side to at most ``most`` samples.
+
+    Only the rectangle that holds all heights is taken. A block of which less than half has a height is a
+    hole. Of a block that holds more than one piece, or measured and filled pixels, only those of the middle
+    kind are taken, which is the most common one wherever one has more than half: heights of different kinds
+    are never mixed.
+
+    Parameters
+    ----------
+    result : Result
+        Of (H, W) maps, with some heights; without pixel size, places are in pixels.
+    most : int
+    """
+    assert result.height is not None
+    answered = np.isfinite(result.height)
+    rows, columns = (_reach(np.asarray(answered.any(axis=axis))) for axis in (1, 0))
+    y, x = _places(result)
+    kind_of, height = _kinds(result)[rows, columns], result.height[rows, columns].astype(np.float64)
+    block = -(-height.shape[0] // most), -(-height.shape[1] // most)
+    kind, mean = _averaged(_blocks(kind_of, block, _HOLE), _blocks(height, block, np.nan))
+    kind[2 * _count(kind_of != _HOLE, block) < _count(np.ones_like(kind_of, bool), block)] = _HOLE
+    hole = kind == _HOLE
+    return Grid(
+        _means(x[columns], block[1]),
+        _means(y[rows], block[0]),
+        np.where(hole, np.nan, mean),
+        np.where(hole, _HOLE, kind // 2),
+        ~hole & (kind % 2 == 1),
+    )
+
+
+def _reach(answered: NDArray[np.bool_]) -> slice:
+    """Return from the first to the last that is answered."""
+    (where,) = np.nonzero(answered)
+    return slice(int(where[0]), int(where[-1]) + 1)
+
+
+def _places(result: Result) -> tuple[Floats, Floats]:
+    """Return y and x of the pixels."""
+    if result.x is not None and result.y is not None:
+        return result.y, result.x
+    assert result.height is not None
+    rows, columns = result.height.shape
+    x, y = pixel_axes((rows, columns), (1.0, 1.0))
+    return y, x
+
+
+def _kinds(result: Result) -> NDArray[np.int64]:
+    """Return a number for what may be averaged: twice the piece, and one more where it was filled."""
+    assert result.height is not None
+    kind = np.zeros(result.height.shape, np.int64)
+    if result.component is not None:
+        kind += 2 * np.maximum(result.component, 0)
+    if result.filled is not None:
+        kind += result.filled > 0
+    return np.where(np.isfinite(result.height), kind, _HOLE)
+
+
+def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Return the middle kind of each block, and the mean height of what is of it; of holes only, a hole."""
+    ordered = np.sort(kinds, axis=-1)  # holes come first
+    size, known = kinds.shape[-1], np.count_nonzero(kinds != _HOLE, axis=-1)
+    middle = np.minimum(size - known + known // 2, size - 1)[..., np.newaxis]
+    kind = np.take_along_axis(ordered, middle, axis=-1)
+    chosen = (kinds == kind) & (kinds != _HOLE)
+    count = np.maximum(np.count_nonzero(chosen, axis=-1), 1)
+    return kind[..., 0], np.sum(heights, axis=-1, where=chosen) / count
+
+
+def _blocks(values: NDArray[Number], block: tuple[int, int], beyond: float) -> NDArray[Number]:
+    """Put the pixels of each block into a row, (m, n, pixels); beyond the picture lies what is given."""
+    beside = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
+    whole = np.pad(values, beside, constant_values=beyond)
+    rows, columns = whole.shape[0] // block[0], whole.shape[1] // block[1]
+    return whole.reshape(rows, block[0], columns, block[1]).swapaxes(1, 2).reshape(rows, columns, -1)
+
+
+def _count(where: NDArray[np.bool_], block: tuple[int, int]) -> NDArray[np.int64]:
+    """Count in each block."""
+    return np.asarray(np.count_nonzero(_blocks(where, block, False), axis=-1))
+
+
+def _means(places: Floats, step: int) -> Floats:
+    """Return where the middles of the blocks are."""
+    starts = np.arange(0, len(places), step)
+    lengths = np.minimum(step, len(places) - starts)
+    return np.asarray(np.add.reduceat(places, starts) / lengths)

@@ -14,12 +14,17 @@ import numpy as np
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.canvas import encode_figure, new_figure
-from mirrorskin.view.result.classes import draw_edges, draw_status
-from mirrorskin.view.result.height import draw_height
-from mirrorskin.view.result.histogram import draw_histogram
-from mirrorskin.view.result.normals import draw_normals
-from mirrorskin.view.result.scalars import draw_azimuth, draw_height_sigma, draw_modulation, draw_normal_sigma
-from mirrorskin.view.result.section import draw_section
+from mirrorskin.view.result.maps import (
+    draw_azimuth,
+    draw_edges,
+    draw_height,
+    draw_height_sigma,
+    draw_modulation,
+    draw_normal_sigma,
+    draw_normals,
+    draw_status,
+)
+from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import BOX, TEXT, Sheet, sheet_of
 
 if TYPE_CHECKING:

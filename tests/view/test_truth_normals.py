@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io, view
-from mirrorskin.view.truth import normals
+from mirrorskin.view import truth as normals
 
 SHAPE = (20, 30)
 ZENITH = np.radians(30)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io, view
-from mirrorskin.view.truth import surfaces
+from mirrorskin.view import truth as surfaces
 
 SHAPE = (21, 31)
 TRUE = np.fromfunction(lambda row, column: -0.01 * column - 0.001 * row, SHAPE).astype(np.float32)
@@ -26,7 +26,7 @@ def truth():
 
 def drawn(results):
     """Draw; return the axes of the surface, the map, the errors, the cuts and their errors."""
-    figure = surfaces._draw(results, truth())
+    figure = surfaces._draw_surfaces(results, truth())
     return [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
 
 

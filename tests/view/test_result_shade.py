@@ -5,7 +5,7 @@ import pytest
 from matplotlib import colormaps
 
 from mirrorskin.view.colours import MISSING_RGB
-from mirrorskin.view.result.shade import shaded
+from mirrorskin.view.result.maps import shaded
 
 PIXEL = 0.1, 0.25
 

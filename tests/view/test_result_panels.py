@@ -9,12 +9,17 @@ from shown import ball, colours_at, rendered
 from mirrorskin import io
 from mirrorskin.engine.metrology.sections import section
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
-from mirrorskin.view.result.classes import draw_edges, draw_status
-from mirrorskin.view.result.height import draw_height
-from mirrorskin.view.result.histogram import draw_histogram
-from mirrorskin.view.result.normals import draw_normals
-from mirrorskin.view.result.scalars import draw_azimuth, draw_height_sigma, draw_modulation, draw_normal_sigma
-from mirrorskin.view.result.section import draw_section
+from mirrorskin.view.result.maps import (
+    draw_azimuth,
+    draw_edges,
+    draw_height,
+    draw_height_sigma,
+    draw_modulation,
+    draw_normal_sigma,
+    draw_normals,
+    draw_status,
+)
+from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import percent, sheet_of
 
 

@@ -1,0 +1,343 @@
+"""Maps of a result: heights under a lamp, normals, expected errors, modulation, edges, status."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from mirrorskin.engine.nearest import with_nearest
+from mirrorskin.io.types import Floats
+from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
+from mirrorskin.view.colours import MISSING, MISSING_RGB, Colours, normal_colours, span
+from mirrorskin.view.result.sheet import SMALL, TEXT, Sheet, draw_map, entitle, lay_out, percent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from mirrorskin.engine.metrology.sections import Section
+
+_BAR = 0.3  # of the picture's width: the longest scale bar
+_MARGIN = 0.05
+_EDGE = 0.1  # of the picture's width: room for a letter
+
+
+def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
+    """Draw heights as a lit surface, with a scale bar, and where the section runs.
+
+    Parameters
+    ----------
+    axes : Axes
+    sheet : Sheet
+        Of a result with heights.
+    cut : Section, optional
+        Drawn from A to B.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    height = sheet.result.height
+    assert height is not None
+    ends = span(height)
+    draw_map(axes, sheet, shaded(height, sheet.filled, _pixel(sheet), ends), interpolation="antialiased")
+    colours = ScalarMappable(Normalize(*_apart(*ends)), "viridis")
+    explain_colours(axes, colours, f"{quantity(sheet)} (mm)", exceeded(height, *ends))
+    if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
+        _draw_scale(axes, sheet)
+    if cut is not None:
+        _draw_line(axes, sheet, cut)
+    lay_out(axes, sheet)
+    entitle(axes, quantity(sheet).capitalize(), "; ".join(_notes(sheet)))
+
+
+def quantity(sheet: Sheet) -> str:
+    """Name what heights are: relative where nobody knows how high they lie."""
+    unknown = sheet.result.offset_unknown
+    return "relative height" if unknown is not None and unknown.size and unknown.all() else "height"
+
+
+def _notes(sheet: Sheet) -> Iterator[str]:
+    """Tell what colours mean, and what a level is worth."""
+    result, filled = sheet.result, sheet.filled
+    assert result.height is not None
+    if filled.any():
+        yield f"orange: filled ({percent(int(np.count_nonzero(filled)), filled.size)})"
+    missing = int(np.count_nonzero(~np.isfinite(result.height)))
+    if missing:
+        yield f"blue: no answer ({percent(missing, filled.size)})"
+    unknown = result.offset_unknown
+    if unknown is not None and unknown.any():
+        pieces = "each piece" if unknown.all() else f"{np.count_nonzero(unknown)} of {unknown.size} pieces"
+        yield "mean 0" if unknown.size == 1 else f"{pieces} about its mean"
+
+
+def _pixel(sheet: Sheet) -> tuple[float, float]:
+    left, right, bottom, top = sheet.place
+    return (right - left) / len(sheet.x), (top - bottom) / len(sheet.y)
+
+
+def _apart(low: float, high: float) -> tuple[float, float]:
+    """Part the ends of a scale that lie together."""
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def outlined(width: float) -> list[Any]:
+    """Return what keeps black lines and letters readable on any colour."""
+    from matplotlib.patheffects import withStroke
+
+    return [withStroke(linewidth=width, foreground="white")]
+
+
+def _draw_scale(axes: Axes, sheet: Sheet) -> None:
+    """Draw a bar of a round length in the lower left corner."""
+    left, right, bottom, top = sheet.place
+    length = round_length(_BAR * (right - left))
+    margin = _MARGIN * min(right - left, top - bottom)
+    ends = [left + margin, left + margin + length]
+    (bar,) = axes.plot(ends, [bottom + margin] * 2, color="black", lw=3, solid_capstyle="butt")
+    bar.set_path_effects(outlined(5))
+    axes.annotate(
+        f"{length:g} mm",
+        (sum(ends) / 2, bottom + margin),
+        (0, 4),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=TEXT,
+        path_effects=outlined(2.5),
+    )
+
+
+def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
+    """Draw the line of a section, and its ends A and B beyond it, or within where it ends at the edge."""
+    (line,) = axes.plot(cut.x[[0, -1]], cut.y[[0, -1]], color="black", lw=1, ls=(0, (6, 3)))
+    line.set_path_effects(outlined(2.5))
+    left, right, _, top = sheet.place
+    edge = _EDGE * (right - left)
+    to_left = cut.x[0] <= cut.x[-1]
+    for name, place, beyond in (("A", 0, to_left), ("B", -1, not to_left)):
+        room = (cut.x[place] - left if beyond else right - cut.x[place]) > edge
+        align = "right" if beyond == room else "left"
+        above = top - cut.y[place] > edge
+        axes.annotate(
+            name,
+            (float(cut.x[place]), float(cut.y[place])),
+            (3 if align == "left" else -3, 3 if above else -3),
+            textcoords="offset points",
+            ha=align,
+            va="bottom" if above else "top",
+            fontsize=SMALL + 2,
+            weight="bold",
+            path_effects=outlined(2.5),
+        )
+
+
+_LAMP = 315.0, 45.0  # degrees: azimuth clockwise from above, which is the upper left, and elevation
+_SMOOTH = 1.0  # pixels, of the slopes that light falls on: steps of a press are no terraces
+_SHOWN_SLOPES = 98.0  # per cent of the slopes that the light tells apart
+_STEEPEST = 20.0  # light tells gentle slopes apart as if they were so many times as steep
+
+
+def shaded(
+    height: NDArray[np.float32],
+    filled: NDArray[np.bool_],
+    pixel: tuple[float, float],
+    span: tuple[float, float],
+) -> Colours:
+    """Return the colours of heights under a lamp at the upper left.
+
+    Parameters
+    ----------
+    height : ndarray, (H, W), float32
+        Millimetres; NaN has the colour of what has no answer.
+    filled : ndarray, (H, W), bool
+        Where heights were not measured: these have colours of their own.
+    pixel : (float, float)
+        Size of a pixel along x and y, mm.
+    span : (float, float)
+        Heights at the ends of the colours, mm.
+
+    Returns
+    -------
+    ndarray, (H, W, 3), uint8
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import LightSource, Normalize
+
+    known = np.isfinite(height)
+    if not known.any():
+        return np.broadcast_to(np.array(MISSING_RGB, np.uint8), (*height.shape, 3)).copy()
+    level = Normalize(*span, clip=True)(np.where(known, height, span[0]))
+    colours = np.where(
+        filled[..., np.newaxis],
+        filled_colours()(level, bytes=True)[..., :3],
+        colormaps["viridis"](level, bytes=True)[..., :3],
+    )
+    lamp = LightSource(*_LAMP)
+    light = _light(height, pixel, lamp.direction)
+    lit = lamp.blend_soft_light(colours.astype(np.float32) / 255, light[..., np.newaxis])
+    return np.asarray(np.where(known[..., np.newaxis], np.rint(255 * lit), MISSING_RGB), np.uint8)
+
+
+def _light(height: NDArray[np.float32], pixel: tuple[float, float], lamp: Floats) -> NDArray[np.float32]:
+    """Return the light on a surface, from 0 to 1; level ground has 0.5."""
+    whole = gaussian_filter(with_nearest(height), _SMOOTH, mode="nearest")
+    dz_dx, dz_dy = _slope(whole, pixel[0], 1), -_slope(whole, pixel[1], 0)
+    change = (lamp[2] - lamp[0] * dz_dx - lamp[1] * dz_dy) / np.sqrt(1 + dz_dx**2 + dz_dy**2) - lamp[2]
+    usual = float(np.percentile(np.abs(change[np.isfinite(height)]), _SHOWN_SLOPES))
+    return np.asarray(np.clip(0.5 + change * min(0.5 / max(usual, 1e-9), _STEEPEST), 0, 1), np.float32)
+
+
+def _slope(height: NDArray[np.float32], step: float, axis: int) -> Floats:
+    """Return the change along an axis of the array, mm per mm; 0 along a single row or column."""
+    if height.shape[axis] == 1:
+        return np.zeros(height.shape)
+    return np.asarray(np.gradient(height.astype(np.float64), step, axis=axis))
+
+
+_KEY = 129  # pixels of the key along a side
+
+
+def draw_normals(axes: Axes, sheet: Sheet) -> None:
+    """Draw normals as colours, edges black, and beside them a half-ball that explains the colours."""
+    result = sheet.result
+    assert result.normals is not None
+    colours = normal_colours(result.normals, result.edges)
+    draw_map(axes, sheet, colours, interpolation="antialiased")
+    _draw_key(axes)
+    missing = bool(np.isnan(result.normals[..., 2]).any())
+    edges = result.edges is not None and bool(result.edges.any())
+    notes = (["black: edges"] if edges else []) + (["blue: no answer"] if missing else [])
+    entitle(axes, "Normals", "; ".join(notes))
+
+
+def _draw_key(axes: Axes) -> None:
+    """Draw the colours of all normals there are, on a half-ball seen from above."""
+    across = np.linspace(-1, 1, _KEY, dtype=np.float32)
+    right, up = np.meshgrid(across, across[::-1])
+    rest = 1 - right**2 - up**2
+    ball = np.stack([right, up, np.sqrt(np.maximum(rest, 0))], axis=-1)
+    colours = np.full((_KEY, _KEY, 4), 255, np.uint8)
+    colours[..., :3] = normal_colours(ball)
+    colours[rest < 0, 3] = 0
+    key = axes.inset_axes((1.03, 0.75, 0.2, 0.2))
+    key.imshow(colours, extent=(-1, 1, -1, 1), interpolation="antialiased")
+    key.set_axis_off()
+    for name, x, y in (("x", 1.25, 0), ("y", 0, 1.25)):
+        key.text(x, y, name, ha="center", va="center", fontsize=SMALL)
+    key.text(0, -1.2, "a ball's colours", ha="center", va="top", fontsize=SMALL)
+
+
+_MICROMETRES = 1e3  # in a millimetre
+_SHOWN = 1, 99  # per cent of the values that the colours tell apart
+_DECADES = 30.0  # times between these, from which on colours are of the logarithm
+
+
+def draw_height_sigma(axes: Axes, sheet: Sheet) -> None:
+    """Draw the standard deviation that is expected of heights, in micrometres."""
+    assert sheet.result.height_sigma is not None
+    sigma = _MICROMETRES * sheet.result.height_sigma.astype(np.float64)
+    _draw_positive(
+        axes, sheet, sigma, "Expected error of heights", "standard deviation", "\N{MICRO SIGN}m", "magma"
+    )
+
+
+def draw_normal_sigma(axes: Axes, sheet: Sheet) -> None:
+    """Draw the angular error that is expected of normals, in degrees."""
+    assert sheet.result.normal_sigma is not None
+    sigma = np.degrees(sheet.result.normal_sigma.astype(np.float64))
+    _draw_positive(axes, sheet, sigma, "Expected error of normals", "RMS angle", "deg", "magma")
+
+
+def draw_modulation(axes: Axes, sheet: Sheet) -> None:
+    """Draw how far the light swings in a turn, in counts."""
+    assert sheet.result.modulation is not None
+    _draw_positive(
+        axes,
+        sheet,
+        sheet.result.modulation.astype(np.float64),
+        "Modulation",
+        "swing of the light",
+        "counts",
+        "viridis",
+    )
+
+
+def draw_azimuth(axes: Axes, sheet: Sheet) -> None:
+    """Draw the azimuth of the normal, in degrees, in colours that go round as it does."""
+    assert sheet.result.azimuth is not None
+    azimuth = np.degrees(np.angle(np.exp(1j * sheet.result.azimuth.astype(np.float64))))
+    draw_map(axes, sheet, azimuth, "azimuth (deg)", cmap="twilight", vmin=-180, vmax=180)
+    axes.child_axes[0].set_yticks(range(-180, 181, 90))
+    entitle(axes, "Azimuth of the normal", "0: to the right; 90: up")
+
+
+def _draw_positive(
+    axes: Axes, sheet: Sheet, values: Floats, title: str, quantity: str, unit: str, colours: str
+) -> None:
+    """Draw numbers above zero; where they span decades, by their logarithm."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    values = np.where(np.isfinite(values), values, np.nan)
+    known = values[np.isfinite(values)]
+    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
+    scale = LogNorm if low > 0 and high > _DECADES * low else Normalize
+    if not high > low:
+        low, high = low - 0.5, high + 0.5
+    beyond = exceeded(known, low, high)
+    label = f"{quantity} ({unit})"
+    draw_map(axes, sheet, values, label, extend=beyond, cmap=colours, norm=scale(low, high))
+    missing = "; blue: no answer" if 0 < known.size < values.size else ""
+    entitle(axes, title, f"median {np.median(known):.3g} {unit}{missing}" if known.size else "no answer")
+
+
+_ONSET = "invalid input", "onset", "never light", "light at start"
+_RELEASE = "invalid input", "release", "dark at start", "light to the end"
+_UNKNOWN = "unknown number"
+_STATUS_COLOURS = "#d55e00", "#009e73", "0.25", "#f0e442", "white"
+_EDGE_COLOURS = "0.85", "black", MISSING
+
+
+def draw_edges(axes: Axes, sheet: Sheet) -> None:
+    """Draw edges, and where the sheet was in contact in every frame, if that is told."""
+    edges, contact = sheet.result.edges, sheet.result.contact
+    assert edges is not None
+    classes = np.zeros(edges.shape, np.uint8)
+    if contact is not None:
+        classes[contact == 0] = 2
+    classes[edges > 0] = 1
+    names = ("no edge" if contact is None else "in contact", "edge", "no lasting contact")
+    _draw_shares(axes, sheet, classes, _EDGE_COLOURS, names)
+    entitle(axes, "Edges" if contact is None else "Edges and contact")
+
+
+def draw_status(axes: Axes, sheet: Sheet) -> None:
+    """Draw what became of each pixel in a press or a release."""
+    status = sheet.result.status
+    assert status is not None
+    released = sheet.result.process.get("event") == "release"
+    names = *(_RELEASE if released else _ONSET), _UNKNOWN
+    classes = np.minimum(status, names.index(_UNKNOWN)).astype(np.uint8)
+    _draw_shares(axes, sheet, classes, _STATUS_COLOURS, names)
+    entitle(axes, "Status")
+
+
+def _draw_shares(
+    axes: Axes, sheet: Sheet, classes: NDArray[np.uint8], colours: tuple[str, ...], names: tuple[str, ...]
+) -> None:
+    """Draw classes, and tell of each how many per cent of the pixels it has."""
+    counts = np.bincount(classes.ravel(), minlength=len(names))
+    labels = {
+        number: f"{name}\n{percent(int(counts[number]), classes.size)}"
+        for number, name in enumerate(names)
+        if counts[number]
+    }
+    draw_classes(axes, classes, colours, labels, sheet.place, "antialiased")
+    legend = axes.get_legend()
+    assert legend is not None
+    for text in legend.get_texts():
+        text.set_fontsize(SMALL)
+    lay_out(axes, sheet)

@@ -1,0 +1,382 @@
+"""Figures of results beside the truth that a simulation knows: heights, normals, surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.angles import angle_between, true_normals
+from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io.types import Floats
+from mirrorskin.view.canvas import draw_image, extent, filled_colours, new_figure, save_figure
+from mirrorskin.view.colours import FILLED, span
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
+
+_MESH = 120  # samples of a surface along its longer side
+_FILLED = "orange: filled"
+
+
+@dataclass(frozen=True, slots=True)
+class Relief:
+    """Heights as figures show them.
+
+    Attributes
+    ----------
+    height : ndarray, (H, W), float32
+        Millimetres; NaN without an answer.
+    filled : ndarray, (H, W), bool
+        Where it was not measured.
+    x, y : ndarray, (W,) and (H,), float64
+        Millimetres.
+    levelled : bool
+        Whether a component lies at the truth's mean height, as nobody knows its own.
+    """
+
+    height: NDArray[np.float32]
+    filled: NDArray[np.bool_]
+    x: Floats
+    y: Floats
+    levelled: bool
+
+    def notes(self, missing: str) -> str:
+        """Tell what colours mean, and what a level is worth."""
+        filled = [_FILLED] if self.filled.any() else []
+        return ", ".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
+
+
+def relief_of(result: Result, truth: Truth) -> Relief:
+    """Return a result's heights; components of unknown offset are moved to the truth's mean height there.
+
+    Raises
+    ------
+    InputError
+        The result has no heights or axes, is of one row or column, or not of the truth's size.
+    """
+    height, x, y = result.height, result.x, result.y
+    if height is None or x is None or y is None or height.ndim != 2 or min(height.shape) < 2:
+        raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")
+    check_same_size(height.shape, truth.height)
+    filled = np.zeros(height.shape, bool) if result.filled is None else result.filled.astype(bool)
+    levelled = result.offset_unknown is not None and bool(result.offset_unknown.any())
+    return Relief(_level(result, height, truth.height) if levelled else height, filled, x, y, levelled)
+
+
+def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Take the mean error off each component that knows no height; one off the truth stays where it is."""
+    assert result.component is not None
+    assert result.offset_unknown is not None
+    error = height.astype(np.float64) - truth
+    told = np.isfinite(error) & (result.component >= 0)
+    count, label = result.offset_unknown.size, result.component[told]
+    mean = np.bincount(label, error[told], count) / np.maximum(np.bincount(label, minlength=count), 1)
+    # The last one is for pixels that are in no component.
+    shift = np.append(np.where(result.offset_unknown, mean, 0.0), 0.0)[result.component]
+    return np.asarray(height - shift, np.float32)
+
+
+def draw_map(axes: Axes, name: str, relief: Relief) -> None:
+    """Draw heights by brightness, filled ones in shades of orange."""
+    lowest, highest = span(relief.height)
+    shades: list[str | Colormap] = ["gray", filled_colours()]
+    for filled in (False, True) if relief.filled.any() else (False,):
+        shown, place = np.where(relief.filled == filled, relief.height, np.nan), extent(relief.x, relief.y)
+        label = "" if filled else "height (mm)"
+        draw_image(axes, shown, place, label, cmap=shades[filled], vmin=lowest, vmax=highest)
+    axes.axhline(0, color="tab:red", lw=0.8, ls=":")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}\n{relief.notes('blue: no answer')}")
+
+
+def draw_surface(axes: Axes3D, name: str, relief: Relief) -> None:
+    """Draw heights as a surface in space; filled ones have a colour of their own."""
+    step = max(1, max(relief.height.shape) // _MESH)
+    lowest, highest = span(relief.height)
+    height, filled = relief.height[::step, ::step], relief.filled[::step, ::step]
+    shown = np.where((height >= lowest) & (height <= highest) | filled, height, np.nan)
+    across, up = np.meshgrid(relief.x[::step], relief.y[::step])
+    # One surface with colours of its own, as Matplotlib would not know which of two lies in front.
+    colours = {"facecolors": _colours(shown, filled), "shade": False} if filled.any() else {"cmap": "viridis"}
+    axes.plot_surface(across, up, shown, rstride=1, cstride=1, linewidth=0, antialiased=True, **colours)
+    axes.set_box_aspect((np.ptp(relief.x), np.ptp(relief.y), 0.45 * np.ptp(relief.x)), zoom=1.15)
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name} (mm)\n{relief.notes('holes: no answer')}")
+
+
+def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_]) -> Floats:
+    """Return the colours of a surface, (H, W, 4): by height, and of what was filled."""
+    from matplotlib import colormaps
+    from matplotlib.colors import Normalize, to_rgba
+
+    known = height[np.isfinite(height)]
+    colours = np.array(colormaps["viridis"](Normalize(known.min(), known.max())(np.nan_to_num(height))))
+    colours[filled] = to_rgba(FILLED)
+    return colours
+
+
+def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth) -> None:
+    """Draw heights on the middle row against the truth; filled ones are open circles."""
+    row = len(truth.height) // 2
+    any_relief = next(iter(reliefs.values()))
+    axes.plot(any_relief.x, truth.height[row], color="0.6", lw=3, label="truth")
+    dots_on_row(axes, {name: relief.height[row] for name, relief in reliefs.items()}, reliefs)
+    opened = any(relief.filled[row].any() for relief in reliefs.values())
+    title = "cut across the middle" + ("; open circles: filled" if opened else "")
+    axes.set(xlabel="x (mm)", ylabel="height (mm)", title=title)
+    lowest = min(span(relief.height)[0] for relief in reliefs.values())
+    axes.set_ylim(1.35 * lowest - 0.02, -0.12 * lowest + 0.02)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower center", ncols=2, markerscale=2)
+
+
+def dots_on_row(axes: Axes, values: Mapping[str, NDArray[np.float32]], reliefs: Mapping[str, Relief]) -> None:
+    """Draw values along the middle row, (W,), in the colours and with the names of the reliefs."""
+    for number, (name, relief) in enumerate(reliefs.items()):
+        filled = relief.filled[len(relief.filled) // 2]
+        # The first lies on top, small enough to show the others round it.
+        style: dict[str, Any] = {"ms": 3 + number, "zorder": 9 - number, "color": f"C{number}", "ls": ""}
+        axes.plot(relief.x, np.where(filled, np.nan, values[name]), marker=".", label=name, **style)
+        if filled.any():
+            axes.plot(relief.x, np.where(filled, values[name], np.nan), marker="o", mfc="none", **style)
+
+
+def check_same_size(shape: tuple[int, ...], truth: NDArray[np.float32]) -> None:
+    """Raise InputError unless a result and the truth are of one stack."""
+    if truth.shape != shape:
+        raise InputError(f"the result is {shape} pixels, the truth {truth.shape}: not of one stack")
+
+
+def height_figure(
+    results: Mapping[str, Result], truth: Truth, title: str, path: Path, *, surface: bool = False
+) -> None:
+    """Draw heights, and cuts across the middle against the truth, into a PNG.
+
+    Parameters
+    ----------
+    results : mapping
+        Names and results with ``height``, ``x`` and ``y``. The first and the last are drawn as a whole, all
+        are cut. What was ``filled`` is drawn apart, and what has no known offset lies as the truth does.
+    truth : Truth
+        Of the same size.
+    title : str
+    path : Path
+        PNG to write.
+    surface : bool
+        Draw a surface in space, as Fig. 5 (a) of the paper, instead of height by brightness, as its Fig. 6.
+
+    Raises
+    ------
+    InputError
+        Matplotlib is not installed, a result has no heights or axes, or the file cannot be written.
+    """
+    save_figure(_draw_heights(results, truth, surface), title, path)
+
+
+def _draw_heights(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
+    reliefs = {name: relief_of(result, truth) for name, result in results.items()}
+    names = list(reliefs)
+    whole = dict.fromkeys([names[0], names[-1]])
+    figure = new_figure(14, 4.6)
+    grid = figure.add_gridspec(1, len(whole) + 1, width_ratios=[1] * len(whole) + [1.2])
+    for place, name in enumerate(whole):
+        if surface:
+            draw_surface(figure.add_subplot(grid[place], projection="3d"), name, reliefs[name])
+        else:
+            draw_map(figure.add_subplot(grid[place]), name, reliefs[name])
+    draw_cuts(figure.add_subplot(grid[-1]), reliefs, truth)
+    return figure
+
+
+_NEEDLES = 36  # along the longer side
+_WORST = 98  # per cent of the errors that the colours tell apart
+
+
+def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path: Path) -> None:
+    """Draw normals, a row for each result, into a PNG.
+
+    From left to right: the customary colours, red, green and blue for x, y and z from -1 to 1, with edges
+    black; the normals projected on the sheet as needles, as Fig. 10 (a) of the paper; the angle to the
+    true normal where the sheet was in contact in every frame.
+
+    Parameters
+    ----------
+    results : mapping
+        Names and results with ``normals``, ``x`` and ``y``.
+    truth : Truth
+        Of the same size.
+    title : str
+    path : Path
+        PNG to write.
+
+    Raises
+    ------
+    InputError
+        Matplotlib is not installed, a result has no normals of one turn or no axes, or the file cannot be
+        written.
+    """
+    for result in results.values():
+        _check(result, truth)
+    errors = {name: _errors(result, truth) for name, result in results.items()}
+    known = np.concatenate([error[np.isfinite(error)] for error in errors.values()])
+    worst = float(np.percentile(known, _WORST)) if known.size else 1.0
+    figure = new_figure(14, 4.4 * len(results))
+    axes = figure.subplots(len(results), 3, squeeze=False)
+    for row, (name, result) in zip(axes, results.items(), strict=True):
+        _draw_normals(row[0], name, result)
+        _draw_needles(row[1], result)
+        _draw_angles(row[2], result, errors[name], worst)
+    save_figure(figure, title, path)
+
+
+def _check(result: Result, truth: Truth) -> None:
+    normals = result.normals
+    if normals is None or normals.ndim != 3 or result.x is None or result.y is None or min(normals.shape) < 2:
+        raise InputError("a figure needs normals of one turn and the pixel size, of 2 x 2 pixels at least")
+    check_same_size(normals.shape[:2], truth.height)
+
+
+def _maps(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
+    assert result.normals is not None
+    assert result.x is not None
+    assert result.y is not None
+    return result.normals, result.x, result.y
+
+
+def _errors(result: Result, truth: Truth) -> Floats:
+    """Return the angles to the true normals, degrees, where there was contact in every frame, else NaN."""
+    normals, _, _ = _maps(result)
+    angle = np.degrees(angle_between(normals, true_normals(truth)))
+    told = truth.contact.astype(bool)
+    if result.contact is not None:
+        told = told & result.contact.astype(bool)
+    return np.where(told, angle, np.nan)
+
+
+def _draw_normals(axes: Axes, name: str, result: Result) -> None:
+    normals, x, y = _maps(result)
+    known = np.asarray(np.isfinite(normals).all(axis=-1))
+    colours = np.ones((*known.shape, 4))
+    colours[..., :3] = np.where(known[..., np.newaxis], (np.nan_to_num(normals) + 1) / 2, 0)
+    if result.edges is not None:
+        colours[result.edges.astype(bool)] = 0, 0, 0, 1
+        known = known | result.edges.astype(bool)
+    colours[~known, 3] = 0
+    draw_image(axes, colours, extent(x, y))
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}; black: edges, blue: no answer")
+
+
+def _draw_needles(axes: Axes, result: Result) -> None:
+    normals, x, y = _maps(result)
+    step = max(1, max(normals.shape[:2]) // _NEEDLES)
+    shown = normals[step // 2 :: step, step // 2 :: step]
+    told = np.isfinite(shown).all(axis=-1)
+    if result.contact is not None:
+        told &= result.contact[step // 2 :: step, step // 2 :: step].astype(bool)
+    across, up = np.meshgrid(x[step // 2 :: step], y[step // 2 :: step])
+    pixel = step * abs(x[1] - x[0])
+    axes.plot(across[told], up[told], ".", ms=2.5, color="tab:red")
+    axes.quiver(
+        across[told],
+        up[told],
+        shown[told][:, 0],
+        shown[told][:, 1],
+        angles="xy",
+        scale_units="xy",
+        scale=0.6 / pixel,
+        width=0.0025,
+        headwidth=1,
+        headlength=0,
+        headaxislength=0,
+    )
+    left, right, bottom, top = extent(x, y)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="normals, projected on x and y")
+
+
+def _draw_angles(axes: Axes, result: Result, error: Floats, worst: float) -> None:
+    _, x, y = _maps(result)
+    known = error[np.isfinite(error)]
+    told = f"median {np.median(known):.2f} deg" if known.size else "no pixel in contact"
+    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", cmap="magma", vmin=0, vmax=worst)
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{told}; blue: no lasting contact")
+
+
+_MICROMETRES = 1e3  # in a millimetre
+
+
+def surface_figure(results: Mapping[str, Result], truth: Truth, title: str, path: Path) -> None:
+    """Draw a surface, and how it came about, into a PNG.
+
+    The last result is drawn in space, as Fig. 10 (b) of the paper, by brightness, and as what is left when
+    the truth is taken away; all are cut across the middle, and below lies what is left of these cuts. What
+    was filled is orange or open; what nobody answered stays empty.
+
+    Parameters
+    ----------
+    results : mapping
+        Names and results with ``height``, ``x`` and ``y``. A component of unknown offset is moved to the
+        truth's mean height.
+    truth : Truth
+        Of the same size.
+    title : str
+    path : Path
+        PNG to write.
+
+    Raises
+    ------
+    InputError
+        Matplotlib is not installed, a result has no heights or axes, or the file cannot be written.
+    """
+    save_figure(_draw_surfaces(results, truth), title, path)
+
+
+def _draw_surfaces(results: Mapping[str, Result], truth: Truth) -> Figure:
+    reliefs = {name: relief_of(result, truth) for name, result in results.items()}
+    last = list(reliefs)[-1]
+    figure = new_figure(13, 10)
+    grid = figure.add_gridspec(2, 2)
+    draw_surface(figure.add_subplot(grid[0, 0], projection="3d"), last, reliefs[last])
+    draw_map(figure.add_subplot(grid[0, 1]), last, reliefs[last])
+    _draw_height_errors(figure.add_subplot(grid[1, 0]), reliefs[last], truth)
+    cuts = grid[1, 1].subgridspec(2, 1, height_ratios=[2, 1])
+    above = figure.add_subplot(cuts[0])
+    draw_cuts(above, reliefs, truth)
+    above.tick_params(labelbottom=False)
+    above.set_xlabel("")
+    _draw_errors_on_row(figure.add_subplot(cuts[1], sharex=above), reliefs, truth)
+    return figure
+
+
+def _draw_height_errors(axes: Axes, relief: Relief, truth: Truth) -> None:
+    error = _MICROMETRES * (relief.height - truth.height)
+    known = error[np.isfinite(error)]
+    worst = float(np.percentile(np.abs(known), _WORST)) if known.size else 1.0
+    told = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
+    place, label = extent(relief.x, relief.y), "height - truth (\N{MICRO SIGN}m)"
+    draw_image(axes, error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
+    if relief.filled.any():
+        marks = relief.filled.astype(float)
+        axes.contour(relief.x, relief.y, marks, levels=[0.5], colors=FILLED, linewidths=1)
+        told += ", orange: round what was filled"
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"error: {told}\nblue: no answer")
+
+
+def _draw_errors_on_row(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth) -> None:
+    row = len(truth.height) // 2
+    errors = {
+        name: _MICROMETRES * (relief.height[row] - truth.height[row]) for name, relief in reliefs.items()
+    }
+    axes.axhline(0, color="0.6", lw=3)
+    dots_on_row(axes, errors, reliefs)
+    last = np.abs(list(errors.values())[-1])
+    worst = np.percentile(last[np.isfinite(last)], _WORST) if np.isfinite(last).any() else 1.0
+    axes.set_ylim(-2.5 * worst - 1, 2.5 * worst + 1)
+    axes.set(xlabel="x (mm)", ylabel="error (\N{MICRO SIGN}m)")
+    axes.grid(alpha=0.3)

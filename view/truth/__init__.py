@@ -1,1 +1,0 @@
-"""Pictures of results beside the truth that a simulation knows."""
