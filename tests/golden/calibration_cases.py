@@ -21,14 +21,13 @@ from golden import Answer, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
 from mirrorskin import hw, io
-from mirrorskin.engine.calibration.ball.search import Followed
-from mirrorskin.engine.calibration.lens.board import Dots
-from mirrorskin.engine.calibration.lens.fit import calibrate_lens
-from mirrorskin.engine.calibration.references.measure import measure_references
-from mirrorskin.engine.calibration.tilt.fit import study_tracks
-from mirrorskin.engine.calibration.tilt.model import BallTrack, PlateTrack
-from mirrorskin.engine.calibration.tilt.tracks import Tilts
-from mirrorskin.engine.calibration.wall.zenith import fit_zenith
+from mirrorskin.engine.calibration.ball import Followed
+from mirrorskin.engine.calibration.board import Dots
+from mirrorskin.engine.calibration.lens import calibrate_lens
+from mirrorskin.engine.calibration.references import measure_references
+from mirrorskin.engine.calibration.tilt import BallTrack, PlateTrack, study_tracks
+from mirrorskin.engine.calibration.tilt_tracks import Tilts
+from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.live import LivePress, LiveRotation
 from mirrorskin.engine.undistort import undistort
 

@@ -40,7 +40,11 @@ def main() -> int:
 def report(name: str, frozen: dict[str, dict[str, golden.NDArray]], freeze: bool) -> bool:
     """Print how a case's arrays differ, and tell whether they are the same; take them over if asked."""
     begin = time.perf_counter()
-    found, known = golden.answers(name), frozen.get(name, {})
+    try:
+        found, known = golden.answers(name), frozen.get(name, {})
+    except Exception as error:
+        print(f"{name}: FAILS with {type(error).__name__}: {error}")
+        return False
     wrong = golden.differences(name, found, known)
     print(f"{name}: {'DIFFERS' if wrong else 'same'} ({time.perf_counter() - begin:.2f} s)")
     for key in sorted(found.keys() | known.keys()):
