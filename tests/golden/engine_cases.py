@@ -24,6 +24,16 @@ from scenes import (
 )
 
 from mirrorskin import engine, io
+from mirrorskin.engine.fusion import fuse_sources as engine_fuse_sources
+from mirrorskin.engine.measure.plane import fit_plane as engine_fit_plane
+from mirrorskin.engine.measure.quantity import Quantity
+from mirrorskin.engine.measure.section import section as engine_section
+from mirrorskin.engine.measure.sphere import fit_sphere as engine_fit_sphere
+from mirrorskin.engine.measure.steps import step_height as engine_step_height
+from mirrorskin.engine.measure.texture import roughness as engine_roughness
+from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.rotation import correlate_source as engine_correlate_source
+from mirrorskin.engine.summary import summarise as engine_summarise
 
 HEIGHT: Tolerance = (1e-4, 1e-5)  # mm: single precision, and what solvers leave
 SOLVED: Tolerance = (0.0, 1e-4)  # mm: the integration's own tolerance
@@ -484,7 +494,7 @@ def reconstruct_a_registered_rotation() -> Answer:
 @case((1e-5, 1e-5))
 def registered_frames() -> Answer:
     heights = dome((40, 52))[0].astype(np.float32)
-    source = engine.Registered(turn_source(dtype="float32", pivot=(0.4, -0.3, 5.0)), heights)
+    source = Registered(turn_source(dtype="float32", pivot=(0.4, -0.3, 5.0)), heights)
     out = np.empty(source.shape, source.dtype)
     parts = []
     while (block := source.read(out)) is not None:
@@ -494,7 +504,7 @@ def registered_frames() -> Answer:
 
 @case(FITTED)
 def correlate_a_source() -> Answer:
-    return result_maps(engine.correlate_source(turn_source(2)))
+    return result_maps(engine_correlate_source(turn_source(2)))
 
 
 # Surfaces.
@@ -627,7 +637,7 @@ def fuse_sources() -> Answer:
     dark, bright = (np.full(shape, level, np.float32) for level in LEVELS["uint8"])
     header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab")
     down = Source(frames, header, travel=travel)
-    return result_maps(engine.fuse_sources(down, turn_source(pivot=(0.4, -0.3, 5.0)), press={"noise": 1.0}))
+    return result_maps(engine_fuse_sources(down, turn_source(pivot=(0.4, -0.3, 5.0)), press={"noise": 1.0}))
 
 
 # Measures.
@@ -646,7 +656,7 @@ def cap(shape: tuple[int, int] = (48, 64), radius: float = 4.0) -> io.Result:
     return io.Result(height=height.astype(np.float32), height_sigma=sigma, x=axis_x, y=axis_y)
 
 
-def numbers(quantities: dict[str, engine.Quantity]) -> dict[str, list[Any]]:
+def numbers(quantities: dict[str, Quantity]) -> dict[str, list[Any]]:
     """Return measured quantities as JSON."""
     return {name: [float(one.value), float(one.sigma), one.unit] for name, one in quantities.items()}
 
@@ -657,8 +667,8 @@ def fit_plane() -> Answer:
     height = 0.1 * x - 0.05 * y + 0.3 + np.random.default_rng(2).normal(0, 0.003, x.shape)
     height[pick(x.shape, 0.02, 5)] += 0.5
     axis_x, axis_y = io.pixel_axes(x.shape, PIXEL)
-    found = engine.fit_plane(height, axis_x, axis_y, np.full(x.shape, 0.003))
-    bare = engine.fit_plane(height, axis_x, axis_y)
+    found = engine_fit_plane(height, axis_x, axis_y, np.full(x.shape, 0.003))
+    bare = engine_fit_plane(height, axis_x, axis_y)
     return {
         "numbers": numbers(found.quantities()),
         "residual": found.residual,
@@ -671,7 +681,7 @@ def fit_plane() -> Answer:
 @case(FITTED)
 def fit_sphere() -> Answer:
     known = cap()
-    found = engine.fit_sphere(known.height, known.x, known.y, known.height_sigma)
+    found = engine_fit_sphere(known.height, known.x, known.y, known.height_sigma)
     return {
         "numbers": numbers(found.quantities()),
         "residual": found.residual,
@@ -688,8 +698,8 @@ def roughness() -> Answer:
         0.004 * np.sin(9 * x) + 0.002 * np.cos(7 * y) + np.random.default_rng(8).normal(0, 1e-3, x.shape)
     )
     residual[10:13, 20:23] = np.nan
-    plain = engine.roughness(residual, PIXEL)
-    fine = engine.roughness(residual, PIXEL, cutoff=0.8, sigma=np.full(x.shape, 1e-3))
+    plain = engine_roughness(residual, PIXEL)
+    fine = engine_roughness(residual, PIXEL, cutoff=0.8, sigma=np.full(x.shape, 1e-3))
     counts = [[one.pixels, one.left_out, one.unsure] for one in (plain, fine)]
     return {
         "plain": numbers(plain.quantities()),
@@ -707,9 +717,9 @@ def section_and_step() -> Answer:
     axis_x, axis_y = io.pixel_axes((48, 64), PIXEL)
     sigma = np.full((48, 64), 0.002, np.float32)
     result = io.Result(height=height.astype(np.float32), height_sigma=sigma, x=axis_x, y=axis_y)
-    along = engine.section(result, (-1.2, 0.1), (1.3, -0.2))
-    across = engine.section(cap())
-    step = engine.step_height(along)
+    along = engine_section(result, (-1.2, 0.1), (1.3, -0.2))
+    across = engine_section(cap())
+    step = engine_step_height(along)
     return {
         "distance": along.distance,
         "height": along.height,
@@ -745,7 +755,7 @@ def score() -> Answer:
 
 @case()
 def summarise() -> Answer:
-    told = engine.summarise(engine.reconstruct(press_source()))
+    told = engine_summarise(engine.reconstruct(press_source()))
     return {
         "what": told.what,
         "counts": np.array([told.pixels, told.answered, told.filled]),
