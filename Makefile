@@ -77,7 +77,7 @@ $(READY): pyproject.toml
 	echo 'setting up .venv (once, a minute or two)'
 	export PYTHONWARNINGS=ignore  # setuptools warns of every editable installation
 	$(PIP) install --editable '.[dev]'
-	$(BIN)/python -P -c 'from mirrorskin.kernels import pocl; pocl.verify()' 2>/dev/null || {
+	$(BIN)/python -P -c 'from mirrorskin.kernels import embedded; embedded.verify()' 2>/dev/null || {
 	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'
 	    $(PIP) install --editable '.[linker]'
 	}

@@ -27,8 +27,9 @@ def command(as_json: options.Json = False) -> None:
             device.driver,
             f"{device.compute_units}",
             f"{device.memory / 1e9:.1f} GB",
+            device.note,
         ]
         for number, device in enumerate(devices)
     ]
-    print_table(["", "number", "kind", "name", "driver", "units", "memory"], rows)
+    print_table(["", "number", "kind", "name", "driver", "units", "memory", "note"], rows)
     typer.echo("* is the default; choose another with --device NUMBER or a part of its name")

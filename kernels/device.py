@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels import pocl
+from mirrorskin.kernels import embedded
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, pinned
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -50,6 +50,8 @@ class DeviceInfo:
         Whether it works in the host's own memory.
     float64 : bool
         Whether it has double precision.
+    note : str
+        What a user should know of it; mostly nothing.
     """
 
     name: str
@@ -61,6 +63,7 @@ class DeviceInfo:
     max_allocation: int
     shares_memory: bool
     float64: bool
+    note: str = ""
 
     @property
     def title(self) -> str:
@@ -116,7 +119,7 @@ class Device:
     def __init__(self, device: cl.Device) -> None:
         self.info = _describe(device)
         if _is_pocl(device):
-            pocl.verify()
+            embedded.verify()
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
         self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
@@ -339,7 +342,7 @@ class _ThreadKernels(threading.local):
 
 
 def _find() -> list[cl.Device]:
-    pocl.prepare()
+    embedded.prepare()
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # the loader's way to say that there is none
@@ -370,6 +373,7 @@ def _describe(device: cl.Device) -> DeviceInfo:
         max_allocation=device.max_mem_alloc_size,
         shares_memory=bool(device.host_unified_memory),
         float64="cl_khr_fp64" in device.extensions,
+        note=embedded.note(device.driver_version) if _is_pocl(device) else "",
     )
 
 
@@ -380,7 +384,7 @@ def _is_pocl(device: cl.Device) -> bool:
 def _choose(choice: str | None) -> cl.Device:
     devices = _find()
     if not devices:
-        reason = pocl.why_no_device()
+        reason = embedded.why_no_device()
         raise DeviceError(f"no OpenCL device found: {reason or _INSTALL}")
     if choice is None:
         return _default(devices)

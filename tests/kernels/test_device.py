@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mirrorskin.kernels import array, pocl
+from mirrorskin.kernels import array, embedded
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
@@ -44,7 +44,7 @@ def test_the_environment_may_choose(monkeypatch):
 
 def test_without_any_device_the_remedy_is_named(monkeypatch):
     monkeypatch.setattr(device_layer, "_find", list)
-    monkeypatch.setattr(pocl, "why_no_device", lambda: None)
+    monkeypatch.setattr(embedded, "why_no_device", lambda: None)
     with pytest.raises(DeviceError, match="no OpenCL device found: install"):
         open_device()
 

@@ -1,0 +1,399 @@
+"""The embedded OpenCL device: PoCL from its wheel, which needs no GPU, no driver and no root.
+
+What keeps it from running is corrected or reported here, before PoCL can end the process
+(docs/decisions/0003-embedded-opencl-device.md).
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import logging
+import mmap
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence, Set
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from mirrorskin.kernels.disk_cache import keep, recall
+from mirrorskin.kernels.errors import DeviceError
+
+_log = logging.getLogger("mirrorskin.kernels")
+
+_SCHEME = 1  # version of the answers on disk
+_TIMEOUT = 120  # seconds, for a cold disk
+_RAN = "PoCL ran a kernel"
+_SOURCE = "kernel void probe(global float *x) { const int i = get_global_id(0); x[i] = 2 * x[i] + i; }"
+
+_lock = threading.RLock()
+_processor: str | None = None  # the name it compiles for, once prepared
+_patched = False
+_verified = False
+
+
+def prepare() -> None:
+    """Let PoCL's compiler know this processor; call it before the first look at OpenCL's platforms."""
+    global _processor, _patched
+    with _lock:
+        library = find_library() if _processor is None else None
+        if library is None:
+            return
+        try:
+            _processor, _patched = _ensure_name(library)
+        except (OSError, importlib.metadata.PackageNotFoundError) as error:
+            _processor = "generic"
+            _log.warning("PoCL's compiler does not know this processor, and was not told of it: %s", error)
+
+
+def note(driver: str) -> str:
+    """Return what a user should know of the embedded device, from the driver's version; mostly nothing."""
+    if not (_patched and driver.startswith(_PATCHABLE)):
+        return ""
+    return f"compiles for {_processor}: its function {_NAME_FUNCTION} is patched in memory"
+
+
+def verify() -> None:
+    """Make sure that PoCL can run a kernel; call it before the first one, which else may end the process.
+
+    A child process tries, with the system's linker and then with the package ``ziglang``'s. A good answer
+    is kept in the user's cache folder.
+
+    Raises
+    ------
+    DeviceError
+        No kernel can run here; the message says what to install.
+    """
+    global _verified
+    with _lock:
+        library = find_library()
+        if library is not None and not _verified:
+            prepare()
+            _find_working_linker(library)
+        _verified = True
+
+
+def why_no_device() -> str | None:
+    """Return in one line why OpenCL shows no device, or None where that is unknown."""
+    vendors = os.environ.get("OCL_ICD_VENDORS")
+    if vendors and not Path(vendors).exists():
+        return f"OCL_ICD_VENDORS names {vendors}, which does not exist; unset it"
+    library = find_library()
+    if library is None:
+        return None
+    try:
+        ctypes.CDLL(str(library))
+    except OSError as error:
+        return f"PoCL cannot be loaded: {error}"
+    return _why_no_cache()
+
+
+def find_library() -> Path | None:
+    """Return PoCL's shared library where its wheel is installed, without importing pyopencl."""
+    spec = importlib.util.find_spec("pyopencl")
+    if spec is None or spec.origin is None:
+        return None
+    return next(Path(spec.origin).parent.glob(".libs/libpocl-*.so"), None)
+
+
+# --- The processor's name ------------------------------------------------------------------------------
+#
+# The wheel of PoCL 3.0 holds LLVM 14. A processor younger than that is "generic" to it, a name that its own
+# compiler then refuses, and no option overrides it.
+
+_PATCHABLE = "3.0"  # version of the wheel whose function was looked at
+_NAME_FUNCTION = "pocl_get_llvm_cpu_name"
+_NAME_FUNCTION_SIZE = 83  # bytes, in that wheel
+
+# PoCL's builds of its own library, by the processor they are for. Each needs what the ones before it need
+# and what stands beside it: the instructions that a compiler uses unasked, in the words of /proc/cpuinfo.
+_LEVELS = (
+    ("core2", {"pni", "ssse3", "cx16", "lahf_lm"}),
+    ("penryn", {"sse4_1"}),
+    ("sandybridge", {"sse4_2", "popcnt", "xsave", "avx"}),
+    ("ivybridge", {"f16c"}),
+    ("haswell", {"avx2", "bmi1", "bmi2", "fma", "abm", "movbe"}),
+    ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+)
+
+
+def _ensure_name(library: Path) -> tuple[str, bool]:
+    """Make PoCL compile for a processor that its LLVM knows; return its name, and whether it was patched.
+
+    Raises OSError where the library is another one than expected, or the system forbids changing code.
+    """
+    ask = getattr(ctypes.CDLL(str(library)), _NAME_FUNCTION)
+    ask.restype = ctypes.c_void_p
+    known = _take_string(ask())
+    if known != "generic":
+        return known, False
+    version = importlib.metadata.version("pocl-binary-distribution")
+    size = _symbol_size(ask)
+    if (version, size) != (_PATCHABLE, _NAME_FUNCTION_SIZE):
+        raise OSError(f"{_NAME_FUNCTION} of version {version} has {size} bytes, which is unknown")
+    name = choose_name(_read_flags())
+    _answer_with(_address(ask), name)
+    _log.info("PoCL does not know this processor; it compiles for %s", name)
+    return name, True
+
+
+def choose_name(flags: Set[str]) -> str:
+    """Return the best of PoCL's processors without an instruction that is not among these flags."""
+    name = "x86-64"
+    for better, needs in _LEVELS:
+        if not needs <= flags:
+            break
+        name = better
+    return name
+
+
+def _read_flags() -> frozenset[str]:
+    """Return the features of this machine's processor; none where ``/proc`` cannot be read."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return frozenset()
+    found = (line.partition(":")[2].split() for line in lines if line.startswith("flags"))
+    return frozenset(next(found, ()))
+
+
+class _Symbol(ctypes.Structure):
+    """An entry of an ELF symbol table (Elf64_Sym)."""
+
+    _fields_ = (
+        ("name", ctypes.c_uint32), ("info", ctypes.c_uint8), ("other", ctypes.c_uint8),
+        ("section", ctypes.c_uint16), ("value", ctypes.c_uint64), ("size", ctypes.c_uint64),
+    )  # fmt: skip
+
+
+def _symbol_size(function: Any) -> int:
+    """Return the bytes of a library's function by its symbol table, or 0 where nothing is known of it."""
+    found, symbol = (ctypes.c_void_p * 4)(), ctypes.POINTER(_Symbol)()
+    search = getattr(ctypes.CDLL(None), "dladdr1", None)
+    code = ctypes.c_void_p(_address(function))
+    if search is None or not search(code, ctypes.byref(found), ctypes.byref(symbol), 1) or not symbol:
+        return 0
+    return int(symbol.contents.size)
+
+
+def _take_string(address: int) -> str:
+    text = ctypes.string_at(address).decode()
+    free = ctypes.CDLL(None).free
+    free.argtypes = [ctypes.c_void_p]
+    free(address)
+    return text
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
+@functools.cache
+def _c_string(text: str) -> ctypes.Array[ctypes.c_char]:
+    """Return a string that stays in memory: the machine code below points at it."""
+    return ctypes.create_string_buffer(text.encode())
+
+
+def _answer_with(start: int, name: str) -> None:
+    """Overwrite a ``char *function(void)`` with ``return strdup(name)``; its callers free the copy."""
+    text, strdup = ctypes.addressof(_c_string(name)), _address(ctypes.CDLL(None).strdup)
+    code = (
+        b"\x48\xbf" + text.to_bytes(8, "little")  # mov rdi, text
+        + b"\x48\xb8" + strdup.to_bytes(8, "little")  # mov rax, strdup
+        + b"\xff\xe0"  # jmp rax
+    )  # fmt: skip
+    _protect(start, len(code), mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+    ctypes.memmove(start, code, len(code))
+    _protect(start, len(code), mmap.PROT_READ | mmap.PROT_EXEC)
+
+
+def _protect(start: int, length: int, mode: int) -> None:
+    page = start - start % mmap.PAGESIZE
+    mprotect = ctypes.CDLL(None, use_errno=True).mprotect
+    mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    if mprotect(page, start + length - page, mode) != 0:
+        raise OSError(ctypes.get_errno(), "mprotect refused to open PoCL's code for writing")
+
+
+# --- The linker ----------------------------------------------------------------------------------------
+#
+# PoCL links each kernel with the system's `ld` and the development files of libgcc and libc. The package
+# `ziglang` holds LLVM's linker; a small `ld` in front of it leaves those files out: kernels need none.
+
+_LD = """\
+#!/bin/sh
+# mirrorskin's linker for OpenCL kernels: LLVM's, without the libraries that only compilers bring.
+for arg do
+    shift
+    case $arg in
+        -lgcc | -lgcc_s | -lgcc_eh | -lc | -lm | */crt*.o | crt*.o) ;;
+        *) set -- "$@" "$arg" ;;
+    esac
+done
+exec {command} "$@"
+"""
+
+
+def find_zig() -> Path | None:
+    """Return the program of the package ``ziglang``, or None where it is not installed."""
+    spec = importlib.util.find_spec("ziglang")
+    if spec is None or spec.origin is None:
+        return None
+    program = Path(spec.origin).with_name("zig")
+    return program if program.is_file() else None
+
+
+def write_linker(cache: Path, command: Sequence[str]) -> Path:
+    """Write an ``ld`` that calls a linker, once for each command; return the folder that holds it."""
+    script = _LD.format(command=shlex.join(command))
+    folder = cache / f"linker-{hashlib.sha256(script.encode()).hexdigest()[:16]}"
+    if not (folder / "ld").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=folder)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(script)
+        Path(name).chmod(0o755)
+        Path(name).replace(folder / "ld")  # another process may be writing it too
+    return folder
+
+
+def provide_linker() -> bool:
+    """Put a linker first on this process's ``PATH``; return whether there is one to put."""
+    zig = find_zig()
+    if zig is None:
+        return False
+    command = [str(zig), "ld.lld"]
+    try:
+        folder = write_linker(platformdirs.user_cache_path("mirrorskin"), command)
+    except OSError:
+        private = tempfile.mkdtemp(prefix="mirrorskin-")
+        atexit.register(shutil.rmtree, private, ignore_errors=True)
+        folder = write_linker(Path(private), command)
+    os.environ["PATH"] = os.pathsep.join([str(folder), os.environ.get("PATH", os.defpath)])
+    _log.info("linking OpenCL kernels with %s", zig)
+    return True
+
+
+def _find_working_linker(library: Path) -> None:
+    circumstances = _circumstances(library)
+    known = recall("pocl", circumstances)
+    if known == "system" or (known == "ziglang" and provide_linker()):
+        return
+    answer, problem = "system", _probe()
+    if problem is not None and provide_linker():
+        answer, problem = "ziglang", _probe()
+    if problem is not None:
+        raise DeviceError(problem)
+    keep("pocl", circumstances, answer)
+
+
+def _circumstances(library: Path) -> object:
+    """Return what the answer depends on: this PoCL, this processor, this linker and this Python."""
+    ld = shutil.which("ld")
+    files = [library, Path(ld).resolve()] if ld else [library]
+    stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return _SCHEME, _processor, sys.executable, stamps
+
+
+def _probe() -> str | None:
+    """Run one kernel in a child process; return None, or in one line what went wrong and what to do."""
+    problem = _why_no_cache()
+    if problem is not None:
+        return problem
+    command = [sys.executable, "-P", "-m", "mirrorskin.kernels.embedded"]
+    # A cache of its own: a kernel that was linked before would hide that none can be linked now.
+    with tempfile.TemporaryDirectory(dir=_kernel_cache()) as cache:
+        environment = {**os.environ, "POCL_CACHE_DIR": cache}
+        try:
+            child = subprocess.run(
+                command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT
+            )
+        except subprocess.TimeoutExpired:
+            return f"PoCL did not finish a small kernel within {_TIMEOUT} s; choose another device"
+    if child.returncode == 0 and child.stdout.decode().startswith(_RAN):
+        return None
+    return _explain(child.returncode, child.stderr.decode(errors="replace"))
+
+
+def _explain(status: int, complaints: str) -> str:
+    lines = [line.strip() for line in complaints.splitlines() if line.strip()]
+    if "Final linking" in complaints:
+        return (
+            f"PoCL cannot link kernels ({lines[0]}): install a linker and its libraries "
+            "(Debian: apt install gcc libc6-dev), or pip install 'mirrorskin[linker]'"
+        )
+    lines.insert(0, f"its process ended with status {status}")
+    complaint = next((line for line in lines if line.startswith("error:")), lines[-1])
+    return f"PoCL cannot run kernels here ({complaint}); choose another device"
+
+
+# --- The caches ----------------------------------------------------------------------------------------
+
+
+def _kernel_cache() -> Path:
+    """Return the folder in which PoCL 3.0 keeps compiled kernels."""
+    given = os.environ.get("POCL_CACHE_DIR")
+    if given is not None:
+        return Path(given)
+    home = os.environ.get("HOME")
+    caches = os.environ.get("XDG_CACHE_HOME") or ("/tmp" if home is None else f"{home}/.cache")
+    return Path(caches, "pocl", "kcache")
+
+
+def _why_no_cache() -> str | None:
+    """Try the folders that PoCL and pyopencl must be able to write; return None where both can be."""
+    variable = "POCL_CACHE_DIR" if "POCL_CACHE_DIR" in os.environ else "XDG_CACHE_HOME"
+    needed = [("PoCL", _kernel_cache(), variable)]
+    if "PYOPENCL_NO_CACHE" not in os.environ:
+        needed.append(("pyopencl", platformdirs.user_cache_path(), "XDG_CACHE_HOME"))
+    for owner, folder, remedy in needed:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            problem = f"{owner} cannot write its cache folder {folder} ({error.strerror})"
+            return f"{problem}; set {remedy} to a writable folder"
+    return None
+
+
+def _run_probe() -> None:
+    """Run one kernel on every PoCL there is: what the child process does."""
+    import resource
+
+    import numpy as np
+    import pyopencl as cl
+
+    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+    prepare()
+    platforms = [platform for platform in cl.get_platforms() if "Portable Computing" in platform.name]
+    devices = [device for platform in platforms for device in platform.get_devices()]
+    if not devices:
+        raise SystemExit("error: it shows no device")
+    for device in devices:
+        context = cl.Context([device])
+        queue = cl.CommandQueue(context)
+        kernel = cl.Program(context, _SOURCE).build().probe
+        x = np.ones(64, np.float32)
+        buffer = cl.Buffer(context, cl.mem_flags.COPY_HOST_PTR, hostbuf=x)
+        kernel.set_args(buffer)
+        cl.enqueue_nd_range_kernel(queue, kernel, x.shape, None)
+        cl.enqueue_copy(queue, x, buffer)
+        if not np.array_equal(x, 2 + np.arange(64)):
+            raise SystemExit("error: its numbers are wrong")
+    print(_RAN)
+
+
+if __name__ == "__main__":
+    _run_probe()

@@ -1,0 +1,320 @@
+"""What stands between PoCL and its first kernel. Every try is a real child process."""
+
+import ctypes
+import importlib.metadata
+import mmap
+import os
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from mirrorskin.kernels import embedded
+from mirrorskin.kernels.errors import DeviceError
+
+CORE2 = {"sse2", "pni", "ssse3", "cx16", "lahf_lm"}
+SANDYBRIDGE = CORE2 | {"sse4_1", "sse4_2", "popcnt", "xsave", "avx"}
+HASWELL = SANDYBRIDGE | {"f16c", "avx2", "bmi1", "bmi2", "fma", "abm", "movbe"}
+SKYLAKE = HASWELL | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
+
+
+def script(file: Path, body: str) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"#!/bin/sh\n{body}\n")
+    file.chmod(0o755)
+    return file
+
+
+@pytest.fixture(autouse=True)
+def start(tmp_path, monkeypatch):
+    """Give the test caches of its own, and a way to begin as a new process does."""
+    for name in ("POCL_CACHE_DIR", "OCL_ICD_VENDORS", "PYOPENCL_NO_CACHE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = os.environ["PATH"]
+
+    def begin():
+        monkeypatch.setenv("PATH", path)
+        monkeypatch.setattr(embedded, "_verified", False)
+
+    begin()
+    return begin
+
+
+@pytest.fixture
+def tries(monkeypatch):
+    """Collect the child processes that are started."""
+    started = []
+    run = subprocess.run
+    monkeypatch.setattr(
+        subprocess, "run", lambda *args, **options: started.append(args) or run(*args, **options)
+    )
+    return started
+
+
+@pytest.fixture
+def break_linker(tmp_path, monkeypatch):
+    """Leave nothing that can link."""
+    folder = script(tmp_path / "broken" / "ld", "echo no luck >&2; exit 1").parent
+
+    def hide():
+        monkeypatch.setenv("PATH", str(folder))
+        monkeypatch.setattr(embedded, "find_zig", lambda: None)
+
+    return hide
+
+
+def kept(tmp_path):
+    return [file.read_text() for file in (tmp_path / "cache" / "mirrorskin").glob("pocl-*")]
+
+
+def not_a_folder(tmp_path):
+    (tmp_path / "file").touch()
+    return tmp_path / "file" / "folder"
+
+
+# --- The first kernel ------------------------------------------------------------------------------------
+
+
+def test_a_good_answer_is_kept_but_not_for_another_linker(start, tries, tmp_path, break_linker):
+    embedded.verify()
+    first = len(tries)
+    assert first >= 1
+    assert len(kept(tmp_path)) == 1
+    assert list((tmp_path / "cache" / "pocl" / "kcache").iterdir()) == []
+    start()
+    embedded.verify()
+    assert len(tries) == first
+    start()
+    break_linker()
+    for number in (1, 2):
+        with pytest.raises(DeviceError, match=r"no luck.*gcc libc6-dev.*mirrorskin\[linker\]'") as caught:
+            embedded.verify()
+        assert "\n" not in str(caught.value)
+        assert len(tries) == first + number
+    assert len(kept(tmp_path)) == 1
+
+
+@pytest.mark.slow
+def test_without_any_linker(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(embedded, "find_zig", lambda: None)
+    with pytest.raises(DeviceError, match="gcc libc6-dev"):
+        embedded.verify()
+
+
+def test_ziglang_takes_over_from_a_broken_linker(tries, tmp_path, monkeypatch):
+    zig = embedded.find_zig()
+    working = [str(zig), "ld.lld"] if zig else [str(shutil.which("ld"))]
+    standin = script(tmp_path / "zig", f'shift\nexec {shlex.join(working)} "$@"')
+    broken = str(script(tmp_path / "broken" / "ld", "exit 1").parent)
+    monkeypatch.setattr(embedded, "find_zig", lambda: standin)
+    for _ in ("tried", "remembered"):
+        monkeypatch.setenv("PATH", broken)
+        monkeypatch.setattr(embedded, "_verified", False)
+        embedded.verify()
+        assert os.environ["PATH"].endswith(os.pathsep + broken)
+        assert kept(tmp_path) == ["ziglang"]
+        assert len(tries) == 2
+
+
+@pytest.mark.slow
+def test_an_answer_that_cannot_be_kept_is_found_again(start, tries, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(not_a_folder(tmp_path)))
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "kernels"))
+    monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
+    embedded.verify()
+    first = len(tries)
+    start()
+    embedded.verify()
+    assert len(tries) == 2 * first
+
+
+def test_a_device_that_never_answers(monkeypatch):
+    monkeypatch.setattr(embedded, "_TIMEOUT", 0.001)
+    monkeypatch.setattr(embedded, "find_zig", lambda: None)
+    with pytest.raises(DeviceError, match="did not finish"):
+        embedded.verify()
+
+
+def test_without_the_wheel_nothing_is_done(tries, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr(embedded, "_processor", None)
+    embedded.prepare()
+    embedded.verify()
+    assert embedded._processor is None
+    assert embedded.why_no_device() is None
+    assert tries == []
+
+
+@pytest.mark.parametrize(
+    ("complaints", "complaint"),
+    [
+        ("Build on <device>:\nerror: unknown target CPU 'generic'\n(options: -I x)", "unknown target CPU"),
+        ("Traceback\n  File x\npyopencl.LogicError: no platform\n", "pyopencl.LogicError: no platform"),
+        ("", "ended with status -11"),
+    ],
+)
+def test_other_failures_quote_what_matters(complaints, complaint):
+    explained = embedded._explain(-11, complaints)
+    assert complaint in explained
+    assert "\n" not in explained
+    assert "gcc" not in explained
+
+
+# --- The caches ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variable", "below"),
+    [("POCL_CACHE_DIR", ""), ("XDG_CACHE_HOME", "pocl/kcache"), ("HOME", ".cache/pocl/kcache")],
+)
+def test_an_unwritable_cache_is_named(variable, below, tmp_path, monkeypatch):
+    folder = not_a_folder(tmp_path)
+    if variable == "HOME":
+        monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv(variable, str(folder))
+    remedy = "POCL_CACHE_DIR" if variable == "POCL_CACHE_DIR" else "XDG_CACHE_HOME"
+    with pytest.raises(DeviceError) as caught:
+        embedded.verify()
+    assert f"PoCL cannot write its cache folder {folder / below} (Not a directory)" in str(caught.value)
+    assert f"set {remedy} to a writable folder" in str(caught.value)
+    assert embedded.why_no_device() == str(caught.value)
+
+
+def test_pyopencl_needs_a_cache_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "kernels"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(not_a_folder(tmp_path)))
+    with pytest.raises(DeviceError, match=r"pyopencl cannot write .* set XDG_CACHE_HOME"):
+        embedded.verify()
+    monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
+    assert embedded.why_no_device() is None
+
+
+def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path / "nowhere"))
+    assert f"OCL_ICD_VENDORS names {tmp_path / 'nowhere'}" in str(embedded.why_no_device())
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    assert embedded.why_no_device() is None
+    (tmp_path / "libpocl-0.so").write_text("not a library")
+    monkeypatch.setattr(embedded, "find_library", lambda: tmp_path / "libpocl-0.so")
+    assert "PoCL cannot be loaded" in str(embedded.why_no_device())
+
+
+# --- The processor's name --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        (set(), "x86-64"),
+        ({"sse2", "avx2", "avx512f"}, "x86-64"),
+        (CORE2 | {"sse4_1"}, "penryn"),
+        (HASWELL - {"movbe"}, "ivybridge"),
+        (SKYLAKE | {"avx512_vnni", "amx_tile"}, "skylake-avx512"),
+        (SKYLAKE - {"avx512vl"}, "haswell"),
+    ],
+)
+def test_the_best_name_without_an_instruction_that_is_lacking(flags, name):
+    assert embedded.choose_name(flags) == name
+
+
+def test_flags_are_words_of_one_processor():
+    assert "sse2" in embedded._read_flags()
+
+
+@pytest.mark.parametrize("offset", [0, mmap.PAGESIZE - 5], ids=["in a page", "across two pages"])
+def test_a_function_is_made_to_answer_with_a_copy_of_the_name(offset):
+    code = mmap.mmap(-1, 2 * mmap.PAGESIZE)
+    start = ctypes.addressof(ctypes.c_char.from_buffer(code)) + offset
+    embedded._answer_with(start, "haswell")
+    function = ctypes.CFUNCTYPE(ctypes.c_void_p)(start)
+    first, second = function(), function()
+    assert first != second
+    assert [embedded._take_string(first), embedded._take_string(second)] == ["haswell"] * 2
+
+
+@pytest.mark.parametrize(
+    ("known", "version", "size", "patched"),
+    [
+        ("znver3", "3.0", 83, None),
+        ("generic", "3.0", 83, "skylake-avx512"),
+        ("generic", "3.1", 83, None),
+        ("generic", "3.0", 84, None),
+    ],
+)
+def test_only_a_known_function_that_names_no_processor_is_patched(
+    monkeypatch, caplog, known, version, size, patched
+):
+    libc = ctypes.CDLL(None)
+    libc.strdup.restype = ctypes.c_void_p
+    ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: libc.strdup(known.encode()))
+    library = SimpleNamespace(pocl_get_llvm_cpu_name=ask)
+    given = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libc if name is None else library)
+    monkeypatch.setattr(importlib.metadata, "version", lambda _: version)
+    monkeypatch.setattr(embedded, "_symbol_size", lambda _: size)
+    monkeypatch.setattr(embedded, "_read_flags", lambda: SKYLAKE)
+    monkeypatch.setattr(embedded, "_answer_with", lambda _, name: given.append(name))
+    monkeypatch.setattr(embedded, "_processor", None)
+    monkeypatch.setattr(embedded, "_patched", False)
+    embedded.prepare()
+    assert given == ([patched] if patched else [])
+    assert ("patched" in embedded.note("3.0")) == bool(patched)
+    assert ("which is unknown" in caplog.text) == (known == "generic" and patched is None)
+
+
+def test_the_size_of_a_function_is_read_from_its_library():
+    library = ctypes.CDLL(str(embedded.find_library()))
+    assert embedded._symbol_size(library.pocl_get_llvm_cpu_name) > 22  # what is written over it
+    assert embedded._symbol_size(ctypes.CFUNCTYPE(None)(lambda: None)) == 0
+
+
+# --- The linker ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def zig(tmp_path, monkeypatch):
+    """A ``ziglang`` that says how it was called."""
+    package = tmp_path / "site with a space" / "ziglang"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(package.parent)
+    monkeypatch.setenv("PATH", os.environ["PATH"])
+    return script(package / "zig", "printf '%s\\n' \"$@\"")
+
+
+def test_zig_is_found_beside_its_package(zig):
+    assert embedded.find_zig() == zig
+    zig.unlink()
+    path = os.environ["PATH"]
+    assert embedded.find_zig() is None
+    assert not embedded.provide_linker()
+    assert os.environ["PATH"] == path
+
+
+def test_compiler_libraries_are_left_out_and_the_rest_is_kept_in_order(zig, tmp_path):
+    wanted = ["--hash-style=both", "-shared", "-o", "a.so", "-L/usr/lib/gcc/12", "a's.o", "-lcrystal"]
+    dropped = ["-lgcc", "-lgcc_s", "-lc", "-lm", "/usr/lib/crti.o", "crtbeginS.o"]
+    folder = embedded.write_linker(tmp_path / "cache", [str(zig), "ld.lld"])
+    assert [file.name for file in folder.iterdir()] == ["ld"]
+    given = [*dropped, *wanted[:5], *dropped, *wanted[5:], *dropped]
+    called = subprocess.run([folder / "ld", *given], capture_output=True, text=True, check=True)
+    assert called.stdout.splitlines() == ["ld.lld", *wanted]
+    failing = embedded.write_linker(tmp_path / "cache", ["sh", "-c", "exit 3"])
+    assert failing != folder
+    assert subprocess.run([failing / "ld"]).returncode == 3
+
+
+@pytest.mark.usefixtures("zig")
+def test_an_unwritable_cache_is_replaced_by_a_private_folder(tmp_path, monkeypatch):
+    assert embedded.provide_linker()
+    assert Path(str(shutil.which("ld"))).is_relative_to(tmp_path / "cache" / "mirrorskin")
+    (tmp_path / "private").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(not_a_folder(tmp_path)))
+    monkeypatch.setattr("tempfile.mkdtemp", lambda **_: str(tmp_path / "private"))
+    assert embedded.provide_linker()
+    assert Path(str(shutil.which("ld"))).is_relative_to(tmp_path / "private")
