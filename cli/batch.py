@@ -131,15 +131,18 @@ def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
     """Make the folder, see that it can be written to, and clear away what a killed batch left there."""
     from mirrorskin import io
     from mirrorskin.io.atomic import remove_leftovers
-    from mirrorskin.io.plain import plainly
+    from mirrorskin.io.os_errors import as_input_error
 
-    with plainly(f"{folder} cannot be made", "choose another folder with -o"):
+    with as_input_error(f"{folder} cannot be made", "choose another folder with -o"):
         if folder.exists() and not folder.is_dir():
             raise io.InputError(f"{folder} is no folder: name one with -o")
         if not folder.parent.is_dir():
             raise io.InputError(f"{folder}: there is no folder {folder.parent}: make it first")
         folder.mkdir(exist_ok=True)
-    with plainly(f"{folder} cannot be written to", "choose another with -o"), TemporaryFile(dir=folder):
+    with (
+        as_input_error(f"{folder} cannot be written to", "choose another with -o"),
+        TemporaryFile(dir=folder),
+    ):
         pass
     for place in {job.target.parent for job in jobs} | {folder}:
         if place.is_dir():

@@ -46,7 +46,7 @@ def command(
         if path.resolve() in (other.resolve() for other in output[:number]):
             raise io.InputError(f"{path} is to be written twice: name another output with -o")
         io.check_output(path, result)
-    found = io.of_turn(io.open_result(result), turn)
+    found = io.select_turn(io.open_result(result), turn)
     for path in output:
         io.check_export(found, path)
     columns = _section(found, ends) if ".csv" in suffixes else None

@@ -50,7 +50,7 @@ def command(
     from mirrorskin.cli.stack import region_of
 
     measures = engine.measure(
-        io.of_turn(io.open_result(result), turn),
+        io.select_turn(io.open_result(result), turn),
         region=None if region is None else region_of(region, "--region"),
         form=None if form is None else form.value,
         cutoff=None if cutoff is None else quantity.length(cutoff, "--cutoff"),

@@ -20,7 +20,7 @@ def command(
     from mirrorskin import engine, io
 
     found = io.open_result(result)
-    part = io.part_of(found.process)
+    part = io.source_region(found.process)
     with io.open_recording(truth) as whole:
         if part is not None and not io.Region.whole(whole.shape[1:]).holds(part):
             part = None  # of another stack

@@ -62,7 +62,7 @@ def command(
     view.check_drawing()
     if output is not None:
         _check(output, result)
-    _show(io.of_turn(io.open_result(result), turn), result, name, ends, map_, output)
+    _show(io.select_turn(io.open_result(result), turn), result, name, ends, map_, output)
 
 
 def _refuse_beside_space(map_: list[str] | None, section: str | None, output: Path | None) -> None:
@@ -83,7 +83,7 @@ def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
     kept = where not in (WINDOW, BROWSER)
     if kept:
         io.check_output(Path(where), path)
-    show_surface(io.of_turn(io.open_result(path), turn), where, name)
+    show_surface(io.select_turn(io.open_result(path), turn), where, name)
     if kept:
         typer.echo(f"written to {where}: 'rerun {where}' shows it")
 

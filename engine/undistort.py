@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import Spots
-from mirrorskin.io import UNDISTORTED, InputError, Lens, Result, part_of, pixel_axes
+from mirrorskin.io import UNDISTORTED, InputError, Lens, Result, pixel_axes, source_region
 
 Doubles = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ def _part(
     if not maps:
         raise InputError("there are no maps to undistort: reconstruct first")
     rows, columns = _size(maps)[-2:]
-    told = part_of(result.process)
+    told = source_region(result.process)
     row, column = (told.origin if told else (0, 0)) if origin is None else origin
     if min(row, column) < 0 or row + rows > lens.shape[0] or column + columns > lens.shape[1]:
         raise InputError(

@@ -38,19 +38,16 @@ if TYPE_CHECKING:
         WallResponse,
     )
     from mirrorskin.io.description import describe
-    from mirrorskin.io.export.mesh import Mesh, surface_mesh
-    from mirrorskin.io.export.result import check_export, export_result
-    from mirrorskin.io.export.table import save_table
+    from mirrorskin.io.export import check_export, export_result, save_table
     from mirrorskin.io.frames import open_frames
     from mirrorskin.io.heights import open_heights
+    from mirrorskin.io.mesh import Mesh, surface_mesh
     from mirrorskin.io.positions import Positions, check_phase, check_stroke, check_travel
-    from mirrorskin.io.recorder import Recorder
+    from mirrorskin.io.recorder import COMPRESSIONS, Compression, Recorder
     from mirrorskin.io.recording import Recording, Steps, open_recording
-    from mirrorskin.io.region import Region, part_of
-    from mirrorskin.io.result import open_result, save_result
+    from mirrorskin.io.result import open_result, save_result, select_turn
+    from mirrorskin.io.selection import Region, source_region
     from mirrorskin.io.streaming import StreamRecorder
-    from mirrorskin.io.turns import of_turn
-    from mirrorskin.io.writing import COMPRESSIONS, Compression
 
 __all__ = [
     "COMPRESSIONS",
@@ -90,17 +87,17 @@ __all__ = [
     "check_travel",
     "describe",
     "export_result",
-    "of_turn",
     "open_calibration",
     "open_frames",
     "open_heights",
     "open_recording",
     "open_result",
-    "part_of",
     "pixel_axes",
     "save_calibration",
     "save_result",
     "save_table",
+    "select_turn",
+    "source_region",
     "surface_mesh",
     "update_calibration",
 ]
@@ -119,19 +116,16 @@ _MODULES = {
         "WallResponse",
     ),
     "description": ("describe",),
-    "export.mesh": ("Mesh", "surface_mesh"),
-    "export.result": ("check_export", "export_result"),
-    "export.table": ("save_table",),
+    "export": ("check_export", "export_result", "save_table"),
     "frames": ("open_frames",),
     "heights": ("open_heights",),
+    "mesh": ("Mesh", "surface_mesh"),
     "positions": ("Positions", "check_phase", "check_stroke", "check_travel"),
-    "recorder": ("Recorder",),
+    "recorder": ("COMPRESSIONS", "Compression", "Recorder"),
     "recording": ("Recording", "Steps", "open_recording"),
-    "region": ("Region", "part_of"),
-    "result": ("open_result", "save_result"),
+    "result": ("open_result", "save_result", "select_turn"),
+    "selection": ("Region", "source_region"),
     "streaming": ("StreamRecorder",),
-    "turns": ("of_turn",),
-    "writing": ("COMPRESSIONS", "Compression"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

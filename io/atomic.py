@@ -1,12 +1,14 @@
-"""Files that exist whole or not at all."""
+"""Files that exist whole or not at all, and room on the disk that is taken before it is needed."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import math
 import os
 import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 
 import h5py
 
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
 
 MAKE_ROOM = "make room, or choose another place with -o"
@@ -42,7 +44,7 @@ def check_output(path: Path, *keep: Path | None) -> None:
         Its folder does not exist or cannot be written to, it is a folder itself, it is the input, or an HDF5
         file that is being written.
     """
-    with plainly(f"{path} cannot be written", "choose another place with -o"):
+    with as_input_error(f"{path} cannot be written", "choose another place with -o"):
         if path.is_dir():
             raise InputError(f"{path} is a folder: name a file in it")
         if not path.parent.is_dir():
@@ -88,7 +90,7 @@ class NewHdf5:
     def check(self) -> None:
         """Raise InputError if the disk did not take all that was written so far."""
         if self._disk.error is not None:
-            with plainly(f"{self._path} could not be written", MAKE_ROOM):
+            with as_input_error(f"{self._path} could not be written", MAKE_ROOM):
                 raise self._disk.error
 
     def close(self) -> None:
@@ -115,10 +117,10 @@ def new_file(path: Path) -> Iterator[int]:
     # Its name is known before there is a file: whenever the program is ended, it is removed.
     part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
-        with plainly(f"{path} could not be written"):
+        with as_input_error(f"{path} could not be written"):
             descriptor = _make(part)
         yield descriptor
-        with plainly(f"{path} could not be written", MAKE_ROOM):
+        with as_input_error(f"{path} could not be written", MAKE_ROOM):
             os.close(os.dup(descriptor))  # some disks tell only then that they did not take all
             part.chmod(0o666 & ~_umask())
             part.replace(path)
@@ -212,3 +214,73 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def write_new(path: Path, parts: Sequence[bytes]) -> None:
+    """Write the parts of a file, which exists whole or not at all.
+
+    Raises
+    ------
+    InputError
+        It cannot be written there.
+    """
+    with (
+        new_file(path) as descriptor,
+        as_input_error(f"{path} could not be written", MAKE_ROOM),
+        os.fdopen(descriptor, "wb", closefd=False) as file,
+    ):
+        file.writelines(parts)
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_UNABLE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
+
+
+class Reserve:
+    """The bytes of a file that the disk has promised.
+
+    Parameters
+    ----------
+    path : Path
+        What to call the file in messages.
+    descriptor : int
+        Of the open file; it is grown.
+    step : int
+        Bytes that are asked for at once, if there are so many.
+    """
+
+    def __init__(self, path: Path, descriptor: int, step: int) -> None:
+        self._path, self._descriptor, self._step = path, descriptor, step
+        self._end: float = 0
+
+    def hold(self, end: int) -> None:
+        """See that the file can be written up to some byte.
+
+        A disk that cannot promise anything is believed to have room.
+
+        Raises
+        ------
+        InputError
+            The disk is full, or no file may be so large.
+        """
+        if self._end < math.inf:
+            self._end = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
+        if end > self._end and not self._grow(end + self._step):
+            self._grow(end, last=True)
+
+    def _grow(self, end: int, last: bool = False) -> bool:
+        start = int(self._end)
+        try:
+            os.posix_fallocate(self._descriptor, start, end - start)
+        except OSError as error:
+            if error.errno in _UNABLE:
+                self._end = math.inf
+                return True
+            if error.errno not in _FULL:
+                raise
+            if last:
+                why = os.strerror(error.errno)
+                raise InputError(f"{self._path}: the disk is full ({why}); {MAKE_ROOM}") from error
+            return False
+        self._end = end
+        return True

@@ -12,9 +12,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.plain import plainly
-from mirrorskin.io.storage import virtual_source
+from mirrorskin.io.hdf5 import Hdf5File, virtual_source
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
 
 Spans = NDArray[np.int64]
@@ -43,7 +42,7 @@ def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
     def add(opened: h5py.File) -> None:
         found.setdefault(Path(opened.filename), _state(os.fstat(opened.id.get_vfd_handle())))
 
-    with plainly(f"{file.path}: {dataset.name}"):
+    with as_input_error(f"{file.path}: {dataset.name}"):
         add(file.root)
         visit(dataset)
     return found
@@ -75,15 +74,15 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
         A file cannot be read, or is another than was opened.
     """
     if file.root.swmr_mode:
-        with plainly(f"{file.path}: {dataset.name}"):
+        with as_input_error(f"{file.path}: {dataset.name}"):
             return _of_growing(file.root, dataset, frames)
     spans: dict[Path, list[Spans]] = {path: [] for path in origins}
-    with plainly(f"{file.path}: {dataset.name}"):
+    with as_input_error(f"{file.path}: {dataset.name}"):
         for path, span in _stored(file, dataset):
             spans[path].append(span)
     digest = hashlib.sha256()
     for path, parts in spans.items():
-        with plainly(str(path)), path.open("rb", buffering=0) as opened:
+        with as_input_error(str(path)), path.open("rb", buffering=0) as opened:
             state = os.fstat(opened.fileno())
             if _state(state) != origins[path]:
                 raise InputError(f"{path} was changed while it was open: start again")

@@ -1,16 +1,19 @@
-"""Other people's frames, whatever they come in."""
+"""Other people's frames, whatever they come in, as sources that are read in order."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.picture_files import PICTURE_SUFFIXES
-from mirrorskin.io.pictures import Pictures
-from mirrorskin.io.positions import Positions
-from mirrorskin.io.types import Header, InputError
-from mirrorskin.io.video import Video
+from mirrorskin.io.positions import Positions, check_phase, check_stroke
+from mirrorskin.io.recording import Steps
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 
 def open_frames(
@@ -39,6 +42,9 @@ def open_frames(
     InputError
         The path holds no such frames, or travel or phase is missing or does not fit them.
     """
+    from mirrorskin.io.pictures import PICTURE_SUFFIXES, Pictures
+    from mirrorskin.io.video import Video
+
     path = Path(path)
     for motion, name, positions, options in (
         ("vertical", "travel", travel, "--travel-step"),
@@ -50,3 +56,132 @@ def open_frames(
             raise InputError(f"{path}: frames of {header.motion} motion have no {name}: leave {options} out")
     pictures = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
     return (Pictures if pictures else Video)(path, header, travel, phase)
+
+
+if TYPE_CHECKING:
+    from mirrorskin.io.pictures import Pictures
+    from mirrorskin.io.video import Video
+
+
+class FrameSequence(Closing, ABC):
+    """A source of other people's frames, read in order and rewindable.
+
+    Parameters
+    ----------
+    name : str
+        What to call it in messages.
+    header : Header
+        What holds for all frames; the files themselves say nothing of the movement.
+    shape : (int, int, int)
+        Frames, rows and columns.
+    dtype : dtype
+        uint8, uint16 or float32.
+    travel, phase : Positions or array_like, (T,), optional
+        Millimetres and radians, one a frame, or ``Steps``, which count the frames that were lost, too.
+    time : ndarray, (T,), float64, optional
+        Seconds since the first frame.
+    lost : sequence of int, (T,), optional
+        Frames lost just before each frame; the first is 0.
+    left_out : tuple of str
+        Names of files beside the frames that are none of them.
+
+    Raises
+    ------
+    InputError
+        Travel or phase does not fit the frames.
+    """
+
+    rewindable = True
+
+    def __init__(
+        self,
+        name: str,
+        header: Header,
+        shape: tuple[int, int, int],
+        dtype: np.dtype[Any],
+        *,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
+        time: Floats | None = None,
+        lost: Sequence[int] | None = None,
+        left_out: tuple[str, ...] = (),
+    ) -> None:
+        self.name, self.header, self.motion = name, header, header.motion
+        self.shape, self.dtype, self.left_out = shape, dtype, left_out
+        self._lost = lost or [0] * shape[0]
+        self._time = time
+        travel, phase = self._along(travel), self._along(phase)
+        self.travel = None if travel is None else check_stroke(travel, shape[0], f"{name}: travel")
+        self._phase = None if phase is None else check_phase(phase, shape[0], f"{name}: phase")
+        self._next = 0
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames.
+
+        Parameters
+        ----------
+        out : ndarray, (n, H, W), optional
+            Room for the frames, of the source's dtype; without it one frame is allocated.
+
+        Returns
+        -------
+        Block or None
+            At most ``n`` frames, a view of ``out``, with none lost between them; None at the end.
+
+        Raises
+        ------
+        ValueError
+            ``out`` does not fit the frames.
+        InputError
+            A frame cannot be read, or is unlike the first.
+        """
+        if out is None:
+            out = np.empty((1, *self.shape[1:]), self.dtype)
+        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
+            raise ValueError(
+                f"out is {out.shape} {out.dtype}; needed is (n, H, W) = (n, *{self.shape[1:]}) {self.dtype}"
+            )
+        start = self._next
+        if start == self.shape[0]:
+            return None
+        stop = self._unbroken(start, min(start + len(out), self.shape[0]))
+        frames = out[: stop - start]
+        self._fill(start, frames)
+        self._next = stop
+        time, travel, phase = (
+            v if v is None else v[start:stop] for v in (self._time, self.travel, self._phase)
+        )
+        return Block(frames, start, time, travel, phase, dropped=self._lost[start])
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self._next = 0
+
+    @abstractmethod
+    def _fill(self, start: int, out: NDArray[Any]) -> None:
+        """Read the frames from number ``start`` on into the whole of ``out``."""
+
+    def _unbroken(self, start: int, stop: int) -> int:
+        """Stop before the first frame that others were lost before."""
+        return next((k for k in range(start + 1, stop) if self._lost[k]), stop)
+
+    def _along(self, given: ArrayLike | Positions | None) -> ArrayLike | None:
+        """Write out positions; of steps, a lost frame is one as well."""
+        if isinstance(given, Steps):
+            taken = np.arange(self.shape[0]) + np.cumsum(self._lost)
+            return np.asarray(given.start + given.step * taken)
+        return given.positions(self.shape[0]) if isinstance(given, Positions) else given
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[Any]:
+    """Lend OpenCV with its own messages kept off the terminal: the caller raises its own."""
+    import cv2  # takes longer than everything else that mirrorskin.io imports
+
+    # OpenCV 5 moved it.
+    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    level = set_level(0)
+    try:
+        yield cv2
+    finally:
+        set_level(level)

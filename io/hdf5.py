@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -11,8 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.plain import is_flagged, plainly
-from mirrorskin.io.storage import check_storage
+from mirrorskin.io.os_errors import as_input_error, is_flagged
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.units import conversion_factor
 
@@ -87,13 +87,13 @@ class Hdf5File(Closing):
     def names(self, group: str) -> list[str]:
         """Return the names in a group; none where there is no such group."""
         node = self.find(group)
-        with plainly(f"{self.path}: {group}"):
+        with as_input_error(f"{self.path}: {group}"):
             return list(node) if isinstance(node, h5py.Group) else []
 
     def marked(self, mark: str, group: str = "/entry") -> bool:
         """Tell whether a file is one of ours: whether its entry, or that group, has a certain attribute."""
         entry = self.find(group)
-        with plainly(f"{self.path}: {group}"):
+        with as_input_error(f"{self.path}: {group}"):
             return isinstance(entry, h5py.Group) and mark in entry.attrs
 
     def check_layout(self, mark: str, known: int = 1) -> None:
@@ -105,7 +105,7 @@ class Hdf5File(Closing):
     def attribute(self, name: str, attribute: str) -> Any:
         """Return an attribute, a text or a number, of an object; None where it has none."""
         node = self.find(name)
-        with plainly(f"{self.path}: {name}"):
+        with as_input_error(f"{self.path}: {name}"):
             return None if node is None else _first(node.attrs.get(attribute))
 
     def stacks(self) -> dict[str, str]:
@@ -116,7 +116,7 @@ class Hdf5File(Closing):
             if isinstance(node, h5py.Dataset) and node.ndim == 3:
                 found[f"/{name}"] = f"{' x '.join(map(str, node.shape))} {node.dtype}"
 
-        with plainly(str(self.path)):
+        with as_input_error(str(self.path)):
             self.root.visititems(visit)
         return dict(sorted(found.items()))
 
@@ -148,7 +148,7 @@ class Hdf5File(Closing):
             No numbers, another shape, an unknown unit, or a file that does not hold what it claims.
         """
         remedy = remedy and f": {remedy}"
-        with plainly(lambda: self.where(node)):
+        with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
                 raise InputError(f"{self.where(node)} holds no numbers{remedy}")
             shape = node.id.shape
@@ -158,7 +158,7 @@ class Hdf5File(Closing):
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
         check_storage(self, node, frames=rows)
-        with plainly(lambda: self.where(node)):
+        with as_input_error(lambda: self.where(node)):
             values = _values(node.id) if rows is None else node[:rows]
             stated = unit is not None and h5py.h5a.exists(node.id, b"units")
             given = str(_first(_attribute(node.id, b"units")) or unit) if stated else unit
@@ -168,7 +168,7 @@ class Hdf5File(Closing):
 
     def value(self, node: Node) -> Any:
         """Read one text or number, alone or in an array of one."""
-        with plainly(lambda: self.where(node)):
+        with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.shape not in ((), (1,)):
                 raise InputError(
                     f"{self.where(node)} does not hold one value: write one text or number there"
@@ -177,7 +177,7 @@ class Hdf5File(Closing):
 
     def texts(self, node: Node, remedy: str) -> tuple[str, ...]:
         """Read a list of texts."""
-        with plainly(lambda: self.where(node)):
+        with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.ndim != 1 or node.dtype.kind not in "SO":
                 raise InputError(f"{self.where(node)} holds no list of texts: {remedy}")
             return tuple(str(_first(text)) for text in _values(node.id))
@@ -199,14 +199,14 @@ class Hdf5File(Closing):
         path = self.path if node is None else self.beside(node, str(filename), what)
         real = os.path.realpath(path)
         if real not in self._files:
-            with plainly(str(path)):
+            with as_input_error(str(path)):
                 self._files[real] = _open_file(path)
         return self._files[real]
 
     def beside(self, node: Node, filename: str, what: str) -> Path:
         """Return the file that an object refers to if it lies in the recording's own folder, else raise."""
         what = f"{self.path}: {what}"
-        with plainly(what):
+        with as_input_error(what):
             target = Path(os.path.realpath(Path(node.file.filename).parent / filename))
             if not target.is_relative_to(self._home):
                 raise InputError(f"{what} leads out of its folder, to {filename}: copy that file beside it")
@@ -215,7 +215,7 @@ class Hdf5File(Closing):
         return target
 
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
-        with plainly(lambda: f"{self.where(node)}: {part}"):
+        with as_input_error(lambda: f"{self.where(node)}: {part}"):
             name = part.encode(errors="surrogateescape")
             if not isinstance(node, h5py.Group) or not node.id.links.exists(name):
                 return None
@@ -295,3 +295,121 @@ def _open_file(path: Path) -> h5py.File:
         raise InputError(
             f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
         ) from None
+
+
+_VIRTUAL_DEEP = 4
+
+
+def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
+    """Refuse a dataset that HDF5 could not deliver, or would make up with fill values.
+
+    Parameters
+    ----------
+    file : Hdf5File
+        Knows where it may look for what is stored elsewhere.
+    dataset : h5py.Dataset
+    depth : int, optional
+        How many virtual datasets led here.
+    frames : int, optional
+        How many there must be, along the first axis, where more are yet to be written.
+
+    Raises
+    ------
+    InputError
+        A filter that is not installed, chunks too large to unpack, or less data than the shape says.
+    """
+    if depth > _VIRTUAL_DEEP:
+        where = file.where(dataset)
+        raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
+    with as_input_error(lambda: file.where(dataset)):
+        shape, offset = dataset.id.shape, dataset.id.get_offset()
+        if frames is not None:
+            shape = (frames, *shape[1:])
+        claimed, unit = math.prod(shape) * dataset.id.dtype.itemsize, "bytes"
+        if offset is not None:
+            held = h5py.h5i.get_file_id(dataset.id).get_filesize() - offset
+        elif dataset.chunks and not dataset.is_virtual:
+            _check_filters(dataset, file.where(dataset), file.memory_limit)
+            claimed = math.prod(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
+            held, unit = dataset.id.get_num_chunks(), "chunks"
+        else:
+            held = _bytes_held(file, dataset, depth)
+    if held < claimed:
+        raise InputError(
+            f"{file.where(dataset)} claims {claimed} {unit} and its file holds {held}: it was cut short; "
+            "copy it again"
+        )
+
+
+def describe_storage(dataset: h5py.Dataset) -> str:
+    """Tell how a dataset is stored, for people."""
+    if dataset.is_virtual:
+        return "virtual"
+    if dataset.chunks is None:
+        return "in raw files" if dataset.external else "in one piece"
+    names = [name.split(";")[0].strip() or str(code) for code, name in _filters(dataset)]
+    return f"chunks {dataset.chunks}, {', '.join(names) or 'raw'}"
+
+
+def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
+    plist = dataset.id.get_create_plist()
+    filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
+    return [(code, name.decode(errors="replace")) for code, _, _, name in filters]
+
+
+def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) -> None:
+    filters = _filters(dataset)
+    if not all(h5py.h5z.filter_avail(code) for code, _ in filters):
+        import hdf5plugin  # noqa: F401  # which registers bitshuffle, blosc and others with HDF5
+    for code, name in filters:
+        if not h5py.h5z.filter_avail(code):
+            raise InputError(
+                f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed: "
+                "install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH"
+            )
+    # A frame needs room in any case, however it is packed.
+    several = filters and dataset.ndim > 2 and dataset.chunks[0] > 1
+    size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    if several and memory_limit is not None and size > memory_limit:
+        raise InputError(
+            f"{where} is packed in chunks of {size / 1e6:.3g} MB where memory is limited to "
+            f"{memory_limit / 1e6:.3g} MB: raise --memory, or repack it with h5repack in chunks of one frame"
+        )
+
+
+def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
+    """Return what there is of a dataset that lies elsewhere, in its header, or nowhere yet."""
+    if dataset.is_virtual:
+        elements = sum(_mapped(file, dataset, part, depth) for part in dataset.virtual_sources())
+        return elements * int(dataset.dtype.itemsize)
+    if dataset.external:
+        what = f"the raw storage of {dataset.name}"
+        parts = [(file.beside(dataset, name, what), offset, size) for name, offset, size in dataset.external]
+        return sum(min(size, max(0, path.stat().st_size - offset)) for path, offset, size in parts)
+    return int(dataset.id.get_storage_size())
+
+
+def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dataset:
+    """Return the dataset that a part of a virtual one comes from; InputError if it is not there."""
+    what = f"the virtual dataset {dataset.name}"
+    origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
+    source = file.walk(origin, part.dset_name)
+    if not isinstance(source, h5py.Dataset):
+        raise InputError(f"{file.where(dataset)} needs {part.dset_name} of {part.file_name}: it is not there")
+    return source
+
+
+def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
+    """Return how many elements of a virtual dataset one of its sources holds."""
+    source = virtual_source(file, dataset, part)
+    check_storage(file, source, depth + 1)
+    selected = part.src_space
+    if selected.get_select_type() == h5py.h5s.SEL_ALL:
+        return min(int(part.vspace.get_select_npoints()), int(source.size))
+    if selected.is_regular_hyperslab() and any(
+        h5py.h5s.UNLIMITED in numbers for numbers in selected.get_regular_hyperslab()
+    ):
+        return int(source.size)
+    _, last = selected.get_select_bounds()
+    reaches = all(end < count for end, count in zip(last, source.shape, strict=True))
+    return int(part.vspace.get_select_npoints()) if reaches else 0

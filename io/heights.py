@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK
 from mirrorskin.io.recording import Recording, open_recording
-from mirrorskin.io.region import Region, part_of
 from mirrorskin.io.result import open_result
+from mirrorskin.io.selection import Region, source_region
 from mirrorskin.io.types import UNDISTORTED, InputError, Result
 
 
@@ -48,7 +48,7 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
                 f"{path} holds undistorted heights, and frames are as the camera saw them: {remedy}"
             )
         height = _absolute(result)
-        part = part_of(result.process)
+        part = source_region(result.process)
     if height is None:
         raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
     if source is not None:

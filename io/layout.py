@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import check_phase, check_stroke
-from mirrorskin.io.stacks import Cut
+from mirrorskin.io.selection import Selection
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
 MARK = "mirrorskin_recording"
@@ -73,7 +73,7 @@ def how_taken(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> Taken:
     if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
         state = f"{CUT_SHORT}its writer was killed"
     places = [place for place, _ in (*SERIES.values(), *LIVE.values())]
-    with plainly(str(file.path)):
+    with as_input_error(str(file.path)):
         found = {place: file.find(place) for place in (*places, USED, DROPPED)}
         grown = {place: node for place, node in found.items() if _grows(node)}
         count = min(int(node.shape[0]) for node in (stack, *grown.values()))
@@ -97,11 +97,11 @@ class Layout:
         Whether the file has our layout.
     shape : (int, int, int)
         Frames, rows and columns of the stack.
-    cut : Cut
+    cut : Selection
         What is wanted of it; all series and maps are cut as well.
     """
 
-    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], cut: Cut) -> None:
+    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], cut: Selection) -> None:
         self._file = file
         self._ours = ours
         self._count, self._frame = shape[0], shape[1:]

@@ -16,14 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import fingerprint, modified, origins
-from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
 from mirrorskin.io.layout import MARK, STACK, Layout, Taken, how_taken
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions
-from mirrorskin.io.region import Region
 from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.stacks import Cut, Picked, Stack, open_stack
-from mirrorskin.io.storage import check_storage, describe_storage
+from mirrorskin.io.selection import Region, Selection
+from mirrorskin.io.stack import FrameSubset, Stack, open_stack
 from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
 
 
@@ -81,7 +80,7 @@ class Recording(Closing):
         file: Hdf5File,
         dataset: h5py.Dataset,
         stack: Stack,
-        cut: Cut,
+        cut: Selection,
         header: Header,
         positions: Mapping[str, Floats | None],
         truth: Truth | None,
@@ -243,9 +242,9 @@ def open_recording(
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, _along(given, shape[0]))
-        fetched = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
+        fetched: Stack = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
         if live:
-            fetched = Picked(fetched, chosen)
+            fetched = FrameSubset(fetched, chosen)
         recording = Recording(file, stack, fetched, cut, header, positions, truth, told, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
@@ -258,7 +257,7 @@ def _shape(stack: h5py.Dataset) -> tuple[int, int, int]:
 
 def _cut(
     name: str, shape: tuple[int, int, int], frames: tuple[int, int | None] | None, region: Region | None
-) -> Cut:
+) -> Selection:
     """Return what is wanted of a stack, if it has that."""
     start, end = frames or (0, None)
     stop = shape[0] if end is None else end
@@ -269,7 +268,7 @@ def _cut(
         )
     region = region or Region.whole(shape[1:])
     region.check(shape[1:], name)
-    return Cut((start, stop), region)
+    return Selection((start, stop), region)
 
 
 def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
@@ -300,7 +299,7 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
     where = file.where(stack)
     if not isinstance(stack, h5py.Dataset):
         raise InputError(f"{where} is no dataset: name one with --dataset")
-    with plainly(where):
+    with as_input_error(where):
         shape, dtype = stack.shape, stack.dtype.newbyteorder("=")
     if shape is None or len(shape) != 3:
         raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")

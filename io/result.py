@@ -1,10 +1,10 @@
-"""Result files: the maps of a reconstruction and how they came about."""
+"""Result files: the maps of a reconstruction, how they came about, and one turn of many."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import MAKE_ROOM, new_file, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, carried_by, datasets_of, groups_of
+from mirrorskin.io.dataset_specs import Part, parts_of_process, read_process, write_part
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.mould import Mould
-from mirrorskin.io.parts import Part, parts_of_process, read_process, write_part
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"
@@ -62,7 +62,7 @@ def save_result(result: Result, path: str | Path) -> None:
     form = tuple((part.name, part.values.dtype.str, part.values.shape) for part in parts)
     mould = _moulds.get(form)
     if mould is not None:
-        with new_file(path) as descriptor, plainly(f"{path} could not be written", MAKE_ROOM):
+        with new_file(path) as descriptor, as_input_error(f"{path} could not be written", MAKE_ROOM):
             mould.pour(descriptor, values)
         return
     with new_hdf5(path) as new:
@@ -208,3 +208,49 @@ def _size_of(found: Mapping[str, Node]) -> Shape | None:
             size = shape[:-1] if name == _VECTORS else shape
             return size if len(size) in (2, 3) else None
     return None
+
+
+def select_turn(result: Result, turn: int | None) -> Result:
+    """Return the maps of one turn, or those of a result that has no turns.
+
+    Parameters
+    ----------
+    result : Result
+    turn : int or None
+        Number of the turn, from 0; None of a result whose maps are of all turns together.
+
+    Returns
+    -------
+    Result
+        With maps (H, W); its components are numbered from 0, and its process tells the turn.
+
+    Raises
+    ------
+    InputError
+        The result has turns and none is chosen, or it does not have that one.
+    """
+    maps = result.maps()
+    size = next((values.shape[: values.ndim - (name == "normals")] for name, values in maps.items()), (0, 0))
+    if len(size) == 2:
+        if turn is not None:
+            raise InputError("the maps of this result are not of single turns: leave --turn out")
+        return result
+    if turn is None or not 0 <= turn < size[0]:
+        wrong = "" if turn is None else f", and none of turn {turn}"
+        count, most = ("1 turn", "") if size[0] == 1 else (f"{size[0]} turns", f" to {size[0] - 1}")
+        raise InputError(f"this result has maps of {count}{wrong}: choose one with --turn 0{most}")
+    chosen: dict[str, Any] = {name: values[turn] for name, values in maps.items()}
+    if result.component is not None:
+        chosen |= _renumbered(result.component[turn], result.offset_unknown)
+    return replace(result, **chosen, process={**result.process, "turn": turn})
+
+
+def _renumbered(
+    component: NDArray[np.int32], offset_unknown: NDArray[np.uint8] | None
+) -> dict[str, NDArray[Any]]:
+    """Give the components that one turn has numbers from 0 on."""
+    own = np.unique(component[component >= 0])
+    numbered = np.where(component >= 0, np.searchsorted(own, component), -1).astype(np.int32)
+    if offset_unknown is None:
+        return {"component": numbered}
+    return {"component": numbered, "offset_unknown": offset_unknown[own]}

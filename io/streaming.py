@@ -20,10 +20,9 @@ from mirrorskin.io.atomic import MAKE_ROOM, check_output, new_file
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.growing import GrowingRecording
 from mirrorskin.io.layout import COMPLETE, CUT_SHORT
-from mirrorskin.io.passing import Passing
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.recorder import Compression, TeeSource
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource
-from mirrorskin.io.writing import Compression
 
 _LOOK = 0.5  # seconds from one look whether the program is still there to the next
 _BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
@@ -45,7 +44,7 @@ class _End:
     state: str
 
 
-class StreamRecorder(Passing[LiveSource]):
+class StreamRecorder(TeeSource[LiveSource]):
     """Pass on the frames of a live source at once, and write them to a recording behind its back.
 
     The recording appears under its name with the first frame, and an older file of that name is replaced
@@ -188,7 +187,7 @@ class StreamRecorder(Passing[LiveSource]):
     def _write(self) -> None:
         """Write what is queued; the body of the thread."""
         try:
-            with self._plainly():
+            with self._write_errors():
                 file = self._begin()
                 if file is not None:
                     with file:
@@ -215,7 +214,7 @@ class StreamRecorder(Passing[LiveSource]):
     def _follow(self, file: GrowingRecording) -> _End:
         """Append what comes; after an error, wait for the end."""
         try:
-            with self._plainly():
+            with self._write_errors():
                 return self._append_all(file)
         except InputError as error:
             self._error = error
@@ -250,8 +249,8 @@ class StreamRecorder(Passing[LiveSource]):
         with self._lock:
             self._backlog -= block.frames.nbytes
 
-    def _plainly(self) -> AbstractContextManager[None]:
-        return plainly(f"{self.path} could not be written", MAKE_ROOM)
+    def _write_errors(self) -> AbstractContextManager[None]:
+        return as_input_error(f"{self.path} could not be written", MAKE_ROOM)
 
 
 def _cut_short(error: BaseException) -> str:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.frames import FrameSequence, quiet_opencv
 from mirrorskin.io.positions import Positions
-from mirrorskin.io.sequence import FrameSequence, quiet_opencv
 from mirrorskin.io.types import Floats, Header, InputError
 
 # OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.

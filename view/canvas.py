@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.export.writing import write_new
+from mirrorskin.io.atomic import write_new
 from mirrorskin.io.types import Floats
 from mirrorskin.view.colours import FILLED_SHADES, MISSING
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from mirrorskin.engine.summary import summarise
-from mirrorskin.io import InputError, Mesh, Result, of_turn, surface_mesh
-from mirrorskin.io.export.mesh import normals_around
+from mirrorskin.io import InputError, Mesh, Result, select_turn, surface_mesh
+from mirrorskin.io.mesh import normals_around
 from mirrorskin.view.colours import FILLED_RGB, Colours, height_colours, span
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
@@ -37,7 +37,7 @@ def show_surface(result: Result, where: str | Path, name: str) -> None:
         The result has no heights of three neighbours, or no pixel size; rerun is not installed or does
         not start, or the file cannot be written.
     """
-    result = of_turn(result, None)
+    result = select_turn(result, None)
     mesh = _mesh(result, name)
     assert result.height is not None
     rr = load_rerun()

@@ -57,7 +57,7 @@ def command(
     """Paint a board for printing, in its true size."""
     from mirrorskin.engine.calibration.board import paint_board
     from mirrorskin.io import InputError, check_output
-    from mirrorskin.io.printing import save_print
+    from mirrorskin.io.pictures import save_print
 
     kind = board_of(board)
     if output.suffix.lower() != ".png":

@@ -151,7 +151,7 @@ def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tu
 def _open(path: Path) -> Source:
     """Open frames; where the body was in those of a folder does not matter."""
     from mirrorskin import io
-    from mirrorskin.io.picture_files import PICTURE_SUFFIXES
+    from mirrorskin.io.pictures import PICTURE_SUFFIXES
 
     if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES:
         return io.open_frames(path, io.Header("vertical"), travel=io.Steps(1.0))

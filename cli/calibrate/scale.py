@@ -98,7 +98,7 @@ def _picture(path: Path) -> tuple[NDArray[Any], str, Any]:
     """Read a picture, or the mean of a recording and what that says of its camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
-    from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
+    from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
 
     if path.is_dir() or path.suffix.lower() in (".avi", ".mp4"):
         raise io.InputError(f"{path} is a sequence: name pictures of the board one by one, or a recording")

@@ -29,7 +29,7 @@ from mirrorskin.engine.batch.work import Outcome
 from mirrorskin.engine.provenance import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 
 PATIENCE = 30.0
 """Seconds after which a scheduler that was reached, or the last of its workers, is held to be gone."""
@@ -372,7 +372,7 @@ def _distributed() -> ModuleType:
 def _trace(folder: Path) -> Iterator[Path]:
     """Leave an empty file in a folder for a while: who sees it, sees the folder itself."""
     with ExitStack() as stack:
-        with plainly(f"{folder} cannot be written to", "choose another folder with -o"):
+        with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
             file = stack.enter_context(
                 tempfile.NamedTemporaryFile(prefix=".mirrorskin-", suffix=".part", dir=folder)
             )

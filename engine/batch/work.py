@@ -16,7 +16,7 @@ from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, ProcessValue, Recording
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.result import open_process
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
@@ -91,7 +91,7 @@ def _done(
     target, digest = outcome.job.target, plan.digest(source.motion)
     if _is_made(outcome.job, source, digest):
         return replace(outcome, state="kept", message="there already")
-    with plainly(f"{target.parent} cannot be made", "choose another folder for results"):
+    with as_input_error(f"{target.parent} cannot be made", "choose another folder for results"):
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)
     opened = open_device(device)

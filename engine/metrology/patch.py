@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.turns import of_turn
+from mirrorskin.io.result import select_turn
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,7 +81,7 @@ def heights_of(result: Result) -> NDArray[np.float32]:
     InputError
         There are none, or one map for each turn.
     """
-    height = of_turn(result, None).height
+    height = select_turn(result, None).height
     if height is None:
         raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
     return height

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.io import InputError
-from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
+from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
 
 SUFFIXES = (".npy", *PICTURE_SUFFIXES)
 """How the names of reference files end."""

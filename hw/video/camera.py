@@ -14,7 +14,7 @@ from mirrorskin.hw.settings import CameraSettings
 from mirrorskin.hw.video.capture import OPEN_TIMEOUT, READ_TIMEOUT, Capture
 from mirrorskin.hw.video.source import find_source
 from mirrorskin.io import InputError
-from mirrorskin.io.sequence import quiet_opencv
+from mirrorskin.io.frames import quiet_opencv
 
 PATIENCE = 10.0
 """Seconds from the loss of a camera until it is given up."""

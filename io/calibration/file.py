@@ -25,9 +25,9 @@ from mirrorskin.io.calibration.types import (
     stored,
     unit_of,
 )
+from mirrorskin.io.dataset_specs import Part as Dataset
+from mirrorskin.io.dataset_specs import parts_of_process, read_process, text_of, write_part
 from mirrorskin.io.hdf5 import Hdf5File, Node
-from mirrorskin.io.parts import Part as Dataset
-from mirrorskin.io.parts import parts_of_process, read_process, text_of, write_part
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
 
 MARK, VERSION = "mirrorskin_calibration", 1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.calibration.types import GROUPS, Calibration, CameraId, Part, Precession, stored
-from mirrorskin.io.region import Region
+from mirrorskin.io.selection import Region
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, Source
 
 SIZED = ("zenith", "precession", "gel")

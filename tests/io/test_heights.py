@@ -92,7 +92,7 @@ def simulation(path):
     return record(twin, path, truth=twin.truth), twin.truth.height
 
 
-def part_of(tmp_path, told, name="source_region", shape=(5, 7)):
+def source_region(tmp_path, told, name="source_region", shape=(5, 7)):
     """The heights in a result that tells which part it is of, cut for a region of a recording."""
     rows, columns = shape
     values = np.arange(rows * columns, dtype=np.float32).reshape(shape)
@@ -114,11 +114,11 @@ def test_the_truth_is_cut_for_a_region(tmp_path):
 @pytest.mark.parametrize("name", ["source_region", "vertical_source_region"])
 def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path, name):
     for told in (None, "0,0,7x5"):
-        found, values = part_of(tmp_path, told, name)
+        found, values = source_region(tmp_path, told, name)
         np.testing.assert_array_equal(found, values[1:4, 2:6])
-    found, values = part_of(tmp_path, "1,1,6x3", name, (3, 6))
+    found, values = source_region(tmp_path, "1,1,6x3", name, (3, 6))
     np.testing.assert_array_equal(found, values[:, 1:5])
-    found, values = part_of(tmp_path, "2,1,4x3", name, (3, 4))
+    found, values = source_region(tmp_path, "2,1,4x3", name, (3, 4))
     np.testing.assert_array_equal(found, values)
 
 
@@ -128,4 +128,4 @@ def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path, name):
 )
 def test_heights_of_other_pixels_are_refused(tmp_path, told, shape):
     with pytest.raises(io.InputError, match=r"h\.h5 holds the heights of rows .* and columns .*, where "):
-        part_of(tmp_path, told, shape=shape)
+        source_region(tmp_path, told, shape=shape)

@@ -18,15 +18,15 @@ def a_result(*size, **changes):
 
 def test_a_result_without_turns_passes():
     result = a_result(4, 5)
-    assert io.of_turn(result, None) is result
+    assert io.select_turn(result, None) is result
     vectors = io.Result(normals=np.zeros((4, 5, 3), np.float32))
-    assert io.of_turn(vectors, None) is vectors
+    assert io.select_turn(vectors, None) is vectors
 
 
 @pytest.mark.parametrize("turn", [0, 2])
 def test_the_maps_of_a_turn_are_those_of_it(turn):
     result = a_result(3, 4, 5)
-    found = io.of_turn(result, turn)
+    found = io.select_turn(result, turn)
     assert set(found.maps()) == {"zenith", "normals", "edges"}
     for name, values in found.maps().items():
         np.testing.assert_array_equal(values, getattr(result, name)[turn])
@@ -40,14 +40,14 @@ def test_components_count_from_0_in_each_turn():
     component = np.array([[[0, 0, -1], [1, 1, -1]], [[4, -1, 2], [4, -1, 2]], [[-1, -1, -1]] * 2], np.int32)
     unknown = np.array([1, 0, 1, 0, 0], np.uint8)
     result = a_result(3, 2, 3, component=component, offset_unknown=unknown)
-    second = io.of_turn(result, 1)
+    second = io.select_turn(result, 1)
     assert second.component.tolist() == [[1, -1, 0], [1, -1, 0]]
     assert second.component.dtype == np.int32
     assert second.offset_unknown.tolist() == [1, 0]
-    third = io.of_turn(result, 2)
+    third = io.select_turn(result, 2)
     assert (third.component == -1).all()
     assert third.offset_unknown.tolist() == []
-    bare = io.of_turn(a_result(3, 2, 3, component=component), 1)
+    bare = io.select_turn(a_result(3, 2, 3, component=component), 1)
     assert bare.component.tolist() == second.component.tolist()
     assert bare.offset_unknown is None
 
@@ -64,10 +64,10 @@ def test_components_count_from_0_in_each_turn():
 )
 def test_a_turn_that_is_not_there_is_one_line(size, turn, line):
     with pytest.raises(io.InputError, match=line) as caught:
-        io.of_turn(a_result(*size), turn)
+        io.select_turn(a_result(*size), turn)
     assert "\n" not in str(caught.value)
 
 
 def test_a_result_without_maps_passes():
     empty = io.Result()
-    assert io.of_turn(empty, None) is empty
+    assert io.select_turn(empty, None) is empty

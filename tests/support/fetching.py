@@ -9,8 +9,7 @@ import hdf5plugin
 import numpy as np
 
 from mirrorskin import io
-from mirrorskin.io.stacks.packed import Packed
-from mirrorskin.io.stacks.through import Through
+from mirrorskin.io.chunked_stack import ChunkReader, Hdf5Reader
 
 GIVEN = {"motion": "horizontal"}
 
@@ -91,7 +90,7 @@ def ours(path, room, **given):
 def count_unpacked(monkeypatch):
     """Count how often each chunk is unpacked, or asked of HDF5."""
     counts = Counter()
-    decode, fetch = Packed._decode, Through.fetch
+    decode, fetch = ChunkReader._decode, Hdf5Reader.fetch
 
     def counted(self, position, out, room):
         counts[position] += 1
@@ -103,6 +102,6 @@ def count_unpacked(monkeypatch):
         counts.update((i, j, k) for i in ranges[0] for j in ranges[1] for k in ranges[2])
         fetch(self, cut, out)
 
-    monkeypatch.setattr(Packed, "_decode", counted)
-    monkeypatch.setattr(Through, "fetch", asked)
+    monkeypatch.setattr(ChunkReader, "_decode", counted)
+    monkeypatch.setattr(Hdf5Reader, "fetch", asked)
     return counts

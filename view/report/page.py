@@ -11,9 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mirrorskin.io import InputError, Result, of_turn
+from mirrorskin.io import InputError, Result, select_turn
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
-from mirrorskin.io.plain import plainly
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.view.canvas import check_drawing
 from mirrorskin.view.report.contents import Ends, contents_of
 
@@ -58,11 +58,11 @@ def write_report(
         size to place it by, or the file cannot be written.
     """
     check_report()
-    page = _render(contents_of(of_turn(result, turn), name, section, turn))
+    page = _render(contents_of(select_turn(result, turn), name, section, turn))
     path = Path(path)
     with (
         new_file(path) as descriptor,
-        plainly(f"{path} could not be written", MAKE_ROOM),
+        as_input_error(f"{path} could not be written", MAKE_ROOM),
         os.fdopen(os.dup(descriptor), "w", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
         file.write(page)

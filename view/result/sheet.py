@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io import Result, of_turn, pixel_axes
+from mirrorskin.io import Result, pixel_axes, select_turn
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import Extent, draw_image, extent
 
@@ -74,7 +74,7 @@ def sheet_of(result: Result) -> Sheet:
     mirrorskin.io.InputError
         It has maps of several turns.
     """
-    result = of_turn(result, None)
+    result = select_turn(result, None)
     if result.x is not None and result.y is not None:
         return Sheet(result, result.x, result.y, "mm")
     shape = next(iter(result.maps().values())).shape

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.hw.twin.body import Body
-from mirrorskin.io.picture_files import PICTURE_SUFFIXES, read_picture
+from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
 from mirrorskin.io.types import Floats, InputError
 
 PATTERN_NAMES = ("uniform", "linear")

@@ -54,7 +54,7 @@ def test_text_is_one_line_a_point_and_names_its_columns(slope, tmp_path):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (6, 1), (6, 9), (8, 7)])
 def test_text_of_any_size_is_whole(shape, tmp_path, monkeypatch):
-    monkeypatch.setattr("mirrorskin.io.export.xyz._TOGETHER", 7)
+    monkeypatch.setattr("mirrorskin.io.export_formats._TOGETHER", 7)
     path = tmp_path / "out.xyz"
     x, y = io.pixel_axes(shape, (0.5, 0.25))
     height = np.random.default_rng(0).normal(size=shape).astype(np.float32)

@@ -15,9 +15,8 @@ import pytest
 from fetching import GIVEN, compressible, ours, theirs, write
 
 from mirrorskin import io
-from mirrorskin.io.region import Region
-from mirrorskin.io.stacks.mapped import SPARE, Mapped
-from mirrorskin.io.stacks.stack import Cut, Place
+from mirrorskin.io.mapped_stack import SPARE, MappedStack
+from mirrorskin.io.selection import Place, Region, Selection
 
 SHAPE = (9, 50, 70)
 
@@ -87,9 +86,9 @@ def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
     offset = 3 * mmap.PAGESIZE - spare - frames.nbytes % mmap.PAGESIZE
     data = bytes(offset) + frames.tobytes() + bytes(more)
     (tmp_path / "raw").write_bytes(data)
-    whole = Cut((0, 4), Region.whole((8, 256)))
+    whole = Selection((0, 4), Region.whole((8, 256)))
     with (tmp_path / "raw").open("rb") as file:
-        stack = Mapped(file.fileno(), Place("raw", "x"), offset, frames.shape, frames.dtype, whole)
+        stack = MappedStack(file.fileno(), Place("raw", "x"), offset, frames.shape, frames.dtype, whole)
     out = np.zeros_like(frames)
     np.testing.assert_array_equal(stack.read(0, 4, out), frames)
     assert np.array_equal(out, frames) == (more <= spare < SPARE)
@@ -100,9 +99,9 @@ def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
 def test_frames_at_odd_addresses_are_copied(tmp_path):
     frames = compressible(SHAPE, "u2")
     (tmp_path / "raw").write_bytes(b"x" + frames.tobytes() + bytes(100))
-    whole = Cut((0, 9), Region.whole(SHAPE[1:]))
+    whole = Selection((0, 9), Region.whole(SHAPE[1:]))
     with (tmp_path / "raw").open("rb") as file:
-        stack = Mapped(file.fileno(), Place("raw", "x"), 1, SHAPE, frames.dtype, whole)
+        stack = MappedStack(file.fileno(), Place("raw", "x"), 1, SHAPE, frames.dtype, whole)
     out = np.zeros_like(frames)
     stack.read(0, 9, out)
     np.testing.assert_array_equal(out, frames)

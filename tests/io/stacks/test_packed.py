@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mirrorskin import io
-from mirrorskin.io.region import Region
+from mirrorskin.io.selection import Region
 
 SHAPE = (11, 13, 17)
 CHUNKS = {
@@ -223,17 +223,17 @@ def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
 
 
 def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
-    from mirrorskin.io.stacks.packed import Packed
+    from mirrorskin.io.chunked_stack import ChunkReader
 
     path = write(tmp_path / "a.h5", compressible((30, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
-    decode = Packed._decode
+    decode = ChunkReader._decode
 
     def interrupted(self, position, out, room):
         if position[0] == 20:
             raise KeyboardInterrupt
         decode(self, position, out, room)
 
-    monkeypatch.setattr(Packed, "_decode", interrupted)
+    monkeypatch.setattr(ChunkReader, "_decode", interrupted)
     with io.open_recording(path, motion="horizontal", threads=3) as recording:
         out = np.zeros((30, 50, 70), "u2")
         with pytest.raises(KeyboardInterrupt):

@@ -12,8 +12,8 @@ import pytest
 from fetching import GIVEN, ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
 
 from mirrorskin import io
-from mirrorskin.io.region import Region
-from mirrorskin.io.stacks import unpacking
+from mirrorskin.io import chunked_stack as unpacking
+from mirrorskin.io.selection import Region
 
 SHAPE = (24, 13, 17)
 FRAME = 13 * 17 * 2

@@ -1,13 +1,17 @@
-"""A rectangle of the picture."""
+"""Which part of a stack is meant: a rectangle of the picture, some of the frames."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Self
 
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
+
+Span = tuple[int, int]
 
 _TEXT = re.compile("([0-9]{1,9}),([0-9]{1,9}),([1-9][0-9]{0,8})x([1-9][0-9]{0,8})")
 
@@ -93,7 +97,7 @@ class Region:
                 )
 
 
-def part_of(process: Mapping[str, object]) -> Region | None:
+def source_region(process: Mapping[str, object]) -> Region | None:
     """Return the part of the picture that a result says it was made of; None where it says nothing.
 
     Parameters
@@ -103,3 +107,62 @@ def part_of(process: Mapping[str, object]) -> Region | None:
     """
     told = (Region.read(str(process.get(name, ""))) for name in ("source_region", "vertical_source_region"))
     return next((region for region in told if region is not None), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What is wanted of a dataset.
+
+    Attributes
+    ----------
+    frames : (int, int)
+        First frame and end.
+    region : Region
+    """
+
+    frames: tuple[int, int]
+    region: Region
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns."""
+        return (self.frames[1] - self.frames[0], *self.region.shape)
+
+    @property
+    def spans(self) -> tuple[Span, Span, Span]:
+        """First and end of the frames, the rows and the columns."""
+        return self.frames, self.region.rows, self.region.columns
+
+    def overlap(self, other: Selection) -> Selection:
+        """Return what is in both; there must be something."""
+        frames, rows, columns = (
+            (max(a, c), min(b, d)) for (a, b), (c, d) in zip(self.spans, other.spans, strict=True)
+        )
+        return Selection(frames, Region(rows, columns))
+
+    def within(self, outer: Selection) -> tuple[slice, slice, slice]:
+        """Return what cuts this out of an array that holds another cut."""
+        frames, rows, columns = (
+            slice(a - c, b - c) for (a, b), (c, _) in zip(self.spans, outer.spans, strict=True)
+        )
+        return frames, rows, columns
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where frames come from, for messages.
+
+    Attributes
+    ----------
+    path : str
+        As the user calls the file.
+    dataset : str
+    """
+
+    path: str
+    dataset: str
+
+    def reading(self, start: int, stop: int) -> AbstractContextManager[None]:
+        """Name the frames, ``start`` to ``stop`` of the whole stack, if it fails to read them."""
+        frames = f"frame {start}" if stop == start + 1 else f"frames {start} to {stop - 1}"
+        return as_input_error(f"{self.path}: {frames} of {self.dataset} cannot be read")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.plain import legible
+from mirrorskin.io.os_errors import legible
 from mirrorskin.io.types import ProcessValue
 
 

@@ -15,7 +15,7 @@ _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeE
 _LONGEST = 100
 
 
-def plainly(what: str | Callable[[], str], remedy: str = "") -> AbstractContextManager[None]:
+def as_input_error(what: str | Callable[[], str], remedy: str = "") -> AbstractContextManager[None]:
     """Turn what goes wrong with a file into an InputError of one line.
 
     Parameters
@@ -25,10 +25,10 @@ def plainly(what: str | Callable[[], str], remedy: str = "") -> AbstractContextM
     remedy : str, optional
         The line's end: what to do about it.
     """
-    return _Plainly(what, remedy)
+    return _AsInputError(what, remedy)
 
 
-class _Plainly(AbstractContextManager[None]):
+class _AsInputError(AbstractContextManager[None]):
     """A class, because files are opened with many of these and a generator takes several times as long."""
 
     def __init__(self, what: str | Callable[[], str], remedy: str) -> None:

@@ -1,20 +1,20 @@
-"""The best way to fetch the frames of a dataset."""
+"""The frames of a dataset: the best way to fetch them, and some of them as if there were no others."""
 
 from __future__ import annotations
 
 import math
 import os
+from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
-from mirrorskin.io.plain import plainly
-from mirrorskin.io.stacks.codecs import find_codecs
-from mirrorskin.io.stacks.index import chunk_index
-from mirrorskin.io.stacks.mapped import Mapped
-from mirrorskin.io.stacks.packed import Packed
-from mirrorskin.io.stacks.stack import Chunks, Cut, Place, Stack
-from mirrorskin.io.stacks.through import Through
-from mirrorskin.io.stacks.unpacking import Ordered
+from mirrorskin.io.chunked_stack import ChunkedStack, ChunkReader, Hdf5Reader, chunk_index
+from mirrorskin.io.codecs import find_codecs
+from mirrorskin.io.mapped_stack import MappedStack
+from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.selection import Place, Selection
 from mirrorskin.io.types import InputError
 
 _LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is said
@@ -23,11 +23,11 @@ _LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is said
 def open_stack(
     dataset: h5py.Dataset,
     path: str,
-    cut: Cut,
+    cut: Selection,
     memory_limit: int | None = None,
     threads: int | None = None,
     frames: int | None = None,
-) -> Stack:
+) -> MappedStack | ChunkedStack:
     """Open the frames of a dataset.
 
     Parameters
@@ -36,7 +36,7 @@ def open_stack(
         What it claims was checked.
     path : str
         What to call the file in messages.
-    cut : Cut
+    cut : Selection
         What is wanted of it.
     memory_limit : int, optional
         Bytes that unpacked frames may take which are kept for later reads.
@@ -51,23 +51,23 @@ def open_stack(
         The file is damaged, or cannot be opened.
     """
     place, limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
-    with plainly(f"{path}: {dataset.name}"):
+    with as_input_error(f"{path}: {dataset.name}"):
         why = _only_hdf5(dataset)
         offset = None if why or dataset.chunks else dataset.id.get_offset()
         if not why and not dataset.chunks and offset is None:
             why = "in its header"
         if why:
-            return Ordered(Through(dataset, place, why), place, cut, limit)
+            return ChunkedStack(Hdf5Reader(dataset, place, why), place, cut, limit)
         shape = (frames or dataset.shape[0], *dataset.shape[1:])
         file = _open_again(dataset.file)
         try:
             if offset is None:
                 chunks = _open_chunks(dataset, shape, file, place, _threads(dataset, threads, limit))
                 if not isinstance(chunks, int):
-                    file = -1 if isinstance(chunks, Packed) else file
-                    return Ordered(chunks, place, cut, limit)
+                    file = -1 if isinstance(chunks, ChunkReader) else file
+                    return ChunkedStack(chunks, place, cut, limit)
                 offset = chunks
-            return Mapped(file, place, offset, shape, dataset.dtype, cut)
+            return MappedStack(file, place, offset, shape, dataset.dtype, cut)
         finally:
             if file >= 0:
                 os.close(file)
@@ -102,17 +102,59 @@ def _only_hdf5(dataset: h5py.Dataset) -> str:
 
 def _open_chunks(
     dataset: h5py.Dataset, shape: tuple[int, int, int], file: int, place: Place, threads: int
-) -> Chunks | int:
+) -> ChunkReader | Hdf5Reader | int:
     """Return what fetches chunks; of raw frames that lie in one piece, where that begins."""
     codecs = find_codecs(dataset)
     if isinstance(codecs, str):
-        return Through(dataset, place, codecs)
+        return Hdf5Reader(dataset, place, codecs)
     index = chunk_index(dataset, shape, os.fstat(file).st_size)
     if isinstance(index, str):
-        return Through(dataset, place, index)
+        return Hdf5Reader(dataset, place, index)
     if not codecs:
         index = index.frame_by_frame(dataset.dtype.itemsize)
         start = index.piece(shape)
         if start is not None:
             return start
-    return Packed(file, place, shape, dataset.dtype, index, codecs, threads)
+    return ChunkReader(file, place, shape, dataset.dtype, index, codecs, threads)
+
+
+class FrameSubset:
+    """The frames of a stack that were chosen, numbered from 0; those between are not read.
+
+    Parameters
+    ----------
+    stack : Stack
+    frames : ndarray, (n,), int
+        Their numbers in the stack, which increase.
+    """
+
+    def __init__(self, stack: MappedStack | ChunkedStack, frames: NDArray[np.intp]) -> None:
+        self.shape, self.dtype = (len(frames), *stack.shape[1:]), stack.dtype
+        self._stack = stack
+        self._frames: list[int] = frames.tolist()
+        # Frames that follow each other in the stack are a run, and are read together.
+        breaks = np.flatnonzero(np.diff(frames) != 1) + 1
+        ends = np.append(breaks, len(frames))
+        self._ends: list[int] = np.repeat(ends, np.diff(ends, prepend=0)).tolist()
+
+    @property
+    def how(self) -> str:
+        """How frames are fetched, for people."""
+        return self._stack.how
+
+    def end(self, start: int, stop: int) -> int:
+        """Return where a read that begins at ``start`` had better end, at the latest with its run."""
+        first = self._frames[start]
+        return start + self._stack.end(first, first + min(stop, self._ends[start]) - start) - first
+
+    def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
+        """Return frames of one run; see ``Stack.read``."""
+        first = self._frames[start]
+        return self._stack.read(first, first + stop - start, out)
+
+    def close(self) -> None:
+        """Let go of the file; what was lent lives on."""
+        self._stack.close()
+
+
+Stack = MappedStack | ChunkedStack | FrameSubset

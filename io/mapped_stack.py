@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.stacks.stack import Cut, Place
+from mirrorskin.io.selection import Place, Selection
 
 SPARE = 64
 """Bytes behind the last sample that must be there, too: kernels load their last word whole."""
 
 
-class Mapped:
+class MappedStack:
     """Frames in one piece, whole ones lent where they lie.
 
     Parameters
@@ -29,7 +29,7 @@ class Mapped:
     shape : (int, int, int)
         Frames, rows and columns that lie there.
     dtype : dtype
-    cut : Cut
+    cut : Selection
         What is wanted of them.
     how : str, optional
 
@@ -46,7 +46,7 @@ class Mapped:
         offset: int,
         shape: tuple[int, int, int],
         dtype: np.dtype[Any],
-        cut: Cut,
+        cut: Selection,
         how: str = "mapped",
     ) -> None:
         self.shape, self.dtype, self.how = cut.shape, dtype, how

@@ -1,1 +1,0 @@
-"""Results as files that other programs open: meshes, points, pictures, tables, arrays."""
