@@ -1,4 +1,4 @@
-"""The one loop: from a source of frames into an estimator."""
+"""What an estimator is, and the one loop: frames of a source into an estimator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,21 @@ Progress = Callable[[int], None]
 
 
 class Estimator(Protocol):
-    """What the loop feeds: it takes in blocks, and offers room to read them into."""
+    """Takes frames as they come, and returns maps of those so far.
+
+    ``push(frames, travel=...)`` takes the next frames of a press, ``push(frames, phase=...)`` those of a
+    rotation: frames (n, H, W) as a plain array and one position a frame, mm or radians, as a keyword. The
+    keyword ``lent=True`` says that nobody writes to the frames' memory as long as it is referred to, so that
+    a device may read them where they lie. Frames that were read into ``room`` are not copied either. The same
+    frames give the same result, bit by bit, however they are cut into pushes.
+
+    ``result()`` returns the maps of the frames so far as plain arrays in a data class. It changes nothing: it
+    may be called again, and more frames may follow. ``reset()`` forgets the frames, and what was estimated
+    from them; parameters, references and device buffers stay.
+    """
+
+    position: str
+    """The keyword of ``push`` that says where the body was: "travel" or "phase"."""
 
     @property
     def device(self) -> Device:
@@ -25,8 +39,14 @@ class Estimator(Protocol):
     def room(self) -> NDArray[Any]:
         """Where the next frames may be written, (n, H, W)."""
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames."""
+    def push(self, *args: Any, **kwargs: Any) -> None:
+        """Take in the next frames: ``push(frames, *, travel, lent=False)``, or ``phase``."""
+
+    def result(self) -> Any:
+        """Return the maps of the frames so far."""
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
 
 
 def feed(source: Source, estimator: Estimator, frames: range, progress: Progress | None = None) -> None:
@@ -43,24 +63,33 @@ def feed(source: Source, estimator: Estimator, frames: range, progress: Progress
     frames : range
         Which of them, in steps of 1; those before are read and dropped.
     progress : callable, optional
-        Told the number of frames so far.
+        Called with the number of frames so far.
     """
     if source.rewindable:
         source.rewind()
     ahead = not estimator.device.info.shares_memory
     done = 0
-    for block in _in_place(source, estimator, frames.start):
+    for block in _read_in_place(source, estimator, frames.start):
         done += len(block.frames)
         if progress:
             progress(done)
-    for block in (_ahead if ahead else _in_place)(source, estimator, len(frames)):
+    for block in (_read_ahead if ahead else _read_in_place)(source, estimator, len(frames)):
+        push_block(estimator, block)
+        done += len(block.frames)
+        if progress:
+            progress(done)
+
+
+def push_block(estimator: Estimator, block: Block) -> None:
+    """Push what a source yields: its frames and their positions."""
+    if not hasattr(estimator, "position"):  # until every estimator follows the protocol
         estimator.push(block)
-        done += len(block.frames)
-        if progress:
-            progress(done)
+        return
+    where = {estimator.position: getattr(block, estimator.position)}
+    estimator.push(block.frames, **where, lent=block.lent)
 
 
-def _in_place(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+def _read_in_place(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
     """Read frames to where the estimator wants them."""
     while count > 0:
         block = source.read(estimator.room[:count])
@@ -70,7 +99,7 @@ def _in_place(source: Source, estimator: Estimator, count: int) -> Iterator[Bloc
         count -= len(block.frames)
 
 
-def _ahead(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+def _read_ahead(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
     """Read frames to two places in turns, one while the other is copied from."""
     length = max(1, len(estimator.room) // 2)
     shape = max(1, min(length, count)), *estimator.room.shape[1:]

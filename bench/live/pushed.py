@@ -14,6 +14,7 @@ from mirrorskin.bench.results import Case, Row
 from mirrorskin.bench.same import check_frames, check_heights
 from mirrorskin.bench.stacks import fill
 from mirrorskin.engine import OnsetSearch
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 
@@ -65,7 +66,7 @@ def _press(search: OnsetSearch, blocks: list[Block]) -> Work:
     def press() -> None:
         search.reset()
         for block in blocks:
-            search.push(block)
+            push_block(search, block)
         search.device.finish()
 
     return press

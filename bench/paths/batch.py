@@ -29,6 +29,7 @@ from mirrorskin.engine import OnsetSearch
 from mirrorskin.engine.batch.jobs import Job, make_jobs
 from mirrorskin.engine.batch.local import run_local
 from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io.layout import STACK
 from mirrorskin.kernels.device import Device
 
@@ -96,7 +97,7 @@ def run_batch(case: BatchCase, device: Device, quick: bool) -> Case:
         jobs = make_jobs(_record_all(press, case.count, folder), folder / "results")
         search, copies = search_of(press, device), min(case.count, _COPIES)
         limits = Limits(device, np.concatenate([press.block.frames] * copies))
-        search.push(press.block)
+        push_block(search, press.block)
         check = partial(_check, jobs, maps_of(search.result()))
         works = {**limits.works(), **_works(jobs, search, press.block, device)}
         measured = take_turns(works, 1 if quick else _ROUNDS, device.profile, check)
@@ -167,7 +168,7 @@ def _do_least(pieces: list[_Piece], search: OnsetSearch, known: io.Block, result
     """Map, search and write, for each file; return the last one's maps."""
     for piece in pieces:
         search.reset()
-        search.push(replace(known, frames=piece.map(known.frames)))
+        push_block(search, replace(known, frames=piece.map(known.frames)))
         maps = maps_of(search.result())
         with (results / piece.path.name).open("wb") as file:
             for values in maps.values():

@@ -21,6 +21,7 @@ from mirrorskin.bench.paths.child import Memory, is_told
 from mirrorskin.bench.paths.equal import check_equal
 from mirrorskin.bench.paths.press import make_press, maps_of, search_of
 from mirrorskin.bench.results import Case, Target
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io.layout import SERIES, STACK
 from mirrorskin.kernels.device import Device, DeviceInfo, list_devices
 
@@ -69,7 +70,7 @@ def run_budget(case: BudgetCase, device: Device, quick: bool) -> Case:
     with files.new_folder(case.name, 2 * case.bytes + _MAPS * math.prod(case.shape[1:])) as folder:
         press = make_press(case.shape)
         search = search_of(press, device)
-        search.push(press.block)
+        push_block(search, press.block)
         expected = maps_of(search.result())
         targets = []
         for kind, write in KINDS.items():

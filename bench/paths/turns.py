@@ -24,6 +24,7 @@ from mirrorskin.bench.paths.whole import PATH, ROUNDS, to_new_results, to_result
 from mirrorskin.bench.results import Case, Row, Target
 from mirrorskin.bench.turns import SCALES, STEPS, TILT, fill, phases
 from mirrorskin.engine import Correlation, Correlator, NormalEstimator, Normals
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.kernels.device import Device
 
@@ -133,7 +134,7 @@ def _answer(estimator: Correlator | NormalEstimator, block: io.Block, times: int
     """Push a block so many times, and return the maps."""
     estimator.reset()
     for _ in range(times):
-        estimator.push(block)
+        push_block(estimator, block)
     return estimator.result()
 
 

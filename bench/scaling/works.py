@@ -14,6 +14,7 @@ from mirrorskin.bench.sweep.scene import make_mask
 from mirrorskin.bench.turns import SCALES, TILT, phases
 from mirrorskin.bench.turns import fill as fill_turn
 from mirrorskin.engine import Correlator, Integrator, NormalEstimator, OnsetSearch
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 
@@ -52,7 +53,7 @@ def scale_press(device: Device, shape: Shape, count: int) -> Scaled:
 
     def work() -> object:
         search.reset()
-        search.push(block)
+        push_block(search, block)
         return search.result()
 
     return Scaled(work, frames.nbytes, count)
@@ -67,7 +68,7 @@ def scale_correlation(device: Device, shape: Shape, count: int) -> Scaled:
 
     def work() -> object:
         correlator.reset()
-        correlator.push(block)
+        push_block(correlator, block)
         return correlator.result()
 
     return Scaled(work, frames.nbytes + 16 * frames[0].size, count)
@@ -92,7 +93,7 @@ def scale_turn(device: Device, shape: Shape, count: int) -> Scaled:
 
     def work() -> object:
         estimator.reset()
-        estimator.push(block)
+        push_block(estimator, block)
         return estimator.result()
 
     return Scaled(work, frames.nbytes + _NORMAL * frames[0].size, count)

@@ -11,6 +11,7 @@ from mirrorskin.bench.stacks import LEVELS, fill, noise_of, references
 from mirrorskin.bench.sweep.sweep import FRAME_TYPES, Family, Job, Shape, agree, run_kernel
 from mirrorskin.engine import ChangePointSearch, Onset, OnsetSearch
 from mirrorskin.engine.frames import reference_maps, reference_pair
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block
 from mirrorskin.kernels import changepoint, onset
 from mirrorskin.kernels.changepoint import DECIDED, SLOTS, UNIT
@@ -42,7 +43,7 @@ def _make_onset(device: Device, shape: Shape, kind: str, count: int) -> dict[str
 
     def scan() -> None:
         search.reset()
-        search.push(block)
+        push_block(search, block)
 
     def check() -> None:
         scan()
@@ -85,7 +86,7 @@ def _make_known(device: Device, shape: Shape, kind: str, count: int) -> dict[str
 
     def scan() -> None:
         search.reset()
-        search.push(block)
+        push_block(search, block)
 
     def check() -> None:
         scan()
@@ -112,9 +113,9 @@ def _make_unknown(device: Device, shape: Shape, kind: str, count: int) -> dict[s
 
     def passes() -> None:
         search.reset()
-        search.push(block)
-        search.rewind()
-        search.push(block)
+        push_block(search, block)
+        search.start_second_pass()
+        push_block(search, block)
 
     def check() -> None:
         passes()

@@ -104,7 +104,7 @@ class LivePress:
 
     def push(self, block: Block) -> None:
         """Take in the next frames; see ``OnsetSearch.push``."""
-        self._search.push(block)
+        self._search.push(block.frames, travel=block.travel, lent=block.lent)
         assert block.travel is not None
         self._travel.append(block.travel)
         self._frames += len(block.frames)

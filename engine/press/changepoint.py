@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.frames import reference_pair, travel_pairs
 from mirrorskin.engine.press.onset import Event, Onset, Search, check_stack
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, join_rows
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Device, Kernel, open_device
@@ -77,11 +77,10 @@ def find_change_point(
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
-    block = Block(frames, index=0, travel=np.asarray(travel))
-    search.push(block)
+    search.push(frames, travel=travel)
     if search.passes == 2:
-        search.rewind()
-        search.push(block)
+        search.start_second_pass()
+        search.push(frames, travel=travel)
     return search.result()
 
 
@@ -89,7 +88,7 @@ class ChangePointSearch(Search):
     """Find the change from dark to light, or back, in frames that come block by block, however they are cut.
 
     With known levels one pass is enough, and ``result`` may be asked for at any time. With unknown ones all
-    frames are pushed twice, with ``rewind`` in between.
+    frames are pushed twice, with ``start_second_pass`` in between.
 
     Parameters
     ----------
@@ -150,7 +149,7 @@ class ChangePointSearch(Search):
         if self.passes == 2:
             self._fill(total=zeros, total_rest=zeros)
 
-    def rewind(self) -> None:
+    def start_second_pass(self) -> None:
         """Be ready for the same frames once more, when unknown levels need a second pass.
 
         Raises
@@ -175,22 +174,21 @@ class ChangePointSearch(Search):
             for name in ("total", "total_rest", "score"):
                 band.write(name, np.zeros_like(mean))
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames.
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each; see `Estimator`.
 
         Raises
         ------
         mirrorskin.io.InputError
             Travel is missing, or runs back; or there are more frames in the second pass than in the first.
         """
-        frames, first = block.frames, len(self._travel)
+        first = len(self._travel)
         if self._weight is not None and first + len(frames) >= len(self._weight.host):
             raise InputError("there are more frames in the second pass than in the first: give the same ones")
-        travel = self._accept(block, self._travel)
-        self._travel.extend(travel)
+        self._travel.extend(self._accept(frames, travel, self._travel))
         for band in self._bands:
             with band.resident():
-                for staged in band.stage(frames, block.lent):
+                for staged in band.stage(frames, lent):
                     self._take(band, staged, first + staged.frames.start)
 
     def result(self) -> Onset:

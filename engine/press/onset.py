@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.autotune import fit
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, check_threshold, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, cut_into_bands, join_rows
-from mirrorskin.io import Block, InputError, check_travel
+from mirrorskin.io import InputError, check_travel
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
@@ -98,18 +98,21 @@ class Search:
         alone = len(self._bands) == 1
         self._room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
 
+    position = "travel"
+
     @property
     def room(self) -> NDArray[Any]:
         """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
         return self._room
 
-    def _accept(self, block: Block, so_far: Sequence[float]) -> NDArray[np.float64]:
-        """Look at a block before it is taken in: return its travel, if it can follow the travel so far."""
-        frames = block.frames
+    def _accept(
+        self, frames: NDArray[Any], travel: ArrayLike | None, so_far: Sequence[float]
+    ) -> NDArray[np.float64]:
+        """Check frames before they are taken in: return their travel, if it can follow the travel so far."""
         check_frames(frames, self._dtype, self._shape)
-        travel = check_travel(block.travel, len(frames), "travel", after=so_far[-1:], falls=self._release)
+        checked = check_travel(travel, len(frames), "travel", after=so_far[-1:], falls=self._release)
         self._noise.look(frames)
-        return travel
+        return checked
 
 
 def check_stack(frames: NDArray[Any]) -> tuple[int, int]:
@@ -180,7 +183,7 @@ def find_onset(
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
-    search.push(Block(frames, index=0, travel=np.asarray(travel)))
+    search.push(frames, travel=travel)
     return search.result()
 
 
@@ -247,21 +250,20 @@ class OnsetSearch(Search):
         self._travel.clear()
         self._noise.reset()
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames.
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each; see `Estimator`.
 
         Raises
         ------
         mirrorskin.io.InputError
             Travel is missing, or runs back.
         """
-        frames, first = block.frames, self._travel.count
-        travel = self._accept(block, self._travel.latest)
-        self._travel.extend(travel)
+        first = self._travel.count
+        self._travel.extend(self._accept(frames, travel, self._travel.latest))
         for band in self._bands:
             if self._subframe:
                 self._prepare(band, frames[0] if first == 0 else None)
-            self._scan(band, block, first)
+            self._scan(band, frames, first, lent)
         self._sure_at = self._noise.value
 
     def result(self) -> Onset:
@@ -283,14 +285,14 @@ class OnsetSearch(Search):
             with band.resident():
                 self._launch(band, "onset_sure", band.stride, _SURELY * noise, "levels", "marks")
 
-    def _scan(self, band: Band, block: Block, first: int) -> None:
+    def _scan(self, band: Band, frames: NDArray[Any], first: int, lent: bool) -> None:
         # One frame alone tells no noise, and needs none: it is taken for dark.
         look = self._look(self._noise.value or 0.0)
         arguments: list[str | float | Operand] = ["marks", "closed", "busy", "times"]
         if self._subframe:
             arguments = [*arguments, "levels", *self._travel.arguments, *look, "samples", "answers", "status"]
         with band.resident():
-            for staged in band.stage(block.frames, block.lent):
+            for staged in band.stage(frames, lent):
                 part = staged.count, band.pixels, band.stride, first + staged.frames.start
                 known = staged.array, *part, *arguments
                 self._launch(band, "onset_scan", *known, frames=staged.count, aligned=staged.aligned)
@@ -397,11 +399,11 @@ def _trial(device: Device) -> Callable[[], None]:
     front = np.linspace(1, count, shape[0])[:, np.newaxis]
     for number, frame in enumerate(search.room[:count]):
         frame[:] = np.where(front <= number, 200, 20)
-    press = Block(search.room[:count], 0, travel=np.arange(count, dtype=np.float64))
+    press, travel = search.room[:count], np.arange(count, dtype=np.float64)
 
     def run() -> None:
         search.reset()
-        search.push(press)
+        search.push(press, travel=travel)
         device.finish()
 
     return run

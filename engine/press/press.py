@@ -100,7 +100,7 @@ def reconstruct_press(
     twice = False
     if isinstance(search, ChangePointSearch) and search.passes == 2:
         twice = True
-        search.rewind()
+        search.start_second_pass()
         feed(source, search, frames, progress)
     onset = search.result()
     process: dict[str, ProcessValue] = {

@@ -16,6 +16,7 @@ from mirrorskin import io
 from mirrorskin.cli import live
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import file, rig
 
@@ -97,7 +98,7 @@ def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
         header = recording.header
         search = OnsetSearch(SHAPE, "uint8", dark=header.dark, bright=header.bright)
         while (block := recording.read(np.empty((7, *SHAPE), np.uint8))) is not None:
-            search.push(block)
+            push_block(search, block)
     result = io.open_result(output)
     measured = result.filled == 0
     assert measured.sum() > 20

@@ -7,7 +7,6 @@ import pytest
 
 from mirrorskin.engine import OnsetSearch, autotune
 from mirrorskin.engine.press.onset import _trial
-from mirrorskin.io import Block
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
@@ -109,7 +108,7 @@ def test_both_shapes_give_the_same(device, monkeypatch, dtype):
     for shape in (CPU_LAYOUT, GPU_LAYOUT):
         monkeypatch.setattr(device, "layout", shape)
         search = OnsetSearch((13, 29), dtype, dark=10, bright=200, noise=8.0, device=device)
-        search.push(Block(frames, 0, travel=np.arange(70.0)))
+        search.push(frames, travel=np.arange(70.0))
         found.append(search.result())
     for name in ("height", "sigma", "status", "frame"):
         np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))

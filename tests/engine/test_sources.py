@@ -5,6 +5,7 @@ import pytest
 from presses import SPEC, random_press
 
 from mirrorskin import engine, io
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.kernels.device import open_device
 
 
@@ -63,7 +64,7 @@ def test_a_result_outlives_its_recording(tmp_path):
     recording = io.open_recording(tmp_path / "press.h5")
     search = engine.OnsetSearch((64, 64), "uint8", device=open_device())
     while (block := recording.read(search.room)) is not None:
-        search.push(block)
+        push_block(search, block)
     recording.close()
     (tmp_path / "press.h5").unlink()
     wanted = engine.find_onset(frames, source.travel)

@@ -6,7 +6,6 @@ import pytest
 from presses import SPEC, assert_equal, random_press
 
 from mirrorskin.engine import OnsetSearch, find_onset
-from mirrorskin.io import Block
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.errors import DeviceError
 
@@ -23,7 +22,7 @@ def test_less_room_gives_the_same_answer(small_device, limit):
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
     for start in range(0, 30, 4):
         part = slice(start, start + 4)
-        search.push(Block(FRAMES[part], start, travel=TRAVEL[part]))
+        search.push(FRAMES[part], travel=TRAVEL[part])
     assert_equal(search.result(), whole)
     assert_equal(search.result(), whole)
     assert (len(search._bands) > 1) == (limit < LARGEST)
@@ -44,7 +43,7 @@ def test_one_row_that_does_not_fit_is_said_so(small_device):
 def test_bands_leave_the_device_to_each_other(small_device):
     small_device.max_allocation = SMALLEST
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
-    search.push(Block(FRAMES, 0, travel=TRAVEL))
+    search.push(FRAMES, travel=TRAVEL)
     search.result()
     arrays = [
         array
@@ -73,7 +72,7 @@ def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     small_device.max_allocation = SMALLEST
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
     search.room[:30] = FRAMES
-    search.push(Block(search.room[:30], 0, travel=TRAVEL))
+    search.push(search.room[:30], travel=TRAVEL)
     small_device.max_allocation = 10**9
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=small_device))
 
@@ -99,7 +98,7 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     search = OnsetSearch(size, dtype, dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
     room = search.room.copy()
     for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
-        search.push(Block(placed[part], part.start, travel=travel[part], lent=True))
+        search.push(placed[part], travel=travel[part], lent=True)
     assert_equal(search.result(), find_onset(frames, travel, *SPEC[dtype], device=device))
     np.testing.assert_array_equal(search.room, room)  # nothing was copied there
 
@@ -115,7 +114,7 @@ def test_lent_frames_stay_until_their_kernels_are_done(device):
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
-        search.push(Block(lent(FRAMES[part], 64), start, travel=TRAVEL[part], lent=True))
+        search.push(lent(FRAMES[part], 64), travel=TRAVEL[part], lent=True)
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
 
 
@@ -124,7 +123,7 @@ def test_a_block_may_be_written_anew_after_it_was_pushed(device):
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
         block = FRAMES[part].copy()
-        search.push(Block(block, start, travel=TRAVEL[part]))
+        search.push(block, travel=TRAVEL[part])
         block[:] = 255 - block
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
 
@@ -135,5 +134,5 @@ def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
 
     monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
-    search.push(Block(lent(FRAMES, 64), 0, travel=TRAVEL, lent=True))
+    search.push(lent(FRAMES, 64), travel=TRAVEL, lent=True)
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))

@@ -33,6 +33,7 @@ from mirrorskin.engine.metrology.sections import step_height as engine_step_heig
 from mirrorskin.engine.metrology.texture import roughness as engine_roughness
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.rotation.rotation import correlate_source as engine_correlate_source
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.summary import summarise as engine_summarise
 
 HEIGHT: Tolerance = (1e-4, 1e-5)  # mm: single precision, and what solvers leave
@@ -222,7 +223,7 @@ def find_onset_block_by_block() -> Answer:
     dark, bright = level_maps("uint8", frames.shape[1:])
     search = engine.OnsetSearch(frames.shape[1:], frames.dtype, dark=dark, bright=bright)
     for block in blocks(frames, [1, 1, 3, 2, 7], travel=travel):
-        search.push(block)
+        push_block(search, block)
     return onset_maps(search.result())
 
 
@@ -262,10 +263,10 @@ def find_change_point_block_by_block() -> Answer:
     search = engine.ChangePointSearch(frames.shape[1:], frames.dtype)
     cut = blocks(frames, [2, 1, 6, 1], travel=travel)
     for block in cut:
-        search.push(block)
-    search.rewind()
+        push_block(search, block)
+    search.start_second_pass()
     for block in cut:
-        search.push(block)
+        push_block(search, block)
     return onset_maps(search.result())
 
 
@@ -344,7 +345,7 @@ def correlate_block_by_block() -> Answer:
         frames, phase = long_turn(dtype)
         correlator = engine.Correlator(frames.shape[1:], frames.dtype)
         for block in blocks(frames, [3, 1, 8, 5], phase=phase):
-            correlator.push(block)
+            push_block(correlator, block)
         answers[dtype] = wave_maps(correlator.result())
     return named(**answers)
 
@@ -356,7 +357,7 @@ def correlate_a_sliding_window() -> Answer:
         frames, phase = long_turn(dtype)
         correlator = engine.Correlator(frames.shape[1:], frames.dtype, window=10)
         for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
-            correlator.push(block)
+            push_block(correlator, block)
             answers[f"{dtype}_{number}"] = wave_maps(correlator.result())
     return named(**answers)
 
@@ -419,7 +420,7 @@ def estimate_normals_block_by_block() -> Answer:
             frames.shape[1:], frames.dtype, tilt=TILT, gain=3400.0, offset=150.0, per_turn=per_turn
         )
         for block in blocks(frames, [5, 1, 9, 3], phase=phase):
-            estimator.push(block)
+            push_block(estimator, block)
         answers["each" if per_turn else "mean"] = normal_maps(estimator.result())
     return named(**answers)
 

@@ -10,7 +10,6 @@ import pytest
 from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
-from mirrorskin.io.types import Block
 
 SHAPE = (5, 7)
 SOON = 5.0  # seconds, that nothing here takes
@@ -276,7 +275,7 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
     frames[17:, 2:7, 3:11] += 150
     travel = np.linspace(0.0, 2.0, count)
     whole = OnsetSearch(shape, np.uint8, device=device)
-    whole.push(Block(frames, 0, travel=travel))
+    whole.push(frames, travel=travel)
     ring = Ring(shape, np.uint8, 6)
     search = OnsetSearch(shape, np.uint8, device=device)
     sent = done = 0
@@ -288,7 +287,7 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
         while done < stop:
             taken = ring.take(2, SOON)
             part = slice(done, done + len(taken.pixels))
-            search.push(Block(taken.pixels, done, travel=travel[part], lent=True))
+            search.push(taken.pixels, travel=travel[part], lent=True)
             done = part.stop
             ring.slot()[...] = 255  # a kernel that is still at work must not see it
     for name in ("height", "status", "frame"):

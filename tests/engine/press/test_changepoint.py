@@ -11,7 +11,7 @@ from stacks import MadeUp, ball
 
 from mirrorskin import engine, io
 from mirrorskin.engine import ChangePointSearch, find_change_point, find_onset
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)
 
@@ -23,14 +23,14 @@ def uneven_travel(count, start=0.0):
 def push_all(search, frames, travel, cuts):
     for part in np.split(np.arange(len(frames)), cuts):
         if len(part):
-            search.push(Block(frames[part], index=int(part[0]), travel=travel[part]))
+            search.push(frames[part], travel=travel[part])
 
 
 def search_in_blocks(frames, travel, cuts, device, **options):
     search = ChangePointSearch(frames.shape[1:], frames.dtype, device=device, **options)
     push_all(search, frames, travel, cuts)
     if search.passes == 2:
-        search.rewind()
+        search.start_second_pass()
         push_all(search, frames, travel, cuts)
     return search.result()
 
@@ -145,7 +145,7 @@ def test_less_room_gives_the_same_answer(small_device, limit, known):
     assert (len(search._bands) > 1) == (limit < 23 * 31 * 25)
     push_all(search, frames, travel, range(4, 30, 4))
     if not known:
-        search.rewind()
+        search.start_second_pass()
         push_all(search, frames, travel, range(5, 30, 5))
     assert_equal(search.result(), whole)
     assert_equal(search.result(), whole)
@@ -342,7 +342,7 @@ def test_results_on_the_way_change_nothing(device):
     frames, travel = random_press("uint8", 30, (9, 13), seed=7), uneven_travel(30)
     search = ChangePointSearch((9, 13), frames.dtype, dark=20, bright=220, noise=1.5, device=device)
     for number in range(30):
-        search.push(Block(frames[number : number + 1], number, travel=travel[number : number + 1]))
+        search.push(frames[number : number + 1], travel=travel[number : number + 1])
         if number:
             so_far = slice(0, number + 1)
             expected = find_change_point(frames[so_far], travel[so_far], 20, 220, noise=1.5, device=device)
@@ -358,7 +358,7 @@ def test_a_search_can_be_used_again(device, known):
         search.reset()
         push_all(search, frames, uneven_travel(20), [])
         if not known:
-            search.rewind()
+            search.start_second_pass()
             push_all(search, frames, uneven_travel(20), [])
     assert_equal(search.result(), find_change_point(second, uneven_travel(20), **options))
 
@@ -372,7 +372,7 @@ def test_frames_read_into_the_room_are_not_copied(device):
     for start in range(0, 20, 6):
         count = min(6, 20 - start)
         search.room[:count] = frames[start : start + count]
-        search.push(Block(search.room[:count], start, travel=np.arange(20.0)[start : start + count]))
+        search.push(search.room[:count], travel=np.arange(20.0)[start : start + count])
     assert_equal(search.result(), find_change_point(frames, np.arange(20.0), 20, 220, device=device))
 
 
@@ -407,23 +407,23 @@ def test_a_block_of_other_frames_is_refused():
     search = ChangePointSearch((4, 5), np.uint8)
     for frames in (np.zeros((2, 4, 4), np.uint8), np.zeros((2, 4, 5), np.uint16), np.zeros((0, 4, 5), "u1")):
         with pytest.raises(InputError, match="expected uint8"):
-            search.push(Block(frames, 0, travel=np.arange(len(frames)) * 0.1))
+            search.push(frames, travel=np.arange(len(frames)) * 0.1)
 
 
 def test_passes_that_do_not_match_are_refused():
     frames = random_press("uint8", 8, (4, 5))
     search = ChangePointSearch((4, 5), np.uint8)
     with pytest.raises(InputError, match="0 frames has no change-point"):
-        search.rewind()
+        search.start_second_pass()
     push_all(search, frames, np.arange(8.0), [])
     with pytest.raises(InputError, match="needs all frames twice: give dark and bright"):
         search.result()
-    search.rewind()
+    search.start_second_pass()
     push_all(search, frames[:7], np.arange(7.0), [])
     with pytest.raises(InputError, match="needs all frames twice"):
         search.result()
     with pytest.raises(InputError, match="more frames in the second pass"):
-        search.push(Block(frames[:2], 7, travel=np.array([7.0, 8.0])))
+        search.push(frames[:2], travel=np.array([7.0, 8.0]))
 
 
 TRAVEL = 0.1 * np.arange(1, 31)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import OnsetSearch
-from mirrorskin.io import Block
 from mirrorskin.kernels import onset as reference
 
 SHAPE = (61, 67)
@@ -36,7 +35,7 @@ def test_levels_are_those_of_the_reference(device, dtype, threshold, event):
     )
     (band,) = search._bands
     known = band.maps["levels"].download().copy()[:, : band.pixels].reshape(2, *SHAPE)
-    search.push(Block(np.zeros((1, *SHAPE), dtype), 0, travel=np.zeros(1)))  # looks for what is surely dark
+    search.push(np.zeros((1, *SHAPE), dtype), travel=np.zeros(1))  # looks for what is surely dark
     for name in ("marks", "closed"):
         band.maps[name].download()
     level, plateau, light = reference.onset_levels(

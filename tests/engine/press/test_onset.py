@@ -13,7 +13,7 @@ from presses import (
 )
 
 from mirrorskin.engine import OnsetSearch, find_onset
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 from mirrorskin.kernels.layout import CPU_LAYOUT
 
 DTYPES = sorted(SPEC)
@@ -30,7 +30,7 @@ def search_in_blocks(frames, travel, cuts, device, **options):
     search = OnsetSearch(frames.shape[1:], frames.dtype, device=device, **options)
     for part in np.split(np.arange(len(frames)), cuts):
         if len(part):
-            search.push(Block(frames[part], index=int(part[0]), travel=travel[part]))
+            search.push(frames[part], travel=travel[part])
     return search.result()
 
 
@@ -253,7 +253,7 @@ def test_results_on_the_way_change_nothing(device):
     whole = find_onset(frames, travel, 20, 220, noise=1.5, device=device)
     search = OnsetSearch((9, 13), frames.dtype, dark=20, bright=220, noise=1.5, device=device)
     for number in range(30):
-        search.push(Block(frames[number : number + 1], number, travel=travel[number : number + 1]))
+        search.push(frames[number : number + 1], travel=travel[number : number + 1])
         part = search.result()
         so_far = (
             find_onset(frames[: number + 1], travel[: number + 1], 20, 220, noise=1.5, device=device)
@@ -269,9 +269,9 @@ def test_a_search_can_be_used_again(device):
     first, second = (random_press("uint8", 20, (9, 13), seed=seed) for seed in (1, 2))
     travel = uneven_travel(20)
     search = OnsetSearch((9, 13), first.dtype, device=device)
-    search.push(Block(first, 0, travel=travel))
+    search.push(first, travel=travel)
     search.reset()
-    search.push(Block(second, 0, travel=travel))
+    search.push(second, travel=travel)
     assert_equal(search.result(), find_onset(second, travel, device=device))
 
 
@@ -283,7 +283,7 @@ def test_frames_read_into_the_room_are_not_copied(device):
     for start in range(0, 20, 6):
         count = min(6, 20 - start)
         search.room[:count] = frames[start : start + count]
-        search.push(Block(search.room[:count], start, travel=travel[start : start + count]))
+        search.push(search.room[:count], travel=travel[start : start + count])
     assert_equal(search.result(), find_onset(frames, travel, device=device))
 
 
@@ -321,9 +321,9 @@ def test_bad_input_is_refused(change, words):
 def test_travel_must_not_run_back_between_blocks():
     search = OnsetSearch((3, 3), np.dtype(np.uint8))
     frames = np.zeros((2, 3, 3), np.uint8)
-    search.push(Block(frames, 0, travel=np.array([0.0, 1.0])))
+    search.push(frames, travel=np.array([0.0, 1.0]))
     with pytest.raises(InputError, match="runs back at frame 0"):
-        search.push(Block(frames, 2, travel=np.array([0.5, 2.0])))
+        search.push(frames, travel=np.array([0.5, 2.0]))
 
 
 def test_travel_may_pause(device):
@@ -336,7 +336,7 @@ def test_travel_may_pause(device):
 
 def test_one_frame_is_no_press():
     search = OnsetSearch((3, 3), np.dtype(np.uint8))
-    search.push(Block(np.zeros((1, 3, 3), np.uint8), 0, travel=np.array([0.0])))
+    search.push(np.zeros((1, 3, 3), np.uint8), travel=np.array([0.0]))
     with pytest.raises(InputError, match="1 frames has no onset"):
         search.result()
 
@@ -386,7 +386,7 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
 def test_a_block_of_other_frames_is_refused(frames):
     search = OnsetSearch((4, 5), np.dtype(np.uint8))
     with pytest.raises(InputError, match="expected uint8"):
-        search.push(Block(frames, 0, travel=np.arange(len(frames)) * 0.1))
+        search.push(frames, travel=np.arange(len(frames)) * 0.1)
 
 
 def test_thresholds_that_binary_cannot_hold_are_met():
@@ -400,7 +400,7 @@ def test_thresholds_that_binary_cannot_hold_are_met():
 
 def test_types_may_be_given_as_numpy_knows_them():
     search = OnsetSearch((4, 5), np.uint16)
-    search.push(Block(np.zeros((2, 4, 5), np.uint16), 0, travel=np.arange(2.0)))
+    search.push(np.zeros((2, 4, 5), np.uint16), travel=np.arange(2.0))
     assert np.all(search.result().status == 2)
 
 
@@ -555,10 +555,10 @@ def test_nothing_is_left_of_the_press_before(device):
     frames[[0, 1]], frames[6:] = 200, 124
     travel = np.arange(40) * 0.1
     search = OnsetSearch((1, 1), np.uint8, dark=20, bright=220, hold=5, noise=1.5, device=device)
-    search.push(Block(before, 0, travel=travel))
+    search.push(before, travel=travel)
     search.reset()
     for part in (slice(0, 2), slice(2, 12)):
-        search.push(Block(frames[part], part.start, travel=travel[part]))
+        search.push(frames[part], travel=travel[part])
     expected = numpy_onset(frames, travel[:12], 20, 220, noise=1.5, hold=5)
     assert_within_an_ulp(search.result(), expected, travel[:12])
 

@@ -13,7 +13,7 @@ from presses import (
 )
 
 from mirrorskin.engine import OnsetSearch, find_onset
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)
 ODD, EVEN = (33, 61), (32, 64)  # pixels: a frame of the latter is whole words
@@ -39,7 +39,7 @@ def search_in_blocks(frames, travel, cuts, device, **options):
     search = OnsetSearch(frames.shape[1:], frames.dtype, event="release", device=device, **options)
     for part in np.split(np.arange(len(frames)), cuts):
         if len(part):
-            search.push(Block(frames[part], index=int(part[0]), travel=travel[part]))
+            search.push(frames[part], travel=travel[part])
     return search.result()
 
 
@@ -128,7 +128,7 @@ def test_less_room_gives_the_same_answer(small_device):
     assert len(search._bands) > 1
     for start in range(0, 30, 4):
         part = slice(start, start + 4)
-        search.push(Block(frames[part], start, travel=travel[part]))
+        search.push(frames[part], travel=travel[part])
     assert_equal(search.result(), whole)
 
 
@@ -269,7 +269,7 @@ def test_results_on_the_way_change_nothing(device):
     known = {"dark": 20, "bright": 220, "noise": 1.5, "device": device, **RELEASE}
     search = OnsetSearch((9, 13), frames.dtype, **known)
     for number in range(30):
-        search.push(Block(frames[number : number + 1], number, travel=travel[number : number + 1]))
+        search.push(frames[number : number + 1], travel=travel[number : number + 1])
         part = search.result()
         if number:
             assert_equal(part, find_onset(frames[: number + 1], travel[: number + 1], **known))
@@ -279,9 +279,9 @@ def test_a_search_can_be_used_again(device):
     first, second = (random_release("uint8", 20, (9, 13), seed=seed) for seed in (1, 2))
     travel = uneven_rise(20)
     search = OnsetSearch((9, 13), first.dtype, device=device, **RELEASE)
-    search.push(Block(first, 0, travel=travel))
+    search.push(first, travel=travel)
     search.reset()
-    search.push(Block(second, 0, travel=travel))
+    search.push(second, travel=travel)
     assert_equal(search.result(), find_onset(second, travel, device=device, **RELEASE))
 
 
@@ -363,6 +363,6 @@ def test_an_unknown_event_is_refused():
 def test_travel_must_not_run_back_between_blocks():
     search = OnsetSearch((3, 3), np.dtype(np.uint8), event="release")
     frames = np.zeros((2, 3, 3), np.uint8)
-    search.push(Block(frames, 0, travel=np.array([1.0, 0.0])))
+    search.push(frames, travel=np.array([1.0, 0.0]))
     with pytest.raises(InputError, match="runs back at frame 0: a release only goes up"):
-        search.push(Block(frames, 2, travel=np.array([0.5, 0.2])))
+        search.push(frames, travel=np.array([0.5, 0.2]))

@@ -7,7 +7,7 @@ from presses import SPEC, assert_equal, random_press
 from ramps import NOISES, ramps, rms
 
 from mirrorskin.engine import ChangePointSearch, find_change_point
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)
 RELEASE = {"event": "release"}
@@ -25,9 +25,9 @@ def search_in_blocks(frames, travel, cuts, device, **options):
     search = ChangePointSearch(frames.shape[1:], frames.dtype, device=device, **RELEASE, **options)
     for turn in range(search.passes):
         if turn:
-            search.rewind()
+            search.start_second_pass()
         for part in np.split(np.arange(len(frames)), cuts):
-            search.push(Block(frames[part], index=int(part[0]), travel=travel[part]))
+            search.push(frames[part], travel=travel[part])
     return search.result()
 
 
