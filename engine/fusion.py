@@ -75,7 +75,7 @@ def fuse(
     The surface is the one that fits the slopes of the normals and the known heights best, each weighed by
     its inverse variance; see ``mirrorskin.engine.integrate``. A height is known to lie in the interval
     between two frames. That is more than its standard deviation says: once a first surface is there, heights
-    inside their intervals pull no more, and those at the ends do; see `mirrorskin.engine.press.interval`.
+    inside their intervals pull no more, and those at the ends do; see `mirrorskin.engine.press.intervals`.
 
     Where there is a height but no normal, the height is the press's own; near normals it gets the slope of
     the smooth surface that fits what is around, if one does. Where there is a normal but no height, slopes

@@ -13,8 +13,7 @@ from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.holes import fill_holes
-from mirrorskin.engine.press.interval import find_spread, look_inside
-from mirrorskin.engine.press.trend import find_trend
+from mirrorskin.engine.press.intervals import find_spread, find_trend, look_inside
 from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device

@@ -7,8 +7,14 @@ import pytest
 from contact_theory import Pressed, cone, paraboloid, rectangle_responses, sphere
 
 from mirrorskin.engine import NotConverged
-from mirrorskin.engine.press.elastic import correct_onset, correct_press, threshold_at
-from mirrorskin.engine.press.elastic_grid import Splines, cut_into_cells, touched
+from mirrorskin.engine.press.elastic import (
+    Splines,
+    correct_onset,
+    correct_press,
+    cut_into_cells,
+    threshold_at,
+    touched,
+)
 from mirrorskin.engine.press.halfspace import HalfSpace, press
 from mirrorskin.hw.twin import Body, visible_zenith
 from mirrorskin.io import Gel, InputError, Result, pixel_axes

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mirrorskin.engine.press.interval import Spread, find_spread, look_inside
+from mirrorskin.engine.press.intervals import Spread, find_spread, look_inside
 
 
 def log_likelihood(height, middle, half, blur):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.press.trend import find_trend
+from mirrorskin.engine.press.intervals import find_trend
 
 ROWS, COLUMNS = np.mgrid[:30, :40].astype(float)
 

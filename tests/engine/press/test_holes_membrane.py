@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.press.membrane import stretch
+from mirrorskin.engine.press.holes import stretch
 
 
 def a_hole(shape, radius):
