@@ -1,0 +1,39 @@
+from .errors import NotConverged
+from .fusion import fuse
+from .integration.integration import Integrator, integrate
+from .integration.surface import Surface
+from .metrology.measures import Measures, measure
+from .press.changepoint import ChangePointSearch, find_change_point
+from .press.holes import fill_holes
+from .press.onset import Onset, OnsetSearch, find_onset
+from .reconstruction import reconstruct
+from .rotation.correlation import Correlation, Correlator, correlate
+from .rotation.edges import find_edges
+from .rotation.normals import NormalEstimator, Normals, estimate_normals
+from .scoring import Score, score
+
+__all__ = [
+    "ChangePointSearch",
+    "Correlation",
+    "Correlator",
+    "Integrator",
+    "Measures",
+    "NormalEstimator",
+    "Normals",
+    "NotConverged",
+    "Onset",
+    "OnsetSearch",
+    "Score",
+    "Surface",
+    "correlate",
+    "estimate_normals",
+    "fill_holes",
+    "find_change_point",
+    "find_edges",
+    "find_onset",
+    "fuse",
+    "integrate",
+    "measure",
+    "reconstruct",
+    "score",
+]
