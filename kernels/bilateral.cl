@@ -7,6 +7,8 @@
 // first of a row, and the one above the first row, may be any of those. PoCL makes vector code of loops without
 // branches, calls and sums.
 
+#include "common.clh"
+
 #define RIGHT 1
 #define DOWN 2
 #define SHARE 1e-6f
@@ -18,9 +20,6 @@
 #define CHUNK 256
 #endif
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define MAP __global const float *restrict
-#define OUT __global float *restrict
 #define SIZE const int rows, const int columns
 #define SLOPES __global const uchar *restrict flags, MAP slope_x, MAP slope_y
 

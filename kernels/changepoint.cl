@@ -5,6 +5,7 @@
 // TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define INVALID -2
 #define DECIDED INT_MAX
@@ -51,8 +52,8 @@ int excess_of_noise(const float quiet, const float gain)
 
 __kernel void changepoint_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int first,
-    const int level, const int least, const float quiet, __global const float *restrict dark,
-    __global const float *restrict gain, __global int *restrict start, __global int *restrict excess,
+    const int level, const int least, const float quiet, MAP dark,
+    MAP gain, __global int *restrict start, __global int *restrict excess,
     __global int *restrict below, __global FRAME *restrict ring)
 {
     const int base = get_global_id(0) * TILE;
@@ -105,39 +106,28 @@ __kernel void changepoint_scan(
     }
 }
 
-// Sums are held as two floats, so that they are as good as in float64 without it (Knuth, TAOCP 2, 4.2.2).
-
-float2 add(const float2 sum, const float2 more)
-{
-    const float high = sum.x + more.x;
-    const float part = high - sum.x;
-    const float low = ((sum.x - (high - part)) + (more.x - part)) + (sum.y + more.y);
-    const float whole = high + low;
-    return (float2)(whole, low - (whole - high));
-}
-
 __kernel void changepoint_sum(
-    __global const FRAME *restrict frames, const int count, const int pixels, __global float *restrict total,
-    __global float *restrict total_rest)
+    __global const FRAME *restrict frames, const int count, const int pixels, OUT total,
+    OUT total_rest)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);
     for (int t = 0; t < count; ++t) {
         __global const FRAME *restrict frame = frames + (size_t)t * pixels;
         for (int p = base; p < end; ++p) {
-            const float2 sum = add((float2)(total[p], total_rest[p]), (float2)((float)frame[p], 0));
-            total[p] = sum.x;
-            total_rest[p] = sum.y;
+            const Pair sum = settle(plus((Pair){total[p], total_rest[p]}, (Pair){(float)frame[p], 0}));
+            total[p] = sum.high;
+            total_rest[p] = sum.rest;
         }
     }
 }
 
 __kernel void changepoint_split(
     __global const FRAME *restrict frames, const int count, const int pixels, const int first,
-    __global const float *restrict mean, __global const float *restrict mean_rest,
-    __global const float *restrict weight, __global float *restrict total,
-    __global float *restrict total_rest, __global int *restrict start, __global int *restrict since,
-    __global float *restrict score, __global FRAME *restrict ring)
+    MAP mean, MAP mean_rest,
+    MAP weight, OUT total,
+    OUT total_rest, __global int *restrict start, __global int *restrict since,
+    OUT score, __global FRAME *restrict ring)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);
@@ -147,12 +137,12 @@ __kernel void changepoint_split(
         __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels;
         for (int p = base; p < end; ++p) {
             const FRAME sample = frame[p];
-            const float2 deviation = add((float2)((float)sample, 0), (float2)(-mean[p], -mean_rest[p]));
-            const float2 sum = add((float2)(total[p], total_rest[p]), deviation);
-            total[p] = sum.x;
-            total_rest[p] = sum.y;
+            const Pair deviation = settle(minus((Pair){(float)sample, 0}, (Pair){mean[p], mean_rest[p]}));
+            const Pair sum = settle(plus((Pair){total[p], total_rest[p]}, deviation));
+            total[p] = sum.high;
+            total_rest[p] = sum.rest;
 
-            const float found = -sum.x * weight[number + 1];
+            const float found = -sum.high * weight[number + 1];
             const int better = found > score[p];
             since[p] = (better & (number - start[p] > REACH)) ? number : since[p];
             start[p] = better ? number + 1 : start[p];
@@ -355,10 +345,10 @@ float2 travel_at(
 __kernel void changepoint_heights(
     const int pixels, const int count, __global const int *restrict start,
     __global const int *restrict excess, __global const int *restrict below,
-    __global const int *restrict since, __global const float *restrict dark,
-    __global const float *restrict gain, __global const FRAME *restrict ring,
+    __global const int *restrict since, MAP dark,
+    MAP gain, __global const FRAME *restrict ring,
     __global const float2 *restrict travel, const float noise, const float quiet, const float level,
-    const int own, __global float *restrict height, __global float *restrict sigma,
+    const int own, OUT height, OUT sigma,
     __global uchar *restrict status)
 {
     const int base = get_global_id(0) * TILE;

@@ -7,6 +7,7 @@
 // PoCL makes vector code of loops without branches.
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define SLOPE 4
 #define KNOWN 8
@@ -18,7 +19,6 @@
 #define CHUNK 256
 #endif
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
 #define ANSWERED(p) (flags[p] & (SLOPE | KNOWN))
 #define RISEN(p, column) (relief[p] + (start + plane_x * (column)))
 
@@ -42,10 +42,10 @@ float chosen(const int which, const float one, const float other)
 #else
 #define VALUE(p, column) (RISEN(p, column) - heights[p])
 #if HEIGHTS == 1
-#define HEIGHT_MAPS __global const float *restrict heights,
+#define HEIGHT_MAPS MAP heights,
 #define SHARE(p) ((flags[p] & KNOWN) ? 1.0f : 0.0f)
 #else
-#define HEIGHT_MAPS __global const float *restrict heights, __global const float *restrict height_weights,
+#define HEIGHT_MAPS MAP heights, MAP height_weights,
 #define SHARE(p) chosen(flags[p] & KNOWN, height_weights[p], 0.0f)
 #endif
 #endif
@@ -59,8 +59,8 @@ float chosen(const int which, const float one, const float other)
 // Each item sums over its rows, into its own row of the sums.
 __kernel void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    __global const float *restrict relief, const float plane_x, const float plane_y, const float plane_z,
-    HEIGHT_MAPS const int strip, const int pieces, __global float *restrict sums, __global float *restrict totals)
+    MAP relief, const float plane_x, const float plane_y, const float plane_z,
+    HEIGHT_MAPS const int strip, const int pieces, OUT sums, OUT totals)
 {
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;
@@ -102,8 +102,8 @@ __kernel void components_sum(
 
 __kernel void components_settle(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    __global const float *restrict relief, const float plane_x, const float plane_y, const float plane_z,
-    __global const float *restrict offsets, __global float *restrict height)
+    MAP relief, const float plane_x, const float plane_y, const float plane_z,
+    MAP offsets, OUT height)
 {
     const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int row = item / pieces, begin = item % pieces * CHUNK, end = LESSER(columns, begin + CHUNK);
@@ -118,8 +118,8 @@ __kernel void components_settle(
 
 // What brings the mean of each piece to 0.
 __kernel void components_level(
-    const int strips, const int count, __global const float *restrict sums, __global const float *restrict totals,
-    __global float *restrict offsets)
+    const int strips, const int count, MAP sums, MAP totals,
+    OUT offsets)
 {
     const int piece = get_global_id(0);
     if (piece >= count) return;

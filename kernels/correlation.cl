@@ -6,6 +6,7 @@
 // TILE   pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define WINDOW 64  // frames whose sums fit into Narrow
 #define CHUNK (TILE < 256 ? TILE : 256)  // pixels whose sums stay in a core's nearest memory
@@ -99,60 +100,6 @@ __kernel void correlation_add(
 }
 #endif
 
-// --- Numbers as sums of two floats (Knuth, TAOCP 2, 4.2.2; Dekker, Numerische Mathematik 18, 1971) ----------------
-
-typedef struct {
-    float high, rest;
-} Pair;
-
-// The same number, with as much of it as possible in the first float; the second one must not be greater.
-Pair settle(const Pair a)
-{
-    const float sum = a.high + a.rest;
-    return (Pair){sum, a.rest - (sum - a.high)};
-}
-
-// Of settled numbers or a few sums and products of such; not settled itself.
-Pair plus(const Pair a, const Pair b)
-{
-    const float sum = a.high + b.high, part = sum - a.high;
-    return (Pair){sum, ((a.high - (sum - part)) + (b.high - part)) + (a.rest + b.rest)};
-}
-
-Pair minus(const Pair a, const Pair b) { return plus(a, (Pair){-b.high, -b.rest}); }
-
-// What a product of floats lacks. The library's fma is a call on some processors, the compiler's is not.
-#if defined(FP_FAST_FMAF)
-float lack(const float product, const float a, const float b) { return fma(a, b, -product); }
-#elif defined(__FMA__)
-float lack(const float product, const float a, const float b) { return __builtin_fmaf(a, b, -product); }
-#else
-float upper(const float a)
-{
-    const float big = 4097 * a;
-    return big - (big - a);
-}
-
-// Halves of floats have exact products.
-float lack(const float product, const float a, const float b)
-{
-    const float a1 = upper(a), a2 = a - a1, b1 = upper(b), b2 = b - b1;
-    return ((a1 * b1 - product) + a1 * b2 + a2 * b1) + a2 * b2;
-}
-#endif
-
-Pair times(const Pair a, const Pair b)
-{
-    const float product = a.high * b.high;
-    return (Pair){product, lack(product, a.high, b.high) + (a.high * b.rest + a.rest * b.high)};
-}
-
-Pair product(const float a, const float b)
-{
-    const float product = a * b;
-    return (Pair){product, lack(product, a, b)};
-}
-
 // --- Sums of some pixels' samples less their references -----------------------------------------------------------
 
 enum { TOTAL, COSINE, SINE, SQUARE, SUMS };
@@ -215,11 +162,11 @@ void add(
 {
     for (int p = 0; p < width; ++p) {
         const float sample = (float)frame[p] - sums->reference[p];
-        SET(sums, TOTAL, p, settle(plus(GET(sums, TOTAL, p), product(weight, sample))))
-        SET(sums, COSINE, p, settle(plus(GET(sums, COSINE, p), product(cosine, sample))))
-        SET(sums, SINE, p, settle(plus(GET(sums, SINE, p), product(sine, sample))))
-        const Pair square = product(sample, sample);
-        Pair part = product(weight, square.high);
+        SET(sums, TOTAL, p, settle(plus(GET(sums, TOTAL, p), product_of(weight, sample))))
+        SET(sums, COSINE, p, settle(plus(GET(sums, COSINE, p), product_of(cosine, sample))))
+        SET(sums, SINE, p, settle(plus(GET(sums, SINE, p), product_of(sine, sample))))
+        const Pair square = product_of(sample, sample);
+        Pair part = product_of(weight, square.high);
         part.rest += weight * square.rest;
         SET(sums, SQUARE, p, settle(plus(GET(sums, SQUARE, p), part)))
     }
@@ -227,22 +174,12 @@ void add(
 
 // --- The fit that sums tell ---------------------------------------------------------------------------------------
 
-// The library's square root keeps a loop from becoming vector code on some processors.
-float root(const float x)
-{
-    float inverse = as_float(0x5f375a86 - (as_int(x) >> 1));
-    inverse *= 1.5f - 0.5f * x * inverse * inverse;
-    inverse *= 1.5f - 0.5f * x * inverse * inverse;
-    inverse *= 1.5f - 0.5f * x * inverse * inverse;
-    return x * inverse;
-}
-
 #define FIT(i) ((Pair){fit[i], fit[9 + (i)]})
 #define ROW(i) settle(plus(plus(times(FIT(3 * i), a), times(FIT(3 * i + 1), b)), times(FIT(3 * i + 2), c)))
 
 void solve(
-    const Sums *restrict sums, const int width, __global const float *restrict fit, __global float *restrict mean,
-    __global float *restrict cosine, __global float *restrict sine, __global float *restrict residual)
+    const Sums *restrict sums, const int width, MAP fit, OUT mean,
+    OUT cosine, OUT sine, OUT residual)
 {
     for (int p = 0; p < width; ++p) {
         const Pair a = GET(sums, TOTAL, p), b = GET(sums, COSINE, p), c = GET(sums, SINE, p);
@@ -262,8 +199,8 @@ void solve(
 __kernel void correlation_solve_counts(
     const int pixels, const int frames, const long cosines, const long sines, __global const Sum *restrict total,
     __global const Sum *restrict cosine, __global const Sum *restrict sine, __global const Sum *restrict square,
-    __global const float *restrict fit, __global float *restrict mean, __global float *restrict cosine_part,
-    __global float *restrict sine_part, __global float *restrict residual)
+    MAP fit, OUT mean, OUT cosine_part,
+    OUT sine_part, OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -279,7 +216,7 @@ __kernel void correlation_solve_counts(
 
 __kernel void correlation_convert(
     const int pixels, const int frames, const long cosines, const long sines, const float unit,
-    __global float *restrict reference, __global Sum *restrict total, __global Sum *restrict cosine,
+    OUT reference, __global Sum *restrict total, __global Sum *restrict cosine,
     __global Sum *restrict sine, __global Sum *restrict square)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
@@ -305,7 +242,7 @@ __kernel void correlation_convert(
 #define FLOAT2(sums, k, p) (float2)((sums).high[k][p], (sums).rest[k][p])
 
 void load(
-    Sums *restrict sums, const int width, __global const float *restrict reference,
+    Sums *restrict sums, const int width, MAP reference,
     __global const float2 *restrict total, __global const float2 *restrict cosine,
     __global const float2 *restrict sine, __global const float2 *restrict square)
 {
@@ -320,7 +257,7 @@ void load(
 
 __kernel void correlation_sum(
     __global const FRAME *restrict frames, const int count, const int pixels, const int fresh,
-    __global const int *restrict place, __global const float *restrict basis, __global float *restrict reference,
+    __global const int *restrict place, MAP basis, OUT reference,
     __global float2 *restrict total, __global float2 *restrict cosine, __global float2 *restrict sine,
     __global float2 *restrict square)
 {
@@ -346,10 +283,10 @@ __kernel void correlation_sum(
 }
 
 __kernel void correlation_solve_pairs(
-    const int pixels, __global const float *restrict reference, __global const float2 *restrict total,
+    const int pixels, MAP reference, __global const float2 *restrict total,
     __global const float2 *restrict cosine, __global const float2 *restrict sine,
-    __global const float2 *restrict square, __global const float *restrict fit, __global float *restrict mean,
-    __global float *restrict cosine_part, __global float *restrict sine_part, __global float *restrict residual)
+    __global const float2 *restrict square, MAP fit, OUT mean,
+    OUT cosine_part, OUT sine_part, OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -374,9 +311,9 @@ __kernel void correlation_keep(
 
 __kernel void correlation_window(
     __global const FRAME *restrict ring, const int count, const int pixels, const int stride,
-    __global const int *restrict place, __global const float *restrict basis, __global const float *restrict fit,
-    __global float *restrict mean, __global float *restrict cosine, __global float *restrict sine,
-    __global float *restrict residual)
+    __global const int *restrict place, MAP basis, MAP fit,
+    OUT mean, OUT cosine, OUT sine,
+    OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {

@@ -244,12 +244,12 @@ class Device:
             return self._programs[file, options]
 
     def _build(self, file: str, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
-        source = resources.files("mirrorskin.kernels").joinpath(f"{file}.cl").read_text(encoding="utf-8")
+        source = _read_source(f"{file}.cl")
         start = time.perf_counter()
         try:
             program: cl.Program = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
-            raise DeviceError(_explain_build(f"{file}.cl", source, str(error), self.info)) from error
+            raise DeviceError(_explain_build(f"{file}.cl", str(error), self.info)) from error
         self.profile.add("compile", file, time.perf_counter() - start)
         defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
         return program, read_signatures(source, defines)
@@ -421,13 +421,23 @@ def _open(device: cl.Device) -> Device:
     return Device(device)
 
 
-def _explain_build(file: str, source: str, log: str, info: DeviceInfo) -> str:
+def _read_source(name: str) -> str:
+    """Return a file of kernels, with the files that it includes: so all of it is the key of compiled kernels."""
+    text = resources.files("mirrorskin.kernels").joinpath(name).read_text(encoding="utf-8")
+    lines = [f'#line 1 "{name}"']
+    for number, line in enumerate(text.splitlines(), 1):
+        included = re.fullmatch(r'#include "(\w+\.clh)"', line)
+        lines += [_read_source(included[1]), f'#line {number + 1} "{name}"'] if included else [line]
+    return "\n".join(lines) + "\n"
+
+
+def _explain_build(file: str, log: str, info: DeviceInfo) -> str:
     """Quote the first line that a compiler complains of, in one line."""
-    found = re.search(r":(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
+    found = re.search(r"(\w+\.clh?):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
     if found is None:
         errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
         return f"{file} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
-    number, message = int(found[1]), found[3].strip()
-    lines = source.splitlines()
+    file, number, message = found[1], int(found[2]), found[4].strip()
+    lines = resources.files("mirrorskin.kernels").joinpath(file).read_text(encoding="utf-8").splitlines()
     quoted = f" `{lines[number - 1].strip()}`" if 0 < number <= len(lines) else ""
     return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"

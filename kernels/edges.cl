@@ -12,6 +12,8 @@
 // Cells are six planes (x, y, z, variance, share known, 1 where no line is drawn), with a margin so that no pair leaves
 // them. PoCL makes vector code of loops over pixels without calls, branches and loops inside.
 
+#include "common.clh"
+
 #define WAYS 8
 #define MARGIN 10
 #define LINES 3
@@ -21,9 +23,6 @@
 #else
 #define CHUNK 64
 #endif
-
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
 
 #define EACH_PIXEL                                                                               \
     const int begin = (int)get_global_id(0) * TILE, all = rows * columns;                        \
@@ -48,8 +47,8 @@ __kernel void edges_clean(
 
 // One item a row, of the cells with their margin.
 __kernel void edges_cells(
-    const int rows, const int columns, __global const float *restrict vectors, __global const float *restrict sigma,
-    __global const uchar *restrict contact, __global const uchar *restrict clean, __global float *restrict cells)
+    const int rows, const int columns, MAP vectors, MAP sigma,
+    __global const uchar *restrict contact, __global const uchar *restrict clean, OUT cells)
 {
     const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     if (y >= rows + 2 * MARGIN) return;
@@ -75,8 +74,8 @@ __kernel void edges_cells(
 
 // One item a row, of the cells with their margin.
 __kernel void edges_join(
-    const int rows, const int columns, __global const float *restrict cells, __global const uchar *restrict edges,
-    __global float *restrict joined)
+    const int rows, const int columns, MAP cells, __global const uchar *restrict edges,
+    OUT joined)
 {
     const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     if (y >= rows + 2 * MARGIN) return;
@@ -100,9 +99,9 @@ __kernel void edges_join(
 #ifdef SPACING
 // Runs of CHUNK pixels of a row, one an item.
 __kernel void edges_jumps(
-    const int rows, const int columns, __global const float *restrict cells, __global const int *restrict places,
-    __global const float *restrict distances, const float jump, const float bend, const float sure, const float quiet,
-    const float floor_, const float lowest, __global uchar *restrict doubt, __global float *restrict strength,
+    const int rows, const int columns, MAP cells, __global const int *restrict places,
+    MAP distances, const float jump, const float bend, const float sure, const float quiet,
+    const float floor_, const float lowest, __global uchar *restrict doubt, OUT strength,
     __global uchar *restrict ways)
 {
     const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
@@ -228,7 +227,7 @@ int guarded(__global const uchar *edges, const int rows, const int columns, cons
 }
 
 __kernel void edges_thin(
-    const int rows, const int columns, __global const float *restrict strength, __global const uchar *restrict ways,
+    const int rows, const int columns, MAP strength, __global const uchar *restrict ways,
     __global const uchar *restrict edges, __global uchar *restrict added)
 {
     EACH_PIXEL {

@@ -13,6 +13,7 @@
 // Maps hold 4 * quarter pixels; the last few may be none of the picture's.
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define LOG_2 0.693147181f
 #define UNIT 0x1p-31f       // of the 31 bits of a uniform number
@@ -27,17 +28,6 @@
     b = (uint)right; \
     c = (uint)(left >> 32) ^ d ^ ((uint)(seed >> 32) + i * 0xBB67AE85u); \
     d = (uint)left; \
-}
-
-// Square root of x >= 0, to some 1e-7: Newton's iteration for 1 / sqrt(x), begun from half the exponent.
-float root(const float x)
-{
-    const float half_x = 0.5f * x;
-    float y = as_float(0x5f375a86 - (as_int(x) >> 1));
-    y *= 1.5f - half_x * y * y;
-    y *= 1.5f - half_x * y * y;
-    y *= 1.5f - half_x * y * y;
-    return x * y;
 }
 
 // Radius of Box and Muller: sqrt(-2 ln u) of a uniform number u in (0, 1].
@@ -94,8 +84,8 @@ FRAME quantise(const float counts, const float top)
 }
 
 __kernel void expose(
-    __global const float *restrict light, __global const float *restrict offset,
-    __global const float *restrict span, const int quarter, const ulong frame, const ulong seed,
+    MAP light, MAP offset,
+    MAP span, const int quarter, const ulong frame, const ulong seed,
     const float read, const float grain, const float top, __global FRAME *restrict counts)
 {
     const int begin = get_global_id(0) * TILE, end = min(quarter, begin + TILE);

@@ -5,8 +5,8 @@
 // STRIDE  work-items that lie side by side: 1 where an item is a core's loop and reads on without a gap; a
 //         work-group where an item is a lane, so that neighbours read neighbouring words
 
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
+#include "common.clh"
+
 typedef JOIN(uint, LANES) WORD;
 typedef JOIN(float, LANES) NUMBERS;
 

@@ -10,6 +10,7 @@
 // vector code of loops without branches and calls; what would read outside the maps is done beside them.
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define RIGHT 1
 #define DOWN 2
@@ -25,8 +26,6 @@
 #define ROWS 16
 #endif
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
 #define FINITE(value) ((value) - (value) == 0.0f)
 
 #if MASK
@@ -44,10 +43,10 @@
 #define X_WEIGHT(here, next) weight_x
 #define Y_WEIGHT(here, next) weight_y
 #elif WEIGHTS == 1
-#define WEIGHT_MAPS __global const float *restrict map_x,
+#define WEIGHT_MAPS MAP map_x,
 #define map_y map_x
 #else
-#define WEIGHT_MAPS __global const float *restrict map_x, __global const float *restrict map_y,
+#define WEIGHT_MAPS MAP map_x, MAP map_y,
 #endif
 
 #if WEIGHTS
@@ -65,11 +64,11 @@
 #if HEIGHTS == 0
 #define HEIGHT_MAPS
 #elif HEIGHTS == 1
-#define HEIGHT_MAPS __global const float *restrict heights,
+#define HEIGHT_MAPS MAP heights,
 #define ANCHOR(p) weight_z
 #define IS_KNOWN(p) FINITE(heights[p])
 #else
-#define HEIGHT_MAPS __global const float *restrict heights, __global const float *restrict height_weights,
+#define HEIGHT_MAPS MAP heights, MAP height_weights,
 #define ANCHOR(p) (weight_z * height_weights[p])
 #define IS_KNOWN(p) (FINITE(heights[p]) & (height_weights[p] > 0.0f))
 #endif
@@ -101,7 +100,7 @@ float harmonic(const float a, const float b)
 }
 
 __kernel void links_flags(
-    const int rows, const int columns, __global const float *restrict dz_dx, __global const float *restrict dz_dy,
+    const int rows, const int columns, MAP dz_dx, MAP dz_dy,
     MASK_MAP WEIGHT_MAPS HEIGHT_MAPS __global uchar *restrict flags)
 {
     PIECE(ROWS)
@@ -152,7 +151,7 @@ int kept(
 #define KEPT(p, row, column) kept(p, row, column, columns, dz_dx, dz_dy, edges, flags)
 
 __kernel void links_cut(
-    const int rows, const int columns, __global const float *restrict dz_dx, __global const float *restrict dz_dy,
+    const int rows, const int columns, MAP dz_dx, MAP dz_dy,
     __global const uchar *restrict edges, __global const uchar *restrict flags, __global uchar *restrict cut)
 {
     PIECE(1)
@@ -208,21 +207,21 @@ float chosen(const int linked, const float value)
 #define LEVEL(row, column) (plane_z + (plane_x * size_x * (column) - plane_y * size_y * (row)))
 
 #define GRAPH                                                                                          \
-    const int rows, const int columns, __global const float *restrict dz_dx,                           \
-        __global const float *restrict dz_dy, __global const uchar *restrict flags, WEIGHT_MAPS        \
+    const int rows, const int columns, MAP dz_dx,                           \
+        MAP dz_dy, __global const uchar *restrict flags, WEIGHT_MAPS        \
         HEIGHT_MAPS const float weight_x, const float weight_y, const float weight_z,                  \
         const float size_x, const float size_y, const float plane_x, const float plane_y,              \
         const float plane_z
 
 #if KEEP && HEIGHTS
-#define KEPT_MAPS __global float *restrict right, __global float *restrict down, __global float *restrict anchor,
+#define KEPT_MAPS OUT right, OUT down, OUT anchor,
 #elif KEEP
-#define KEPT_MAPS __global float *restrict right, __global float *restrict down,
+#define KEPT_MAPS OUT right, OUT down,
 #else
 #define KEPT_MAPS
 #endif
 
-__kernel void links_join(GRAPH, KEPT_MAPS __global float *restrict source)
+__kernel void links_join(GRAPH, KEPT_MAPS OUT source)
 {
     PIECE(ROWS)
     if (top >= rows) return;
@@ -282,7 +281,7 @@ float square(const int linked, const float weight, const float left)
 }
 
 // Sums of an item each: squares of what is left over, times their weights.
-__kernel void links_misfit(GRAPH, __global const float *restrict relief, __global float *restrict sums)
+__kernel void links_misfit(GRAPH, MAP relief, OUT sums)
 {
     PIECE(ROWS)
     if (top >= rows) return;
@@ -311,7 +310,7 @@ __kernel void links_misfit(GRAPH, __global const float *restrict relief, __globa
 
 __kernel void links_smooth(
     const int rows, const int columns, __global const uchar *restrict flags,
-    __global const float *restrict values, __global float *restrict smoothed)
+    MAP values, OUT smoothed)
 {
     PIECE(1)
     if (top >= rows) return;

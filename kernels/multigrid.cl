@@ -11,8 +11,7 @@
 // because their block has more than one, lie behind all levels; whatever has to do with them is done by the
 // passes for odd nodes, row by row of a sparse matrix, over what the plain passes left there.
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+#include "common.clh"
 
 #if WIDTH == 8
 typedef float8 reals;
@@ -52,7 +51,6 @@ typedef float reals;
 #define WITH_ANCHOR(value)
 #endif
 
-#define CONST __global const float *restrict
 #define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
 
 // The links of nodes i: to the right and left, down and up.
@@ -74,8 +72,8 @@ typedef float reals;
 
 // One over the diagonal.
 __kernel void multigrid_invert(
-    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor,
-    __global float *restrict inverse)
+    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor,
+    OUT inverse)
 {
     ITEMS_NODES
     EACH_NODE {
@@ -88,8 +86,8 @@ __kernel void multigrid_invert(
 // Two steps of Jacobi's method from heights of zero.
 #define FIRST(i) (omega * AT(b + (i)) * AT(inverse + (i)))
 void begin_nodes(
-    const int begin, const int end, const int stride, const float omega, const float then, CONST right, CONST down,
-    CONST anchor, CONST inverse, CONST b, __global float *restrict x)
+    const int begin, const int end, const int stride, const float omega, const float then, MAP right, MAP down,
+    MAP anchor, MAP inverse, MAP b, OUT x)
 {
     EACH_NODE {
         LINKS
@@ -98,8 +96,8 @@ void begin_nodes(
 }
 
 __kernel void multigrid_begin(
-    const int base, const int rows, const int stride, const float omega, const float then, CONST right, CONST down,
-    CONST anchor, CONST inverse, CONST b, __global float *restrict x)
+    const int base, const int rows, const int stride, const float omega, const float then, MAP right, MAP down,
+    MAP anchor, MAP inverse, MAP b, OUT x)
 {
     ITEMS_NODES
     begin_nodes(begin, end, stride, omega, then, right, down, anchor, inverse, b, x);
@@ -107,8 +105,8 @@ __kernel void multigrid_begin(
 
 // One step of Jacobi's method.
 void smooth_nodes(
-    const int begin, const int end, const int stride, const float omega, CONST right, CONST down, CONST anchor, CONST b,
-    CONST x, __global float *restrict smoother)
+    const int begin, const int end, const int stride, const float omega, MAP right, MAP down, MAP anchor, MAP b,
+    MAP x, OUT smoother)
 {
     EACH_NODE {
         LINKS
@@ -118,8 +116,8 @@ void smooth_nodes(
 }
 
 __kernel void multigrid_smooth(
-    const int base, const int rows, const int stride, const float omega, CONST right, CONST down, CONST anchor, CONST b,
-    CONST x, __global float *restrict smoother)
+    const int base, const int rows, const int stride, const float omega, MAP right, MAP down, MAP anchor, MAP b,
+    MAP x, OUT smoother)
 {
     ITEMS_NODES
     smooth_nodes(begin, end, stride, omega, right, down, anchor, b, x, smoother);
@@ -127,8 +125,8 @@ __kernel void multigrid_smooth(
 
 // What is left over.
 void residual_nodes(
-    const int begin, const int end, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
-    __global float *restrict left)
+    const int begin, const int end, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
+    OUT left)
 {
     EACH_NODE {
         LINKS
@@ -137,8 +135,8 @@ void residual_nodes(
 }
 
 __kernel void multigrid_residual(
-    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
-    __global float *restrict left)
+    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
+    OUT left)
 {
     ITEMS_NODES
     residual_nodes(begin, end, stride, right, down, anchor, b, x, left);
@@ -146,7 +144,7 @@ __kernel void multigrid_residual(
 
 // Ask for what is left over, and keep the heights so far.
 void keep_nodes(
-    const int begin, const int end, CONST left, CONST x, __global float *restrict b, __global float *restrict kept)
+    const int begin, const int end, MAP left, MAP x, OUT b, OUT kept)
 {
     EACH_NODE {
         PUT(b + i) = AT(left + i);
@@ -155,8 +153,8 @@ void keep_nodes(
 }
 
 __kernel void multigrid_keep(
-    const int base, const int rows, const int stride, CONST left, CONST x, __global float *restrict b,
-    __global float *restrict kept)
+    const int base, const int rows, const int stride, MAP left, MAP x, OUT b,
+    OUT kept)
 {
     ITEMS_NODES
     keep_nodes(begin, end, left, x, b, kept);
@@ -164,8 +162,8 @@ __kernel void multigrid_keep(
 
 // What is left over, over the diagonal.
 void leave_nodes(
-    const int begin, const int end, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
-    __global float *restrict left)
+    const int begin, const int end, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
+    OUT left)
 {
     EACH_NODE {
         LINKS
@@ -175,15 +173,15 @@ void leave_nodes(
 }
 
 __kernel void multigrid_leave(
-    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST x,
-    __global float *restrict left)
+    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
+    OUT left)
 {
     ITEMS_NODES
     leave_nodes(begin, end, stride, right, down, anchor, b, x, left);
 }
 
 // What is left over of heights of zero, over the diagonal.
-void scale_nodes(const int begin, const int end, CONST inverse, CONST b, __global float *restrict left)
+void scale_nodes(const int begin, const int end, MAP inverse, MAP b, OUT left)
 {
     EACH_NODE {
         PUT(left + i) = AT(inverse + i) * AT(b + i);
@@ -191,14 +189,14 @@ void scale_nodes(const int begin, const int end, CONST inverse, CONST b, __globa
 }
 
 __kernel void multigrid_scale(
-    const int base, const int rows, const int stride, CONST inverse, CONST b, __global float *restrict left)
+    const int base, const int rows, const int stride, MAP inverse, MAP b, OUT left)
 {
     ITEMS_NODES
     scale_nodes(begin, end, inverse, b, left);
 }
 
 // Nothing, where no pass writes what others read.
-__kernel void multigrid_clear(const int base, const int rows, const int stride, __global float *restrict x)
+__kernel void multigrid_clear(const int base, const int rows, const int stride, OUT x)
 {
     ITEMS_NODES
     EACH_NODE {
@@ -207,7 +205,7 @@ __kernel void multigrid_clear(const int base, const int rows, const int stride, 
 }
 
 // Heights and others.
-void add_nodes(const int begin, const int end, CONST other, __global float *restrict x)
+void add_nodes(const int begin, const int end, MAP other, OUT x)
 {
     EACH_NODE {
         PUT(x + i) += AT(other + i);
@@ -215,7 +213,7 @@ void add_nodes(const int begin, const int end, CONST other, __global float *rest
 }
 
 __kernel void multigrid_add(
-    const int base, const int rows, const int stride, CONST other, __global float *restrict x)
+    const int base, const int rows, const int stride, MAP other, OUT x)
 {
     ITEMS_NODES
     add_nodes(begin, end, other, x);
@@ -225,8 +223,8 @@ __kernel void multigrid_add(
 // Of each link that enters the block the far end counts, and of those inside both. What is left over lies, of the
 // row above the block, its own two and the one below, at `above` to `below`.
 void restrict_row(
-    const int I, const int K, const int J, const int count, const int stride, CONST right, CONST down, CONST above,
-    CONST upper, CONST lower, CONST below, __global float *restrict b)
+    const int I, const int K, const int J, const int count, const int stride, MAP right, MAP down, MAP above,
+    MAP upper, MAP lower, MAP below, OUT b)
 {
     for (int c = 0; c < count; c += WIDTH) {
         const int f = 2 * c, i = I + f, k = K + f;
@@ -250,7 +248,7 @@ void restrict_row(
 
 __kernel void multigrid_restrict(
     const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    CONST right, CONST down, CONST left, __global float *restrict b)
+    MAP right, MAP down, MAP left, OUT b)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) {
@@ -260,8 +258,8 @@ __kernel void multigrid_restrict(
 
 // The coarse right side of full multigrid, where no block is odd: all that a block's nodes are asked for.
 void gather_row(
-    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, CONST fine,
-    __global float *restrict b)
+    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, MAP fine,
+    OUT b)
 {
     EACH_BLOCK {
         PUT(b + J) = (EVEN(fine + I) + ODD(fine + I)) + (EVEN(fine + K) + ODD(fine + K));
@@ -269,8 +267,8 @@ void gather_row(
 }
 
 __kernel void multigrid_gather(
-    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride, CONST fine,
-    __global float *restrict b)
+    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride, MAP fine,
+    OUT b)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) gather_row(row, base, stride, coarse_base, coarse_stride, fine, b);
@@ -279,8 +277,8 @@ __kernel void multigrid_gather(
 // Heights and the coarse correction, spread by a step of Jacobi's method.
 void prolong_row(
     const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, const float keep,
-    CONST right, CONST down, CONST inverse, CONST e, CONST x, __global float *restrict upper,
-    __global float *restrict lower)
+    MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT upper,
+    OUT lower)
 {
     EACH_BLOCK {
         const reals here = AT(e + J), above = AT(e + J - coarse_stride), below = AT(e + J + coarse_stride);
@@ -306,7 +304,7 @@ void prolong_row(
 
 __kernel void multigrid_prolong(
     const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    const float keep, CONST right, CONST down, CONST inverse, CONST e, CONST x, __global float *restrict corrected)
+    const float keep, MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT corrected)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) {
@@ -318,14 +316,14 @@ __kernel void multigrid_prolong(
 #define STRENGTH 0.25f
 #define GREATEST(PICK, i)                                                                                  \
     GREATER(GREATER(PICK(right + (i)), PICK(right + (i) - 1)), GREATER(PICK(down + (i)), PICK(down + (i) - stride)))
-#define JOIN(w, g, h) ((w) > 0 ? 1 / (1 / (w) + 0.5f / (g) + 0.5f / (h)) : 0)
+#define IN_SERIES(w, g, h) ((w) > 0 ? 1 / (1 / (w) + 0.5f / (g) + 0.5f / (h)) : 0)
 #define COUNT(condition) ((condition) ? (reals)1 : (reals)0)
 #define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= STRENGTH * STRENGTH * (g) * (h)))
 __kernel void multigrid_coarsen(
     const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    CONST right, CONST down, CONST anchor,
-    __global float *restrict coarse_right, __global float *restrict coarse_down, __global float *restrict coarse_anchor,
-    __global float *restrict split)
+    MAP right, MAP down, MAP anchor,
+    OUT coarse_right, OUT coarse_down, OUT coarse_anchor,
+    OUT split)
 {
     const int row = get_global_id(0);
     if (row >= coarse_rows) return;
@@ -337,8 +335,8 @@ __kernel void multigrid_coarsen(
         const reals from_b = ODD(right + I), from_d = ODD(right + K), under_c = EVEN(down + K), under_d = ODD(down + K);
         const reals live = COUNT(a > 0) + COUNT(b > 0) + COUNT(c > 0) + COUNT(d > 0);
         const reals joined = STRONG(ab, a, b) + STRONG(cd, c, d) + STRONG(ac, a, c) + STRONG(bd, b, d);
-        PUT(coarse_right + J) = JOIN(from_b, b, after_b) + JOIN(from_d, d, after_d);
-        PUT(coarse_down + J) = JOIN(under_c, c, below_c) + JOIN(under_d, d, below_d);
+        PUT(coarse_right + J) = IN_SERIES(from_b, b, after_b) + IN_SERIES(from_d, d, after_d);
+        PUT(coarse_down + J) = IN_SERIES(under_c, c, below_c) + IN_SERIES(under_d, d, below_d);
 #if ANCHORED
         PUT(coarse_anchor + J) = (COUNT(a > 0) * EVEN(anchor + I) + COUNT(b > 0) * ODD(anchor + I))
             + (COUNT(c > 0) * EVEN(anchor + K) + COUNT(d > 0) * ODD(anchor + K));
@@ -349,7 +347,7 @@ __kernel void multigrid_coarsen(
 
 // The same passes for odd nodes: row k is of node[k], and SUM over its other nodes j of weight w.
 #define ODD_TILE GREATER(TILE / 16, 1)
-#define ODD_ROWS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, CONST weight
+#define ODD_ROWS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, MAP weight
 #define ITEMS_ODD                                                                                          \
     const int begin = at + (int)get_global_id(0) * ODD_TILE, end = LESSER(begin + ODD_TILE, at + count);
 #define EACH_ODD for (int k = begin; k < end; ++k)
@@ -362,7 +360,7 @@ __kernel void multigrid_coarsen(
     }
 
 __kernel void multigrid_invert_odd(
-    const int at, const int count, ODD_ROWS, CONST anchor, __global float *restrict inverse)
+    const int at, const int count, ODD_ROWS, MAP anchor, OUT inverse)
 {
     ITEMS_ODD
     EACH_ODD {
@@ -374,8 +372,8 @@ __kernel void multigrid_invert_odd(
 
 #define SEED(i) (omega * b[i] * inverse[i])
 void begin_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, const float then, CONST anchor, CONST inverse, CONST b,
-    __global float *restrict x)
+    const int begin, const int end, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b,
+    OUT x)
 {
     EACH_ODD {
         const int i = node[k];
@@ -385,16 +383,16 @@ void begin_odd(
 }
 
 __kernel void multigrid_begin_odd(
-    const int at, const int count, ODD_ROWS, const float omega, const float then, CONST anchor, CONST inverse, CONST b,
-    __global float *restrict x)
+    const int at, const int count, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b,
+    OUT x)
 {
     ITEMS_ODD
     begin_odd(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
 }
 
 void smooth_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, CONST anchor, CONST inverse, CONST b, CONST x,
-    __global float *restrict smoother)
+    const int begin, const int end, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x,
+    OUT smoother)
 {
     EACH_ODD {
         const int i = node[k];
@@ -404,8 +402,8 @@ void smooth_odd(
 }
 
 __kernel void multigrid_smooth_odd(
-    const int at, const int count, ODD_ROWS, const float omega, CONST anchor, CONST inverse, CONST b, CONST x,
-    __global float *restrict smoother)
+    const int at, const int count, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x,
+    OUT smoother)
 {
     ITEMS_ODD
     smooth_odd(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
@@ -413,8 +411,8 @@ __kernel void multigrid_smooth_odd(
 
 // Over the diagonal, if there is one to divide by.
 void leave_odd(
-    const int begin, const int end, ODD_ROWS, const int divide, CONST anchor, CONST inverse, CONST b, CONST x,
-    __global float *restrict left)
+    const int begin, const int end, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x,
+    OUT left)
 {
     EACH_ODD {
         const int i = node[k];
@@ -424,14 +422,14 @@ void leave_odd(
 }
 
 __kernel void multigrid_leave_odd(
-    const int at, const int count, ODD_ROWS, const int divide, CONST anchor, CONST inverse, CONST b, CONST x,
-    __global float *restrict left)
+    const int at, const int count, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x,
+    OUT left)
 {
     ITEMS_ODD
     leave_odd(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, left);
 }
 
-void restrict_odd(const int begin, const int end, ODD_ROWS, CONST left, __global float *restrict b)
+void restrict_odd(const int begin, const int end, ODD_ROWS, MAP left, OUT b)
 {
     EACH_ODD {
         SUM(whole, w * left[j])
@@ -440,15 +438,15 @@ void restrict_odd(const int begin, const int end, ODD_ROWS, CONST left, __global
 }
 
 __kernel void multigrid_restrict_odd(
-    const int at, const int count, ODD_ROWS, CONST left, __global float *restrict b)
+    const int at, const int count, ODD_ROWS, MAP left, OUT b)
 {
     ITEMS_ODD
     restrict_odd(begin, end, node, start, column, weight, left, b);
 }
 
 void prolong_odd(
-    const int begin, const int end, ODD_ROWS, const float keep, CONST inverse, CONST e, CONST x,
-    __global float *restrict corrected)
+    const int begin, const int end, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x,
+    OUT corrected)
 {
     EACH_ODD {
         const int i = node[k];
@@ -458,8 +456,8 @@ void prolong_odd(
 }
 
 __kernel void multigrid_prolong_odd(
-    const int at, const int count, ODD_ROWS, const float keep, CONST inverse, CONST e, CONST x,
-    __global float *restrict corrected)
+    const int at, const int count, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x,
+    OUT corrected)
 {
     ITEMS_ODD
     prolong_odd(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
@@ -467,7 +465,7 @@ __kernel void multigrid_prolong_odd(
 
 // The coarsest level: the pseudo-inverse of its matrix, times what is asked of its nodes.
 void solve_node(
-    const int k, const int count, __global const int *restrict bottom, CONST matrix, CONST b, __global float *restrict x)
+    const int k, const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
 {
     float sum = 0;
     for (int m = 0; m < count; ++m) {
@@ -477,7 +475,7 @@ void solve_node(
 }
 
 __kernel void multigrid_solve(
-    const int count, __global const int *restrict bottom, CONST matrix, CONST b, __global float *restrict x)
+    const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
 {
     const int k = get_global_id(0);
     if (k < count) solve_node(k, count, bottom, matrix, b, x);
@@ -507,9 +505,9 @@ void clear_line(__global float *line, const int stride)
 // over is kept if `keep` is 1.
 __kernel void multigrid_descend(
     const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
-    const int coarse_stride, const int band, const int keep, const float omega, const float then, CONST right, CONST down,
-    CONST anchor, CONST inverse, CONST b, __global float *restrict x, __global float *restrict left,
-    __global float *restrict lines, __global float *restrict coarse_b)
+    const int coarse_stride, const int band, const int keep, const float omega, const float then, MAP right, MAP down,
+    MAP anchor, MAP inverse, MAP b, OUT x, OUT left,
+    OUT lines, OUT coarse_b)
 {
     BAND
     if (first >= last) return;
@@ -544,9 +542,9 @@ __kernel void multigrid_descend(
 // rows of the table for odd prolongation that belong to a row of the picture begin at odd[row].
 __kernel void multigrid_ascend(
     const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
-    const int coarse_stride, const int band, const float omega, const float then, CONST right, CONST down, CONST anchor,
-    CONST inverse, CONST b, CONST e, CONST x, __global float *restrict lines, __global float *restrict smoother,
-    __global float *restrict parts, const int odds, __global const int *restrict odd, ODD_ROWS)
+    const int coarse_stride, const int band, const float omega, const float then, MAP right, MAP down, MAP anchor,
+    MAP inverse, MAP b, MAP e, MAP x, OUT lines, OUT smoother,
+    OUT parts, const int odds, __global const int *restrict odd, ODD_ROWS)
 {
     BAND
     if (first >= last) return;
@@ -602,13 +600,13 @@ typedef struct {
 #define GRAPH right, down, anchor
 #define ALL_NODES(l) PICTURE_OF(l), LEVEL(l).stride
 #define TAIL                                                                                               \
-    const int first, const int last, __global const Level *restrict levels, CONST right, CONST down, CONST anchor, \
-    CONST inverse, ODD_ROWS, const int count, __global const int *restrict bottom, CONST matrix, const float omega, \
+    const int first, const int last, __global const Level *restrict levels, MAP right, MAP down, MAP anchor, \
+    MAP inverse, ODD_ROWS, const int count, __global const int *restrict bottom, MAP matrix, const float omega, \
     const float then
 
 void tail_restrict(
-    const int l, __global const Level *restrict levels, CONST right, CONST down, ODD_ROWS, CONST left,
-    __global float *restrict b)
+    const int l, __global const Level *restrict levels, MAP right, MAP down, ODD_ROWS, MAP left,
+    OUT b)
 {
     const int base = LEVEL(l).base, stride = LEVEL(l).stride;
     const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
@@ -619,8 +617,8 @@ void tail_restrict(
 }
 
 void tail_prolong(
-    const int l, __global const Level *restrict levels, const float keep, CONST right, CONST down, CONST inverse, ODD_ROWS,
-    CONST e, CONST x, __global float *restrict corrected)
+    const int l, __global const Level *restrict levels, const float keep, MAP right, MAP down, MAP inverse, ODD_ROWS,
+    MAP e, MAP x, OUT corrected)
 {
     const int base = LEVEL(l).base, stride = LEVEL(l).stride;
     const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
@@ -631,8 +629,8 @@ void tail_prolong(
 }
 
 void tail_smooth(
-    const int l, __global const Level *restrict levels, const float omega, CONST right, CONST down, CONST anchor,
-    CONST inverse, ODD_ROWS, CONST b, CONST x, __global float *restrict smoother)
+    const int l, __global const Level *restrict levels, const float omega, MAP right, MAP down, MAP anchor,
+    MAP inverse, ODD_ROWS, MAP b, MAP x, OUT smoother)
 {
     smooth_nodes(ALL_NODES(l), omega, GRAPH, b, x, smoother);
     smooth_odd(GRAPH_OF(l), ODDS, omega, anchor, inverse, b, x, smoother);
@@ -718,10 +716,10 @@ __kernel void multigrid_tail_full(TAIL, CYCLE, __global float *full_b, __global 
 // The next direction, the matrix times it, and the product of both.
 #define DIRECTION(i) (AT(z + (i)) + beta * AT(before + (i)))
 __kernel void multigrid_direct(
-    const int base, const int rows, const int stride, const float beta, CONST right,
-    CONST down, CONST anchor, CONST z,
-    CONST before, __global float *restrict direction, __global float *restrict image,
-    __global float *restrict parts)
+    const int base, const int rows, const int stride, const float beta, MAP right,
+    MAP down, MAP anchor, MAP z,
+    MAP before, OUT direction, OUT image,
+    OUT parts)
 {
     EACH_PART {
         LINKS
@@ -735,9 +733,9 @@ __kernel void multigrid_direct(
 
 // A step along it, what is left over then, and the square of that.
 __kernel void multigrid_advance(
-    const int base, const int rows, const int stride, const float alpha, CONST direction,
-    CONST image, __global float *restrict b, __global float *restrict x,
-    __global float *restrict parts)
+    const int base, const int rows, const int stride, const float alpha, MAP direction,
+    MAP image, OUT b, OUT x,
+    OUT parts)
 {
     EACH_PART {
         const reals r = AT(b + i) - alpha * AT(image + i);
@@ -753,8 +751,8 @@ __kernel void multigrid_advance(
 #define STEP(i) AT(p + (i))
 #define CORRECTION(i) AT(z + (i))
 __kernel void multigrid_curve(
-    const int base, const int rows, const int stride, CONST right, CONST down, CONST anchor, CONST b, CONST z, CONST p,
-    const int count, __global float *restrict parts)
+    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP z, MAP p,
+    const int count, OUT parts)
 {
     const int begin = base + stride + (int)get_global_id(0) * PART;
     const int end = LESSER(begin + PART, base + stride * (rows + 1));
@@ -778,8 +776,8 @@ __kernel void multigrid_curve(
 // The best step in the plane of both, by the parts of these products and of that of b and z. No sum goes to the host.
 #define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
 __kernel void multigrid_follow(
-    const int base, const int rows, const int stride, const int products, CONST product, const int count, CONST parts,
-    CONST z, __global float *restrict p, __global float *restrict x)
+    const int base, const int rows, const int stride, const int products, MAP product, const int count, MAP parts,
+    MAP z, OUT p, OUT x)
 {
     ITEMS_NODES
     float bz = 0, zz = 0, zp = 0, pp = 0, bp = 0;
@@ -803,8 +801,8 @@ __kernel void multigrid_follow(
 
 // The product of two.
 __kernel void multigrid_dot(
-    const int base, const int rows, const int stride, CONST one,
-    CONST other, __global float *restrict parts)
+    const int base, const int rows, const int stride, MAP one,
+    MAP other, OUT parts)
 {
     EACH_PART {
         sum += AT(one + i) * AT(other + i);
@@ -814,7 +812,7 @@ __kernel void multigrid_dot(
 
 // What the anchors weigh of heights.
 __kernel void multigrid_weigh(
-    const int base, const int rows, const int stride, CONST anchor, CONST x, __global float *restrict parts)
+    const int base, const int rows, const int stride, MAP anchor, MAP x, OUT parts)
 {
     EACH_PART {
         sum += AT(anchor + i) * HEIGHT(i) * HEIGHT(i);
@@ -824,8 +822,8 @@ __kernel void multigrid_weigh(
 
 // Maps of pixels without margins, to and from the finest level, row by row.
 __kernel void multigrid_admit(
-    const int rows, const int columns, const int stride, CONST map,
-    __global float *restrict level)
+    const int rows, const int columns, const int stride, MAP map,
+    OUT level)
 {
     const int row = get_global_id(0);
     if (row >= rows) return;
@@ -835,8 +833,8 @@ __kernel void multigrid_admit(
 }
 
 __kernel void multigrid_release(
-    const int rows, const int columns, const int stride, CONST level,
-    __global float *restrict map)
+    const int rows, const int columns, const int stride, MAP level,
+    OUT map)
 {
     const int row = get_global_id(0);
     if (row >= rows) return;

@@ -31,8 +31,7 @@
 //
 // All maps but those are answers; of the second turn on they are joined with those of the `turns` - 1 before.
 
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
+#include "common.clh"
 typedef JOIN(FRAME, LANES) Raw;
 typedef JOIN(float, LANES) F;
 typedef JOIN(int, LANES) I;
@@ -121,10 +120,6 @@ typedef struct {
 #endif
 #endif
 
-// Comparisons where the library has functions: PoCL calls those, and around a call nothing stays in registers.
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
-
 int any4(const int4 flags)
 {
     const int2 pair = flags.lo | flags.hi;
@@ -133,7 +128,7 @@ int any4(const int4 flags)
 
 // To 5e-7 of itself, by Newton's steps after a guess: the processor's own, where it has one, for the library's root is a call
 // in PoCL; else one from the exponent, with Kadlec's constants.
-F inverse_root(const F x)
+F inverse_roots(const F x)
 {
 #if LANES != 8
     return rsqrt(x);
@@ -147,7 +142,7 @@ F inverse_root(const F x)
 #endif
 }
 
-F root(const F x) { return x * inverse_root(GREATER(x, (F)1e-30f)); }
+F roots(const F x) { return x * inverse_roots(GREATER(x, (F)1e-30f)); }
 
 F cosine(const F angle)
 {
@@ -174,9 +169,9 @@ F angle_by_half_sine(const F x)
 
 Direction direction_of(const F x, const F y, const F z)
 {
-    const F flat = x * x + y * y, inverse = inverse_root(flat + z * z);
+    const F flat = x * x + y * y, inverse = inverse_roots(flat + z * z);
     const I level = flat < 1e-20f;
-    const F across = inverse_root(level ? (F)1.0f : flat);
+    const F across = inverse_roots(level ? (F)1.0f : flat);
     Direction found;
     found.ct = z * inverse;
     found.st = level ? (F)0.0f : flat * across * inverse;
@@ -229,10 +224,10 @@ Direction direction_of(const F x, const F y, const F z)
     const F facing = sx * bx + sy * by + bz, twice = facing + facing;                            \
     const F rx = twice * bx - sx, ry = twice * by - sy, rz = twice * bz - 1.0f, flat = rx * rx + ry * ry; \
     const F room = RADIUS * RADIUS - px * px - py * py, along = px * rx + py * ry;               \
-    const F square = along * along + flat * room, per_leave = inverse_root(square);              \
+    const F square = along * along + flat * room, per_leave = inverse_roots(square);              \
     const F way = room / (along + square * per_leave);                                           \
     const F mx = px + way * rx, my = py + way * ry, h = pz + way * rz;                            \
-    const F far = h * h + RADIUS * RADIUS, per_far = inverse_root(far), per_both = 1.0f / (far * per_far + RADIUS); \
+    const F far = h * h + RADIUS * RADIUS, per_far = inverse_roots(far), per_both = 1.0f / (far * per_far + RADIUS); \
     const F q = h * per_both, least_q = GREATER(q, (F)NEAREST), held = LESSER(least_q, (F)FURTHEST); \
     F level = OF_CURVE(CURVE - 1), steep = 0.0f;                                                 \
     const F place_q = (held - MIDDLE) * PER_Q;                                                   \
@@ -280,7 +275,7 @@ Direction direction_of(const F x, const F y, const F z)
 #define PREDICT(k)                                                                               \
     const F near = at.cp * COSINE(k) + at.sp * SINE(k), beside = beside_x * SINE(k) - beside_y * COSINE(k); \
     const F most = LESSER(base + lean * near, (F)0.5f), x = GREATER(most, (F)1e-12f);            \
-    const F rest = x - x * x, inverse = inverse_root(rest);                                      \
+    const F rest = x - x * x, inverse = inverse_roots(rest);                                      \
     const F zenith = rest * inverse * angle_by_half_sine(x), by_sine = WEIGH(inverse, k); \
     const F u1 = (low_part * near + high_part) * by_sine, u2 = beside * by_sine;                 \
     const F u3 = (high_part * near + low_part) * by_sine;
@@ -417,13 +412,13 @@ Direction begin_at_wall(const F *lights, const F mean, __global const float *tur
     q = q > FURTHEST ? (F)FURTHEST : q;
     const F swing = x * x + y * y;
     const I swings = swing > 0.0f;
-    const F inverse = SENSE * inverse_root(swings ? swing : (F)1.0f);
+    const F inverse = SENSE * inverse_roots(swings ? swing : (F)1.0f);
     x = swings ? x * inverse : (F)1.0f;
     y = swings ? y * inverse : (F)0.0f;
     const F along = place.x * x + place.y * y;
-    const F out = root(along * along + RADIUS * RADIUS - place.x * place.x - place.y * place.y) - along;
-    const F rise = 2.0f * RADIUS * q / (1.0f - q * q) - place.z, per_ray = inverse_root(out * out + rise * rise);
-    const F per_sight = inverse_root(place.slope_x * place.slope_x + place.slope_y * place.slope_y + 1.0f);
+    const F out = roots(along * along + RADIUS * RADIUS - place.x * place.x - place.y * place.y) - along;
+    const F rise = 2.0f * RADIUS * q / (1.0f - q * q) - place.z, per_ray = inverse_roots(out * out + rise * rise);
+    const F per_sight = inverse_roots(place.slope_x * place.slope_x + place.slope_y * place.slope_y + 1.0f);
     return direction_of(out * x * per_ray + place.slope_x * per_sight, out * y * per_ray + place.slope_y * per_sight,
                         rise * per_ray + per_sight);
 }
@@ -488,7 +483,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
         STORE(mean, p, now_mean);                                                                \
         STORE(cosines, p, now_cosine);                                                           \
         STORE(sines, p, now_sine);                                                               \
-        STORE(residual, p, root(now_left));                                                      \
+        STORE(residual, p, roots(now_left));                                                      \
     }
 #endif
 
@@ -533,11 +528,11 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
             nx = own * (new ? nx : (F)0.0f) + theirs * (old ? ox : (F)0.0f);                     \
             ny = own * (new ? ny : (F)0.0f) + theirs * (old ? oy : (F)0.0f);                     \
             nz = own * (new ? nz : (F)0.0f) + theirs * (old ? oz : (F)0.0f);                     \
-            const F length = inverse_root(nx * nx + ny * ny + nz * nz);                          \
+            const F length = inverse_roots(nx * nx + ny * ny + nz * nz);                          \
             nx = old | new ? nx * length : (F)NAN;                                               \
             ny = old | new ? ny * length : (F)NAN;                                               \
             nz = old | new ? nz * length : (F)NAN;                                               \
-            now = old | new ? inverse_root(own + theirs) : (F)NAN;                               \
+            now = old | new ? inverse_roots(own + theirs) : (F)NAN;                               \
             flags &= *(__global const B *)(contact + p);                                         \
         }                                                                                        \
         KEEP_VECTORS(nx, ny, nz)                                                                 \
@@ -552,23 +547,23 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 #define AT_REST (wave.mean < rest_below)
 
 #if WALL
-#define WALL_ARGUMENT __global const float *restrict wall,
+#define WALL_ARGUMENT MAP wall,
 #else
 #define WALL_ARGUMENT
 #endif
 #define ARGUMENTS                                                                                \
-    __global const FRAME *restrict stack, __global const float *restrict tables,                 \
-    __global const float *restrict scale, WALL_ARGUMENT const int table, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
+    __global const FRAME *restrict stack, MAP tables,                 \
+    MAP scale, WALL_ARGUMENT const int table, const int start, const int pixels, const int stride, const int turns, const float cos_tilt,               \
     const float sin_tilt, const float noise_base, const float noise_slope, const float noise_least, \
     const float noise_limit, const float limit, const float still_below, const float wild_above, const float rest_below,                         \
-    __global float *restrict vectors, __global float *restrict sigma,                            \
-    __global uchar *restrict contact, __global float *restrict mean,                             \
-    __global float *restrict cosines, __global float *restrict sines,                            \
-    __global float *restrict residual
+    OUT vectors, OUT sigma,                            \
+    __global uchar *restrict contact, OUT mean,                             \
+    OUT cosines, OUT sines,                            \
+    OUT residual
 
 #define EACH_VECTOR                                                                              \
     FRAMES;                                                                                      \
-    __global const float *restrict turn = tables + (size_t)table * 6 * ROOM;                     \
+    MAP turn = tables + (size_t)table * 6 * ROOM;                     \
     const int first = (int)get_global_id(0) * WORDS * LANES;                                     \
     for (int p = first; p < LESSER(first + WORDS * LANES, pixels); p += LANES)
 
@@ -603,14 +598,14 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
         whole -= there;                                                                          \
     }                                                                                            \
     const F level = sum / PRESENT_COUNT, variance = noise_base + noise_slope * level;            \
-    const F error_of_one = root(GREATER(variance, (F)noise_least)) * GREATER(per_count, -per_count); \
+    const F error_of_one = roots(GREATER(variance, (F)noise_least)) * GREATER(per_count, -per_count); \
     COUNT_WITHIN                                                                                 \
     const Wave wave = fit_wave(zeniths, turn);
 
 // With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
 #define CONCLUDE(plain, at_rest, model)                                                          \
     const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;                \
-    const F error = error_of_one * root((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));       \
+    const F error = error_of_one * roots((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));       \
     const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f); \
     const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;                             \
     const F d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scaled;                             \
@@ -619,7 +614,7 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);                 \
     const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;             \
     const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;                 \
-    const F doubt = 3.0f * error_of_one * inverse_root(told);                                    \
+    const F doubt = 3.0f * error_of_one * inverse_roots(told);                                    \
     const I apart = at_rest | (more_tilt + doubt < still_below) | (more_tilt - doubt > wild_above); \
     KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left, model) & ~apart)
 
@@ -698,14 +693,14 @@ __kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosin
         }
         const F swing = wave.cosine * wave.cosine + wave.sine * wave.sine;
         const I swings = swing > STEADY * STEADY;
-        const F inverse = inverse_root(swings ? swing : (F)1.0f);
+        const F inverse = inverse_roots(swings ? swing : (F)1.0f);
         const F cp = swings ? wave.cosine * inverse : (F)1.0f, sp = swings ? wave.sine * inverse : (F)0.0f;
         const F st = sine(wave.mean), ct = cosine(wave.mean), slant = st * inverse, both = 2.0f * cp * sp * of_both;
         const F across = sp * sp * of_cosine - both + cp * cp * of_sine;
         const F along = cp * cp * of_cosine + both + sp * sp * of_sine;
-        const F error = error_of_one * root(of_mean + slant * slant * across);
+        const F error = error_of_one * roots(of_mean + slant * slant * across);
         const I answered = swings & (ct > 0.0f);
-        const F swung = swing * inverse, doubt = 3.0f * error_of_one * root(along);
+        const F swung = swing * inverse, doubt = 3.0f * error_of_one * roots(along);
         const I apart = AT_REST | (swung + doubt < still_below) | (swung - doubt > wild_above);
         KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves, limit) & ~apart)
         KEEP_WAVE(waves)

@@ -26,6 +26,7 @@
 // travel   has planes of `room` frames: travel; the step to it; travel since the first frame
 
 #pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
 
 #define DARK -1
 #define INVALID -2
@@ -34,8 +35,6 @@
 #define GROUP 8   // frames that are compared at once
 #define NEEDED (!SAMPLES || HOLD > 3 ? HOLD : 3)  // frames from an onset on, after which nothing about it can change
 
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
 typedef JOIN(uint, LANES) Word;
 
 #define PLANES (SPAN / BITS)
@@ -70,13 +69,13 @@ typedef struct __attribute__((packed)) { Word word; } Stored;
 #define COMPLEMENTS(x) ((x) ^ TOP)
 #define AT_LEAST(x, y) JOIN(as_uint, LANES)(JOIN(as_float, LANES)(x) >= JOIN(as_float, LANES)(y))
 #define BROKEN(x) (((x) & ~TOP) + 0x00800000u)  // carries into TOP where the exponent says NaN or infinite
-#define LESSER(a, b) fmin(a, b)
+#define LEAST(a, b) fmin(a, b)
 #else
 #define COMPLEMENT(x) ((FRAME)~(x))
 #define COMPLEMENTS(x) (~(x))
 // TOP is set where x >= y: by the highest bits where they differ, else by the difference of the others.
 #define AT_LEAST(x, y) (((x) & ~(y)) | (~((x) ^ (y)) & (((x) | TOP) - ((y) & ~TOP))))
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define LEAST(a, b) LESSER(a, b)
 #endif
 #if RELEASE
 #define SEE(x) COMPLEMENT(x)
@@ -108,15 +107,6 @@ int lowest_bit(const uint bits) { return (int)(as_uint((float)(int)(bits & -bits
 // Of 31 bits; -1 without any. No neighbour below the highest, so it is not rounded up to the next power of two.
 int highest_bit(const uint bits) { return (int)(as_uint((float)(int)(bits & ~(bits >> 1)) + 0.5f) >> 23) - 127; }
 
-// To 5e-6 of itself. The library's is a call on some processors, which keeps a loop from becoming vector code.
-float root(const float x)
-{
-    float inverse = as_float(0x5f375a86 - (as_int(x) >> 1));
-    inverse *= 1.5f - 0.5f * x * inverse * inverse;
-    inverse *= 1.5f - 0.5f * x * inverse * inverse;
-    return x * inverse;
-}
-
 // OpenCL's prefetch does nothing in PoCL. Where an item is a core's loop, addresses are the same in all address spaces.
 #if LANES == 16 && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
@@ -129,40 +119,23 @@ float root(const float x)
 
 // --- Which samples are light -----------------------------------------------------------------------------------
 
-float2 two_sum(const float a, const float b)
-{
-    const float sum = a + b, part = sum - a;
-    return (float2)(sum, (a - (sum - part)) + (b - part));
-}
-
-// Without fma, which is a call on some processors: the halves of floats have exact products.
-float2 two_product(const float a, const float b)
-{
-    const float product = a * b, c = 4097 * a, d = 4097 * b;
-    const float a_high = c - (c - a), a_low = a - a_high, b_high = d - (d - b), b_low = b - b_high;
-    const float error = a_low * b_low - (((product - a_high * b_high) - a_low * b_high) - a_high * b_low);
-    return (float2)(product, error);
-}
-
 float next_up(const float x)
 {
     const int bits = as_int(x), up = bits + (bits < 0 ? -1 : 1);
     return as_float(x == 0 ? 1 : up);
 }
 
-// The smallest float that is not below dark + share (bright - dark), as if in double precision: every number is the
-// sum of two floats. Dekker (1971); Knuth, TAOCP 2, 4.2.2.
+// The smallest float that is not below dark + share (bright - dark), as if in double precision.
 float level_between(const float dark, const float bright, const float share, const float share_rest)
 {
-    const float2 range = two_sum(bright, -dark), product = two_product(share, range.x);
-    const float2 sum = two_sum(dark, product.x);
-    const float2 level = two_sum(sum.x, sum.y + (product.y + (share * range.y + share_rest * range.x)));
-    return level.y > 0 ? next_up(level.x) : level.x;
+    const Pair range = sum_of(bright, -dark), product = product_of(share, range.high), sum = sum_of(dark, product.high);
+    const Pair level = sum_of(sum.high, sum.rest + (product.rest + (share * range.rest + share_rest * range.high)));
+    return level.rest > 0 ? next_up(level.high) : level.high;
 }
 
 // Turns bright and dark, in the planes of `levels`, into level and dark, and tells what is light.
 __kernel void onset_levels(
-    const int pixels, const int stride, const float share, const float share_rest, __global float *restrict levels,
+    const int pixels, const int stride, const float share, const float share_rest, OUT levels,
     __global FRAME *restrict marks, __global Bits *restrict closed)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);
@@ -192,7 +165,7 @@ __kernel void onset_levels(
 
 // Tells what is surely dark: samples that miss the level by `tolerance` counts.
 __kernel void onset_sure(
-    const int stride, const float tolerance, __global const float *restrict levels, __global FRAME *restrict marks)
+    const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);
     for (int i = 0; i < size; ++i) {
@@ -276,7 +249,7 @@ void pick(const Bits time, __global const FRAME *restrict row, __global const FR
           __global const FRAME *restrict first, __global const FRAME *restrict second, Around *restrict around)
 {
     for (int i = 0; i < PIXELS; ++i) {
-        const FRAME one = SEE(first[i]), two = SEE(second[i]), lesser = LESSER(one, two);
+        const FRAME one = SEE(first[i]), two = SEE(second[i]), lesser = LEAST(one, two);
         const FRAME low = SEE(before[i]), high = SEE(row[i]);
         const FRAME old_low = around->before[i], old_high = around->at[i], old_lesser = around->after[i];
         const int here = around->when[i] == time;
@@ -292,7 +265,7 @@ void complete(const Bits time, const int whole, __global const FRAME *restrict f
 {
     for (int i = 0; i < PIXELS; ++i) {
         const FRAME kept = around->after[i], one = whole ? SEE(first[i]) : kept, two = SEE(second[i]);
-        const FRAME lesser = LESSER(one, two);
+        const FRAME lesser = LEAST(one, two);
         around->after[i] = around->when[i] == time ? lesser : kept;
     }
 }
@@ -344,9 +317,9 @@ __kernel void onset_scan(
     __global const FRAME *restrict marks, __global Word *restrict closed, __global uchar *restrict busy,
     __global int *restrict times
 #if SAMPLES
-    , __global const float *restrict levels, __global const float *restrict travel, const int room,
+    , MAP levels, MAP travel, const int room,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
-    __global float *restrict answers, __global uchar *restrict status
+    OUT answers, __global uchar *restrict status
 #endif
     )
 {
@@ -494,7 +467,7 @@ __kernel void onset_scan(
                         const float height = answers[p + i], sigma = answers[stride + p + i];
                         const uchar was = status[p + i];
                         answers[p + i] = known ? found.x : height;
-                        answers[stride + p + i] = known ? root(found.y) : sigma;
+                        answers[stride + p + i] = known ? found.y * rough_inverse_root(found.y) : sigma;
                         status[p + i] = begin == INVALID ? 0 : done ? (begin == 0 ? FROM_START : 1) : was;
                     }
                 if (running)
@@ -528,9 +501,9 @@ __kernel void onset_scan(
 // Answers for the pixels whose run is open or not complete, as if the press ended after `count` frames; `undo` takes
 // that back, so that more frames can follow.
 __kernel void onset_heights(
-    const int count, const int stride, __global const int *restrict times, __global const float *restrict travel,
-    const int room, __global float *restrict answers, __global uchar *restrict status,
-    __global const uchar *restrict busy, __global const FRAME *restrict samples, __global const float *restrict levels,
+    const int count, const int stride, __global const int *restrict times, MAP travel,
+    const int room, OUT answers, __global uchar *restrict status,
+    __global const uchar *restrict busy, __global const FRAME *restrict samples, MAP levels,
     const float noise, const float dark_tolerance, const float light_tolerance, const int undo)
 {
     const int base = get_global_id(0) * WORDS, width = min(WORDS, stride / PIXELS - base);
@@ -551,7 +524,7 @@ __kernel void onset_heights(
                                         levels[stride + p + i], noise, dark_tolerance, light_tolerance);
             const int known = begin > 0 && !undo;
             answers[p + i] = known ? found.x : NAN;
-            answers[stride + p + i] = known ? root(found.y) : NAN;
+            answers[stride + p + i] = known ? found.y * rough_inverse_root(found.y) : NAN;
             status[p + i] = undo ? NEVER : begin == 0 ? FROM_START : 1;
         }
     }
@@ -559,8 +532,8 @@ __kernel void onset_heights(
 #else
 // Heights by the paper's equation 4, at the frame of the onset itself.
 __kernel void onset_heights(
-    const int stride, __global const int *restrict times, __global const float *restrict travel, const int room,
-    __global float *restrict answers, __global uchar *restrict status)
+    const int stride, __global const int *restrict times, MAP travel, const int room,
+    OUT answers, __global uchar *restrict status)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);
     for (int i = 0; i < size; ++i) {

@@ -18,12 +18,12 @@
 // The spectrum lies in strips of 16 slots, for modes k ... k + 7 and length - k ... length - k - 7; a strip has 16 numbers of
 // each of `padded` lines.
 
+#include "common.clh"
+
 #define HALF 8
 #define SLOTS 16
-#define TABLE __global const float *restrict
-#define STEPS const int steps, __global const int *restrict plan, TABLE factors
+#define STEPS const int steps, __global const int *restrict plan, MAP factors
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
 
 #if LANES == 8
 typedef float8 F;
@@ -105,10 +105,10 @@ typedef __global F *Point;
 // Adds numbers that are `far` from each other, again and again `next` further, in several blocks.
 #define STEP(radix)                                                                                    \
     void step_##radix(                                                                                 \
-        WORK, const int blocks, const int inner, const long next, const long far, TABLE turns, const int way) \
+        WORK, const int blocks, const int inner, const long next, const long far, MAP turns, const int way) \
     {                                                                                                  \
         for (int block = 0; block < blocks; ++block, work += radix * far - inner * next) {             \
-            TABLE turn = turns;                                                                        \
+            MAP turn = turns;                                                                        \
             for (int j = 0; j < inner; ++j, work += next, turn += 2 * (radix - 1)) {                   \
                 ALL_##radix(GET_FAR)                                                                   \
                 if (way == UP) { ALL_##radix(TURN_FAR) }                                               \
@@ -127,12 +127,12 @@ STEP(5)
 
 // Numbers n and radix - n go together: cosines meet their sums, sines their differences.
 void step_odd(
-    WORK, const int blocks, const int inner, const long next, const long far, TABLE turns, const int way,
-    const int radix, TABLE roots)
+    WORK, const int blocks, const int inner, const long next, const long far, MAP turns, const int way,
+    const int radix, MAP roots)
 {
     const int pairs = radix / 2;
     for (int block = 0; block < blocks; ++block, work += radix * far - inner * next) {
-        TABLE turn = turns - 2;
+        MAP turn = turns - 2;
         for (int j = 0; j < inner; ++j, work += next, turn += 2 * (radix - 1)) {
             F sum_r[MOST_PAIRS], sum_i[MOST_PAIRS], off_r[MOST_PAIRS], off_i[MOST_PAIRS];
             GET(0, work)
@@ -164,10 +164,10 @@ void step_odd(
 }
 
 void step(
-    WORK, const int from, const int count, __global const int *restrict plan, TABLE factors, const int way)
+    WORK, const int from, const int count, __global const int *restrict plan, MAP factors, const int way)
 {
     const int radix = plan[0], q = plan[1], some = radix > 5 ? 2 * radix : 0;
-    TABLE roots = factors + plan[2];
+    MAP roots = factors + plan[2];
     work = AT(from);
 #define TAKE(steps, ...)                                                                               \
     if (q > 1) steps(MINE, count, q, 2 * APART, 2 * APART * q, roots + some, way __VA_ARGS__);         \
@@ -201,7 +201,7 @@ void to_points(WORK, STEPS)
 }
 
 #if CHIRP
-#define CHIRPS , TABLE chirp, TABLE other
+#define CHIRPS , MAP chirp, MAP other
 // With the numbers times a chirp, the transform is their convolution with another chirp, times the first: to modes, times the
 // other's transform, and back. All in order.
 void convolve(WORK, const int length, const int size, STEPS CHIRPS)
@@ -299,8 +299,8 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // a line begins an
 #endif
 
 __kernel void rectangle_modes(
-    const int along, const int lines, const int padded, const int length, const int size, TABLE source,
-    __global const int *restrict place, TABLE turns, STEPS CHIRPS, __global float *restrict spectrum SCRATCH)
+    const int along, const int lines, const int padded, const int length, const int size, MAP source,
+    __global const int *restrict place, MAP turns, STEPS CHIRPS, OUT spectrum SCRATCH)
 {
     const int first = get_global_id(0) * PAIR;
     if (first >= lines) return;
@@ -353,8 +353,8 @@ __kernel void rectangle_modes(
 }
 
 __kernel void rectangle_heights(
-    const int along, const int lines, const int padded, const int length, const int size, TABLE spectrum,
-    __global const int *restrict place, TABLE turns, STEPS CHIRPS, __global float *restrict height SCRATCH)
+    const int along, const int lines, const int padded, const int length, const int size, MAP spectrum,
+    __global const int *restrict place, MAP turns, STEPS CHIRPS, OUT height SCRATCH)
 {
     const int first = get_global_id(0) * PAIR;
     if (first >= lines) return;
@@ -495,7 +495,7 @@ void march_slowly(const int lines, const F level, const int depth, __global cons
 
 __kernel void rectangle_columns(
     const int lines, const int padded, const int slots, const int level, __global const int *restrict reach,
-    TABLE fading, TABLE ends, __global float *restrict spectrum)
+    MAP fading, MAP ends, OUT spectrum)
 {
     const int slot = get_global_id(0) * (LANES == 8 ? SLOTS : 1), strip = slot / SLOTS;
     if (slot >= slots) return;

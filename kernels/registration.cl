@@ -10,6 +10,8 @@
 // A missing sample is a NaN, and so is the border round a padded frame: whatever is made of one is a NaN as
 // well, without a question.
 
+#include "common.clh"
+
 #define BORDER 2
 
 #if TILE < 64
@@ -39,8 +41,8 @@
 }
 
 __kernel void registration_admit(
-    const int rows, const int columns, __global const FRAME *restrict frame, __global const float *restrict offset,
-    __global const float *restrict gain, __global float *restrict padded)
+    const int rows, const int columns, __global const FRAME *restrict frame, MAP offset,
+    MAP gain, OUT padded)
 {
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
     if (row >= rows) return;
@@ -58,7 +60,7 @@ __kernel void registration_admit(
 }
 
 // Each place has five numbers: where it lies in the padded frame, and the four samples of which it is the mean.
-__kernel void registration_mend(const int count, __global const int *restrict places, __global float *restrict padded)
+__kernel void registration_mend(const int count, __global const int *restrict places, OUT padded)
 {
     const int first = get_global_id(0) * TILE, end = min(first + TILE, count);
     for (int i = first; i < end; ++i) {
@@ -69,9 +71,9 @@ __kernel void registration_mend(const int count, __global const int *restrict pl
 }
 
 __kernel void registration_resample(
-    const int rows, const int columns, __global const float *restrict padded, __global const float *restrict height,
-    __global const float *restrict shift, __global const float *restrict offset, __global const float *restrict gain,
-    __global float *restrict registered, __global float *restrict noise)
+    const int rows, const int columns, MAP padded, MAP height,
+    MAP shift, MAP offset, MAP gain,
+    OUT registered, OUT noise)
 {
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
     if (row >= rows) return;

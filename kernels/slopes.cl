@@ -5,8 +5,7 @@
 //
 // Maps are as long as the picture, but whole vectors of them may be read and written.
 
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+#include "common.clh"
 
 #define STEEPEST 0.17364818f  // cosine of the zenith beyond which a slope would grow without bounds
 #define WIDEST 0.25f          // radians^2: variance of an azimuth beyond which its mean cosine is not made good
@@ -52,9 +51,9 @@ typedef int I;
 // Slopes, and the squares of the normal's parts along x and y. Where nothing is known slopes are no numbers, and the
 // squares 0.
 __kernel void slopes_find(
-    const int pixels, const float least, __global const float *restrict vectors, __global const float *restrict sigma,
-    __global const uchar *restrict contact, __global float *restrict dz_dx, __global float *restrict dz_dy,
-    __global float *restrict squares_x, __global float *restrict squares_y)
+    const int pixels, const float least, MAP vectors, MAP sigma,
+    __global const uchar *restrict contact, OUT dz_dx, OUT dz_dy,
+    OUT squares_x, OUT squares_y)
 {
     const int first = (int)get_global_id(0) * TILE;
     for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
@@ -95,9 +94,9 @@ __kernel void slopes_find(
 // Inverse variances of slopes along x and y, within bounds; 0 where nothing is known.
 __kernel void slopes_weigh(
     const int rows, const int columns, const float least, const float lowest, const float highest,
-    __global const float *restrict sigma, __global const float *restrict dz_dx,
-    __global const float *restrict squares_x, __global const float *restrict squares_y,
-    __global float *restrict weight_x, __global float *restrict weight_y)
+    MAP sigma, MAP dz_dx,
+    MAP squares_x, MAP squares_y,
+    OUT weight_x, OUT weight_y)
 {
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);

@@ -6,6 +6,8 @@
 // TABLE    what the wall's radiance depends on: 0 nothing, 1 the height, 2 the azimuth, too
 // LAMPS    1 where the lamps light one side more than the other
 
+#include "common.clh"
+
 #if TILE < 64
 #define CHUNK TILE
 #else
@@ -15,29 +17,14 @@
 #define TINY 1e-20f
 #define LEAST 1e-6f  // one over a way that no ray goes, mm
 
-// Calls keep a loop from becoming vector code, and on some processors the library's functions are calls: hence these.
-#define LESSER(a, b) ((a) < (b) ? (a) : (b))
-#define GREATER(a, b) ((a) > (b) ? (a) : (b))
-
-// One over the root of a positive number, within 5e-6 of itself, and once more refined: within rounding.
+// Where an item is a lane, the library's root is the faster one.
 #if TILE == 1
-#define ABOUT_PER_ROOT(x) rsqrt(x)
-#define PER_ROOT(x) rsqrt(x)
+#define ROUGH_INVERSE_ROOT(x) rsqrt(x)
+#define INVERSE_ROOT(x) rsqrt(x)
 #else
-#define ABOUT_PER_ROOT(x) about_per_root(x)
-#define PER_ROOT(x) per_root(x)
+#define ROUGH_INVERSE_ROOT(x) rough_inverse_root(x)
+#define INVERSE_ROOT(x) inverse_root(x)
 #endif
-float about_per_root(const float x)
-{
-    float found = as_float(0x5f375a86 - (as_int(x) >> 1));
-    found *= 1.5f - 0.5f * x * found * found;
-    return found * (1.5f - 0.5f * x * found * found);
-}
-float per_root(const float x)
-{
-    const float found = about_per_root(x);
-    return found * (1.5f - 0.5f * x * found * found);
-}
 
 #if TABLE == 2
 // Within 1e-7 of atan2, in a way that vectorises.
@@ -66,7 +53,7 @@ float2 leave(const float x, const float y, const float ray_x, const float ray_y,
 {
     const float along = x * ray_x + y * ray_y;
     const float square = along * along + (ray_x * ray_x + ray_y * ray_y) * room + TINY;
-    const float cosine = square * PER_ROOT(square);
+    const float cosine = square * INVERSE_ROOT(square);
     return (float2)(cosine, (along + cosine) * per_room);
 }
 
@@ -75,7 +62,7 @@ float2 leave(const float x, const float y, const float ray_x, const float ray_y,
 float refracted(const float in, const float index)
 {
     const float square = 1 - index * index * (1 - in * in), passing = GREATER(square, TINY);
-    return square > 0 ? passing * PER_ROOT(passing) : 0;
+    return square > 0 ? passing * INVERSE_ROOT(passing) : 0;
 }
 
 // What share of light is not reflected, by Fresnel: the mean of both polarisations.
@@ -89,7 +76,7 @@ float passed(const float in, const float out, const float index)
 float cross_gap(const float out, const float ray_x, const float ray_y, const float radius, const float outer)
 {
     const float towards = radius * out, square = towards * towards + (ray_x * ray_x + ray_y * ray_y) * outer + TINY;
-    return outer / (towards + square * PER_ROOT(square));
+    return outer / (towards + square * INVERSE_ROOT(square));
 }
 #endif
 
@@ -98,7 +85,7 @@ float within_edges(const float z, const float below, const float ray_z, const fl
                    const float radius, const float sharpness)
 {
     const float edge = below * per_way, bound = radius * edge;
-    const float over = (edge - ray_z) * cosine * ABOUT_PER_ROOT(cosine * cosine + bound * bound);
+    const float over = (edge - ray_z) * cosine * ROUGH_INVERSE_ROOT(cosine * cosine + bound * bound);
     const float above = ray_z + z * per_way;
     const float inside = 0.5f + sharpness * LESSER(over, above);
     return LESSER(GREATER(inside, 0), 1);
@@ -106,7 +93,7 @@ float within_edges(const float z, const float below, const float ray_z, const fl
 
 #if TABLE
 // Bilinear between the table's samples; `row` counts from the one before the first.
-float look_up(__global const float *restrict table, const int columns, const float row, const float x, const float y)
+float look_up(MAP table, const int columns, const float row, const float x, const float y)
 {
     const int top = row;
     const float down = row - top;
@@ -125,10 +112,10 @@ float look_up(__global const float *restrict table, const int columns, const flo
 #endif
 
 __kernel void wall_light(
-    const int pixels, const int samples, const int rows, const int columns, __global const float *restrict sheet,
-    __global const float *restrict places, __global const float *restrict rays, __global const float *restrict table,
+    const int pixels, const int samples, const int rows, const int columns, MAP sheet,
+    MAP places, MAP rays, MAP table,
     const float radius, const float rim, const float gap, const float index, const float scatter, const float fade,
-    const float asymmetry_x, const float asymmetry_y, __global float *restrict light)
+    const float asymmetry_x, const float asymmetry_y, OUT light)
 {
     const int first = get_global_id(0) * TILE, end = min(first + TILE, pixels);
     const float sharpness = fade > 0 ? 1 / fade : 1e30f, slack = tan(scatter + fade), per_radius = 1 / radius;
@@ -158,7 +145,7 @@ __kernel void wall_light(
             const float twice = 2 / (1 + slope_x * slope_x + slope_y * slope_y);
 #if OBLIQUE
             const float view_x = places[2 * pixels + p], view_y = places[3 * pixels + p];
-            const float unit = PER_ROOT(1 + view_x * view_x + view_y * view_y);
+            const float unit = INVERSE_ROOT(1 + view_x * view_x + view_y * view_y);
             const float onto = twice * unit * (1 - view_x * slope_x - view_y * slope_y);
             x[i] = places[p] + z[i] * view_x;
             y[i] = places[pixels + p] + z[i] * view_y;
@@ -173,7 +160,7 @@ __kernel void wall_light(
             ray_z[i] = twice - 1;
 #endif
             const float off = x[i] * x[i] + y[i] * y[i] + TINY, flat = ray_x[i] * ray_x[i] + ray_y[i] * ray_y[i] + TINY;
-            const float way = radius - off * PER_ROOT(off), level = flat * PER_ROOT(flat);
+            const float way = radius - off * INVERSE_ROOT(off), level = flat * INVERSE_ROOT(flat);
             // Dark without a look at its rays: one that leans as far as any passes over the rim of the nearest wall.
             const int over = (level + ray_z[i] * slack) * (rim - z[i]) < way * (ray_z[i] - level * slack);
             lit[i] = (way > 0) & !over;
@@ -192,7 +179,7 @@ __kernel void wall_light(
             const float span = 1 / GREATER(left.y, LEAST);
             const float up_x = -ray_z[i] * (x[i] + span * ray_x[i]), up_y = -ray_z[i] * (y[i] + span * ray_y[i]);
             const float square = (up_x * up_x + up_y * up_y + left.x * left.x) * per_radius * per_radius;
-            const float scale = PER_ROOT(square + TINY) * per_radius;
+            const float scale = INVERSE_ROOT(square + TINY) * per_radius;
             const int known = square > 1e-12f;
             steep_x[i] = known ? up_x * scale : 1;
             steep_y[i] = known ? up_y * scale : 0;
