@@ -422,7 +422,7 @@ def _open(device: cl.Device) -> Device:
 
 
 def _read_source(name: str) -> str:
-    """Return a file of kernels, with the files that it includes: so all of it is the key of compiled kernels."""
+    """Return a file of kernels with the files that it includes: all of it is the key of what was compiled."""
     text = resources.files("mirrorskin.kernels").joinpath(name).read_text(encoding="utf-8")
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate(text.splitlines(), 1):
