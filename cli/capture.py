@@ -37,8 +37,8 @@ def command(
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
-    from mirrorskin.hw.rig.file import load_rig
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig_file import load_rig
     from mirrorskin.kernels.correlation import WINDOW
 
     settings = load_rig(rig_file)

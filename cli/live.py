@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
     from mirrorskin.engine.live import LivePress, LiveRotation, Loop
     from mirrorskin.hw.rig.plans import Plan
-    from mirrorskin.hw.settings import RigSettings
+    from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource, Result
 
 _LATENCY = "100ms"
@@ -97,7 +97,7 @@ def command(
     """Reconstruct while the stage moves; Ctrl-C stops it, and what was found and recorded is kept."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
-    from mirrorskin.hw.rig.file import load_rig
+    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context.params, settings)  # from the options above

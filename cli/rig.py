@@ -14,8 +14,8 @@ from mirrorskin.cli.groups import Group
 from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.finding import Finding
-    from mirrorskin.hw.settings import RigSettings
+    from mirrorskin.hw.rig.check import Finding
+    from mirrorskin.hw.rig_file import RigSettings
 
 app = typer.Typer(cls=Group, help="Look at a stage and a camera before they are used.", no_args_is_help=True)
 
@@ -27,7 +27,7 @@ def new(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
 ) -> None:
     """Write a rig file to begin with; docs/rig.md tells of every key."""
-    from mirrorskin.hw.rig.template import TEMPLATE
+    from mirrorskin.hw.rig_file import TEMPLATE
     from mirrorskin.io import InputError
 
     try:
@@ -48,7 +48,7 @@ def check(
 ) -> None:
     """Open a rig and tell whether it is as its file says; nothing moves without --move."""
     from mirrorskin.hw.errors import HardwareError
-    from mirrorskin.hw.rig.file import load_rig
+    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     findings: list[Finding] = []

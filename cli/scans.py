@@ -13,9 +13,9 @@ import typer
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
-    from mirrorskin.hw.rig.steps import StepScan
+    from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
-    from mirrorskin.hw.settings import RigSettings
+    from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, StreamRecorder
 
 SETTLE = "100ms"
@@ -80,7 +80,7 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
     InputError
         An option belongs to the other motion, is missing, cannot be, or is more than the rig can do.
     """
-    from mirrorskin.hw.rig.possible import check_plan
+    from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.io import InputError
 
     motion = ScanName(words["motion"])
@@ -108,7 +108,7 @@ def make_scan(
         The plan goes beyond the rig's limits, or an option of steps was given and it has none.
     """
     from mirrorskin.cli.quantity import duration
-    from mirrorskin.hw.rig.steps import StepScan
+    from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
 
     check_steps(plan, settle, frames)

@@ -168,9 +168,9 @@ def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str
         Stage or camera failed; the stage was stopped.
     """
     from mirrorskin import io
-    from mirrorskin.hw.rig.file import load_rig
-    from mirrorskin.hw.rig.possible import check_plan
+    from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig_file)
     paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
@@ -232,8 +232,8 @@ def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
     travel : float, optional
         Where it ends, mm; without it, the body stays lifted.
     """
-    from mirrorskin.hw.rig.file import load_rig
     from mirrorskin.hw.rig.plans import VerticalPlan
+    from mirrorskin.hw.rig_file import load_rig
 
     start = load_rig(rig_file).stage.limits.travel[0] if travel is None else travel - _STILL
     return VerticalPlan(start, start + _STILL, step=_STILL)

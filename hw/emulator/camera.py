@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.running import RunningCamera
+from mirrorskin.hw.camera_thread import ThreadedCamera
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Twin
 from mirrorskin.hw.twin.movement import Pose, pose_at_lean, pose_at_press
@@ -27,7 +27,7 @@ class _Frame(NamedTuple):
     lost: int
 
 
-class TwinCamera(RunningCamera):
+class TwinCamera(ThreadedCamera):
     """A `mirrorskin.hw.camera.Camera` that sees what the twin sees, wherever the body is at that time.
 
     Frame n is exposed about the time t = start + n / rate and arrives at t + delay + N(0, jitter), but not

@@ -1,5 +1,1 @@
-"""A stage behind GRBL: the serial line, its words, and the moves."""
-
-from mirrorskin.hw.grbl.stage import GrblStage
-
-__all__ = ["GrblStage"]
+"""A stage behind GRBL: replies, the serial line, moves, and the stage."""

@@ -2,30 +2,265 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import statistics
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
+
+import serial
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.lines import Noise, Splitter, Window
-from mirrorskin.hw.grbl.port import Port, close_port
 from mirrorskin.hw.grbl.replies import (
     Alarm,
     Banner,
     Message,
+    Noise,
     Ok,
     Refusal,
     Reply,
     Setting,
+    Splitter,
     Status,
+    Window,
     parse,
     salvage,
 )
-from mirrorskin.hw.grbl.stopping import HOLDING, LONGEST, Stopping
-from mirrorskin.hw.grbl.watch import Answer, Watch
+from mirrorskin.io import InputError
+
+SLICE = 0.02
+"""Longest time that a read waits, seconds: how finely a silence is measured."""
+
+_WRITE = 0.25  # seconds after which a line that takes nothing more is broken
+_REMEDIES = {
+    errno.ENOENT: "there is no such port; plug the controller in, or correct the rig file's port",
+    errno.ENODEV: "there is no such port; plug the controller in, or correct the rig file's port",
+    errno.ENXIO: "there is no such port; plug the controller in, or correct the rig file's port",
+    errno.EACCES: "no permission to open it; join the group that owns it (dialout, uucp)",
+    errno.EBUSY: "another program uses it; close that first",
+    errno.EAGAIN: "another program uses it; close that first",
+}
+
+
+class Port(Protocol):
+    """What of a serial port is used: pyserial's, or anything alike."""
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read at once."""
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Wait for so many bytes, `SLICE` seconds at most, and return what came."""
+
+    def write(self, data: bytes, /) -> int | None:
+        """Send."""
+
+    def close(self) -> None:
+        """Let the port go."""
+
+
+def open_port(url: str, baud: int, name: str) -> Port:
+    """Open a serial port, or what a URL of pyserial names, for us alone.
+
+    Parameters
+    ----------
+    url : str
+        Such as ``/dev/ttyUSB0``, ``socket://host:port`` or ``rfc2217://host:port``.
+    baud : int
+        Bits per second.
+    name : str
+        What to call the stage in messages.
+
+    Returns
+    -------
+    Port
+        Its reads wait `SLICE` seconds at most.
+
+    Raises
+    ------
+    InputError
+        There is no such port, it is in use, or it cannot be opened.
+    """
+    try:
+        port = serial.serial_for_url(url, baud, timeout=SLICE, do_not_open=True)
+        if os.name == "posix":
+            port.exclusive = True
+        if not url.lower().startswith("rfc2217:"):  # which knows no such limit
+            port.write_timeout = _WRITE
+        port.open()
+    except (OSError, ValueError) as error:
+        known = _REMEDIES.get(getattr(error, "errno", None) or 0)
+        raise InputError(f"{name}: {known or f'cannot be opened ({error}); correct the rig file'}") from error
+    opened: Port = port
+    return opened
+
+
+def close_port(port: Port) -> None:
+    """Close a port, also one that is gone."""
+    socket = getattr(port, "_socket", None)  # pyserial forgets it where the other side has left
+    try:
+        port.close()
+        if socket is not None:
+            socket.close()
+    except Exception:  # pyserial raises many kinds, and there is nothing left to do
+        return
+
+
+_DELAYED = 2 * SLICE  # of our own sleep: a busy computer may hush others, too
+_PART = 0.5  # of a slice that such a sleep counts as silence
+_SURELY = 0.4  # seconds after which nobody is that busy
+_MEDIAN_OF = 15  # round trips that the usual one is the median of
+_TIMES, _LATE = 3.0, 0.004  # of the usual, and seconds more, that a round trip may take to be trusted
+_AGAIN = 0.04  # seconds, and at least two usual round trips, after which a question is asked again
+_FIRST = 0.2  # the same before any was answered
+_WIDER = 2.0  # times what an answer took that several questions were open for: the same until one is trusted
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """When an answer was asked for, when it was so, and whether that can be trusted."""
+
+    asked: float
+    time: float
+    sure: bool
+
+
+class Watch:
+    """Keeps the times of questions and answers.
+
+    A question that stays open is asked again. From then on nobody knows which one an answer is meant for,
+    until a period has passed without any; and it is waited longer before the next is asked again.
+
+    Parameters
+    ----------
+    period : float
+        Seconds from one question to the next; may be changed at any time.
+    """
+
+    def __init__(self, period: float) -> None:
+        self.period = period
+        self._quiet = -math.inf  # since when nothing was asked, nor answered that cannot be trusted
+        self._wider = 0.0
+        self._resume = 0.0  # when no answers to earlier questions are to be expected any more
+        self._open: list[float] = []
+        self._unsure = False
+        self._silence = 0.0
+        self._trips: deque[float] = deque(maxlen=_MEDIAN_OF)
+
+    @property
+    def usual(self) -> float:
+        """Seconds of the usual round trip; NaN before the first."""
+        return statistics.median(self._trips) if self._trips else math.nan
+
+    def listened(self, began: float, now: float) -> None:
+        """Note that somebody listened for `SLICE` seconds at most; an answer that came is told afterwards."""
+        if self._open:
+            delayed = now - began > _DELAYED
+            self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._open[0]))
+
+    def silence(self, now: float) -> float:
+        """Return for how long a question has been open, as far as somebody listened for an answer."""
+        if self._open and now - self._open[0] > _SURELY:
+            return now - self._open[0]
+        return self._silence
+
+    def due(self, now: float) -> bool:
+        """Return whether to ask now."""
+        if not self._open:
+            return now - self._quiet >= self.period and now >= self._resume
+        wait = max(_AGAIN, 2 * self.usual) if self._trips else _FIRST
+        return now - self._open[-1] >= max(wait, self._wider)
+
+    def ask(self, now: float) -> None:
+        """Note that the question was sent."""
+        self._unsure = bool(self._open)
+        self._open.append(now)
+        self._quiet = now
+
+    def answer(self, now: float) -> Answer:
+        """Note that an answer came: it was so in the middle between question and answer.
+
+        It cannot be trusted if no question was open or several were, which makes it as if asked for never,
+        or if it came late.
+        """
+        asked, self._open = self._open, []
+        self._silence = 0.0
+        if self._unsure or not asked:
+            self._quiet = now
+            if asked:
+                self._wider = min(_WIDER * (now - asked[0]), _SURELY)  # homing answers nothing for long
+                self._resume = asked[-1] + self._wider
+            return Answer(-math.inf, now, False)
+        trip = now - asked[0]
+        late = bool(self._trips) and trip > _LATE + _TIMES * self.usual
+        self._trips.append(trip)
+        self._wider = self._wider if late else 0.0
+        return Answer(asked[0], now - trip / 2, not late)
+
+
+HOLDING = 0.3
+"""Seconds that a stop waits for rest before it resets."""
+
+_RESETTING = 0.3  # seconds that a reset may take to be answered
+
+LONGEST = HOLDING + _RESETTING
+"""Seconds that a stop takes at most."""
+
+
+class Stopping:
+    """Where a stop has got to; it needs no lock, so that anyone can begin it at any moment.
+
+    Attributes
+    ----------
+    over : bool
+        Whether it is done.
+    """
+
+    def __init__(self) -> None:
+        self.over = False
+        self._began = math.inf
+        self._reset = math.inf
+
+    @property
+    def begun(self) -> bool:
+        """Whether the machine was told to hold."""
+        return self._began < math.inf
+
+    @property
+    def resetting(self) -> bool:
+        """Whether it was told to reset."""
+        return self._reset < math.inf
+
+    def begin(self, now: float) -> None:
+        """Note that the machine was told to hold."""
+        self._began = min(self._began, now)
+
+    def reset(self, now: float, rested: float, gone: bool) -> bool:
+        """Return whether to reset now: the machine rests, the line is gone, or the time is up.
+
+        Parameters
+        ----------
+        now : float
+            Seconds.
+        rested : float
+            When the newest report was asked for, if it tells of rest.
+        gone : bool
+            Whether there is nobody to wait for.
+        """
+        if self.resetting or not (gone or rested > self._began or now - self._began > HOLDING):
+            return False
+        self._reset = now
+        return True
+
+    def finish(self, now: float, answered: bool) -> None:
+        """Note whether the reset was answered: then the stop is over, and after a while in any case."""
+        self.over = self.over or answered or now - self._reset > _RESETTING
+
 
 ASK, HOLD, RESET = b"?", b"!", b"\x18"
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from mirrorskin.hw.settings import StageSettings
+from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 

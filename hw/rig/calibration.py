@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.grbl.moves import SLOWEST
+from mirrorskin.hw.rig.check import unit_of
 from mirrorskin.hw.rig.delay import Delay, block_means, estimate_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig
-from mirrorskin.hw.rig.stage_check import unit_of
 from mirrorskin.hw.rig.track import Track, even_times
-from mirrorskin.hw.settings import Axis
+from mirrorskin.hw.rig_file import Axis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Floats
 

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.hw.stage import Limits, Position
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats
@@ -290,3 +291,32 @@ def _check_steps(count: float, least: int) -> None:
         raise InputError(
             f"{count:.3g} steps cannot be: {least} to {_STEPS_MAX} are possible; change the step or the way"
         )
+
+
+def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
+    """Refuse a plan that a stage cannot do: places beyond its limits, too fast, too slow, no axes for arcs.
+
+    Parameters
+    ----------
+    plan : VerticalPlan or AxialPlan
+    stage : StageSettings
+        As the rig file says.
+    name : str
+        What to call the stage in messages.
+
+    Raises
+    ------
+    InputError
+        Naming what cannot be done, and the remedy.
+    """
+    from mirrorskin.hw.grbl.moves import Axes
+
+    plan.check(stage.limits, name)
+    if plan.in_steps:  # moves between steps go as fast as the axes do
+        return
+    axes = Axes(stage, name)
+    if isinstance(plan, AxialPlan):
+        # One turn is as possible as many, wherever the work coordinates begin.
+        axes.arcs(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0, 0.0, axes.machine(Position()))
+    else:
+        axes.straight(plan.first, Position(plan.stop), plan.speed)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.settings import RigSettings
+from mirrorskin.hw.rig_file import RigSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.grbl import GrblStage
+    from mirrorskin.hw.grbl.stage import GrblStage
 
 _TICK = 0.02
 """Seconds from one look of the guard to the next."""
@@ -280,7 +280,7 @@ def open_rig(settings: RigSettings) -> Rig:
     HardwareError
         No frame came.
     """
-    from mirrorskin.hw.grbl import GrblStage
+    from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.video import VideoCamera
 
     with ExitStack() as opening:

@@ -14,12 +14,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.rig.plans import AxialPlan, Plan
-from mirrorskin.hw.rig.possible import check_plan
-from mirrorskin.hw.rig.references import given_reference, take_dark
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, check_plan
+from mirrorskin.hw.rig.references import read_reference
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.stage import Position, Report
-from mirrorskin.io.types import Block, Closing, Floats, Header
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
+
+_DARK_FRAMES = 16
 
 UNKNOWN_DELAY = 0.2
 """Seconds that a camera's frames are taken to be late at most, where nobody said."""
@@ -200,3 +202,132 @@ class Scan(Closing):
 
 def _scalar(value: float | None) -> Floats | None:
     return None if value is None else np.asarray(value, np.float64)
+
+
+_ASTRAY = (0.02, 2e-3)
+"""How far from where it was sent the body may rest, mm and rad."""
+
+
+class StepScan(Scan):
+    """Stands still for each of its frames; see ``Scan``.
+
+    Frames count whose exposure began after the body had settled: they arrive later by the camera's delay,
+    which is taken as 0.2 s where the rig file does not say, and half an exposure.
+
+    Parameters
+    ----------
+    rig : Rig
+    plan : VerticalPlan or AxialPlan
+        With steps.
+    settle : float
+        Seconds from rest to the first exposure.
+    frames : int
+        At each place, 1 or more.
+    """
+
+    def __init__(self, rig: Rig, plan: Plan, settle: float = 0.1, frames: int = 1) -> None:
+        if not 0 <= settle < np.inf:
+            raise InputError(f"a settling time of {settle} s cannot be: give 0 or more")
+        if frames < 1:
+            raise InputError(f"{frames} frames a step cannot be: give 1 or more")
+        super().__init__(rig, plan)
+        self.settle, self.frames = settle, frames
+        self._values, self._places = plan.values, plan.places
+        self._step = -1
+        self._left = 0
+        self._since = 0.0
+
+    @property
+    def expected(self) -> int:
+        """Frames that the scan will give."""
+        return len(self._values) * self.frames
+
+    def _next(self, most: int, origin: float) -> Block | None:
+        if self._left == 0:
+            if self._step + 1 == len(self._values):
+                return None
+            self._go_on()
+        frames, arrival, dropped = self._take(min(most, self._left))
+        self._left -= len(frames)
+        place = np.full(len(frames), self._values[self._step])
+        return self._block(frames, arrival, place, dropped, origin)
+
+    def _go_on(self) -> None:
+        """Move to the next place, and tell from when on frames show the body settled there."""
+        self._step += 1
+        place = self._places[self._step]
+        rest = self.rig.go(place)
+        _check_there(rest, place, self.rig.stage.name)
+        camera = self.rig.settings.camera
+        delay = UNKNOWN_DELAY if camera.delay is None else camera.delay
+        exposure = self.rig.period if camera.exposure is None else camera.exposure
+        self._since = rest.time + self.settle + delay + exposure / 2
+        self._left = self.frames
+        self.rig.camera.flush()
+
+    def _take(self, most: int) -> tuple[NDArray[Any], Floats, int]:
+        """Take frames that are new enough; what was lost before the first of a place does not matter."""
+        while True:
+            taken = self.rig.take(most)
+            new = int(np.searchsorted(taken.time, self._since, side="right"))
+            if new < len(taken.time):
+                first = self._left == self.frames
+                return taken.pixels[new:], taken.time[new:], 0 if first else taken.dropped
+
+
+def _check_there(rest: Report, place: Position, name: str) -> None:
+    """Refuse a stage that rests elsewhere than it was sent."""
+    travel, lean = _ASTRAY
+    off = abs(rest.position.travel - place.travel)
+    leans = max(abs(rest.position.pitch - place.pitch), abs(rest.position.roll - place.roll))
+    if off > travel or leans > lean:
+        raise HardwareError(
+            f"{name} rests {off:.3f} mm and {np.degrees(leans):.3f} degrees from where it was sent:"
+            " look at its steps per mm and for what holds it"
+        )
+
+
+def given_reference(rig: Rig, name: str) -> NDArray[np.float32] | None:
+    """Return a reference that the rig file gives, (H, W), or None.
+
+    Parameters
+    ----------
+    rig : Rig
+    name : {"dark", "bright"}
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or does not fit the camera.
+    """
+    camera = rig.settings.camera
+    value = camera.dark if name == "dark" else camera.bright
+    return None if value is None else read_reference(value, camera, f"{rig.settings.path}: camera.{name}")
+
+
+def take_dark(rig: Rig, since: float, count: int = _DARK_FRAMES) -> NDArray[np.float32]:
+    """Take the mean of some frames of a sheet that touches nothing, (H, W), float32.
+
+    Parameters
+    ----------
+    rig : Rig
+        The body is lifted.
+    since : float
+        Frames that arrived earlier do not count, seconds of `time.monotonic`.
+    count : int
+        How many frames.
+
+    Raises
+    ------
+    HardwareError
+        The camera gives none.
+    """
+    total = np.zeros(rig.camera.shape)
+    left = count
+    rig.camera.flush()
+    while left:
+        frames = rig.take(left)
+        new = frames.pixels[frames.time > since]
+        total += new.sum(axis=0, dtype=np.float64)
+        left -= len(new)
+    return (total / count).astype(np.float32)

@@ -17,8 +17,9 @@ from mirrorskin.cli import live
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.engine.streaming import push_block
+from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig import file, rig
+from mirrorskin.hw.rig import rig
 
 SHAPE = (24, 32)
 OFFSET, GAIN = 20.0, 200.0

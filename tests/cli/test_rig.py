@@ -11,10 +11,9 @@ import pytest
 from commands import run
 
 from mirrorskin.cli import rig as command
-from mirrorskin.hw.emulator.machine import GrblMachine
-from mirrorskin.hw.emulator.pty import GrblPort
-from mirrorskin.hw.rig.file import load_rig
-from mirrorskin.hw.rig.finding import Finding
+from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
+from mirrorskin.hw.rig.check import Finding
+from mirrorskin.hw.rig_file import load_rig
 
 RIG = """
 [stage]
@@ -48,7 +47,7 @@ MACHINE = {24: 600.0, 25: 3000.0, 26: 10.0, 27: 0.3, 132: 10.0} | dict.fromkeys(
 def folder(tmp_path, monkeypatch):
     """Work in a folder with a film of 5 s, and look at things for a shorter time than a user does."""
     monkeypatch.chdir(tmp_path)
-    for module in ("stage_check", "camera_check"):
+    for module in ("check",):
         monkeypatch.setattr(f"mirrorskin.hw.rig.{module}._PERIOD", 0.1)
     picture = np.arange(0, 96, 2, dtype=np.uint8).tobytes()
     film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + picture) * 250

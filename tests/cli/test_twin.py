@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from mirrorskin.hw.rig.file import load_rig
+from mirrorskin.hw.rig_file import load_rig
 
 PATIENCE = 60.0  # seconds, for a busy machine
 SMALL = ("--size", "42x31", "--pixel-size", "0.3mm")

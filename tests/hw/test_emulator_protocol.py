@@ -10,8 +10,8 @@ from grbl_bench import Bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mirrorskin.hw.emulator.grbl_errors import GrblError
-from mirrorskin.hw.emulator.machine import GrblMachine
+from mirrorskin.hw.emulator.gcode import GrblError
+from mirrorskin.hw.emulator.port import GrblMachine
 
 BANNER = ["", "Grbl 1.1h ['$' for help]"]
 

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import serial
 
-from mirrorskin.hw.emulator.machine import GrblMachine
-from mirrorskin.hw.emulator.pty import GrblPort
+from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 
 LONG = 10.0  # seconds that a slow computer may take
 

@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.emulator.rig_file import write_rig
-from mirrorskin.hw.rig.file import load_rig
+from mirrorskin.hw.emulator.rig import EmulatedRig, write_rig
+from mirrorskin.hw.rig_file import load_rig
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Twin, Vertical
 from mirrorskin.io import InputError

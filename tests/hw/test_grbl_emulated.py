@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.emulator.machine import GrblMachine
-from mirrorskin.hw.emulator.pty import GrblPort
+from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 LEAN = math.radians(2.5)

@@ -13,7 +13,8 @@ import pytest
 from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl import GrblStage, link
+from mirrorskin.hw.grbl import link
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 SOON = 2.0  # seconds: far more than anything here takes, far less than a hang
@@ -381,7 +382,7 @@ def _home(stage):
 
 FORGETFUL = """
 from scripted_grbl import ScriptedGrbl, stage_settings
-from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 class Loud(ScriptedGrbl):

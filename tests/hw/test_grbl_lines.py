@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mirrorskin.hw.grbl.lines import Noise, Splitter, Window
-from mirrorskin.hw.grbl.replies import LONGEST
+from mirrorskin.hw.grbl.replies import LONGEST, Noise, Splitter, Window
 
 TEXT = st.binary(max_size=40).map(lambda text: text.replace(b"\n", b"").replace(b"\r", b""))
 

@@ -9,7 +9,7 @@ import pytest
 from scripted_grbl import stage_settings
 
 from mirrorskin.hw.grbl.moves import Axes
-from mirrorskin.hw.settings import Axis
+from mirrorskin.hw.rig_file import Axis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 

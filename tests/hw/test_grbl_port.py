@@ -10,8 +10,8 @@ import pytest
 from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl import GrblStage
-from mirrorskin.hw.grbl.port import open_port
+from mirrorskin.hw.grbl.link import open_port
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 

@@ -9,8 +9,8 @@ import pytest
 from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl import GrblStage
-from mirrorskin.hw.settings import Axis
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig_file import Axis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 

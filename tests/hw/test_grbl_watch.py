@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from mirrorskin.hw.grbl.stopping import HOLDING, LONGEST, Stopping
-from mirrorskin.hw.grbl.watch import Watch
+from mirrorskin.hw.grbl.link import HOLDING, LONGEST, Stopping, Watch
 
 
 def answered(watch, asked, trip):

@@ -10,11 +10,8 @@ import pytest
 
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.camera_check import check_camera
-from mirrorskin.hw.rig.check import check_rig
-from mirrorskin.hw.rig.move_check import check_moves
-from mirrorskin.hw.rig.stage_check import check_stage
-from mirrorskin.hw.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig.check import check_camera, check_moves, check_rig, check_stage
+from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 
@@ -55,7 +52,7 @@ class Clock:
 def clock(monkeypatch):
     """Wait without waiting."""
     clock = Clock()
-    for module in ("stage_check", "camera_check"):
+    for module in ("check",):
         monkeypatch.setattr(f"mirrorskin.hw.rig.{module}.time", clock)
     monkeypatch.setattr(Stage, "clock", clock)
     monkeypatch.setattr(Camera, "clock", clock)

@@ -9,11 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.hw.rig.file import KEYS, load_rig
-from mirrorskin.hw.rig.keys import REQUIRED
-from mirrorskin.hw.rig.reference_files import read_reference
-from mirrorskin.hw.rig.template import TEMPLATE
-from mirrorskin.hw.settings import Axis, CameraSettings, StageSettings
+from mirrorskin.hw.rig.references import read_reference
+from mirrorskin.hw.rig_file import KEYS, REQUIRED, TEMPLATE, Axis, CameraSettings, StageSettings, load_rig
 from mirrorskin.hw.stage import Limits
 from mirrorskin.io import InputError
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from rig_fakes import settings
 
-from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan
-from mirrorskin.hw.rig.possible import check_plan
+from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan, check_plan
 from mirrorskin.hw.stage import Limits, Position
 from mirrorskin.io import InputError
 

@@ -11,7 +11,7 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import calibration
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.hw.rig.steps import StepScan
+from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError

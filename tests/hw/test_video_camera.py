@@ -22,9 +22,8 @@ import pytest
 
 from mirrorskin.hw.camera import Tally
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.settings import CameraSettings
-from mirrorskin.hw.video import VideoCamera, camera, capture, source
-from mirrorskin.hw.video.grey import to_grey
+from mirrorskin.hw.rig_file import CameraSettings
+from mirrorskin.hw.video import VideoCamera, camera, capture, source, to_grey
 from mirrorskin.io import InputError
 
 FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()

@@ -17,10 +17,10 @@ from mirrorskin import engine
 from mirrorskin.engine.scoring import score
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.hw.rig.steps import StepScan
+from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.twin import Axial, Twin, Vertical
 from mirrorskin.io.types import Block, Closing, Floats, Header, Truth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mirrorskin.hw.emulator.machine import GrblMachine
+from mirrorskin.hw.emulator.port import GrblMachine
 
 
 class Bench:

@@ -20,7 +20,7 @@ import numpy as np
 from mirrorskin import io
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl import GrblStage
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan

@@ -13,7 +13,7 @@ import numpy as np
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.plans import Trapezoid
-from mirrorskin.hw.settings import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Limits, Position, Report
 
 LIMITS = Limits((-5.0, 3.0), 0.1, 2.0)

@@ -9,8 +9,8 @@ import time
 
 import serial
 
-from mirrorskin.hw.grbl.port import SLICE
-from mirrorskin.hw.settings import Axis, StageSettings
+from mirrorskin.hw.grbl.link import SLICE
+from mirrorskin.hw.rig_file import Axis, StageSettings
 
 SLOTS = 4
 SETTINGS = {

@@ -14,7 +14,8 @@ from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
-from mirrorskin.hw.rig import file, rig
+from mirrorskin.hw import rig_file as file
+from mirrorskin.hw.rig import rig
 
 SHAPE = (9, 11)
 X, Y = np.meshgrid(np.linspace(-1, 1, 11), np.linspace(1, -1, 9))

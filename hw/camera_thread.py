@@ -13,7 +13,7 @@ from mirrorskin.hw.ring import Ring, usual_slots
 from mirrorskin.io.types import Closing
 
 
-class RunningCamera(Closing):
+class ThreadedCamera(Closing):
     """A ``mirrorskin.hw.camera.Camera`` but for the thread that brings the frames, and ``close``.
 
     That thread fills ``_slot()`` and calls ``_put``, again and again, and ``_fail`` when it gives up.

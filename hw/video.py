@@ -1,0 +1,497 @@
+"""What a rig file's ``camera.source`` means: a camera of this machine, a stream, or a file."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import re
+import threading
+import time as clock
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.hw.camera import Frames
+from mirrorskin.hw.camera_thread import ThreadedCamera
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig_file import CameraSettings
+from mirrorskin.io import InputError
+from mirrorskin.io.frames import quiet_opencv
+
+Kind = Literal["device", "stream", "file"]
+
+_DEVICES = Path("/dev")
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSource:
+    """Where pictures come from.
+
+    Attributes
+    ----------
+    kind : {"device", "stream", "file"}
+    target : str
+        A device's path, a URL, or a file's path.
+    name : str
+        What messages call it, without a password.
+    """
+
+    kind: Kind
+    target: str
+    name: str
+
+
+def find_source(source: int | str) -> VideoSource:
+    """Tell what kind of source it is, and see that it is there.
+
+    Parameters
+    ----------
+    source : int or str
+        The number of a camera or its path under /dev, a URL, or the path of a video file.
+
+    Raises
+    ------
+    InputError
+        There is no such device or file, or it may not be read.
+    """
+    text = str(source)
+    if re.fullmatch(r"\d+", text):
+        text = str(_DEVICES / f"video{text}")
+    if Path(text).is_relative_to(_DEVICES):
+        _check_device(Path(text))
+        return VideoSource("device", text, f"camera {text}")
+    if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]+://", text):
+        return VideoSource("stream", text, f"camera {re.sub('//[^/]*@', '//', text)}")
+    if not Path(text).is_file():
+        raise InputError(f"camera {text}: there is no such file; give a camera's number, a URL or a video")
+    return VideoSource("file", str(Path(text).absolute()), f"camera {text}")
+
+
+def _check_device(path: Path) -> None:
+    if not path.exists():
+        there = sorted(str(found) for found in _DEVICES.glob("video*"))
+        raise InputError(
+            f"camera {path}: there is no such device; "
+            + (f"there are {', '.join(there)}" if there else "no camera is connected that Linux knows")
+        )
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise InputError(f"camera {path} may not be used: add yourself to the group 'video'")
+
+
+_CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+
+
+def to_grey(picture: NDArray[Any], out: NDArray[Any], name: str) -> None:
+    """Write a picture's grey to a frame.
+
+    A grey picture is copied. Of two channels (YUYV) the first is taken, the luma as the camera sent it. BGR
+    becomes the luma of ITU-R BT.601, which is exactly the one value where all three are equal, as a grey
+    camera's are.
+
+    Parameters
+    ----------
+    picture : ndarray, (H, W) or (H, W, channels)
+    out : ndarray, (H, W)
+    name : str
+        What messages call the camera.
+
+    Raises
+    ------
+    InputError
+        The picture's size or type is not the frame's.
+    """
+    if picture.shape[:2] != out.shape or picture.dtype != out.dtype:
+        raise InputError(
+            f"{name} gives pictures of {_say(picture)}, and {_say(out)} is asked for: "
+            "set camera.size, camera.dtype or camera.fourcc in the rig file so that they agree"
+        )
+    channels = 1 if picture.ndim == 2 else picture.shape[2]
+    if channels in _CONVERSIONS:
+        cv2.cvtColor(picture, _CONVERSIONS[channels], dst=out)
+    elif picture.ndim == 2:
+        np.copyto(out, picture)
+    else:
+        np.copyto(out, picture[..., 0])
+
+
+def _say(picture: NDArray[Any]) -> str:
+    return f"{picture.shape[1]} x {picture.shape[0]} {picture.dtype}"
+
+
+OPEN_TIMEOUT = 5.0
+"""Seconds that a stream has for its opening."""
+READ_TIMEOUT = 2.0
+"""Seconds without a picture after which a stream or camera counts as lost."""
+
+_log = logging.getLogger("mirrorskin.hw")
+
+# OpenCV takes these from the environment only: no messages of FFmpeg's, and whole seconds for a camera.
+_ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
+_RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if told to
+_GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # what FFmpeg calls the grey ones
+_MANUAL = 1.0  # V4L2's "manual exposure"
+_EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
+_STALEST = 0.5  # seconds: a camera's own time that is older is not a time of this clock
+_LONGEST_BACKLOG = 0.5  # seconds
+_USUAL_RATE = 25.0  # frames a second, of what does not say
+
+
+class Capture:
+    """A camera, stream or file that is open.
+
+    Parameters
+    ----------
+    source : VideoSource
+    settings : CameraSettings
+    timeout : float
+        Seconds that a stream may take to open.
+
+    Raises
+    ------
+    InputError
+        It cannot be opened, or not with the size that is asked for.
+    """
+
+    def __init__(self, source: VideoSource, settings: CameraSettings, timeout: float = OPEN_TIMEOUT) -> None:
+        self._source, self._settings = source, settings
+        self._video = _open(source, timeout)
+        self._picture: NDArray[Any] | None = None
+        self._trusts = source.kind == "device"
+        self._last = -math.inf
+        try:
+            self._raw = _configure(self._video, source, settings)
+            declared = float(self._video.get(cv2.CAP_PROP_FPS))
+            self._declared = declared if math.isfinite(declared) and declared > 0 else _USUAL_RATE
+            if source.kind == "stream":
+                self._skip_backlog()
+        except BaseException:
+            self._video.release()
+            raise
+
+    def grab(self) -> float | None:
+        """Wait for the next picture, and return when it arrived, monotonic seconds; None: there is none."""
+        if not self._video.grab():
+            return None
+        now = clock.monotonic()
+        if self._trusts:
+            # V4L2 tells when the driver had it, on this clock if the driver is a good one.
+            stamp = float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+            self._trusts = now - _STALEST <= stamp <= now and stamp > self._last
+            now = stamp if self._trusts else now
+        self._last = max(self._last, now)
+        return self._last
+
+    def retrieve(self, out: NDArray[Any]) -> None:
+        """Write the picture that was grabbed to a frame, (H, W).
+
+        Raises
+        ------
+        InputError
+            It has another size or type, or cannot be decoded.
+        """
+        try:
+            done, picture = self._video.retrieve(out if self._raw else self._picture)
+        except cv2.error as error:
+            raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from error
+        if not done:
+            raise InputError(f"{self._source.name}: a picture cannot be decoded: see camera.fourcc")
+        if picture is not out:
+            self._picture = picture
+            to_grey(picture, out, self._source.name)
+
+    @property
+    def position(self) -> float:
+        """Seconds from a file's beginning to the picture that was grabbed, as the file says."""
+        return float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+
+    @property
+    def period(self) -> float:
+        """Seconds from picture to picture, as the source declares."""
+        return 1 / self._declared
+
+    def release(self) -> None:
+        """Let it go."""
+        self._video.release()
+
+    def _skip_backlog(self) -> None:
+        """Forget the pictures that waited while the stream was opened: when they were taken is not known."""
+        period = 1 / (self._settings.rate or self._declared)
+        begun = before = clock.monotonic()
+        waited = 0
+        while (time := self.grab()) is not None and time - begun < _LONGEST_BACKLOG:
+            # One alone can be a decoder's start.
+            waited = waited + 1 if time - before > period / 2 else 0
+            if waited == 2:
+                return
+            before = time
+
+
+def _open(source: VideoSource, timeout: float) -> Any:
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    backend, parameters = cv2.CAP_FFMPEG, []
+    if source.kind == "device":
+        backend = cv2.CAP_V4L2
+    elif source.kind == "stream":
+        # Of several threads each holds a picture back.
+        parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1000 * timeout)]
+        parameters += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1000 * READ_TIMEOUT), cv2.CAP_PROP_N_THREADS, 1]
+    video = cv2.VideoCapture(source.target, backend, parameters)
+    if not video.isOpened():
+        video.release()
+        why = {
+            "device": "another program may be using it, or it is no camera",
+            "stream": f"nothing answers there within {timeout:.3g} s that is a video",
+            "file": "it is damaged, or no video",
+        }
+        raise InputError(f"{source.name} cannot be opened: {why[source.kind]}")
+    return video
+
+
+def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> bool:
+    """Set what is asked for, tell what was not taken, and return whether pictures come as they are stored."""
+    if source.kind == "device":
+        _set_up(video, source, settings)
+        raw = _letters(video.get(cv2.CAP_PROP_FOURCC)).strip() in _RAW
+    else:
+        asked = [name for name in ("fourcc", "exposure", "gain") if getattr(settings, name) is not None]
+        if asked:
+            _log.warning("%s: %s can only be set where it is sent from", source.name, " and ".join(asked))
+        raw = _is_grey(video, source)
+    _check_size(video, source, settings)
+    if raw:
+        video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+    return raw
+
+
+def _set_up(video: Any, source: VideoSource, settings: CameraSettings) -> None:
+    """Set a camera's format, size, rate, exposure and gain, and read them back."""
+    rows, columns = settings.shape
+    if settings.fourcc is not None:
+        video.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc.ljust(4)))
+    video.set(cv2.CAP_PROP_FRAME_WIDTH, columns)
+    video.set(cv2.CAP_PROP_FRAME_HEIGHT, rows)
+    numbers = [
+        ("rate", settings.rate, cv2.CAP_PROP_FPS, 1.0, " Hz"),
+        ("exposure", settings.exposure, cv2.CAP_PROP_EXPOSURE, _EXPOSURE_UNIT, " s"),
+        ("gain", settings.gain, cv2.CAP_PROP_GAIN, 1.0, ""),
+    ]
+    if settings.exposure is not None:
+        video.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
+    for _, asked, code, unit, _ in numbers:
+        if asked is not None:
+            video.set(code, asked / unit)
+    for name, asked, code, unit, symbol in numbers:
+        got = float(video.get(code)) * unit
+        if asked is not None and not math.isclose(asked, got, rel_tol=0.01, abs_tol=0.5 * _EXPOSURE_UNIT):
+            what = f"{name} {asked:g}{symbol} was asked for, the camera set {got:g}{symbol}"
+            _log.warning("%s: %s", source.name, what)
+    got_format = _letters(video.get(cv2.CAP_PROP_FOURCC))
+    if settings.fourcc is not None and got_format != settings.fourcc.ljust(4):
+        what = f"fourcc {settings.fourcc} was asked for, the camera set {got_format}"
+        _log.warning("%s: %s", source.name, what)
+
+
+def _check_size(video: Any, source: VideoSource, settings: CameraSettings) -> None:
+    rows, columns = settings.shape
+    got = [int(video.get(code)) for code in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+    if got != [columns, rows]:
+        raise InputError(
+            f"{source.name} gives pictures of {got[0]} x {got[1]}, and {columns} x {rows} is asked for: "
+            "set camera.size in the rig file to a size that the camera has"
+        )
+
+
+def _is_grey(video: Any, source: VideoSource) -> bool:
+    """Whether FFmpeg decodes to grey of 8 or 16 bits, which needs no conversion."""
+    tag = _tag(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
+    # FFmpeg's tags of the deeper formats end in the number of bits.
+    if 8 < tag[3] < 16 or (tag[3] == 16 and tag != _GREY16):
+        raise InputError(
+            f"{source.name} has {tag[3]} bits a sample, but only 8 would be read: send grey of 8 or 16 bits"
+        )
+    return tag in (_GREY8, _GREY16)
+
+
+def _letters(fourcc: float) -> str:
+    return _tag(fourcc).decode("ascii", "replace").rstrip("\0")
+
+
+def _tag(code: float) -> bytes:
+    return (int(code) & 0xFFFFFFFF).to_bytes(4, "little")
+
+
+PATIENCE = 10.0
+"""Seconds from the loss of a camera until it is given up."""
+
+_FIRST = OPEN_TIMEOUT + READ_TIMEOUT  # seconds until the first frame
+_CLOSING = READ_TIMEOUT + 1.0  # seconds that the thread has for its end
+_PAUSES = (0.05, 1.0)  # seconds between two tries to have a camera back, at first and at most
+
+_log = logging.getLogger("mirrorskin.hw")
+
+
+class VideoCamera(ThreadedCamera):
+    """A camera that OpenCV can open, as a ``mirrorskin.hw.camera.Camera``.
+
+    A camera of this machine (V4L2) is given the format, size, rate, exposure and gain that the settings
+    ask for; what it did not take is logged as a warning. Frames are grey: as the camera sends them where
+    it sends grey (8 or 16 bits) or YUYV, else the luma of the colours. Their times are the driver's where
+    these are on the clock of ``time.monotonic``, else that of the arrival here.
+
+    A file plays once at its own rate, and ends with an error that says so. Of a stream, the pictures that
+    waited while it was opened are left out.
+
+    A camera or stream that is lost is opened again, for at most 10 s; it is logged that it is lost, and
+    that it is back. Numbers then go on after as many as the time away had room for. ``error`` stays None
+    meanwhile; ``latest`` tells at once that nothing comes.
+
+    Parameters
+    ----------
+    settings : CameraSettings
+    slots : int, optional
+        Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+
+    Raises
+    ------
+    InputError
+        It is not there, cannot be opened, gives no frame within 7 s, or frames of another size or type.
+    """
+
+    def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:
+        self._source = find_source(settings.source)
+        self._settings = settings
+        super().__init__(self._source.name, settings.shape, settings.dtype, settings.rate, slots)
+        self._lost: float | None = None  # since when
+        self._pause = _PAUSES[0]
+        self._refusal: InputError | None = None
+        self._ready, self._stop = threading.Event(), threading.Event()
+        # OpenCV may hang in a driver: the program's end must not wait for that.
+        self._thread = threading.Thread(target=self._drain, name=self.name, daemon=True)
+        self._thread.start()
+        try:
+            self._await_first()
+        except BaseException:
+            self.close()
+            raise
+
+    def take(self, most: int, timeout: float) -> Frames:
+        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
+        try:
+            return super().take(most, timeout)
+        except HardwareError as error:
+            lost = self._lost
+            if lost is None or self.error is not None:
+                raise
+            away = clock.monotonic() - lost
+            raise HardwareError(f"{self.name} was lost {away:.1f} s ago and is not back yet") from error
+
+    def close(self) -> None:
+        """Let the camera go; a driver that does not answer is left to itself after 3 s."""
+        self._stop.set()
+        self._fail(f"{self.name} is closed")
+        self._thread.join(_CLOSING)
+        if self._thread.is_alive():
+            _log.warning("%s does not let go: unplug it before it is used again", self.name)
+
+    def _await_first(self) -> None:
+        if not self._ready.wait(_FIRST):
+            raise InputError(f"{self.name} gave no picture within {_FIRST:.3g} s: see its cable and power")
+        if self._refusal is not None:
+            raise self._refusal
+
+    def _drain(self) -> None:
+        """Move frames to the ring until the end: what the thread does."""
+        with quiet_opencv():
+            try:
+                self._keep_open()
+            except Exception as error:  # whatever it is, readers must not wait
+                _log.debug("%s failed", self.name, exc_info=error)
+                self._fail(f"{self.name} failed: {error}")
+            finally:
+                self._ready.set()
+
+    def _keep_open(self) -> None:
+        """Open the source and follow it; again and again if it is lost."""
+        timeout = OPEN_TIMEOUT
+        while not self._stop.is_set():
+            try:
+                why = self._follow(Capture(self._source, self._settings, timeout))
+            except InputError as error:
+                why = str(error)
+            if not self._ready.is_set():
+                self._refusal = InputError(why)
+                return
+            if self._source.kind == "file":
+                self._fail(why)
+                return
+            if not self._stop.is_set():
+                timeout = self._wait_for_return(why)
+
+    def _follow(self, capture: Capture) -> str:
+        """Put frames into the ring as they come, and return why they do not come any more."""
+        pace = _Pace(capture.period) if self._source.kind == "file" else None
+        try:
+            while not self._stop.is_set():
+                time = capture.grab()
+                if time is None:
+                    break
+                capture.retrieve(self._slot())
+                if pace is not None:
+                    self._stop.wait(pace.due(capture.position) - clock.monotonic())
+                    time = clock.monotonic()
+                self._put(time, 0 if self._lost is None else self._came_back(time))
+                self._ready.set()
+        finally:
+            capture.release()
+        if self._source.kind == "file":
+            return f"{self.name} has ended after {self._number} frames"
+        return f"{self.name} gives no picture"
+
+    def _wait_for_return(self, why: str) -> float:
+        """Wait before a lost camera is tried again, or give it up; return the seconds left to try."""
+        now = clock.monotonic()
+        if self._lost is None:
+            self._lost = now
+            told = "%s: it was lost after %d frames, and is tried again for %.3g s"
+            _log.warning(told, why, self._number, PATIENCE)
+        left = self._lost + PATIENCE - now
+        if left <= 0:
+            self._fail(f"{why}: it was lost, and not back within {PATIENCE:.3g} s; see its cable and power")
+            self._stop.set()
+        self._stop.wait(min(self._pause, max(left, 0.0)))
+        self._pause = min(2 * self._pause, _PAUSES[1])
+        return min(OPEN_TIMEOUT, max(left, 0.1))
+
+    def _came_back(self, time: float) -> int:
+        """Tell that the camera is back, and return how many frames it would have given meanwhile."""
+        away = time - self.latest
+        rate = self._tally.counts().rate
+        missing = max(1, round(away * rate) - 1) if math.isfinite(rate) else 1
+        self._lost, self._pause = None, _PAUSES[0]
+        self._reconnects += 1
+        _log.warning("%s is back after %.2f s; about %d frames are missing", self.name, away, missing)
+        return missing
+
+
+class _Pace:
+    """When the pictures of a file that begins to play now are due."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._start: float | None = None
+        self._position = 0.0
+
+    def due(self, position: float) -> float:
+        """Return when a picture is due, monotonic seconds, from its position in the file."""
+        if self._start is None:
+            self._start = clock.monotonic() - position
+        elif not position > self._position:  # some files do not say
+            position = self._position + self._period
+        self._position = position
+        return self._start + position
