@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.io import FRAME_DTYPES, InputError
 from mirrorskin.kernels.array import Array
@@ -92,10 +92,12 @@ class Noise:
             self.value = estimate_noise(self._seen[0], self._seen[1], self._integer)
 
 
-def check_dtype(dtype: np.dtype[Any]) -> None:
-    """Raise InputError unless samples are of a type that kernels take."""
-    if dtype not in FRAME_DTYPES:
-        raise InputError(f"frames of type {dtype}: uint8, uint16 or float32 are needed")
+def check_dtype(dtype: DTypeLike) -> np.dtype[Any]:
+    """Return the type of samples if kernels take it, else raise InputError."""
+    found = np.dtype(dtype)
+    if found not in FRAME_DTYPES:
+        raise InputError(f"frames of type {found}: uint8, uint16 or float32 are needed")
+    return found
 
 
 def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> None:

@@ -257,6 +257,14 @@ def cut_into_bands(
     return cut(slice(0, shape[0]))
 
 
+def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
+    """Return where frames may be written: a single band's room, or host memory for so many frames."""
+    frames = bands[0].frames.host
+    if len(bands) == 1:
+        return frames
+    return np.empty((length, bands[-1].rows.stop, frames.shape[2]), frames.dtype)
+
+
 def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Put a map together from those of the bands; that of a single one is taken as it is."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -43,7 +43,7 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
     """Return targets of changes from one frame to the next."""
     place = np.random.default_rng(1).uniform(2, _FRAMES - 2, shape)
     frames, known = _frames(kind, place, 0.0)
-    found = find_onset(frames, *known, noise=_noise(kind), device=device)
+    found = find_onset(frames, **known, noise=_noise(kind), device=device)
     first = np.ceil(place)
     error = _error(found, place) * np.sqrt(12)
     sigma = float(np.mean(found.sigma)) / _STEP * np.sqrt(12)
@@ -60,8 +60,8 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
     place = np.random.default_rng(2).uniform(2 + lasts, _FRAMES - 2 - lasts, shape)
     frames, known = _frames(kind, place, lasts)
     noise = _noise(kind)
-    onset = find_onset(frames, *known, noise=noise, device=device)
-    change = find_change_point(frames, *known, noise=noise, device=device)
+    onset = find_onset(frames, **known, noise=noise, device=device)
+    change = find_change_point(frames, **known, noise=noise, device=device)
     share = np.ceil(place) - place  # of the interval that lies behind the crossing
     span = _LEVELS[kind][1] - _LEVELS[kind][0]
     line = noise * lasts / span * np.sqrt(np.mean(share**2 + (1 - share) ** 2))
@@ -76,7 +76,7 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
     ]
 
 
-def _frames(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], tuple[Doubles, float, float]]:
+def _frames(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], dict[str, Any]]:
     """Return frames that cross half of the way at a place, (T, H, W), and travel, dark and bright."""
     dark, bright = _LEVELS[kind]
     number = np.arange(_FRAMES)[:, np.newaxis, np.newaxis]
@@ -84,7 +84,7 @@ def _frames(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], tupl
     noise = np.random.default_rng(3).normal(0, _NOISE, share.shape)
     counts = dark + (bright - dark) * (share + noise)
     frames = counts.astype(kind) if kind == "float32" else np.rint(counts).astype(kind)
-    return frames, (np.arange(_FRAMES, dtype=np.float64) * _STEP, dark, bright)
+    return frames, {"travel": np.arange(_FRAMES) * _STEP, "dark": dark, "bright": bright}
 
 
 def _noise(kind: str) -> float:

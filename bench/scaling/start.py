@@ -42,7 +42,7 @@ def main() -> None:
     mask = place > 2.5
 
     works = {
-        "press": lambda: engine.find_onset(press, travel, 20, 220, device=device).height,
+        "press": lambda: engine.find_onset(press, travel, dark=20, bright=220, device=device).height,
         "turn": lambda: engine.estimate_normals(turn, phase, 0.0436, 180.0, 16.0, device=device).vectors,
         "surface": lambda: engine.integrate(dz_dx, dz_dy, 0.03, mask=mask, sigma=False, device=device).height,
     }

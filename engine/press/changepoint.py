@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import reference_pair, travel_pairs
-from mirrorskin.engine.press.onset import Event, Onset, Search, check_stack
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, join_rows
-from mirrorskin.io import InputError
-from mirrorskin.kernels.array import Array, Operand
+from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair, travel_pairs
+from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.io import InputError, check_travel
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Device, Kernel, open_device
 
@@ -22,6 +22,7 @@ _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light t
 def find_change_point(
     frames: NDArray[Any],
     travel: ArrayLike,
+    *,
     dark: ArrayLike | None = None,
     bright: ArrayLike | None = None,
     threshold: float = 0.5,
@@ -32,6 +33,9 @@ def find_change_point(
 ) -> Onset:
     """Find the change from dark to light, or back, in a stack that fits in memory.
 
+    With known levels it is a CUSUM of each pixel's samples (Page, Biometrika 41, 1954, 100-115); with unknown
+    ones the split of its samples that leaves the least squares.
+
     Parameters
     ----------
     frames : ndarray, (T, H, W), uint8, uint16 or float32
@@ -40,14 +44,14 @@ def find_change_point(
         Millimetres that the body has been lowered, one a frame: never decreasing in a press, never increasing
         in a release.
     dark, bright : array_like, scalar or (H, W), optional
-        Counts without and with full light. With one of them missing, both are taken from each pixel's own
+        Counts without and with full light. With one of them missing, both are estimated from each pixel's own
         samples before and after the change.
     threshold : float
         Share of the way from dark to bright whose crossing is looked for.
     hold : int
         Fully light frames, or dark ones of a release, that it takes to make sure of a change, 1 to 12.
     noise : float, optional
-        Standard deviation of a sample in counts; by default told from the first two frames.
+        Standard deviation of a sample in counts; by default estimated from the first two frames.
     event : {"onset", "release"}
         Whether to look for the light state's begin or its end.
     device : str or Device, optional
@@ -64,6 +68,13 @@ def find_change_point(
         Frames, travel, references or parameters that cannot be used.
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
+
+    Examples
+    --------
+    >>> frames = np.zeros((6, 1, 2), np.uint8)
+    >>> frames[3:, 0, 0] = 200
+    >>> find_change_point(frames, 0.1 * np.arange(6), dark=0, bright=200).frame
+    array([[ 3, -1]], dtype=int32)
     """
     search = ChangePointSearch(
         check_stack(frames),
@@ -84,10 +95,10 @@ def find_change_point(
     return search.result()
 
 
-class ChangePointSearch(Search):
-    """Find the change from dark to light, or back, in frames that come block by block, however they are cut.
+class ChangePointSearch:
+    """Find the change in frames that come block by block; see `mirrorskin.engine.streaming.Estimator`.
 
-    With known levels one pass is enough, and ``result`` may be asked for at any time. With unknown ones all
+    With known levels one pass is enough, and ``result`` may be called at any time. With unknown ones all
     frames are pushed twice, with ``start_second_pass`` in between.
 
     Parameters
@@ -97,16 +108,17 @@ class ChangePointSearch(Search):
     dtype : dtype
         uint8, uint16 or float32.
     dark, bright, threshold, hold, noise, event, device
-        As for ``find_change_point``.
+        As for `find_change_point`.
     memory_limit : int
         Bytes of host memory for frames on the move; half of it is the room for one block.
 
     Attributes
     ----------
-    device : Device
     passes : int
         How often the frames are needed: 1, or 2 where a level is unknown.
     """
+
+    position = "travel"
 
     def __init__(
         self,
@@ -122,22 +134,40 @@ class ChangePointSearch(Search):
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
-        _check(threshold, hold)
-        dtype = np.dtype(dtype)
+        if not 0 < threshold < 1:
+            raise InputError(
+                f"threshold {threshold}: a change-point needs a share between 0 and 1, such as 0.5"
+            )
+        if not 1 <= hold <= REACH:
+            raise InputError(f"hold {hold}: a change-point needs a number of frames from 1 to {REACH}")
+        self._shape, self._dtype = shape, check_dtype(dtype)
+        self._release, self._hold = check_event(event) == "release", hold
+        self._noise = Noise(noise, self._dtype.kind == "u")
         self.passes = 2 if dark is None or bright is None else 1
-        maps, opened = _maps(dtype, self.passes), open_device(device)
-        super().__init__(shape, dtype, maps, noise, event, opened, memory_limit)
-        references = reference_pair(dark, bright, shape, dtype) if self.passes == 1 else None
-        self._hold = hold
+        self.device = open_device(device)
+        length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
+        self._bands = cut_into_bands(self.device, shape, self._dtype, self._maps(), length)
+        self.room = room_of(self._bands, length)
         # A release is a change as well, from bright to dark: its first level is the bright one.
         self._level = 1 - threshold if self._release else threshold
         self._travel: list[float] = []
         self._start = np.zeros(shape, np.int32)
-        if references is not None:
+        if self.passes == 1:
+            references = reference_pair(dark, bright, shape, self._dtype)
             first, second = reversed(references) if self._release else references
             self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
         self.reset()
+
+    def _maps(self) -> dict[str, DTypeLike]:
+        """Return what is kept of each pixel."""
+        integers = dict.fromkeys(("start", "excess", "below", "since"), np.int32)
+        floats = dict.fromkeys(("dark", "gain", "height", "sigma"), np.float32)
+        twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
+        ring = np.dtype((np.void, SLOTS * self._dtype.itemsize))  # the last samples
+        return {
+            "ring": ring, "status": np.uint8, **integers, **floats, **(twice if self.passes == 2 else {})
+        }  # fmt: skip
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
@@ -158,7 +188,7 @@ class ChangePointSearch(Search):
             Fewer than two frames came in the first pass.
         """
         count = len(self._travel)
-        self._noise_of(count)
+        self._check_count()
         self._travel.clear()
         split = np.arange(1.0, count)
         self._weight = self.device.array("weight", (count + 1,), np.float32)
@@ -175,21 +205,47 @@ class ChangePointSearch(Search):
                 band.write(name, np.zeros_like(mean))
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each; see `Estimator`.
+        """Take in the next frames, (n, H, W), and the travel of each.
 
         Raises
         ------
         mirrorskin.io.InputError
-            Travel is missing, or runs back; or there are more frames in the second pass than in the first.
+            Frames of another shape or type; travel is missing, or runs back; or there are more frames in the
+            second pass than in the first.
         """
         first = len(self._travel)
         if self._weight is not None and first + len(frames) >= len(self._weight.host):
             raise InputError("there are more frames in the second pass than in the first: give the same ones")
-        self._travel.extend(self._accept(frames, travel, self._travel))
+        check_frames(frames, self._dtype, self._shape)
+        last = self._travel[-1:]
+        self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
+        self._noise.look(frames)
         for band in self._bands:
             with band.resident():
                 for staged in band.stage(frames, lent):
-                    self._take(band, staged, first + staged.frames.start)
+                    self._scan(band, staged, first + staged.frames.start)
+
+    def _scan(self, band: Band, staged: Staged, first: int) -> None:
+        """Let the kernel of this pass go through frames of a band."""
+        known: dict[str, Any] = {"first": first}
+        if self.passes == 1:
+            name, maps = "changepoint_scan", "dark gain start excess below ring"
+            level = round(self._level * UNIT)
+            known |= {"level": level, "least": self._hold * (UNIT - level), "quiet": self._quiet()}
+        elif self._weight is None:
+            name, maps, known = "changepoint_sum", "total total_rest", {}
+        else:
+            name, maps = "changepoint_split", "mean mean_rest total total_rest start since score ring"
+            known |= {"weight": self._weight}
+        known |= {one: band.maps[one] for one in maps.split()}
+        self._kernel(name)(
+            self._items(band),
+            frames=staged.array,
+            count=staged.count,
+            pixels=band.pixels,
+            **known,
+            moved=staged.count * band.pixels * self._dtype.itemsize,
+        )
 
     def result(self) -> Onset:
         """Return the maps of the frames so far.
@@ -199,70 +255,38 @@ class ChangePointSearch(Search):
         mirrorskin.io.InputError
             There are fewer than two frames, or the second pass over them is missing.
         """
-        count = len(self._travel)
-        noise = self._noise_of(count)
+        count, noise = len(self._travel), self._check_count()
         if self.passes == 2 and (self._weight is None or count + 1 != len(self._weight.host)):
             raise InputError("a change between unknown levels needs all frames twice: give dark and bright")
-        maps = [self._heights(band, noise) for band in self._bands]
+        maps = [self._finish(band, noise) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
         return Onset(height, sigma, status, np.where(answered, frame, np.int32(-1)), noise)
 
-    def _noise_of(self, count: int) -> float:
-        if count < 2 or self._noise.value is None:
-            raise InputError(f"a press of {count} frames has no change-point: at least 2 are needed")
-        return self._noise.value
-
-    def _fill(self, **maps: NDArray[Any]) -> None:
-        for band in self._bands:
-            for name, values in maps.items():
-                band.write(name, values[band.rows])
-
-    def _take(self, band: Band, staged: Staged, first: int) -> None:
-        """Let the kernel of this pass go through frames of a band."""
-        block = staged.array, np.int32(staged.count), np.int32(band.pixels)
-        if self.passes == 1:
-            level = round(self._level * UNIT)
-            evidence = np.int32(level), np.int32(self._hold * (UNIT - level)), self._quiet()
-            state = "dark gain start excess below ring"
-            self._run("changepoint_scan", band, *block, np.int32(first), *evidence, state)
-        elif self._weight is None:
-            self._run("changepoint_sum", band, *block, "total total_rest")
-        else:
-            state = "total total_rest start since score ring"
-            arguments = np.int32(first), "mean mean_rest", self._weight, state
-            self._run("changepoint_split", band, *block, *arguments)
-
-    def _run(
-        self, name: str, band: Band, frames: Operand, count: np.int32, *arguments: str | Array | np.generic
-    ) -> None:
-        """Launch a kernel on frames of a band; its maps are told by their names."""
-        values: list[Array | np.generic] = []
-        for argument in arguments:
-            values += [band.maps[n] for n in argument.split()] if isinstance(argument, str) else [argument]
-        moved = int(count) * band.pixels * self._dtype.itemsize
-        self._kernel(name)(self._items(band), frames, count, *values, moved=moved)
-
-    def _heights(self, band: Band, noise: float) -> list[NDArray[Any]]:
+    def _finish(self, band: Band, noise: float) -> list[NDArray[Any]]:
+        """Return height, sigma, status and frame of a band's rows."""
         if self.passes == 2:
-            self._settle(band, noise)
-        travel = travel_pairs(self.device, self._travel)
-        known = [band.maps[name] for name in ("start", "excess", "below", "since", "dark", "gain", "ring")]
-        wanted = [band.maps[name] for name in ("height", "sigma", "status")]
+            self._take_levels(band, noise)
+        names = ["start", "excess", "below", "since", "dark", "gain", "ring", "height", "sigma", "status"]
+        maps: dict[str, Any] = {name: band.maps[name] for name in names}
         with band.resident():
             self._kernel("changepoint_heights")(
                 self._items(band),
-                *map(np.int32, (band.pixels, len(self._travel))),
-                *(*known, travel),
-                *(np.float32(noise), self._quiet(), np.float32(self._level), np.int32(self.passes == 2)),
-                *wanted,
-                moved=sum(array.host.nbytes for array in (*known, *wanted)),
+                pixels=band.pixels,
+                count=len(self._travel),
+                travel=travel_pairs(self.device, self._travel),
+                noise=noise,
+                quiet=self._quiet(),
+                level=self._level,
+                own=self.passes == 2,
+                **maps,
+                moved=sum(array.host.nbytes for array in maps.values()),
             )
-            return [array.download().copy() for array in (*wanted, band.maps["start"])]
+            return [maps[name].download().copy() for name in ("height", "sigma", "status", "start")]
 
-    def _settle(self, band: Band, noise: float) -> None:
-        """Turn the best splits into levels, and tell those that noise alone would not make."""
+    def _take_levels(self, band: Band, noise: float) -> None:
+        """Turn the best splits into levels, where noise alone would not make such a split."""
         count = len(self._travel)
         with band.resident():
             score, mean, start = (
@@ -279,12 +303,30 @@ class ChangePointSearch(Search):
             band.write(name, values)
 
     @property
+    def travel(self) -> NDArray[np.float64]:
+        """The travel of the frames so far, (T,), mm."""
+        return np.array(self._travel, np.float64)
+
+    def _check_count(self) -> float:
+        """Return the noise, which two frames tell."""
+        if len(self._travel) < 2 or self._noise.value is None:
+            raise InputError(
+                f"a press of {len(self._travel)} frames has no change-point: at least 2 are needed"
+            )
+        return self._noise.value
+
+    def _fill(self, **maps: NDArray[Any]) -> None:
+        for band in self._bands:
+            for name, values in maps.items():
+                band.write(name, values[band.rows])
+
+    @property
     def _sign(self) -> int:
         return -1 if self._release else 1
 
-    def _quiet(self) -> np.float32:
+    def _quiet(self) -> float:
         """Square counts of excess that noise alone would make; a first frame alone decides nothing."""
-        return np.float32(_EVIDENCE * (self._noise.value or 0.0) ** 2)
+        return _EVIDENCE * (self._noise.value or 0.0) ** 2
 
     def _items(self, band: Band) -> int:
         return int(-(-band.pixels // self.device.layout.tile))
@@ -292,18 +334,3 @@ class ChangePointSearch(Search):
     def _kernel(self, name: str) -> Kernel:
         top = {} if self._dtype.kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}
         return self.device.kernel("changepoint", name, FRAME=C_TYPES[self._dtype.name], **top)
-
-
-def _maps(dtype: np.dtype[Any], passes: int) -> dict[str, DTypeLike]:
-    whole = dict.fromkeys(("start", "excess", "below", "since"), np.int32)
-    floats = dict.fromkeys(("dark", "gain", "height", "sigma"), np.float32)
-    twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
-    ring = np.dtype((np.void, SLOTS * dtype.itemsize))
-    return {"ring": ring, "status": np.uint8, **whole, **floats, **(twice if passes == 2 else {})}
-
-
-def _check(threshold: float, hold: int) -> None:
-    if not 0 < threshold < 1:
-        raise InputError(f"threshold {threshold}: a change-point needs a share between 0 and 1, such as 0.5")
-    if not 1 <= hold <= REACH:
-        raise InputError(f"hold {hold}: a change-point needs a number of frames from 1 to {REACH}")

@@ -28,7 +28,7 @@ def test_onset_is_bit_by_bit_that_of_the_same_frames_offline(device, dtype):
         live.push(block)
         live.update()
     dark, bright = references(SHAPE[1:], np.dtype(dtype))
-    found, exact = live.result(), find_onset(frames, TRAVEL, dark, bright, device=device)
+    found, exact = live.result(), find_onset(frames, TRAVEL, dark=dark, bright=bright, device=device)
     assert (exact.status == 1).sum() > 50
     for one, other in ((found.height, exact.height), (found.height_sigma, exact.sigma)):
         np.testing.assert_array_equal(one, other)

@@ -16,7 +16,9 @@ def twin(**options):
 def test_the_recordings_own_references_are_used():
     source = twin()
     result = engine.reconstruct(source, fill=False)
-    given = engine.find_onset(source_frames(twin()), TRAVEL, source.header.dark, source.header.bright)
+    given = engine.find_onset(
+        source_frames(twin()), TRAVEL, dark=source.header.dark, bright=source.header.bright
+    )
     np.testing.assert_array_equal(result.height, given.height)
     assert result.process["dark"] == result.process["bright"] == "map of the recording"
 

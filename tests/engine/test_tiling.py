@@ -3,7 +3,7 @@
 import numpy as np
 import pyopencl as cl
 import pytest
-from presses import SPEC, assert_equal, random_press
+from presses import LEVELS, SPEC, assert_equal, random_press
 
 from mirrorskin.engine import OnsetSearch, find_onset
 from mirrorskin.kernels import device as device_layer
@@ -17,7 +17,7 @@ SMALLEST = 3 * 64 * 4  # the travel must fit too
 
 @pytest.mark.parametrize("limit", [40_000, LARGEST, LARGEST - 1, 1500, SMALLEST])
 def test_less_room_gives_the_same_answer(small_device, limit):
-    whole = find_onset(FRAMES, TRAVEL, *SPEC["uint8"], device=small_device)
+    whole = find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=small_device)
     small_device.max_allocation = limit
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
     for start in range(0, 30, 4):
@@ -74,7 +74,7 @@ def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     search.room[:30] = FRAMES
     search.push(search.room[:30], travel=TRAVEL)
     small_device.max_allocation = 10**9
-    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=small_device))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=small_device))
 
 
 def lent(frames, offset):
@@ -99,7 +99,7 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     room = search.room.copy()
     for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
         search.push(placed[part], travel=travel[part], lent=True)
-    assert_equal(search.result(), find_onset(frames, travel, *SPEC[dtype], device=device))
+    assert_equal(search.result(), find_onset(frames, travel, **LEVELS[dtype], device=device))
     np.testing.assert_array_equal(search.room, room)  # nothing was copied there
 
 
@@ -115,7 +115,7 @@ def test_lent_frames_stay_until_their_kernels_are_done(device):
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
         search.push(lent(FRAMES[part], 64), travel=TRAVEL[part], lent=True)
-    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))
 
 
 def test_a_block_may_be_written_anew_after_it_was_pushed(device):
@@ -125,7 +125,7 @@ def test_a_block_may_be_written_anew_after_it_was_pushed(device):
         block = FRAMES[part].copy()
         search.push(block, travel=TRAVEL[part])
         block[:] = 255 - block
-    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))
 
 
 def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
@@ -135,4 +135,4 @@ def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
     monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)
     search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
     search.push(lent(FRAMES, 64), travel=TRAVEL, lent=True)
-    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, 20, 220, device=device))
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))

@@ -622,7 +622,7 @@ def fuse() -> Answer:
     x, y = places(shape)
     starts = np.where(np.hypot(x, y) < 0.3, 9.0, -dome(shape)[0])
     counts = counted((travel[:, None, None] > starts).astype(float), "uint8")
-    onset = engine.find_onset(counts, travel, *LEVELS["uint8"], noise=1.0)
+    onset = engine.find_onset(counts, travel, dark=LEVELS["uint8"][0], bright=LEVELS["uint8"][1], noise=1.0)
     return named(
         whole=surface_maps(engine.fuse(onset, normals, PIXEL)),
         masked=surface_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),

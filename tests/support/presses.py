@@ -10,6 +10,7 @@ from mirrorskin.kernels import onset as reference
 from mirrorskin.kernels.layout import CPU_LAYOUT
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
+LEVELS = {dtype: {"dark": dark, "bright": bright} for dtype, (dark, bright) in SPEC.items()}
 
 
 def random_press(dtype, frames, shape, seed=0, noise=0.008):

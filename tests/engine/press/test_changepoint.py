@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from changes import assert_near, numpy_change, numpy_split
-from presses import SPEC, assert_equal, random_press
+from presses import LEVELS, SPEC, assert_equal, random_press
 from ramps import NOISES, WIDTHS, compare, errors, ramps, rms
 from stacks import MadeUp, ball
 
@@ -60,7 +60,7 @@ def test_no_fixed_threshold_is_better_at_other_levels(noise, dark, bright):
 def test_sigma_is_honest(device, noise):
     frames, middle = ramps(noise, pixels=500, seed=2)
     known = {"noise": float(np.hypot(noise, 1 / np.sqrt(12))), "device": device}
-    found = find_change_point(frames, np.arange(64.0), 20, 220, **known)
+    found = find_change_point(frames, np.arange(64.0), dark=20, bright=220, **known)
     square = (errors(found.height, found.status, middle) / found.sigma) ** 2
     assert 0.75 < np.mean(square) < 1.1
     each = np.mean(square, axis=1)
@@ -73,7 +73,7 @@ def test_sigma_is_honest(device, noise):
 def test_unknown_levels_cost_little(device, noise):
     frames, middle = ramps(noise, pixels=300, seed=3)
     known = {"noise": float(np.hypot(noise, 1 / np.sqrt(12))), "device": device}
-    given = find_change_point(frames, np.arange(64.0), 20, 220, **known)
+    given = find_change_point(frames, np.arange(64.0), dark=20, bright=220, **known)
     told = find_change_point(frames, np.arange(64.0), **known)
     assert np.all(told.status == 1)
     error = errors(told.height, told.status, middle)
@@ -89,7 +89,7 @@ def test_a_device_agrees_with_the_reference(device, dtype, hold, threshold):
     dark, bright = SPEC[dtype]
     options = {"threshold": threshold, "hold": hold, "noise": 0.05 * (bright - dark)}
     travel = uneven_travel(40, start=-1.7)
-    found = find_change_point(frames, travel, dark, bright, device=device, **options)
+    found = find_change_point(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert {1, 2, 3} <= set(found.status.flat)
     assert_near(found, numpy_change(frames, travel, dark, bright, **options), travel)
 
@@ -111,7 +111,7 @@ def test_references_of_each_pixel_are_obeyed(device, dtype):
     generator = np.random.default_rng(6)
     dark, bright = (level * generator.uniform(0.8, 1.2, (17, 23)) for level in SPEC[dtype])
     travel = uneven_travel(30)
-    found = find_change_point(frames, travel, dark, bright, noise=0.01, device=device)
+    found = find_change_point(frames, travel, dark=dark, bright=bright, noise=0.01, device=device)
     assert_near(found, numpy_change(frames, travel, dark, bright, noise=0.01), travel)
 
 
@@ -130,7 +130,7 @@ def test_blocks_make_no_difference(device, dtype, cuts, known):
 def test_odd_sizes(device, shape):
     frames = random_press("uint8", 12, shape, seed=9)
     travel = np.arange(12) * 0.1
-    found = find_change_point(frames, travel, *SPEC["uint8"], noise=1.5, device=device)
+    found = find_change_point(frames, travel, **LEVELS["uint8"], noise=1.5, device=device)
     assert_near(found, numpy_change(frames, travel, *SPEC["uint8"], noise=1.5), travel)
 
 
@@ -185,7 +185,9 @@ def test_a_ramp_is_measured_exactly_on_uneven_travel(device):
     frames = np.clip((np.arange(40) - 10) * 16 + 20, 20, 220).astype(np.uint8)[:, None, None]
     travel = uneven_travel(40)
     for threshold in (0.3, 0.5, 0.7):
-        found = find_change_point(frames, travel, 20, 220, threshold=threshold, noise=0.3, device=device)
+        found = find_change_point(
+            frames, travel, dark=20, bright=220, threshold=threshold, noise=0.3, device=device
+        )
         crossing = 10 + threshold * 200 / 16
         assert found.height[0, 0] == pytest.approx(-np.interp(crossing, np.arange(40), travel), abs=1e-3)
 
@@ -197,7 +199,7 @@ def test_ramps_longer_than_the_samples_kept_are_measured_on_those(device, width,
     share = np.clip((np.arange(200)[:, None, None] - middle) / width + 0.5, 0, 1)
     frames = np.clip(np.rint(20 + 200 * share + generator.normal(0, noise, share.shape)), 0, 255)
     found = find_change_point(
-        frames.astype(np.uint8), np.arange(200.0), 20, 220, noise=float(noise), device=device
+        frames.astype(np.uint8), np.arange(200.0), dark=20, bright=220, noise=float(noise), device=device
     )
     error = -found.height - middle
     assert np.all(found.status == 1)
@@ -213,7 +215,7 @@ def test_a_pixel_that_never_gets_as_bright_as_it_should_is_not_biased(device):
     share = plateau * (np.arange(60)[:, None, None] >= change)
     counts = 20 + 200 * share + generator.normal(0, 3, share.shape)
     frames = np.clip(np.rint(counts), 0, 255).astype(np.uint8)
-    found = find_change_point(frames, np.arange(60.0), 20, 220, noise=3.0, device=device)
+    found = find_change_point(frames, np.arange(60.0), dark=20, bright=220, noise=3.0, device=device)
     error = -found.height - change
     assert np.all(found.status == 1)
     assert np.all(np.abs(error.mean(axis=1)) < 0.02)
@@ -225,7 +227,7 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
     generator = np.random.default_rng(3)
     counts = np.where(np.arange(120)[:, None, None] >= 3, 119.5, 20) + generator.normal(0, 1.5, (120, 50, 60))
     frames = np.rint(counts).astype(np.uint8)
-    found = find_change_point(frames, np.arange(120) * 0.1, 20, 220, noise=1.5, device=device)
+    found = find_change_point(frames, np.arange(120) * 0.1, dark=20, bright=220, noise=1.5, device=device)
     expected = numpy_change(frames, np.arange(120) * 0.1, 20, 220, noise=1.5)
     assert_near(found, expected, np.arange(120) * 0.1)
     late = (found.status == 1) & (found.frame > 20)
@@ -237,7 +239,7 @@ def test_a_spike_is_no_change_unless_the_stack_ends_on_it(device):
     frames = np.full((9, 1, 4), 20, np.uint8)
     frames[3, 0, 0] = frames[8, 0, 1] = 255
     frames[[3, 4], 0, 2] = 255
-    found = find_change_point(frames, np.arange(9.0), 20, 220, noise=1.0, device=device)
+    found = find_change_point(frames, np.arange(9.0), dark=20, bright=220, noise=1.0, device=device)
     np.testing.assert_array_equal(found.frame, [[-1, 8, 3, -1]])
 
 
@@ -247,7 +249,7 @@ def test_spikes_near_the_change_move_it_little(device):
     for pixel in range(24):
         if not 18 <= pixel + 8 <= 21:  # where it passes for the change itself
             frames[pixel + 8, 0, pixel] = 255 if pixel + 8 < 20 else 20
-    found = find_change_point(frames, np.arange(40.0), 20, 220, noise=1.5, device=device)
+    found = find_change_point(frames, np.arange(40.0), dark=20, bright=220, noise=1.5, device=device)
     assert np.all(np.abs(found.height + 19.5) < 0.6)
     assert np.all(np.abs(found.height + 19.5) < 3 * found.sigma)
     assert_near(found, numpy_change(frames, np.arange(40.0), 20, 220, noise=1.5), np.arange(40.0))
@@ -260,7 +262,7 @@ def test_a_change_of_another_shape_costs_precision_and_says_so(device):
     share = 1 - np.exp(-np.maximum(np.arange(64)[:, None, None] - start, 0) / 3)
     counts = 20 + 200 * share + generator.normal(0, 2, (64, *start.shape))
     frames = np.clip(np.rint(counts), 0, 255).astype(np.uint8)
-    found = find_change_point(frames, np.arange(64.0), 20, 220, noise=2.0, device=device)
+    found = find_change_point(frames, np.arange(64.0), dark=20, bright=220, noise=2.0, device=device)
     error = -found.height - (start + 3 * np.log(2))
     assert rms(error) < 0.5
     assert np.max(np.abs(error / found.sigma)) < 10
@@ -269,7 +271,7 @@ def test_a_change_of_another_shape_costs_precision_and_says_so(device):
 
 def test_a_change_at_the_end_has_a_sigma(device):
     frames = random_press("uint8", 20, (60, 60), seed=3, noise=0.05)
-    found = find_change_point(frames, np.arange(20.0), 20, 220, noise=10.0, device=device)
+    found = find_change_point(frames, np.arange(20.0), dark=20, bright=220, noise=10.0, device=device)
     late = (found.status == 1) & (found.frame >= 18)
     assert late.sum() > 50
     assert np.all(found.sigma[late] > 0.1)
@@ -280,7 +282,7 @@ def test_a_change_is_not_undone(device):
     """Released again, and pressed once more: the first contact counts."""
     frames = np.full((90, 1, 1), 20, np.uint8)
     frames[10:40] = frames[70:] = 220
-    found = find_change_point(frames, np.arange(90.0), 20, 220, noise=1.0, device=device)
+    found = find_change_point(frames, np.arange(90.0), dark=20, bright=220, noise=1.0, device=device)
     assert found.frame[0, 0] == 10
     assert found.height[0, 0] == pytest.approx(-9.5, abs=0.01)
 
@@ -289,7 +291,7 @@ def test_a_change_is_not_undone(device):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_all_equal_frames(device, dtype, value, status):
     frames = np.full((6, 5, 7), value, dtype)
-    given = find_change_point(frames, np.arange(6.0), 20, 220, device=device)
+    given = find_change_point(frames, np.arange(6.0), dark=20, bright=220, device=device)
     told = find_change_point(frames, np.arange(6.0), device=device)
     for found, expected in ((given, status), (told, 2)):
         assert np.all(found.status == expected)
@@ -302,7 +304,9 @@ def test_noise_alone_is_no_change(device):
     counts = 100 + np.random.default_rng(7).normal(0, 5, (200, 100, 100))
     frames = np.rint(counts).astype(np.uint8)
     assert np.all(find_change_point(frames, np.arange(200.0), device=device).status == 2)
-    assert np.all(find_change_point(frames, np.arange(200.0), 100, 140, device=device).status == 2)
+    assert np.all(
+        find_change_point(frames, np.arange(200.0), dark=100, bright=140, device=device).status == 2
+    )
     falling = np.where(np.arange(200)[:, None, None] < 100, frames + 50, frames)
     assert np.all(find_change_point(falling, np.arange(200.0), device=device).status == 2)
 
@@ -313,7 +317,7 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_change_is_seen(devi
     frames[10:] = 0.9
     frames[0, 0, 0] = frames[9, 0, 1] = frames[10, 0, 2] = frames[22, 0, 3] = frames[23, 0, 4] = broken
     travel = np.arange(40) * 0.1
-    found = find_change_point(frames, travel, 0.1, 0.9, noise=0.01, device=device)
+    found = find_change_point(frames, travel, dark=0.1, bright=0.9, noise=0.01, device=device)
     np.testing.assert_array_equal(found.status, [[0, 0, 0, 0, 1]])
     assert_near(found, numpy_change(frames, travel, 0.1, 0.9, noise=0.01), travel)
     told = find_change_point(frames, travel, noise=0.01, device=device)
@@ -323,7 +327,9 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_change_is_seen(devi
 def test_a_saturated_sample_is_light(device):
     frames = np.full((9, 1, 2), 20, np.uint8)
     frames[4:, 0, 0], frames[4:, 0, 1] = 255, 254
-    found = find_change_point(frames, np.arange(9.0), 20, 400, threshold=0.9, noise=1.0, device=device)
+    found = find_change_point(
+        frames, np.arange(9.0), dark=20, bright=400, threshold=0.9, noise=1.0, device=device
+    )
     np.testing.assert_array_equal(found.status, [[1, 2]])
     assert found.height[0, 0] == pytest.approx(-3.5, abs=0.01)
 
@@ -333,7 +339,7 @@ def test_pixels_without_references_are_invalid(device):
     frames[3:] = 200
     dark, bright = np.full((2, 4), 20.0), np.full((2, 4), 220.0)
     bright[0, 0], dark[0, 1], bright[1, 2] = 20, np.nan, np.inf
-    found = find_change_point(frames, np.arange(5.0), dark, bright, device=device)
+    found = find_change_point(frames, np.arange(5.0), dark=dark, bright=bright, device=device)
     np.testing.assert_array_equal(found.status, [[0, 0, 1, 1], [1, 1, 0, 1]])
     assert found.frame[0, 0] == -1
 
@@ -345,7 +351,9 @@ def test_results_on_the_way_change_nothing(device):
         search.push(frames[number : number + 1], travel=travel[number : number + 1])
         if number:
             so_far = slice(0, number + 1)
-            expected = find_change_point(frames[so_far], travel[so_far], 20, 220, noise=1.5, device=device)
+            expected = find_change_point(
+                frames[so_far], travel[so_far], dark=20, bright=220, noise=1.5, device=device
+            )
             assert_equal(search.result(), expected)
 
 
@@ -373,7 +381,9 @@ def test_frames_read_into_the_room_are_not_copied(device):
         count = min(6, 20 - start)
         search.room[:count] = frames[start : start + count]
         search.push(search.room[:count], travel=np.arange(20.0)[start : start + count])
-    assert_equal(search.result(), find_change_point(frames, np.arange(20.0), 20, 220, device=device))
+    assert_equal(
+        search.result(), find_change_point(frames, np.arange(20.0), dark=20, bright=220, device=device)
+    )
 
 
 @pytest.mark.parametrize(
@@ -442,7 +452,7 @@ def frames_of(source):
 def test_a_source_is_reconstructed_by_its_change_points():
     result = engine.reconstruct(twin(), method="change-point", fill=False, memory_limit=2 * 7 * 120 * 120)
     source = twin()
-    given = find_change_point(frames_of(source), TRAVEL, source.header.dark, source.header.bright)
+    given = find_change_point(frames_of(source), TRAVEL, dark=source.header.dark, bright=source.header.bright)
     np.testing.assert_array_equal(result.height, given.height)
     np.testing.assert_array_equal(result.height_sigma, given.sigma)
     assert result.process["method"] == "change-point"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from presses import (
+    LEVELS,
     SPEC,
     assert_equal,
     assert_within_an_ulp,
@@ -55,7 +56,7 @@ def test_a_device_agrees_with_the_reference(device, dtype, hold, size):
     travel = uneven_travel(40, start=-1.7)
     subframe = looks_between(device, dtype, hold)
     options = {"threshold": 0.4, "hold": hold, "subframe": subframe, "noise": noise}
-    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert {1, 2, 3} <= set(found.status.flat)
     assert_within_an_ulp(found, numpy_onset(frames, travel, dark, bright, **options), travel)
 
@@ -74,7 +75,7 @@ def test_references_of_each_pixel_are_obeyed(device, dtype):
     generator = np.random.default_rng(6)
     dark, bright = (level * generator.uniform(0.8, 1.2, (17, 23)) for level in SPEC[dtype])
     travel = uneven_travel(30)
-    found = find_onset(frames, travel, dark, bright, noise=0.01, device=device)
+    found = find_onset(frames, travel, dark=dark, bright=bright, noise=0.01, device=device)
     assert_within_an_ulp(found, numpy_onset(frames, travel, dark, bright, noise=0.01), travel)
 
 
@@ -102,7 +103,7 @@ def test_blocks_make_no_difference_to_a_dark_of_its_own(device):
 def test_odd_sizes(device, shape):
     frames = random_press("uint8", 12, shape, seed=9)
     travel = np.arange(12) * 0.1
-    found = find_onset(frames, travel, *SPEC["uint8"], noise=1.5, device=device)
+    found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.5, device=device)
     assert_within_an_ulp(found, numpy_onset(frames, travel, *SPEC["uint8"], noise=1.5), travel)
 
 
@@ -111,14 +112,14 @@ def test_long_stacks(device, count, dtype):
     dark, bright = SPEC[dtype]
     onset = np.array([[1, 254, 255, 256], [count - 300, count - 2, count - 1, count + 1]])
     frames = np.where(np.arange(count)[:, None, None] >= onset, bright, dark).astype(dtype)
-    found = find_onset(frames, np.arange(count) * 1e-3, dark, bright, device=device)
+    found = find_onset(frames, np.arange(count) * 1e-3, dark=dark, bright=bright, device=device)
     np.testing.assert_array_equal(found.frame, np.where(onset < count, onset, -1))
 
 
 def test_a_sudden_step_lies_in_the_middle_of_its_interval(device):
     frames = np.full((4, 1, 1), 20, np.uint8)
     frames[2:] = 180
-    found = find_onset(frames, [0.0, 0.1, 0.4, 0.5], 20, 220, noise=1.0, device=device)
+    found = find_onset(frames, [0.0, 0.1, 0.4, 0.5], dark=20, bright=220, noise=1.0, device=device)
     assert found.height[0, 0] == np.float32(-0.25)
     assert found.sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
 
@@ -126,7 +127,7 @@ def test_a_sudden_step_lies_in_the_middle_of_its_interval(device):
 def test_a_ramp_is_interpolated_exactly(device):
     """A ramp of 16 counts a frame crosses 120 at 1.25 frames after the fifth, whatever the references."""
     frames = (np.arange(12) * 16 + 20).astype(np.uint8)[:, None, None]
-    found = find_onset(frames, np.arange(12) * 0.1, 20, 220, noise=1.0, device=device)
+    found = find_onset(frames, np.arange(12) * 0.1, dark=20, bright=220, noise=1.0, device=device)
     assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
     share = 0.25
     assert found.sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(share, 1 - share), rel=1e-5)
@@ -135,7 +136,7 @@ def test_a_ramp_is_interpolated_exactly(device):
 def test_without_subframe_the_height_is_equation_4_to_the_letter(device):
     frames = random_press("uint8", 30, (9, 9), seed=2)
     travel = np.arange(1, 31) * 0.1
-    found = find_onset(frames, travel, *SPEC["uint8"], subframe=False, device=device)
+    found = find_onset(frames, travel, **LEVELS["uint8"], subframe=False, device=device)
     answered = found.status == 1
     np.testing.assert_array_equal(found.height[answered], -travel[found.frame[answered]].astype(np.float32))
     np.testing.assert_allclose(found.sigma[answered], 0.1 / np.sqrt(3), rtol=1e-6)
@@ -149,7 +150,7 @@ def test_sigma_is_honest_on_ramps(device):
     number = np.arange(count)[:, None, None]
     counts = 120 + slope * (number - crossing) + generator.normal(0, 1.5, (count, *shape))
     frames = counts.astype(np.float32)
-    found = find_onset(frames, np.arange(count) * 0.1, 20, 220, noise=1.5, device=device)
+    found = find_onset(frames, np.arange(count) * 0.1, dark=20, bright=220, noise=1.5, device=device)
     error = found.height + 0.1 * crossing
     assert np.all(found.status == 1)
     assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
@@ -161,7 +162,9 @@ def test_sigma_is_honest_on_steps(device):
     frames = np.where(np.arange(30)[:, None, None] >= crossing, 200, 20) + generator.normal(
         0, 1.5, (30, 200, 250)
     )
-    found = find_onset(np.rint(frames).astype(np.uint8), np.arange(30) * 0.1, 20, 220, device=device)
+    found = find_onset(
+        np.rint(frames).astype(np.uint8), np.arange(30) * 0.1, dark=20, bright=220, device=device
+    )
     error = found.height + 0.1 * crossing
     assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
     assert abs(np.mean(error)) < 0.001
@@ -172,7 +175,7 @@ def test_noise_is_told_from_the_first_two_frames():
     for noise in (0.6, 1.5, 6.0):
         frames = np.rint(30 + generator.normal(0, noise, (5, 200, 200))).astype(np.uint8)
         frames[1, :, :40] = 200  # what changes in between is left out
-        found = find_onset(frames, np.arange(5.0), 20, 220)
+        found = find_onset(frames, np.arange(5.0), dark=20, bright=220)
         assert found.noise == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
 
 
@@ -181,7 +184,7 @@ def test_a_spike_is_no_onset_unless_the_stack_ends_on_it(device):
     frames[3, 0, 0] = 255
     frames[8, 0, 1] = 255
     frames[[3, 4], 0, 2] = 255
-    found = find_onset(frames, np.arange(9.0), 20, 220, device=device)
+    found = find_onset(frames, np.arange(9.0), dark=20, bright=220, device=device)
     np.testing.assert_array_equal(found.frame, [[-1, 8, 3, -1]])
 
 
@@ -189,7 +192,7 @@ def test_a_spike_on_the_plateau_moves_nothing(device):
     frames = np.full((9, 1, 4), 20, np.uint8)
     frames[4:] = 150
     frames[4, 0, 1] = frames[5, 0, 2] = frames[6, 0, 3] = 255
-    found = find_onset(frames, np.arange(9) * 0.1, 20, 220, noise=1.5, device=device)
+    found = find_onset(frames, np.arange(9) * 0.1, dark=20, bright=220, noise=1.5, device=device)
     np.testing.assert_allclose(found.height, np.full((1, 4), -0.35), rtol=1e-6)
 
 
@@ -197,7 +200,7 @@ def test_a_spike_on_the_plateau_moves_nothing(device):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_all_equal_frames(device, dtype, value, status):
     frames = np.full((6, 5, 7), value, dtype)
-    found = find_onset(frames, np.arange(6.0), 20, 220, device=device)
+    found = find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
     assert np.all(found.status == status)
     assert np.all(np.isnan(found.height))
     assert np.all(np.isnan(found.sigma))
@@ -209,7 +212,7 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_onset(device, broke
     frames[4:] = 0.9
     frames[0, 0, 0] = frames[3, 0, 1] = frames[4, 0, 2] = frames[7, 0, 3] = broken
     frames[5, 0, 4] = broken  # the second frame of the run: not decided yet
-    found = find_onset(frames, np.arange(9) * 0.1, 0, 1, noise=0.01, device=device)
+    found = find_onset(frames, np.arange(9) * 0.1, dark=0, bright=1, noise=0.01, device=device)
     np.testing.assert_array_equal(found.status, [[0, 0, 0, 1, 0]])
     assert found.height[0, 3] == pytest.approx(-0.35)
     assert np.isnan(found.height[0, [0, 1, 2, 4]]).all()
@@ -218,7 +221,7 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_onset(device, broke
 def test_a_saturated_sample_is_light(device):
     frames = np.full((5, 1, 2), 20, np.uint8)
     frames[2:, 0, 0], frames[2:, 0, 1] = 255, 254
-    found = find_onset(frames, np.arange(5.0), 20, 400, threshold=0.9, device=device)
+    found = find_onset(frames, np.arange(5.0), dark=20, bright=400, threshold=0.9, device=device)
     np.testing.assert_array_equal(found.status, [[1, 2]])
 
 
@@ -227,7 +230,7 @@ def test_pixels_without_references_are_invalid(device):
     frames[3:] = 200
     dark, bright = np.full((2, 4), 20.0), np.full((2, 4), 220.0)
     bright[0, 0], dark[0, 1], bright[1, 2] = 20, np.nan, np.inf
-    found = find_onset(frames, np.arange(5.0), dark, bright, device=device)
+    found = find_onset(frames, np.arange(5.0), dark=dark, bright=bright, device=device)
     np.testing.assert_array_equal(found.status, [[0, 0, 1, 1], [1, 1, 0, 1]])
     assert found.frame[0, 0] == -1
 
@@ -243,20 +246,24 @@ def test_the_level_is_the_smallest_light_sample(device, dtype, threshold):
     below = least - 1 if dtype != "float32" else np.nextafter(least, np.float32(-np.inf))
     frames = np.zeros((4, 1, 2), dtype)
     frames[2:, 0, 0], frames[2:, 0, 1] = least, below
-    found = find_onset(frames, np.arange(4.0), dark, bright, threshold=threshold, noise=0.1, device=device)
+    found = find_onset(
+        frames, np.arange(4.0), dark=dark, bright=bright, threshold=threshold, noise=0.1, device=device
+    )
     np.testing.assert_array_equal(found.status, [[1, 2]])
 
 
 def test_results_on_the_way_change_nothing(device):
     frames = random_press("uint8", 30, (9, 13), seed=7)
     travel = uneven_travel(30)
-    whole = find_onset(frames, travel, 20, 220, noise=1.5, device=device)
+    whole = find_onset(frames, travel, dark=20, bright=220, noise=1.5, device=device)
     search = OnsetSearch((9, 13), frames.dtype, dark=20, bright=220, noise=1.5, device=device)
     for number in range(30):
         search.push(frames[number : number + 1], travel=travel[number : number + 1])
         part = search.result()
         so_far = (
-            find_onset(frames[: number + 1], travel[: number + 1], 20, 220, noise=1.5, device=device)
+            find_onset(
+                frames[: number + 1], travel[: number + 1], dark=20, bright=220, noise=1.5, device=device
+            )
             if number
             else None
         )
@@ -329,7 +336,7 @@ def test_travel_must_not_run_back_between_blocks():
 def test_travel_may_pause(device):
     frames = np.full((5, 1, 1), 20, np.uint8)
     frames[3:] = 200
-    found = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], 20, 220, noise=1.0, device=device)
+    found = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], dark=20, bright=220, noise=1.0, device=device)
     assert found.height[0, 0] == np.float32(-0.1)
     assert found.sigma[0, 0] == 0
 
@@ -366,7 +373,7 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
     generator = np.random.default_rng(3)
     counts = np.where(np.arange(40)[:, None, None] >= 3, 119.5, 20) + generator.normal(0, 1.5, (40, 50, 60))
     found = find_onset(
-        np.rint(counts).astype(np.uint8), np.arange(40) * 0.1, 20, 220, noise=1.5, device=device
+        np.rint(counts).astype(np.uint8), np.arange(40) * 0.1, dark=20, bright=220, noise=1.5, device=device
     )
     error = found.height + 0.25
     late = (found.status == 1) & (found.frame > 10)
@@ -394,7 +401,7 @@ def test_thresholds_that_binary_cannot_hold_are_met():
     for percent in range(1, 100):
         frames = np.zeros((4, 1, 2), np.uint8)
         frames[2:, 0] = percent, percent - 1
-        found = find_onset(frames, np.arange(4.0), 0, 100, threshold=percent / 100, noise=0.5)
+        found = find_onset(frames, np.arange(4.0), dark=0, bright=100, threshold=percent / 100, noise=0.5)
         np.testing.assert_array_equal(found.status, [[1, 2]], err_msg=str(percent))
 
 
@@ -410,7 +417,7 @@ def test_a_saturated_sample_below_its_level_is_not_taken_for_dark(device):
     frames[2:, 0, 0], frames[4:, 0, 1] = 255, 255
     frames[2, 0, 1] = 255
     options = {"threshold": 1.0, "noise": 0.3}
-    found = find_onset(frames, np.arange(6) * 0.1, 20, 300, device=device, **options)
+    found = find_onset(frames, np.arange(6) * 0.1, dark=20, bright=300, device=device, **options)
     assert_within_an_ulp(found, numpy_onset(frames, np.arange(6) * 0.1, 20, 300, **options), np.arange(6))
     np.testing.assert_array_equal(found.frame, [[2, 4]])
     assert np.all(found.sigma > 0)
@@ -447,7 +454,7 @@ def test_pictures_of_any_width(device, dtype):
     for width in range(1, 131):
         noise = [1.5, None][width % 2]
         frames = random_press(dtype, 40, (1 + width % 3, width), seed=width)
-        found = find_onset(frames, travel, dark, bright, noise=noise, device=device)
+        found = find_onset(frames, travel, dark=dark, bright=bright, noise=noise, device=device)
         expected = numpy_onset(frames, travel, dark, bright, noise=found.noise)
         assert noise in (None, found.noise)
         assert_within_an_ulp(found, expected, travel)
@@ -460,7 +467,7 @@ def test_the_whole_range_of_uint16(device, level, hold):
     frames = np.random.default_rng(level).choice(edges, (70, 7, 37)).astype(np.uint16)
     options = {"threshold": 1.0, "hold": hold, "noise": 0.5}
     travel = np.arange(70) / 64
-    found = find_onset(frames, travel, 0, level, device=device, **options)
+    found = find_onset(frames, travel, dark=0, bright=level, device=device, **options)
     assert_within_an_ulp(found, numpy_onset(frames, travel, 0, level, **options), travel)
 
 
@@ -480,7 +487,7 @@ def test_the_whole_range_of_float32(device, level, hold, broken):
     options = {"threshold": 1.0, "hold": hold, "noise": 0.0}
     travel = np.arange(70) / 64
     for subframe in (True, False):
-        found = find_onset(frames, travel, 0, level, device=device, subframe=subframe, **options)
+        found = find_onset(frames, travel, dark=0, bright=level, device=device, subframe=subframe, **options)
         with np.errstate(all="ignore"):
             expected = numpy_onset(frames, travel, 0, level, subframe=subframe, **options)
         np.testing.assert_array_equal(found.status, expected.status)
@@ -492,7 +499,7 @@ def test_the_whole_range_of_float32(device, level, hold, broken):
 def test_a_negative_zero_is_a_zero(device, level):
     frames = np.full((4, 1, 2), -1, np.float32)
     frames[2:] = 0.0, -0.0
-    found = find_onset(frames, np.arange(4.0), -1, level, threshold=1.0, noise=0.0, device=device)
+    found = find_onset(frames, np.arange(4.0), dark=-1, bright=level, threshold=1.0, noise=0.0, device=device)
     np.testing.assert_array_equal(found.frame, [[2, 2]])
 
 
@@ -566,5 +573,5 @@ def test_nothing_is_left_of_the_press_before(device):
 def test_a_hold_without_end_lets_no_broken_sample_pass(device):
     frames = np.full((9, 1, 1), 0.1, np.float32)
     frames[2:], frames[4] = 0.9, np.inf
-    found = find_onset(frames, np.arange(9.0), 0, 1, noise=0.01, hold=2**31 - 1, device=device)
+    found = find_onset(frames, np.arange(9.0), dark=0, bright=1, noise=0.01, hold=2**31 - 1, device=device)
     assert found.status[0, 0] == 0

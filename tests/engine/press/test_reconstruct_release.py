@@ -67,8 +67,8 @@ def test_a_recording_may_hold_a_release_alone():
     given = engine.find_onset(
         frames_of(twin(DOWN[::-1], seed=3)),
         DOWN[::-1],
-        source.header.dark,
-        source.header.bright,
+        dark=source.header.dark,
+        bright=source.header.bright,
         event="release",
     )
     np.testing.assert_array_equal(result.height, given.height)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from presses import (
+    LEVELS,
     SPEC,
     assert_equal,
     assert_within_an_ulp,
@@ -64,7 +65,7 @@ def test_a_device_agrees_with_the_reference(device, dtype, hold, size):
     travel = uneven_rise(60)
     subframe = looks_between(device, dtype, hold)
     options = {"threshold": 0.4, "hold": hold, "subframe": subframe, "noise": noise, **RELEASE}
-    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert {1, 2, 3} <= set(found.status.flat)
     assert_within_an_ulp(found, numpy_release(frames, travel, dark, bright, **options), travel)
 
@@ -73,7 +74,7 @@ def test_a_device_agrees_with_the_reference(device, dtype, hold, size):
 def test_the_light_plateau_may_be_each_pixels_own(device, dark):
     frames = random_release("uint8", 40, (33, 61), seed=8)
     travel = uneven_rise(40)
-    found = find_onset(frames, travel, dark, noise=1.5, device=device, **RELEASE)
+    found = find_onset(frames, travel, dark=dark, noise=1.5, device=device, **RELEASE)
     expected = numpy_release(frames, travel, dark, None, noise=1.5)
     assert_within_an_ulp(found, expected, travel)
 
@@ -84,7 +85,7 @@ def test_references_of_each_pixel_are_obeyed(device, dtype):
     generator = np.random.default_rng(6)
     dark, bright = (level * generator.uniform(0.8, 1.2, (17, 23)) for level in SPEC[dtype])
     travel = uneven_rise(30)
-    found = find_onset(frames, travel, dark, bright, noise=0.01, device=device, **RELEASE)
+    found = find_onset(frames, travel, dark=dark, bright=bright, noise=0.01, device=device, **RELEASE)
     expected = numpy_release(frames, travel, dark, bright, noise=0.01)
     assert_within_an_ulp(found, expected, travel)
 
@@ -116,7 +117,7 @@ def test_odd_sizes(device, dtype, shape):
     travel = 1.2 - np.arange(12) * 0.1
     dark, bright = SPEC[dtype]
     options = {"noise": 0.008 * (bright - dark), **RELEASE}
-    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert_within_an_ulp(found, numpy_release(frames, travel, dark, bright, **options), travel)
 
 
@@ -135,7 +136,7 @@ def test_less_room_gives_the_same_answer(small_device):
 def test_a_sudden_step_lies_in_the_middle_of_its_interval(device):
     frames = np.full((4, 1, 1), 180, np.uint8)
     frames[2:] = 20
-    found = find_onset(frames, [0.5, 0.4, 0.1, 0.0], 20, 220, noise=1.0, device=device, **RELEASE)
+    found = find_onset(frames, [0.5, 0.4, 0.1, 0.0], dark=20, bright=220, noise=1.0, device=device, **RELEASE)
     assert found.frame[0, 0] == 2
     assert found.height[0, 0] == np.float32(-0.25)
     assert found.sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
@@ -144,7 +145,9 @@ def test_a_sudden_step_lies_in_the_middle_of_its_interval(device):
 def test_a_ramp_is_interpolated_exactly(device):
     """A ramp of -16 counts a frame crosses 120 at 3/4 after the fifth frame, whatever the references."""
     frames = (212 - np.arange(12) * 16).astype(np.uint8)[:, None, None]
-    found = find_onset(frames, 1.2 - np.arange(12) * 0.1, 20, 220, noise=1.0, device=device, **RELEASE)
+    found = find_onset(
+        frames, 1.2 - np.arange(12) * 0.1, dark=20, bright=220, noise=1.0, device=device, **RELEASE
+    )
     assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
     assert found.sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.75, 0.25), rel=1e-5)
 
@@ -152,7 +155,7 @@ def test_a_ramp_is_interpolated_exactly(device):
 def test_without_subframe_the_height_is_that_of_the_first_dark_frame(device):
     frames = random_release("uint8", 30, (9, 9), seed=2)
     travel = 3 - np.arange(30) * 0.1
-    found = find_onset(frames, travel, *SPEC["uint8"], subframe=False, device=device, **RELEASE)
+    found = find_onset(frames, travel, **LEVELS["uint8"], subframe=False, device=device, **RELEASE)
     answered = found.status == 1
     assert answered.any()
     np.testing.assert_array_equal(found.height[answered], -travel[found.frame[answered]].astype(np.float32))
@@ -164,7 +167,7 @@ def test_sigma_is_honest_on_steps(device):
     crossing = generator.uniform(1, 28, (200, 250))
     counts = np.where(np.arange(30)[:, None, None] >= crossing, 20, 200)
     frames = np.rint(counts + generator.normal(0, 1.5, counts.shape)).astype(np.uint8)
-    found = find_onset(frames, 3 - np.arange(30) * 0.1, 20, 220, device=device, **RELEASE)
+    found = find_onset(frames, 3 - np.arange(30) * 0.1, dark=20, bright=220, device=device, **RELEASE)
     error = found.height - (0.1 * crossing - 3)
     assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
     assert abs(np.mean(error)) < 0.001
@@ -174,7 +177,7 @@ def test_a_dark_spike_is_no_release_unless_the_stack_ends_on_it(device):
     frames = np.full((9, 1, 4), 200, np.uint8)
     frames[3, 0, 0] = frames[8, 0, 1] = 0
     frames[[3, 4], 0, 2] = 0
-    found = find_onset(frames, 9 - np.arange(9.0), 20, 220, device=device, **RELEASE)
+    found = find_onset(frames, 9 - np.arange(9.0), dark=20, bright=220, device=device, **RELEASE)
     np.testing.assert_array_equal(found.frame, [[-1, 8, 3, -1]])
 
 
@@ -182,7 +185,7 @@ def test_a_dark_spike_is_no_release_unless_the_stack_ends_on_it(device):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_what_never_changes_is_dark_at_start_or_light_to_the_end(device, dtype, value, status):
     frames = np.full((6, 5, 7), value, dtype)
-    found = find_onset(frames, 6 - np.arange(6.0), 20, 220, device=device, **RELEASE)
+    found = find_onset(frames, 6 - np.arange(6.0), dark=20, bright=220, device=device, **RELEASE)
     assert np.all(found.status == status)
     assert np.all(found.frame == (0 if status == 2 else -1))
     assert np.all(np.isnan(found.height))
@@ -193,7 +196,7 @@ def test_a_pixel_that_is_dark_at_start_stays_so_though_it_turns_light(device):
     frames = np.full((9, 1, 2), 20, np.uint8)
     frames[3:6] = 200
     frames[1, 0, 1] = 200  # its dark first frame was a spike
-    found = find_onset(frames, 9 - np.arange(9.0), 20, 220, device=device, **RELEASE)
+    found = find_onset(frames, 9 - np.arange(9.0), dark=20, bright=220, device=device, **RELEASE)
     np.testing.assert_array_equal(found.status, [[2, 1]])
     np.testing.assert_array_equal(found.frame, [[0, 6]])
 
@@ -204,7 +207,9 @@ def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_release(device, bro
     frames[4:] = 0.1
     frames[0, 0, 0] = frames[3, 0, 1] = frames[4, 0, 2] = frames[7, 0, 3] = broken
     frames[5, 0, 4] = broken  # the second frame of the run: not decided yet
-    found = find_onset(frames, 0.8 - np.arange(9) * 0.1, 0, 1, noise=0.01, device=device, **RELEASE)
+    found = find_onset(
+        frames, 0.8 - np.arange(9) * 0.1, dark=0, bright=1, noise=0.01, device=device, **RELEASE
+    )
     np.testing.assert_array_equal(found.status, [[0, 0, 0, 1, 0]])
     assert found.height[0, 3] == pytest.approx(-0.45)
     assert np.isnan(found.height[0, [0, 1, 2, 4]]).all()
@@ -215,7 +220,7 @@ def test_pixels_without_references_are_invalid(device):
     frames[3:] = 20
     dark, bright = np.full((2, 4), 20.0), np.full((2, 4), 220.0)
     bright[0, 0], dark[0, 1], bright[1, 2] = 20, np.nan, np.inf
-    found = find_onset(frames, 5 - np.arange(5.0), dark, bright, device=device, **RELEASE)
+    found = find_onset(frames, 5 - np.arange(5.0), dark=dark, bright=bright, device=device, **RELEASE)
     np.testing.assert_array_equal(found.status, [[0, 0, 1, 1], [1, 1, 0, 1]])
     np.testing.assert_array_equal(found.frame, [[-1, -1, 3, 3], [3, 3, -1, 3]])
 
@@ -233,7 +238,7 @@ def test_the_level_itself_is_light_and_what_is_next_below_it_dark(device, dtype,
     frames[2:, 0, 0], frames[2:, 0, 1] = least, below
     travel = 4 - np.arange(4.0)
     options = {"threshold": threshold, "noise": 0.1, **RELEASE}
-    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
     np.testing.assert_array_equal(found.status, [[3, 1]])
     assert_within_an_ulp(found, numpy_release(frames, travel, dark, bright, **options), travel)
 
@@ -244,7 +249,7 @@ def test_a_saturated_sample_is_light(device):
     frames[20:, 0, 0], frames[20:, 0, 1] = 20, 254
     travel = 3 - np.arange(30) * 0.1
     options = {"threshold": 0.9, "noise": 1.0, **RELEASE}
-    found = find_onset(frames, travel, 20, 400, device=device, **options)
+    found = find_onset(frames, travel, dark=20, bright=400, device=device, **options)
     np.testing.assert_array_equal(found.status, [[1, 1, 3]])
     np.testing.assert_array_equal(found.frame, [[20, 20, -1]])
     assert_within_an_ulp(found, numpy_release(frames, travel, 20, 400, **options), travel)
@@ -259,7 +264,7 @@ def test_at_the_ends_of_the_threshold_the_same_samples_are_light(device, dtype, 
     travel = uneven_rise(20)
     dark, bright = SPEC[dtype]
     options = {"threshold": threshold, "noise": 0.1 * (bright - dark), **RELEASE}
-    found = find_onset(frames, travel, dark, bright, device=device, **options)
+    found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert_within_an_ulp(found, numpy_release(frames, travel, dark, bright, **options), travel)
 
 
@@ -312,8 +317,8 @@ def test_a_release_of_the_complement_is_an_onset(device, hold):
     frames = random_press("uint8", 40, (33, 61), seed=11, noise=0.1)
     travel = uneven_rise(40)
     known = {"hold": hold, "noise": 2.0, "device": device}
-    onset = find_onset(frames, -travel, None, 221, **known)  # the level is 110.5
-    release = find_onset(~frames, travel, 255 - 221, None, **known, **RELEASE)
+    onset = find_onset(frames, -travel, dark=None, bright=221, **known)  # the level is 110.5
+    release = find_onset(~frames, travel, dark=255 - 221, bright=None, **known, **RELEASE)
     assert {1, 2, 3} <= set(onset.status.flat)
     np.testing.assert_array_equal(release.frame, onset.frame)
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
@@ -323,16 +328,16 @@ def test_a_release_of_the_complement_is_an_onset(device, hold):
     tied = np.full((4, 1, 1), 20, np.uint8)
     tied[2:] = 120
     known = {"noise": 1.0, "device": device}
-    assert find_onset(tied, np.arange(4.0), 20, 220, **known).status == 1
-    assert find_onset(~tied, -np.arange(4.0), 35, 235, **known, **RELEASE).status == 3
+    assert find_onset(tied, np.arange(4.0), dark=20, bright=220, **known).status == 1
+    assert find_onset(~tied, -np.arange(4.0), dark=35, bright=235, **known, **RELEASE).status == 3
 
 
 def test_the_bright_reference_is_not_taken_for_a_pixels_light_plateau(device):
     """It tells the level; how bright a pixel gets is its own affair, in a release as in a press."""
     frames = random_release("uint8", 40, (33, 61), seed=8)
     travel = uneven_rise(40)
-    given = find_onset(frames, travel, 20, 255, noise=1.5, device=device, **RELEASE)
-    assert_equal(given, find_onset(frames, travel, 20, None, noise=1.5, device=device, **RELEASE))
+    given = find_onset(frames, travel, dark=20, bright=255, noise=1.5, device=device, **RELEASE)
+    assert_equal(given, find_onset(frames, travel, dark=20, bright=None, noise=1.5, device=device, **RELEASE))
 
 
 @pytest.mark.parametrize(

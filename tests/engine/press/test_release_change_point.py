@@ -38,7 +38,7 @@ def test_a_device_agrees_with_the_reference(device, dtype, threshold):
     dark, bright = SPEC[dtype]
     options = {"threshold": threshold, "noise": 0.05 * (bright - dark), **RELEASE}
     travel = uneven_rise(40)
-    found = find_change_point(frames, travel, dark, bright, device=device, **options)
+    found = find_change_point(frames, travel, dark=dark, bright=bright, device=device, **options)
     assert {1, 2, 3} <= set(found.status.flat)
     assert_near(found, numpy_change(frames, travel, dark, bright, **options), travel)
 
@@ -83,7 +83,7 @@ def test_what_never_changes_is_dark_at_start_or_light_to_the_end(device):
     travel = 6 - np.arange(6.0)
     for value, status in ((20, 2), (200, 3)):
         frames = np.full((6, 5, 7), value, np.uint8)
-        given = find_change_point(frames, travel, 20, 220, device=device, **RELEASE)
+        given = find_change_point(frames, travel, dark=20, bright=220, device=device, **RELEASE)
         told = find_change_point(frames, travel, device=device, **RELEASE)
         assert np.all(given.status == status)
         assert np.all(told.status == 3)  # no change, whatever the level
@@ -101,7 +101,7 @@ def test_a_saturated_sample_is_light(device):
     frames = np.full((9, 1, 3), 255, np.uint8)
     frames[4:, 0, 0], frames[4:, 0, 1] = 20, 254
     options = {"threshold": 0.9, "noise": 1.0, **RELEASE}
-    found = find_change_point(frames, 9 - np.arange(9.0), 20, 400, device=device, **options)
+    found = find_change_point(frames, 9 - np.arange(9.0), dark=20, bright=400, device=device, **options)
     np.testing.assert_array_equal(found.status, [[1, 1, 3]])
     assert found.height[0, 0] == pytest.approx(-5.5, abs=0.01)
     assert_near(found, numpy_change(frames, 9 - np.arange(9.0), 20, 400, **options), np.arange(9.0))
@@ -112,7 +112,9 @@ def test_pixels_without_references_or_with_a_broken_sample_are_invalid(device):
     frames[4:] = 0.1
     frames[2, 0, 1], frames[2, 0, 2] = np.nan, np.inf
     bright = np.array([[1.0, 1.0, 1.0, np.nan]])
-    found = find_change_point(frames, 9 - np.arange(9.0), 0, bright, noise=0.01, device=device, **RELEASE)
+    found = find_change_point(
+        frames, 9 - np.arange(9.0), dark=0, bright=bright, noise=0.01, device=device, **RELEASE
+    )
     np.testing.assert_array_equal(found.status, [[1, 0, 0, 0]])
 
 
