@@ -11,13 +11,13 @@ PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
 BIN := .venv/bin
 READY := .venv/.ready
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal --ignore tests/browser
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo
 
-# Types are checked meanwhile, as some tests wait for clocks. --dist worksteal: processes that have no tests left take others'.
+# A process for each core, each with files of its own. Types are checked meanwhile, as some tests wait for clocks.
 test: lint
 	@$(MAKE) --no-print-directory types & types=$$!
 	$(PYTEST) -m 'not slow'

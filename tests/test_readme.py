@@ -84,6 +84,7 @@ def test_there_are_commands_to_run():
     assert len(COMMANDS) >= 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", COMMANDS)
 def test_a_command_runs(desk, line):
     words = shlex.split(line, comments=True)[1:]
