@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.bench.sweep.sweep import FRAME_TYPES, MAPS_ONLY, Family, Job, Shape, agree, run_kernel
-from mirrorskin.hw.twin.optics.wall import fade_angle, scatter_rays
+from mirrorskin.hw.twin.optics import fade_angle, scatter_rays
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.exposure import expose
 from mirrorskin.kernels.wall import wall_light

@@ -2,26 +2,14 @@
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera
+from mirrorskin.hw.twin.catalogue import OBJECT_NAMES, check_fits, make_object
+from mirrorskin.hw.twin.coin import Coin
 from mirrorskin.hw.twin.live import Live
 from mirrorskin.hw.twin.movement import Axial, Horizontal, Movement, Twist, Vertical
-from mirrorskin.hw.twin.objects import (
-    OBJECT_NAMES,
-    Coin,
-    Cone,
-    Cylinder,
-    HeightMap,
-    Object,
-    Plane,
-    Sphere,
-    Step,
-    Texture,
-    check_fits,
-    load_height_map,
-    load_mesh,
-    make_object,
-)
+from mirrorskin.hw.twin.object_files import HeightMap, load_height_map, load_mesh
+from mirrorskin.hw.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture
 from mirrorskin.hw.twin.optics import design_range, visible_zenith
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.hw.twin.twin import ContactName, OpticsName, Twin
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.movement import Movement, Pose
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.io.types import Floats
 
 Light = NDArray[np.float32]

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
-from mirrorskin.hw.twin.contact import Conform, Elastic
+from mirrorskin.hw.twin.catalogue import check_fits, make_object
 from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
-from mirrorskin.hw.twin.objects import Object, check_fits, make_object
-from mirrorskin.hw.twin.optics import Ideal, Linear, Pattern, Uniform, Wall, make_pattern
-from mirrorskin.hw.twin.references import REFERENCES, ReferenceName, ball_references, exact_references
+from mirrorskin.hw.twin.objects import Object
+from mirrorskin.hw.twin.optics import Ideal, Wall
+from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
 from mirrorskin.hw.twin.scene import Anywhere, Film, Imprint, Press, Scene
-from mirrorskin.hw.twin.sheet import Sheet
-from mirrorskin.hw.twin.truth import tell_truth
+from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
+from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, tell_truth
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
 from mirrorskin.kernels.device import Device, open_device

@@ -11,7 +11,7 @@ from geometry import pixel_centres
 from mirrorskin.hw.twin import Axial, Camera, Horizontal, Twin, Twist, Vertical
 from mirrorskin.hw.twin.movement import Movement
 from mirrorskin.hw.twin.objects import Cone, Object, Plane, Sphere
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.skin import Sheet
 
 SHAPE, PIXEL_SIZE = (53, 71), 0.6
 # Radians: the twin's target, before its camera model.

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.twin import Axial, Camera, Horizontal, Movement, Plane, Twin, Twist
 from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.optics.ideal import Ideal
-from mirrorskin.hw.twin.optics.pattern import Linear, Pattern, Picture, Uniform
-from mirrorskin.hw.twin.optics.wall import Wall
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.optics import Ideal, Wall
+from mirrorskin.hw.twin.pattern import Linear, Pattern, Picture, Uniform
+from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize
 
-from mirrorskin.hw.twin.contact import elastic
-from mirrorskin.hw.twin.contact.elastic import TOLERANCE, Contact, press
-from mirrorskin.hw.twin.contact.halfspace import HalfSpace
+from mirrorskin.hw.twin import elastic
+from mirrorskin.hw.twin.elastic import TOLERANCE, Contact, HalfSpace, press
 
 Map = NDArray[np.float64]
 

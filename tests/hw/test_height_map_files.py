@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.objects import Sphere, load_height_map, make_object
+from mirrorskin.hw.twin.catalogue import make_object
+from mirrorskin.hw.twin.object_files import load_height_map
+from mirrorskin.hw.twin.objects import Sphere
 from mirrorskin.io import InputError
 
 SHAPE = (40, 56)

@@ -12,8 +12,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.objects import Object, check_fits, make_object
-from mirrorskin.hw.twin.objects.raster import top_surface
+from mirrorskin.hw.twin.catalogue import check_fits, make_object
+from mirrorskin.hw.twin.object_files import top_surface
+from mirrorskin.hw.twin.objects import Object
 from mirrorskin.io import InputError
 
 SHAPE = (120, 160)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mirrorskin.hw.twin import Axial, Body, Cylinder, Horizontal, Object, Plane, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.contact.obstacle import meet
 from mirrorskin.hw.twin.movement import Movement
+from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io import Block, InputError
 

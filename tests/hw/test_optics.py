@@ -12,19 +12,14 @@ import pytest
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.optics import (
     Ideal,
-    Linear,
-    Pattern,
-    Picture,
-    Uniform,
     Wall,
     design_range,
-    linear_pattern,
-    make_pattern,
+    scatter_rays,
+    uniform_response,
     visible_zenith,
 )
-from mirrorskin.hw.twin.optics.ideal import uniform_response
-from mirrorskin.hw.twin.optics.wall import scatter_rays
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.pattern import Linear, Pattern, Picture, Uniform, linear_pattern, make_pattern
+from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, InputError
 from mirrorskin.kernels.device import Device

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw import Twin
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
-from mirrorskin.hw.twin.references import _places
+from mirrorskin.hw.twin.truth import _places
 from mirrorskin.hw.twin.view import View
 
 Counts = NDArray[np.float32]

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.contact import Conform
 from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
-from mirrorskin.hw.twin.optics import Ideal, Uniform
+from mirrorskin.hw.twin.optics import Ideal
+from mirrorskin.hw.twin.pattern import Uniform
 from mirrorskin.hw.twin.scene import Film, Imprint, Press
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.skin import Conform, Sheet
 from mirrorskin.hw.twin.view import View
 
 Map = NDArray[np.float64]

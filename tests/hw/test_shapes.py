@@ -6,19 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.objects import (
-    OBJECT_NAMES,
-    Cone,
-    Cylinder,
-    Object,
-    Plane,
-    Sphere,
-    Step,
-    Texture,
-    check_fits,
-    make_object,
-    zenith_azimuth,
-)
+from mirrorskin.hw.twin.catalogue import OBJECT_NAMES, check_fits, make_object
+from mirrorskin.hw.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture, zenith_azimuth
 from mirrorskin.io import InputError
 
 SHAPE, PIXEL = (480, 480), 0.025

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from mirrorskin.hw.twin import Axial, Body, Camera, Coin, Cylinder, Object, Plane, Sphere, Twin
-from mirrorskin.hw.twin.contact import Conform, Elastic
 from mirrorskin.hw.twin.movement import Pose, pose_at_press
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io import InputError
 

@@ -51,7 +51,7 @@ def on_grid(
 
 def on_coin(x: float, y: float, shape: tuple[int, int], pixel: float = 0.016) -> Case:
     """Look at the twin's coin, round a place in mm."""
-    from mirrorskin.hw.twin.objects import Coin
+    from mirrorskin.hw.twin.coin import Coin
 
     columns, rows = surfaces.places(shape)
     place = x + pixel * columns, y + pixel * rows

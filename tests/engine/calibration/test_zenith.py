@@ -11,8 +11,9 @@ from wall_presses import BODY, DISTANCE, SHAPE, wall_presses
 from mirrorskin import io
 from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.calibration.wall_fit import pivot_of, read_press
-from mirrorskin.hw.twin.optics import Wall, make_pattern
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.optics import Wall
+from mirrorskin.hw.twin.pattern import make_pattern
+from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io import pixel_axes
 from mirrorskin.kernels.device import open_device

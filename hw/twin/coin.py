@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from mirrorskin.hw.twin.objects.surface import difference_slope
-
-if TYPE_CHECKING:
-    from mirrorskin.io.types import Floats
+from mirrorskin.hw.twin.objects import difference_slope
+from mirrorskin.io.types import Floats
 
 RADIUS = 11.0
 HOLE_RADIUS = 2.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.contact.halfspace import HalfSpace, inner, rectangle
+from mirrorskin.hw.twin.elastic import HalfSpace, inner, rectangle
 from mirrorskin.io.types import Floats
 
 TOLERANCE = 1e-3

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.objects.coin import Coin
-from mirrorskin.hw.twin.objects.heightmap import DEFAULT_SCALE, HEIGHT_MAP_SUFFIXES, load_height_map
-from mirrorskin.hw.twin.objects.mesh import MESH_SUFFIXES, load_mesh
-from mirrorskin.hw.twin.objects.plates import PLATE_RADIUS, Plane, Step, Texture
-from mirrorskin.hw.twin.objects.shapes import Cone, Cylinder, Sphere
+from mirrorskin.hw.twin.coin import Coin
+from mirrorskin.hw.twin.object_files import (
+    DEFAULT_SCALE,
+    HEIGHT_MAP_SUFFIXES,
+    MESH_SUFFIXES,
+    load_height_map,
+    load_mesh,
+)
+from mirrorskin.hw.twin.objects import PLATE_RADIUS, Cone, Cylinder, Object, Plane, Sphere, Step, Texture
 from mirrorskin.io.types import InputError
-
-if TYPE_CHECKING:
-    from mirrorskin.hw.twin.objects.surface import Object
 
 OBJECT_NAMES = ("sphere", "coin", "plane", "cone", "cylinder", "step", "texture")
 

@@ -1,9 +1,10 @@
-"""The sheet of a real sensor: the surface of an elastic body, which resists."""
+"""The mirror sheet: how it lies on an object that it conforms to, or that an elastic body resists."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,55 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.contact.elastic import Contact, press
-from mirrorskin.hw.twin.contact.halfspace import HalfSpace
-from mirrorskin.hw.twin.contact.obstacle import meet
+from mirrorskin.hw.twin.elastic import Contact, HalfSpace, press
 from mirrorskin.hw.twin.movement import Pose
 from mirrorskin.hw.twin.objects import Object
-from mirrorskin.hw.twin.sheet import Sheet
+from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, InputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """The mirror in one frame, in the body's frame, at the points that the pixels see.
+
+    Attributes
+    ----------
+    height : ndarray, (H, W), float64
+        Millimetres above the rest plane, 0 or more.
+    dz_dx, dz_dy : ndarray, (H, W), float64
+        Its slopes along the body's x and y.
+    contact : ndarray, (H, W), bool
+        Whether sheet and object touch there.
+    """
+
+    height: Floats
+    dz_dx: Floats
+    dz_dy: Floats
+    contact: NDArray[np.bool_]
+
+
+class Conform:
+    """Equation 1 of the paper, F = f H(-vt - f): the object's shape where it stands above the rest plane.
+
+    Parameters
+    ----------
+    thing : Object
+    view : View
+        Of the camera.
+    """
+
+    def __init__(self, thing: Object, view: View) -> None:
+        self._thing = thing
+        self._view = view
+
+    def lie(self, pose: Pose) -> Sheet:
+        """Lay the sheet on the object in a pose."""
+        obstacle = meet(self._thing, pose, self._view)
+        contact = np.isfinite(obstacle.height) & self._view.on_body
+        height, dz_dx, dz_dy = (np.where(contact, values, 0.0) for values in obstacle)
+        return Sheet(height, dz_dx, dz_dy, contact)
+
 
 _POINTS_MAX = 4_000_000
 _COARSE = 97  # places across the body at which it is looked whether the object stands above the rest plane
