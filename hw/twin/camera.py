@@ -193,11 +193,20 @@ class Sensor:
             WHOLE=int(camera.bits is not None),
             SHOT=int(math.isfinite(camera.electrons)),
         )
-        maps = self._light, self._offset, self._span
-        keys = np.int32(quarter), np.uint64(int(frame) % _WORD), np.uint64(camera.seed)
-        amounts = np.float32(camera.noise), np.float32(1 / camera.electrons), np.float32(camera.top)
-        moved = self._pixels * (len(maps) * 4 + self.dtype.itemsize)
-        expose(-(-quarter // self.device.layout.tile), *maps, *keys, *amounts, self._counts, moved=moved)
+        expose(
+            -(-quarter // self.device.layout.tile),
+            light=self._light,
+            offset=self._offset,
+            span=self._span,
+            quarter=quarter,
+            frame=int(frame) % _WORD,
+            seed=camera.seed,
+            read=camera.noise,
+            grain=1 / camera.electrons,
+            top=camera.top,
+            counts=self._counts,
+            moved=self._pixels * (3 * 4 + self.dtype.itemsize),
+        )
 
 
 def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:

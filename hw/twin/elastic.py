@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from mirrorskin.io.types import Floats
 
@@ -42,6 +41,8 @@ class HalfSpace:
     def __init__(
         self, shape: tuple[int, int], pixel_size: tuple[float, float], modulus: float, depth: float = 0.0
     ) -> None:
+        from scipy import fft
+
         self.shape = shape
         self.pixel_size = pixel_size
         self.modulus = modulus
@@ -118,6 +119,8 @@ class HalfSpace:
         return self._field(spectrum)
 
     def _spectrum(self, values: Floats) -> NDArray[np.complex128]:
+        from scipy import fft
+
         # The axes one by one: rows of zeros need no transform.
         rows, columns = self._padded
         half = fft.rfft(values, columns, axis=1, workers=_WORKERS)
@@ -125,6 +128,8 @@ class HalfSpace:
         return spectrum
 
     def _field(self, spectrum: NDArray[np.complex128]) -> Floats:
+        from scipy import fft
+
         rows, columns = self.shape
         half = fft.ifft(spectrum, axis=0, workers=_WORKERS, overwrite_x=True)[:rows]
         field: Floats = fft.irfft(half, self._padded[1], axis=1, workers=_WORKERS)[:, :columns]
@@ -180,6 +185,8 @@ def _x_log(x: Floats, y: Floats, z: float) -> Floats:
 
 def _transform(corners: Floats) -> Floats:
     """Return the real transform of what a pixel gets from an integral's value at its four corners."""
+    from scipy import fft
+
     pixels = -np.diff(np.diff(corners, axis=0), axis=1)
     return np.ascontiguousarray(fft.rfft2(fft.ifftshift(pixels), workers=_WORKERS).real)
 
@@ -334,6 +341,8 @@ def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
 
     The grid comes round on itself here, and single precision will do: it only steers the search.
     """
+    from scipy import fft
+
     rows, columns = (fft.next_fast_len(n, real=True) for n in space.shape)
     q_x = 2 * np.pi * fft.rfftfreq(columns, space.pixel_size[0])
     q_y = 2 * np.pi * fft.fftfreq(rows, space.pixel_size[1])

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import elementwise
 
 from mirrorskin.hw.twin.movement import TILT_MAX, Pose
 from mirrorskin.hw.twin.objects import Object
@@ -191,6 +190,8 @@ def _narrow(
     left = np.flatnonzero((below > 0) | (above <= 0) | (above - below > _JUMP))
     side = np.zeros(at.shape, bool)
     if left.size:
+        from scipy.optimize import elementwise
+
         foot, lean = foot.of(left), lean.of(left)
         hit = elementwise.find_root(
             lambda height, number: _gap(thing, foot.of(number), lean.of(number), height),

@@ -311,22 +311,27 @@ class Wall:
     def _launch(self) -> None:
         body, pixels = self._body, self._light.host.size
         rows, columns = self._table.host.shape
-        sizes = pixels, self._rays.host.shape[0], rows - 2, columns - 2
-        geometry = body.radius, body.height, body.air_gap, body.index, body.scatter, fade_angle(body.scatter)
-        lamps = (
-            body.asymmetry * math.cos(body.asymmetry_azimuth),
-            body.asymmetry * math.sin(body.asymmetry_azimuth),
-        )
-        maps = self._sheet, self._places
+        lean = body.asymmetry_azimuth
         self._device.kernel("wall", "wall_light", **self._macros)(
             -(-pixels // self._device.layout.tile),
-            *(np.int32(size) for size in sizes),
-            *maps,
-            self._rays,
-            self._table,
-            *(np.float32(value) for value in (*geometry, *lamps)),
-            self._light,
-            moved=sum(array.host.nbytes for array in (*maps, self._light)),
+            pixels=pixels,
+            samples=len(self._rays.host),
+            rows=rows - 2,
+            columns=columns - 2,
+            sheet=self._sheet,
+            places=self._places,
+            rays=self._rays,
+            table=self._table,
+            radius=body.radius,
+            rim=body.height,
+            gap=body.air_gap,
+            index=body.index,
+            scatter=body.scatter,
+            fade=fade_angle(body.scatter),
+            asymmetry_x=body.asymmetry * math.cos(lean),
+            asymmetry_y=body.asymmetry * math.sin(lean),
+            light=self._light,
+            moved=sum(array.host.nbytes for array in (self._sheet, self._places, self._light)),
         )
 
 

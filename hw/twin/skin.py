@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.elastic import Contact, HalfSpace, press
@@ -121,6 +120,8 @@ class Elastic:
 
     def sheet(self, pressure: Floats) -> Sheet:
         """Return the mirror under a pressure, as the camera's pixels see it."""
+        from scipy.ndimage import map_coordinates
+
         height = self.space.mirror(pressure)
         along_x, along_y = self._view.pixel_size
         dz_dx = _slope(height, 1) / along_x
@@ -131,7 +132,7 @@ class Elastic:
             if at is None:
                 here = self.crop(values)
             else:
-                here = ndimage.map_coordinates(values, at, order=order, mode="nearest")
+                here = map_coordinates(values, at, order=order, mode="nearest")
             return np.where(self._view.on_body, here, np.zeros_like(here))
 
         return Sheet(seen(height), seen(dz_dx), seen(dz_dy), seen(pressure > 0, order=0))
@@ -147,12 +148,14 @@ class Elastic:
 
     def _seen(self, height: Floats) -> Floats:
         """Return the rows and columns of the points that oblique rays meet, (2, H, W)."""
+        from scipy.ndimage import map_coordinates
+
         view, (along_x, along_y) = self._view, self._view.pixel_size
         row, column = np.indices(view.shape, dtype=np.float64)
         row, column = row + self._field[0].start, column + self._field[1].start
         at = np.stack([row, column])
         for _ in range(_VIEW_ROUNDS):
-            z = ndimage.map_coordinates(height, at, order=1, mode="nearest")
+            z = map_coordinates(height, at, order=1, mode="nearest")
             at = np.stack([row - z * view.slope_y / along_y, column + z * view.slope_x / along_x])
         return at
 
