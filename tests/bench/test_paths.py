@@ -277,7 +277,7 @@ def test_a_case_without_room_for_its_files_is_refused(monkeypatch):
         CASES["file-press"](open_device(), True)
 
 
-def as_input_error(frames, travel, dark, bright):
+def plainly(frames, travel, dark, bright):
     """Return equation 4 with hold 2, pixel by pixel."""
     height = np.full(frames.shape[1:], np.nan)
     for place in np.ndindex(*frames.shape[1:]):
@@ -303,7 +303,7 @@ def test_a_lab_finds_what_equation_4_says(name, folder):
     made = files.Frames(frames, io.Header("vertical", dark=dark, bright=bright), np.arange(9) * 0.1)
     files.record(made, folder / "press.h5")
     found = known[name](folder / "press.h5", io.layout.STACK, dark, bright, folder / "height.npy")
-    expected = as_input_error(frames, made.block.travel, dark, bright)
+    expected = plainly(frames, made.block.travel, dark, bright)
     assert 0.2 < np.isfinite(expected).mean() < 0.95
     np.testing.assert_array_equal(found, expected.astype(np.float32))
     np.testing.assert_array_equal(np.load(folder / "height.npy"), found)
