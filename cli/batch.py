@@ -19,8 +19,7 @@ from mirrorskin.cli import options
 
 if TYPE_CHECKING:
     from mirrorskin.cli.table import Show
-    from mirrorskin.engine.batch.jobs import Job
-    from mirrorskin.engine.batch.plan import Plan
+    from mirrorskin.engine.batch.jobs import Job, Plan
     from mirrorskin.engine.batch.work import Outcome
 
 # How the commands name results unasked.

@@ -12,7 +12,7 @@ from typing import Any
 from mirrorskin.cli.options import MotionName
 from mirrorskin.cli.quantity import angle, per_angle
 from mirrorskin.cli.stack import StackOptions, stack_options
-from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.engine.batch.jobs import Plan
 from mirrorskin.engine.press.onset import EVENTS
 from mirrorskin.engine.press.press import METHODS
 from mirrorskin.engine.rotation.normals_kernel import NORMAL_METHODS

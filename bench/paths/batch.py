@@ -26,9 +26,8 @@ from mirrorskin.bench.paths.whole import to_result
 from mirrorskin.bench.results import Case, Row, Target
 from mirrorskin.bench.same import DisagreementError
 from mirrorskin.engine import OnsetSearch
-from mirrorskin.engine.batch.jobs import Job, make_jobs
+from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
 from mirrorskin.engine.batch.local import run_local
-from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.io.layout import STACK
 from mirrorskin.kernels.device import Device

@@ -8,10 +8,8 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from threading import Event, Semaphore, Thread
 
-from mirrorskin.engine.batch.jobs import Job
-from mirrorskin.engine.batch.memory import keep_memory
-from mirrorskin.engine.batch.plan import Plan
-from mirrorskin.engine.batch.work import Outcome, do
+from mirrorskin.engine.batch.jobs import Job, Plan
+from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
 from mirrorskin.kernels.device import Device, list_devices, open_device
 
 Watch = Callable[[Job, int], None]
@@ -71,7 +69,7 @@ def run_local(
     def work(device: Device) -> None:
         try:
             while not stop.is_set():
-                told.put(do(job := todo.get_nowait(), plan, device, _telling(job, watch, stop)))
+                told.put(run_job(job := todo.get_nowait(), plan, device, _telling(job, watch, stop)))
         except (Empty, _Stopped):
             pass
         except BaseException as error:

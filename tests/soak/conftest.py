@@ -7,9 +7,8 @@ import os
 import pytest
 import soak
 
-from mirrorskin.engine.batch.jobs import make_jobs
+from mirrorskin.engine.batch.jobs import Plan, make_jobs
 from mirrorskin.engine.batch.local import default_devices, run_local
-from mirrorskin.engine.batch.plan import Plan
 
 
 @pytest.fixture(scope="session")

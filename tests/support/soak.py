@@ -18,7 +18,7 @@ import numpy as np
 import stacks
 
 from mirrorskin import hw, io
-from mirrorskin.engine.batch import place
+from mirrorskin.engine.batch import worker
 from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.work import Outcome
 
@@ -164,7 +164,7 @@ def die_with(recording: str, delay: float, mark: Path) -> None:
 
     It does so unless the mark is there, which says how many results were there then.
     """
-    do = place.do
+    run_job = worker.run_job
 
     def end() -> None:
         mark.write_text(str(len(results(mark.parent))))
@@ -172,10 +172,10 @@ def die_with(recording: str, delay: float, mark: Path) -> None:
 
     def die(job: Job, *rest: Any) -> Outcome:
         if job.source.name != recording or mark.exists():
-            return do(job, *rest)
+            return run_job(job, *rest)
         threading.Timer(delay, end).start()
-        do(job, *rest)
+        run_job(job, *rest)
         time.sleep(_START)
         raise AssertionError("it should have ended")
 
-    place.do = die
+    worker.run_job = die

@@ -13,9 +13,8 @@ from batches import BAD, half_written, press
 
 from mirrorskin import io
 from mirrorskin.engine.batch import local, work
-from mirrorskin.engine.batch.jobs import make_jobs
+from mirrorskin.engine.batch.jobs import Plan, make_jobs
 from mirrorskin.engine.batch.local import default_devices, run_local
-from mirrorskin.engine.batch.plan import Plan
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device, open_device
 

@@ -9,7 +9,7 @@ import pytest
 COUNT = """
 import resource, sys
 import numpy as np
-from mirrorskin.engine.batch.memory import keep_memory
+from mirrorskin.engine.batch.work import keep_memory
 if sys.argv[1] == "kept":
     keep_memory()
 np.ones(1 << 22, np.uint8)

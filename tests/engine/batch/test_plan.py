@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
-from mirrorskin.engine.batch import plan as plans
-from mirrorskin.engine.batch.plan import Plan
+from mirrorskin.engine.batch import jobs as plans
+from mirrorskin.engine.batch.jobs import Plan
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,10 @@ from batches import BAD, half_written, press, rotation
 from stacks import assert_same
 
 from mirrorskin import engine, io
-from mirrorskin.engine.batch import plan as plans
+from mirrorskin.engine.batch import jobs as plans
 from mirrorskin.engine.batch import work
-from mirrorskin.engine.batch.jobs import Job
-from mirrorskin.engine.batch.plan import Plan
-from mirrorskin.engine.batch.work import do
+from mirrorskin.engine.batch.jobs import Job, Plan
+from mirrorskin.engine.batch.work import run_job
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.kernels.errors import DeviceMemoryError
 
@@ -28,7 +27,7 @@ def job(tmp_path):
 def again(job, plan=None):
     """Do a job once more; tell what became of it, and whether its result was left alone."""
     before = job.target.stat().st_mtime_ns, job.target.read_bytes()
-    state = do(job, plan or Plan()).state
+    state = run_job(job, plan or Plan()).state
     return state, before == (job.target.stat().st_mtime_ns, job.target.read_bytes())
 
 
@@ -36,7 +35,7 @@ def again(job, plan=None):
 def test_a_result_is_that_of_reconstruct(tmp_path, make):
     job = Job(make(tmp_path / "a.h5"), tmp_path / "a-result.h5")
     plan = Plan(press={"threshold": 0.3}, rotation={"noise": 2.0})
-    outcome = do(job, plan)
+    outcome = run_job(job, plan)
     assert outcome.state == "done", outcome.message
     with io.open_recording(job.source) as source:
         options = plan.press if make is press else plan.rotation
@@ -49,7 +48,7 @@ def test_a_result_is_that_of_reconstruct(tmp_path, make):
 
 
 def test_an_outcome_tells_what_was_done(job):
-    outcome = do(job, Plan())
+    outcome = run_job(job, Plan())
     assert (outcome.job, outcome.motion, outcome.bytes) == (job, "vertical", 8 * 5 * 7)
     assert outcome.message.startswith("height at 35 of 35 pixels")
     assert 0 < outcome.seconds < 60
@@ -58,10 +57,10 @@ def test_an_outcome_tells_what_was_done(job):
 
 
 def test_a_finished_result_is_kept(job):
-    do(job, Plan())
+    run_job(job, Plan())
     assert again(job) == ("kept", True)
     assert again(job, Plan(rotation={"robust": True}, memory_limit=5000)) == ("kept", True)
-    kept = do(job, Plan())
+    kept = run_job(job, Plan())
     assert (kept.motion, kept.bytes, kept.device) == ("vertical", 0, "")
 
 
@@ -70,19 +69,19 @@ def test_a_finished_result_is_kept(job):
     [Plan(press={"threshold": 0.6}), Plan(opening={"travel": io.Steps(0.2)}), Plan(press={"fill": False})],
 )
 def test_other_parameters_make_it_anew(job, plan):
-    do(job, Plan())
+    run_job(job, Plan())
     assert again(job, plan) == ("done", False)
     assert again(job, plan) == ("kept", True)
 
 
 def test_another_version_makes_it_anew(job, monkeypatch):
-    do(job, Plan())
+    run_job(job, Plan())
     monkeypatch.setattr(plans, "program_version", lambda: "99.0")
     assert again(job) == ("done", False)
 
 
 def test_a_changed_recording_is_done_anew(job):
-    do(job, Plan())
+    run_job(job, Plan())
     written = job.source.stat().st_mtime_ns
     with h5py.File(job.source, "r+") as file:
         file["entry/instrument/detector/data"][3, 2, 1] += 1
@@ -126,26 +125,26 @@ def of_a_strange_shape(path):
     "spoil", [cut, overwritten, emptied, without_maps, of_reconstruct, of_a_strange_shape]
 )
 def test_a_damaged_result_is_made_anew(job, spoil):
-    do(job, Plan())
+    run_job(job, Plan())
     whole = io.open_result(job.target)
     spoil(job.target)
-    assert do(job, Plan()).state == "done"
+    assert run_job(job, Plan()).state == "done"
     found = io.open_result(job.target)
     np.testing.assert_array_equal(found.height, whole.height)
-    assert do(job, Plan()).state == "kept"
+    assert run_job(job, Plan()).state == "kept"
 
 
 def test_a_recording_in_the_result_s_place_is_made_a_result(job):
     job.target.parent.mkdir()
     press(job.target)
-    assert do(job, Plan()).state == "done"
+    assert run_job(job, Plan()).state == "done"
     assert io.open_result(job.target).height is not None
 
 
 @pytest.mark.parametrize(("make", "said"), BAD.items(), ids=[make.__name__ for make in BAD])
 def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, said):
     job = Job(make(tmp_path / "bad.h5"), tmp_path / "out" / "bad-result.h5")
-    outcome = do(job, Plan())
+    outcome = run_job(job, Plan())
     assert outcome.state == "failed"
     assert said in outcome.message
     assert "bad.h5" in outcome.message
@@ -156,7 +155,7 @@ def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, sa
 
 
 def test_a_parameter_that_cannot_be_used_fails_with_the_file_s_name(job):
-    outcome = do(job, Plan(press={"hold": 0}))
+    outcome = run_job(job, Plan(press={"hold": 0}))
     assert outcome.state == "failed"
     assert outcome.message.startswith(f"{job.source}: hold 0")
 
@@ -175,7 +174,7 @@ def test_what_the_engine_raises_is_told(job, monkeypatch, error, said):
         raise error
 
     monkeypatch.setattr(work, "reconstruct", fail)
-    outcome = do(job, Plan())
+    outcome = run_job(job, Plan())
     assert (outcome.state, outcome.motion) == ("failed", "vertical")
     assert outcome.message.endswith(said)
 
@@ -186,7 +185,7 @@ def test_what_ends_the_program_is_no_failure(job, error):
         raise error
 
     with pytest.raises(error):
-        do(job, Plan(), progress=stop)
+        run_job(job, Plan(), progress=stop)
     assert not job.target.exists()
     assert not half_written(job.source.parent)
 
@@ -204,7 +203,7 @@ def replaced(path):
 
 @pytest.mark.parametrize("change", [touched, replaced])
 def test_a_recording_that_is_written_to_meanwhile_fails(job, change):
-    outcome = do(job, Plan(), progress=lambda frames: change(job.source))
+    outcome = run_job(job, Plan(), progress=lambda frames: change(job.source))
     assert outcome.state == "failed"
     assert outcome.message.startswith(f"{job.source} was changed while it was open")
     assert not job.target.exists()
@@ -219,13 +218,13 @@ def test_a_recording_that_is_replaced_while_it_is_opened_fails(job, monkeypatch)
         return source
 
     monkeypatch.setattr(io, "open_recording", replace_then)
-    assert "was changed while it was open" in do(job, Plan()).message
+    assert "was changed while it was open" in run_job(job, Plan()).message
     assert not job.target.exists()
 
 
 def test_a_result_s_folder_that_is_a_file_fails(job):
     job.target.parent.write_text("mine")
-    outcome = do(job, Plan())
+    outcome = run_job(job, Plan())
     assert (outcome.state, outcome.message) == (
         "failed",
         f"{job.target.parent} cannot be made: File exists; choose another folder for results",
@@ -234,10 +233,10 @@ def test_a_result_s_folder_that_is_a_file_fails(job):
 
 
 def test_the_same_job_makes_the_same_maps(job):
-    do(job, Plan())
+    run_job(job, Plan())
     first = io.open_result(job.target)
     job.target.unlink()
-    do(job, Plan(memory_limit=500))
+    run_job(job, Plan(memory_limit=500))
     second = io.open_result(job.target)
     process = {**second.process, "date": first.process["date"]}
     assert_same(io.Result(**second.maps(), x=second.x, y=second.y, process=process), first)

@@ -1,0 +1,144 @@
+"""A worker of a Dask cluster: whether it can take part in a batch, its share of the machine, a job on it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from distributed import WorkerPlugin, get_worker
+
+from mirrorskin.engine.batch.jobs import Job, Plan
+from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
+from mirrorskin.kernels.device import Device, list_devices, open_device
+from mirrorskin.kernels.errors import DeviceError
+
+RESOURCE = "mirrorskin"
+"""Workers that can take part have one of it and each job needs one, so that they do one job at a time. Also
+the topic of the event that says why a worker cannot."""
+
+
+_NUMBERS = f"\0mirrorskin-{os.getuid()}-worker-"  # of sockets that are in no folder (Linux, unix(7))
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What a worker has of its machine.
+
+    Attributes
+    ----------
+    device : Device
+        One of the GPUs in turn, else all workers' CPU.
+    cores : int
+        For decoding, and for a CPU device.
+    number : int
+        Descriptor of a socket whose name says which of the machine's workers it is; held as long as it lives.
+    """
+
+    device: Device
+    cores: int
+    number: int
+
+
+class Enlist(WorkerPlugin):
+    """Finds out whether a worker can take part: those that are there, and those that come later.
+
+    Parameters
+    ----------
+    program : str
+        Version of mirrorskin.
+    sizes : mapping of Path to int
+        Recordings, and how many bytes they have.
+    trace : Path
+        A file that lies, for now, where results will be written.
+    """
+
+    def __init__(self, program: str, sizes: Mapping[Path, int], trace: Path) -> None:
+        self.program, self.sizes, self.trace = program, sizes, trace
+
+    async def setup(self, worker: Any) -> None:
+        """Give the worker what jobs need if it can do them; Dask calls this."""
+        own = version("mirrorskin")
+        problem = None if own == self.program else f"has mirrorskin {own}, and the batch {self.program}"
+        problem = problem or await look_around(self.sizes, self.trace, worker)
+        if problem is not None:
+            worker.log_event(RESOURCE, f"worker {worker.address} is left out: it {problem}")
+        await worker.set_resources(**{RESOURCE: int(problem is None)})
+
+
+async def look_around(sizes: Mapping[Path, int], trace: Path, dask_worker: Any) -> str | None:
+    """Return what keeps a worker from taking part, and the remedy: the predicate of a sentence about it."""
+    host = dask_worker.address.rpartition(":")[0]
+    workers = [other for other in await dask_worker.scheduler.ncores() if other.rpartition(":")[0] == host]
+    return await asyncio.to_thread(_problem, sizes, trace, dask_worker, max(1, len(workers)))
+
+
+def run_on_worker(job: Job, plan: Plan) -> Outcome:
+    """Make the result of a job, whose paths are absolute, on the device of this worker."""
+    worker: Any = get_worker()
+    share: Share = worker.mirrorskin_share
+    opening = {"threads": share.cores, **plan.opening}
+    return run_job(job, replace(plan, opening=opening), share.device)
+
+
+def dask_setup(worker: object) -> None:
+    """Leave Ctrl-C, which a terminal sends to workers as well, to the batch that they belong to.
+
+    Dask calls it in each worker that loads this module at its start.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def take_share(workers: int) -> Share:
+    """Return the next share of a machine that has so many workers.
+
+    PoCL asks once in a process how many threads it may have, so this must be the first to look at OpenCL.
+
+    Raises
+    ------
+    DeviceError
+        There is no OpenCL device, or it cannot run a kernel.
+    """
+    keep_memory()
+    number, held = _take_number()
+    cores = len(os.sched_getaffinity(0))
+    own = max(1, cores // workers + (number < cores % workers))
+    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", str(own))
+    gpus = [str(index) for index, device in enumerate(list_devices()) if device.kind == "gpu"]
+    choice = None if "PYOPENCL_CTX" in os.environ or not gpus else gpus[number % len(gpus)]
+    return Share(open_device(choice), own, held)
+
+
+def _take_number() -> tuple[int, int]:
+    """Return the first number that no other worker of this machine has, and what holds it."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
+        for number in count():
+            with suppress(OSError):  # it is taken
+                held.bind(f"{_NUMBERS}{number}")
+                return number, held.detach()
+    raise AssertionError
+
+
+def _problem(sizes: Mapping[Path, int], trace: Path, worker: Any, workers: int) -> str | None:
+    share = "workers need the same folders under the same names as this machine"
+    for recording, size in sizes.items():
+        if not recording.is_file() or recording.stat().st_size != size:
+            return f"does not see {recording}: {share}"
+    if not trace.is_file():
+        return f"does not see the folder {trace.parent} as it is here: {share}"
+    if not os.access(trace.parent, os.W_OK):
+        return f"cannot write to {trace.parent}: let it, or choose another folder with -o"
+    try:
+        if not hasattr(worker, "mirrorskin_share"):
+            worker.mirrorskin_share = take_share(workers)
+    except DeviceError as error:
+        return f"has no device: {error}"
+    return None
