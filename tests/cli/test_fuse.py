@@ -175,11 +175,6 @@ def test_both_are_read_as_a_calibration_says():
     assert "other" in refused("--calibration", "cal.h5")
 
 
-def test_robust_is_told_to_the_engine():
-    _, ended = fuse("--robust", "--json")
-    assert json.loads(ended.out)["process"]["integration"] == "robust"
-
-
 GRIDS = {
     "of another size": ({"shape": (40, 48)}, ["40", "44"]),
     "of other pixels": ({"pixel_size": 0.2}, ["0.25", "0.2"]),
@@ -242,5 +237,5 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     def fails(*sources, **options):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
 
-    monkeypatch.setattr(engine, "fuse_sources", fails)
+    monkeypatch.setattr("mirrorskin.engine.fusion.fuse_sources", fails)
     assert refused(code=1) == "the residual is 0.3 after 100 iterations: allow more"

@@ -112,27 +112,6 @@ def test_without_a_pixel_size_there_are_no_heights_and_a_line_says_why():
     assert np.isfinite(given.height).all()
 
 
-def test_robust_heights_of_a_smooth_surface_are_the_same_but_for_noise():
-    turn()
-    plain, _ = reconstruct()
-    robust, ended = reconstruct("--robust", "--json")
-    told = json.loads(ended.out)
-    assert told["summary"]["components"] == 1
-    assert told["process"]["integration"] == "robust"
-    assert not np.array_equal(robust.height, plain.height)
-    assert np.max(np.abs(robust.height - plain.height)) < 0.05 * np.ptp(plain.height)
-
-
-def test_pieces_are_told():
-    turn()
-    with h5py.File("turn.h5", "a") as file:
-        stack = file["entry/instrument/detector/data"]
-        stack[:, :, 5] = 0  # no answer there, which cuts the picture in two
-    result, ended = reconstruct()
-    assert ended.out.endswith(", in 2 components, offset unknown\n")
-    assert set(np.unique(result.component)) == {-1, 0, 1}
-
-
 def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     def fails(*maps, **options):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
@@ -144,16 +123,6 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     line = "mirrorskin: turn.h5: the residual is 0.3 after 100 iterations: allow more\n"
     assert (ended.code, ended.out, ended.said) == (1, "", line)
     assert set(Path().iterdir()) == before
-
-
-def test_the_paper_s_method_is_another():
-    turn()
-    exact, ended = reconstruct("--json")
-    assert json.loads(ended.out)["process"]["method"] == "exact"
-    paper, ended = reconstruct("--method", "paper", "--json")
-    assert json.loads(ended.out)["process"]["method"] == "paper"
-    assert not np.array_equal(exact.normals, paper.normals)
-    assert np.max(errors(paper)) < 5
 
 
 def test_each_turn_has_maps_of_its_own():
