@@ -39,22 +39,7 @@ def picture_places(lens: Lens, x: ArrayLike, y: ArrayLike) -> tuple[Doubles, Dou
 
 
 def distorted(rays: Doubles, distortion: ArrayLike) -> Doubles:
-    """Bend rays as OpenCV's model does.
-
-    Parameters
-    ----------
-    rays : ndarray, (..., 3, n), float64
-        (x, y, 1) of a pinhole camera.
-    distortion : array_like, (..., 5)
-        k1, k2, p1, p2, k3. With r^2 = x^2 + y^2, x becomes
-        ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)``, and y
-        ``y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y``.
-
-    Returns
-    -------
-    ndarray, (..., 3, n), float64
-        Far out, where the model folds the picture back, they mean nothing.
-    """
+    """Bend rays as OpenCV's model does."""
     k1, k2, p1, p2, k3 = np.moveaxis(np.asarray(distortion, np.float64), -1, 0)[..., np.newaxis]
     x, y = rays[..., 0, :], rays[..., 1, :]
     square = x * x + y * y

@@ -61,20 +61,7 @@ def new_sheet(width: float, height: float) -> Figure:
 def draw_pixels(
     axes: Axes, values: ArrayLike, title: str, label: str, colours: str = "viridis", even: bool = False
 ) -> None:
-    """Draw a map of all pixels, with its colours explained.
-
-    Parameters
-    ----------
-    axes : Axes
-    values : array_like, (H, W)
-        NaN without an answer.
-    title, label : str
-        What it is, and the unit beside the colours.
-    colours : str
-        Name of a colour map.
-    even : bool
-        Whether the colours go as far below 0 as above.
-    """
+    """Draw a map of all pixels, with its colours explained."""
     shown = np.asarray(values, np.float64)
     known = shown[np.isfinite(shown)]
     low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
@@ -91,15 +78,7 @@ def draw_pixels(
 
 
 def draw_azimuths(axes: PolarAxes, zeniths: Mapping[str, Floats], title: str) -> None:
-    """Draw zeniths over all azimuths of the normal.
-
-    Parameters
-    ----------
-    axes : PolarAxes
-    zeniths : mapping
-        Names, and values at `AZIMUTHS`, (n,), radians; NaN without an answer.
-    title : str
-    """
+    """Draw zeniths over all azimuths of the normal."""
     for name, values in zeniths.items():
         axes.plot(AZIMUTHS, np.degrees(values), lw=1.8, label=name)
     axes.set_rmin(0)
@@ -571,20 +550,7 @@ _WORST = 98  # per cent of the errors that the colours tell apart
 
 
 def check_figure(check: Check, title: str, path: Path) -> None:
-    """Draw the errors before and after a calibration into a PNG: a row for each map, in the same colours.
-
-    Parameters
-    ----------
-    check : Check
-    title : str
-    path : Path
-        PNG to write.
-
-    Raises
-    ------
-    InputError
-        Matplotlib is not installed, or the file cannot be written.
-    """
+    """Draw the errors before and after a calibration into a PNG: a row for each map, in the same colours."""
     columns = [(when, parts) for when, parts in (("before", check.before), ("after", check.after)) if parts]
     figure = new_figure(5.2 * len(columns), 4.4 * len(check.after))
     axes = figure.subplots(len(check.after), len(columns), squeeze=False)
@@ -616,25 +582,7 @@ _DRAW: Mapping[str, Callable[[Any], Figure]] = {
 
 
 def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
-    """Draw the parts of a calibration into PNGs.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    folder : Path
-        Where ``references.png``, ``scale.png``, ``zenith.png``, ``tilt.png`` and ``elastic.png`` go, as many
-        as the calibration has parts; it is made if it is not there.
-
-    Returns
-    -------
-    list of Path
-        What was written.
-
-    Raises
-    ------
-    InputError
-        Matplotlib is not installed, or a file cannot be written.
-    """
+    """Draw the parts of a calibration into PNGs."""
     check_drawing()
     try:
         folder.mkdir(parents=True, exist_ok=True)

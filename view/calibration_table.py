@@ -26,23 +26,12 @@ _DEGREE = math.degrees(1)
 
 
 class Row(NamedTuple):
-    """A number of a calibration.
+    """A number of a calibration."""
 
-    Attributes
-    ----------
-    part : str
-        As the command that finds it out is called.
-    what : str
-    value : float, int or str
-    sigma : float
-        Its standard error; NaN where none is known.
-    unit : str
-    """
-
-    part: str
+    part: str  # As the command that finds it out is called
     what: str
     value: float | int | str
-    sigma: float = math.nan
+    sigma: float = math.nan  # Its standard error; NaN where none is known
     unit: str = ""
 
     def cells(self) -> tuple[str, str, str, str, str]:

@@ -22,19 +22,7 @@ BoardText = Annotated[
 
 
 def board_of(text: str) -> Board:
-    """Read what a board is.
-
-    Parameters
-    ----------
-    text : str
-        ``charuco:7x5:2mm:1.5mm``: columns and rows of squares, edges of squares and of markers;
-        ``dots:11x9:1mm``: columns and rows of dots, and their pitch.
-
-    Raises
-    ------
-    InputError
-        It is neither, or there can be no such board.
-    """
+    """Read what a board is."""
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.board import Charuco, Dots
     from mirrorskin.io import InputError

@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 
 
 def check_call(paths: Sequence[Path], rig: Path | None, **asked: str | None) -> None:
-    """Refuse presses that are neither named nor taken, or both, and what a rig is asked for without one.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-    """
+    """Refuse presses that are neither named nor taken, or both, and what a rig is asked for without one."""
     from mirrorskin.io import InputError
 
     if rig is None and not paths:
@@ -38,13 +33,7 @@ def check_call(paths: Sequence[Path], rig: Path | None, **asked: str | None) -> 
 
 
 def with_scale(told: StackOptions, known: Calibration | None) -> StackOptions:
-    """Return what recordings are opened with, and the pixel size of the calibration's scale, if it has one.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        ``--pixel-size`` says otherwise.
-    """
+    """Return what recordings are opened with, and the pixel size of the calibration's scale, if any."""
     from mirrorskin.io import InputError
     from mirrorskin.io.calibration.source import differ
 
@@ -69,23 +58,7 @@ def camera_of(source: Source) -> CameraId:
 def one_camera(
     names_of: Sequence[str], cameras: Sequence[CameraId], known: Calibration | None, output: Path
 ) -> CameraId:
-    """Return the camera that all recordings are of, if it is that of the calibration.
-
-    Parameters
-    ----------
-    names_of : sequence of str
-        What the recordings are called.
-    cameras : sequence of CameraId
-    known : Calibration or None
-        What is in the file already.
-    output : Path
-        The file.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        They are of several, differ in size or type of sample, or are of another than the calibration.
-    """
+    """Return the camera that all recordings are of, if it is that of the calibration."""
     from mirrorskin import io
 
     names = {camera.name for camera in cameras} - {""}
@@ -121,51 +94,18 @@ Settle = scans.Settle
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A recording that is to be taken.
+    """A recording that is to be taken."""
 
-    Attributes
-    ----------
-    name : str
-        What the recording's file is told apart by: "dark", "ball-1".
-    prompt : str
-        What the user is to do before: "put the ball at place 1 of 9".
-    plan : VerticalPlan or AxialPlan
-        What the body does then.
-    frames : int
-        At each step of a plan in steps.
-    """
-
-    name: str
-    prompt: str
-    plan: Plan
-    frames: int = 1
+    name: str  # What the recording's file is told apart by: "dark", "ball-1"
+    prompt: str  # What the user is to do before: "put the ball at place 1 of 9"
+    plan: Plan  # What the body does then
+    frames: int = 1  # At each step of a plan in steps
 
 
 def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str | None = None) -> list[Path]:
     """Take recordings, and keep them beside the calibration file.
 
     The body is lifted, then the user is asked to make each place ready and to press Enter.
-
-    Parameters
-    ----------
-    rig_file : Path
-    calibration : Path
-        Of CAL.h5 and a place "dark" the recording is CAL-dark.h5.
-    places : sequence of Place
-    settle : str, optional
-        From rest to the first exposure of a step: ``100ms``.
-
-    Returns
-    -------
-    list of Path
-        The recordings, in the order of the places.
-
-    Raises
-    ------
-    InputError
-        A plan goes beyond the rig's limits, or a file cannot be written; nothing has moved then.
-    HardwareError
-        Stage or camera failed; the stage was stopped.
     """
     from mirrorskin import io
     from mirrorskin.hw.rig.plans import check_plan
@@ -184,30 +124,13 @@ def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str
 
 
 def at_each(part: str, prompt: str, count: int, plan: Plan, frames: int = 1) -> list[Place]:
-    """Say that the same is to be done at several places.
-
-    Parameters
-    ----------
-    part : str
-        Of the calibration, which the files are named by.
-    prompt : str
-        With room for the number of the place, and how many there are.
-    count : int
-    plan, frames
-        As of a `Place`.
-    """
+    """Say that the same is to be done at several places."""
     numbers = range(1, count + 1)
     return [Place(f"{part}-{n}", prompt.format(n, count), plan, frames) for n in numbers]
 
 
 def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, example: str) -> AxialPlan:
-    """Return the plan of a turn on a ball, in eight steps with a tilt of 2.5 degrees unless told otherwise.
-
-    Raises
-    ------
-    InputError
-        Nobody says how far the body is lowered; the example does.
-    """
+    """Return the plan of a turn on a ball: eight steps and a tilt of 2.5 degrees unless given."""
     from mirrorskin.cli.quantity import angle, length
     from mirrorskin.hw.rig.plans import AxialPlan
     from mirrorskin.io import InputError
@@ -224,14 +147,7 @@ def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, examp
 
 
 def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
-    """Return a plan in which the body all but stands still: two steps of 0.05 mm.
-
-    Parameters
-    ----------
-    rig_file : Path
-    travel : float, optional
-        Where it ends, mm; without it, the body stays lifted.
-    """
+    """Return a plan in which the body all but stands still: two steps of 0.05 mm."""
     from mirrorskin.hw.rig.plans import VerticalPlan
     from mirrorskin.hw.rig_file import load_rig
 

@@ -60,14 +60,7 @@ class Seen:
 
 
 def rotations(lean: ArrayLike) -> Doubles:
-    """Return how the body sees the world turned, (T, 3, 3), in poses in which it leans.
-
-    Parameters
-    ----------
-    lean : array_like, (T, 2)
-        Radians: the vector l, for a precession of tilt d at the phase a (d cos a, d sin a). The body's axis
-        is ``(-sin|l| l/|l|, cos|l|)``, and a world vector x is seen as ``Rz(a) Ry(|l|) Rz(-a) x``.
-    """
+    """Return how the body sees the world turned, (T, 3, 3), in poses in which it leans."""
     lean = np.asarray(lean, np.float64)
     angle = np.sqrt(np.sum(lean**2, axis=1))
     cross = np.zeros((len(lean), 3, 3))
@@ -90,24 +83,6 @@ def ball_view(pixels: BallView, centre: ArrayLike, radius: float, lean: ArrayLik
     The ball's centre C of the mean pose (pressed, upright) is at ``pivot + R (C - pivot)`` in a pose that
     sees the world turned by R. A line of sight meets the upper side of the ball there; the sheet touches
     where that point is above the rest plane, z > 0.
-
-    Parameters
-    ----------
-    pixels : BallView
-        Of n pixels.
-    centre : array_like, (3,)
-        Of the ball in the mean pose, in the body's frame, mm: at z = depth - radius if its top is pressed so
-        deep into the rest plane.
-    radius : float
-        Of the ball, mm.
-    lean : array_like, (T, 2)
-        See `rotations`.
-    pivot : array_like, (3,)
-        That the body turns about, mm, in the body's frame.
-
-    Returns
-    -------
-    Seen
     """
     x, y, slope_x, slope_y = pixels.place
     middle = moved(centre, lean, pivot)
@@ -143,19 +118,11 @@ _ROUNDS = 8
 
 
 class Found(NamedTuple):
-    """A ball's place in the mean pose.
+    """A ball's place in the mean pose."""
 
-    Attributes
-    ----------
-    x, y : float
-        Of its centre, millimetres from the picture's centre.
-    depth : float
-        By how much its top stands above the rest plane, mm.
-    """
-
-    x: float
-    y: float
-    depth: float
+    x: float  # Of its centre, millimetres from the picture's centre
+    y: float  # Of its centre, millimetres from the picture's centre
+    depth: float  # By how much its top stands above the rest plane, mm
 
 
 class Followed(NamedTuple):
@@ -179,30 +146,7 @@ class Followed(NamedTuple):
 def find_ball(
     frames: NDArray[Any], phase: ArrayLike, pixel_size: tuple[float, float], radius: float
 ) -> Found:
-    """Find the one ball that is pressed into the sheet during a turn; see `follow_ball`.
-
-    Parameters
-    ----------
-    frames : ndarray, (T, H, W)
-        Counts, or light.
-    phase : array_like, (T,)
-        Radians; of either direction and any zero.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    radius : float
-        Of the ball, mm.
-
-    Returns
-    -------
-    Found
-        Its mean over the turn, which for a tilt d is that of the mean pose but for d^2 / 2 times the distance
-        from the pivot.
-
-    Raises
-    ------
-    InputError
-        There is no ball in more than half of the frames, or the phases do not make a turn.
-    """
+    """Find the one ball that is pressed into the sheet during a turn; see `follow_ball`."""
     alpha = check_phases(phase)
     centres = follow_ball(frames, pixel_size, radius).centres
     x, y, z = smooth_turn(centres, alpha)[0]
@@ -219,20 +163,6 @@ def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: f
 
     From a circle of radius a the ball's centre is sqrt(radius^2 - a^2) below the rest plane. Where the light
     ends before the contact does, it is lower than told.
-
-    Parameters
-    ----------
-    frames, pixel_size, radius
-        See `find_ball`.
-
-    Returns
-    -------
-    Followed
-
-    Raises
-    ------
-    InputError
-        There is none in more than half of the frames.
     """
     centres, sigma = np.full((2, len(frames), 3), np.nan)
     for number, frame in enumerate(frames):
@@ -252,19 +182,7 @@ def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: f
 
 
 def smooth_turn(values: Doubles, phase: Doubles) -> Doubles:
-    """Fit mean, cosine and sine over a turn, whatever a few values say that are wrong.
-
-    Parameters
-    ----------
-    values : ndarray, (T, c), float64
-        NaN where unknown.
-    phase : ndarray, (T,), float64
-        Radians.
-
-    Returns
-    -------
-    ndarray, (3, c), float64
-    """
+    """Fit mean, cosine and sine over a turn, whatever a few values say that are wrong."""
     known = np.isfinite(values).all(axis=1)
     functions, values = basis(phase[known]), values[known]
     weight = np.ones(len(values))
@@ -286,24 +204,12 @@ class _Circle(NamedTuple):
 
 
 class _Picture(NamedTuple):
-    """How the brightness of a picture that was made small and blurred changes.
+    """How the brightness of a picture that was made small and blurred changes."""
 
-    Attributes
-    ----------
-    slope : ndarray, (2, h, w), float64
-        Along x and y, a millimetre.
-    steep : ndarray, (h, w), float64
-        Their length.
-    corner : ndarray, (2,), float64
-        x and y of the first pixel, mm.
-    step : ndarray, (2,), float64
-        What a column adds to x, and a row to y, mm.
-    """
-
-    slope: Doubles
-    steep: Doubles
-    corner: Doubles
-    step: Doubles
+    slope: Doubles  # (2, h, w): Along x and y, a millimetre
+    steep: Doubles  # (h, w): Their length
+    corner: Doubles  # (2,): x and y of the first pixel, mm
+    step: Doubles  # (2,): What a column adds to x, and a row to y, mm
 
     def at(self, values: Doubles, places: Doubles) -> Doubles:
         """Read a map, (h, w), between its pixels at places, (2, ...), mm; 0 beyond its edges."""

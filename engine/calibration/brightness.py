@@ -34,52 +34,21 @@ class Shown(Protocol):
     def of_normals(
         self, normals: Doubles, z: Doubles, pixels: NDArray[np.intp]
     ) -> tuple[Doubles, NDArray[np.bool_]]:
-        """Return how bright mirrors are, (N, n), and whether that is within the range that tells them.
-
-        Parameters
-        ----------
-        normals : ndarray, (N, n, 3), float64
-            Unit vectors in the body's frame.
-        z : ndarray, (N, n), float64
-            Height of the mirror above the rest plane, mm.
-        pixels : ndarray, (n,), intp
-            In the picture, row by row.
-        """
+        """Return how bright mirrors are, (N, n), and whether that is within the range that tells them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearShown:
-    """Brightness that is linear in the zenith, and in units of it: radians.
+    """Brightness that is linear in the zenith, and in units of it: radians."""
 
-    Attributes
-    ----------
-    offset, gain : ndarray, (H * W,), float64
-        Counts at zenith 0, and a radian.
-    low, high : ndarray, (H * W,), float64
-        Zeniths at which the light is none, and full.
-    """
-
-    offset: Doubles
-    gain: Doubles
-    low: Doubles
-    high: Doubles
+    offset: Doubles  # (H * W,): Counts at zenith 0, and a radian
+    gain: Doubles  # (H * W,): Counts at zenith 0, and a radian
+    low: Doubles  # (H * W,): Zeniths at which the light is none, and full
+    high: Doubles  # (H * W,): Zeniths at which the light is none, and full
 
     @classmethod
     def of_header(cls, header: Header, shape: tuple[int, int]) -> LinearShown:
-        """Take the scale of a recording.
-
-        Parameters
-        ----------
-        header : Header
-            Without references, the whole line is taken for straight.
-        shape : (int, int)
-            Rows and columns.
-
-        Raises
-        ------
-        InputError
-            It has no scale.
-        """
+        """Take the scale of a recording."""
         if header.zenith_gain is None or header.zenith_offset is None:
             raise InputError(
                 "the recording tells no zenith gain and offset: calibrate the zenith first, or give both"
@@ -117,21 +86,12 @@ class LinearShown:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallShown:
-    """Brightness as a calibrated cylindrical wall gives it, as a share of full light.
-
-    Attributes
-    ----------
-    wall : WallResponse
-    place : ndarray, (2, H * W), float64
-        Of the pixels, mm from the wall's axis.
-    dark, span : ndarray, (H * W,), float64
-        Counts without light, and how many more there are in full light.
-    """
+    """Brightness as a calibrated cylindrical wall gives it, as a share of full light."""
 
     wall: WallResponse
-    place: Doubles
-    dark: Doubles
-    span: Doubles
+    place: Doubles  # (2, H * W): Of the pixels, mm from the wall's axis
+    dark: Doubles  # (H * W,): Counts without light, and how many more there are in full light
+    span: Doubles  # (H * W,): Counts without light, and how many more there are in full light
 
     @classmethod
     def of_pixels(
@@ -142,13 +102,7 @@ class WallShown:
         shape: tuple[int, int],
         pixel_size: tuple[float, float],
     ) -> WallShown:
-        """Put a response and references together.
-
-        Raises
-        ------
-        InputError
-            A reference is missing, or the response is that of a uniform pattern.
-        """
+        """Put a response and references together."""
         if dark is None or bright is None:
             raise InputError(
                 "there are no dark and bright references: make them first with"

@@ -27,15 +27,6 @@ def sphere_travel(touch: ArrayLike, radius: float, compliance: float = 0.0) -> D
     The depth is ``a artanh(a / R)``, and the force over Young's modulus ``4/3 ((a^2 + R^2) artanh(a / R) -
     a R)``, by which the stage gives way as well (Sneddon, Int. J. Eng. Sci. 3, 1965, 47-57, at Poisson ratio
     0.5).
-
-    Parameters
-    ----------
-    touch : array_like
-        Radius of the touch a, mm, below the ball's.
-    radius : float
-        Of the ball R, mm.
-    compliance : float
-        Of the stage, 1/mm; see `Gel`.
     """
     a = np.asarray(touch, np.float64)
     steep = np.arctanh(a / radius)
@@ -52,17 +43,6 @@ def sphere_slope(distance: ArrayLike, touch: ArrayLike, radius: float, sheet: fl
         U = 2 / pi arcsin(2 x / (sqrt((r - x)^2 + z^2) + sqrt((r + x)^2 + z^2)))
 
     and the displacement of an incompressible body is U - z dU/dz (Johnson, Contact Mechanics, 1985, 3.8).
-
-    Parameters
-    ----------
-    distance : array_like, (n,)
-        From the ball's axis r, mm.
-    touch : array_like, (n,)
-        Radius of the touch a, mm, below the ball's.
-    radius : float
-        Of the ball R, mm.
-    sheet : float
-        How deep the mirror lies below the surface z, mm.
     """
     r, a = np.broadcast_arrays(np.asarray(distance, np.float64), np.asarray(touch, np.float64))
     depth = max(sheet, _THINNEST * radius)
@@ -154,13 +134,7 @@ def ball_pixels(
     radius: float,
     name: str = "the press",
 ) -> BallOnset:
-    """Take from maps of a ball's press, as ``find_onset`` gives them, when its pixels turned light.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Less than 50 pixels turned light, or the radius cannot be.
-    """
+    """Take from maps of a ball's press, as ``find_onset`` gives them, when its pixels turned light."""
     if not (math.isfinite(radius) and radius > 0):
         raise InputError(f"a ball of radius {radius:g} mm cannot be: give one above 0")
     heights, sigmas = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
@@ -212,22 +186,12 @@ _BOUNDS = ((0.02, 0.0, 0.0), (0.78, 2.0, 0.2))
 
 @dataclass(frozen=True, slots=True)
 class BallPlace:
-    """Where a ball was found.
+    """Where a ball was found."""
 
-    Attributes
-    ----------
-    x, y : float
-        Of its centre, mm.
-    travel_zero : float
-        Travel at which the sheet met its top, mm.
-    pixels : int
-        That were looked at.
-    """
-
-    x: float
-    y: float
-    travel_zero: float
-    pixels: int
+    x: float  # Of its centre, mm
+    y: float  # Of its centre, mm
+    travel_zero: float  # Travel at which the sheet met its top, mm
+    pixels: int  # That were looked at
 
 
 @dataclass(frozen=True, slots=True, eq=False)

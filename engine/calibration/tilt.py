@@ -55,20 +55,12 @@ class Model:
     The body leans by ``l = centre + tilt (u(a) + oval)`` with a = direction phase + phase_offset, u(a) =
     (cos a, sin a), and oval = (gx cos a + gy sin a, gy cos a - gx sin a), which makes an ellipse of the
     circle: (gx, gy) is the ellipticity times (cos, sin) of twice the azimuth of its major axis.
-
-    Attributes
-    ----------
-    balls, plates
-        The tracks.
-    direction : {1, -1}
-    free_centre : bool
-        Whether the mean lean is looked for, or the mean pose taken for upright.
     """
 
-    balls: Sequence[BallTrack]
-    plates: Sequence[PlateTrack]
+    balls: Sequence[BallTrack]  # The tracks
+    plates: Sequence[PlateTrack]  # The tracks
     direction: int
-    free_centre: bool
+    free_centre: bool  # Whether the mean lean is looked for, or the mean pose taken for upright
 
     def lean(self, parameters: Doubles, phase: Doubles) -> Doubles:
         """Return how the body leans, (T, 2), radians."""

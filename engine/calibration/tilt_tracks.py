@@ -20,58 +20,28 @@ _MOST_BYTES = 2_000_000_000  # bytes of frames that are held
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallTurn:
-    """A turn of the body on a ball.
+    """A turn of the body on a ball."""
 
-    Attributes
-    ----------
-    name : str
-        Of where it comes from.
-    frames : ndarray, (T, H, W)
-        Counts.
-    phase : ndarray, (T,), float64
-        Radians, as the recording says.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    radius : float
-        Of the ball, mm.
-    press : float or None
-        By how much the stage says that it is pressed, upright, mm.
-    """
-
-    name: str
-    frames: NDArray[Any]
-    phase: Doubles
-    pixel_size: tuple[float, float]
-    radius: float
-    press: float | None = None
+    name: str  # Of where it comes from
+    frames: NDArray[Any]  # (T, H, W): Counts
+    phase: Doubles  # (T,): Radians, as the recording says
+    pixel_size: tuple[float, float]  # Millimetres along x and y
+    radius: float  # Of the ball, mm
+    press: float | None = None  # By how much the stage says that it is pressed, upright, mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateTurn:
-    """A turn of the body on a flat plate.
+    """A turn of the body on a flat plate."""
 
-    Attributes
-    ----------
-    name, frames, phase
-        See `BallTurn`.
-    level : bool
-        Whether the plate is known to be level; else it is a wedge, inclined anyhow.
-    """
-
-    name: str
-    frames: NDArray[Any]
-    phase: Doubles
-    level: bool
+    name: str  # See `BallTurn`
+    frames: NDArray[Any]  # See `BallTurn`
+    phase: Doubles  # See `BallTurn`
+    level: bool  # Whether the plate is known to be level; else it is a wedge, inclined anyhow
 
 
 def read_ball(source: Source, radius: float) -> BallTurn:
-    """Read an axial recording of a ball of some radius, mm.
-
-    Raises
-    ------
-    InputError
-        It is of another motion, has no pixel size, or is too long to be held.
-    """
+    """Read an axial recording of a ball of some radius, mm."""
     pixel_size = source.header.pixel_size
     if pixel_size is None:
         raise InputError(f"{source.name}: its pixel size is not told: give it, as in --pixel-size 0.03mm")
@@ -142,11 +112,6 @@ def track_ball(turn: BallTurn, shown: Shown) -> Followed:
     where what lies within does not show the ball up to the rim (the wall ends before the contact does), and
     where the stage says that the ball is pressed by something else (the gel gives way, or the stage's zero is
     wrong).
-
-    Raises
-    ------
-    InputError
-        The ball is seen in no more than half of the frames.
     """
     try:
         followed = follow_ball(turn.frames, turn.pixel_size, turn.radius)
@@ -161,13 +126,7 @@ def track_ball(turn: BallTurn, shown: Shown) -> Followed:
 
 
 def track_plate(turn: PlateTurn, shown: LinearShown) -> Tilts:
-    """Tell how far a plate leans in each frame, by the mean of the pixels that show it.
-
-    Raises
-    ------
-    InputError
-        Hardly any pixel shows it: a level plate is dark unless the wall reaches up to the camera.
-    """
+    """Tell how far a plate leans in each frame, by the mean of the pixels that show it."""
     count = len(turn.frames)
     pixels = np.arange(turn.frames[0].size)
     zenith = shown.of_counts(turn.frames.reshape(count, -1), pixels)

@@ -71,11 +71,6 @@ def fit_touch(samples: Samples, presses: Sequence[BallPress], prior: Prior) -> T
     From well within the light's outline on, each press grows by rings as long as these can be fitted as well
     as those within: a gel leaves the ball earlier than a sheet that takes any shape. Where a ring could not,
     the one before it is left out as well.
-
-    Raises
-    ------
-    InputError
-        A press does not fit to the others.
     """
     rings = _Rings(samples, presses)
     taken = np.full(len(presses), round(_INNER / _RING))

@@ -93,26 +93,7 @@ def read_press(
     precession: Precession | None,
     count: int,
 ) -> BallPress:
-    """Read a recording once, find the ball, and keep some samples of its neighbourhood.
-
-    Parameters
-    ----------
-    source : Source
-        An axial recording; its frames are held while the ball is looked for.
-    ball : float
-        Radius, mm.
-    references : References, optional
-        Else those of the source's header.
-    precession : Precession, optional
-        Else a circle of the header's tilt.
-    count : int
-        Samples to keep, about.
-
-    Raises
-    ------
-    InputError
-        The recording is of another motion, lacks what is needed, or shows no ball.
-    """
+    """Read a recording once, find the ball, and keep some samples of its neighbourhood."""
     levels, pixel_size = _levels(source, references), _pixel_size(source)
     pivot = pivot_of(source, precession).place
     frames, phase = _read(source)
@@ -272,41 +253,21 @@ _STUCK = 1e8  # damping at which no step helps
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What is known of the parameters before the fit.
+    """What is known of the parameters before the fit."""
 
-    Attributes
-    ----------
-    mean, sigma : ndarray, (P,), float64
-        Standard deviations may be infinite; a parameter whose is 0 stays as it is.
-    rising : bool
-        Whether the curve rises from the rim to the rest plane.
-    """
-
-    mean: Doubles
-    sigma: Doubles
-    rising: bool = True
+    mean: Doubles  # (P,): Standard deviations may be infinite; a parameter whose is 0 stays as it is
+    sigma: Doubles  # (P,): Standard deviations may be infinite; a parameter whose is 0 stays as it is
+    rising: bool = True  # Whether the curve rises from the rim to the rest plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallFit:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    parameters : ndarray, (P,), float64
-        See `mirrorskin.engine.calibration.wall_model.split`.
-    covariance : ndarray, (P, P), float64
-        0 for what was not fitted.
-    residuals : ndarray, (N,), float64
-        Light of the samples less what the fit says.
-    rising : bool
-        As of the prior.
-    """
-
-    parameters: Doubles
-    covariance: Doubles
-    residuals: Doubles
-    rising: bool
+    parameters: Doubles  # (P,): See `mirrorskin.engine.calibration.wall_model.split`
+    covariance: Doubles  # (P, P): 0 for what was not fitted
+    residuals: Doubles  # (N,): Light of the samples less what the fit says
+    rising: bool  # As of the prior
 
 
 def fit_wall(
@@ -316,22 +277,6 @@ def fit_wall(
 
     A sample that misses by r counts as ``c^2 log(1 + (r / c)^2)`` with c three times its noise: as a square
     at first, and hardly more the farther off it is, so that dust and glare do little (Cauchy's estimator).
-
-    Parameters
-    ----------
-    samples : Samples
-        N of them.
-    prior : Prior
-    start : ndarray, (P,), float64
-        Where to begin.
-    noise : float or ndarray, (N,)
-        Standard deviation of each sample's light.
-    tolerance : float
-        Change of the sum, as a share, at which it ends.
-
-    Returns
-    -------
-    WallFit
     """
     problem = _Problem(samples, prior, np.broadcast_to(noise, samples.light.shape))
     parameters, sum_, damping = start.copy(), problem.sum(start), _DAMPING

@@ -39,11 +39,6 @@ def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
 
     With G, the antiderivative, they are ``(G(high) - G(low)) / (high - low)``: what a mirror shows that
     spreads each ray evenly over the interval.
-
-    Parameters
-    ----------
-    low, high : array_like, (n,)
-        Ends of the intervals, low < high, which may lie outside 0 to 1.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     grown = _antiderivatives(np.clip(high, 0, 1)) - _antiderivatives(np.clip(low, 0, 1))
@@ -55,11 +50,6 @@ def curve_from_steps(rising: bool) -> Doubles:
 
     The first step is the lower end of the curve; if the others are at least 0, the coefficients never turn
     back, and so neither does the curve.
-
-    Parameters
-    ----------
-    rising : bool
-        Whether light grows from the rim down to the rest plane.
     """
     matrix = np.tril(np.ones((CURVE_COEFFICIENTS, CURVE_COEFFICIENTS)))
     return matrix if rising else matrix[::-1]

@@ -152,16 +152,6 @@ def error_maps(
     What a fit says of the light of 8 frames is off by its slopes times the parameters' errors, and the normal
     of least squares by what comes of that. The root of the mean square over the azimuths is told; NaN where
     none of them shows the wall.
-
-    Parameters
-    ----------
-    fit : WallFit
-    shape : (int, int)
-        Rows and columns of the picture.
-    places, azimuth : ndarray
-        Of `error_places`.
-    zenith : ndarray, (n,), float64
-        Of the normals there, radians; NaN where the wall is not seen.
     """
     seen = np.isfinite(zenith)
     slopes = np.full((2, len(zenith), STEPS.stop), np.nan)
@@ -269,17 +259,6 @@ def make_response(
     """Tell a fit as a response.
 
     Its scatter is 5 % above the fitted one, so that what is within its range is so safely.
-
-    Parameters
-    ----------
-    fit : WallFit
-    samples : Samples
-        That went into it.
-    noise : ndarray, (N,), float64
-        Of their light.
-    pattern : {"graded", "uniform"}
-    source : Source
-        One of the recordings, which tells how many pixels there are, and how large.
     """
     named, steps, _ = split(fit.parameters)
     left, most = error_left(samples, fit, noise)

@@ -47,17 +47,6 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     A press goes over the deeper half of its way; a rotation leans from phase 0 to the opposite one. Each way
     takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
     against the stage's reports: what these are late by themselves is part of it, as it should be.
-
-    Parameters
-    ----------
-    rig : Rig
-        The body stands at the plan's first place, and stands there again when this is done.
-    plan : VerticalPlan or AxialPlan
-
-    Raises
-    ------
-    HardwareError
-        The picture changes too little, or stage or camera failed.
     """
     way = _way(rig, plan)
     rests = rig.go(way.begin).time

@@ -114,16 +114,7 @@ def sizes_of(camera: CameraId) -> dict[str, int]:
 
 
 def shape_of(how: Stored, shape: tuple[int, ...], sizes: dict[str, int]) -> tuple[int, ...]:
-    """Return the shape that an array must have, by name.
-
-    Parameters
-    ----------
-    how : Stored
-    shape : tuple of int
-        The one that it has.
-    sizes : dict
-        Those that are known; a size that is met here first is taken from ``shape`` and remembered.
-    """
+    """Return the shape that an array must have, by name."""
     there = (*shape, *[0] * len(how.shape))
     return tuple(
         size if isinstance(size, int) else sizes.setdefault(size, there[axis])
@@ -139,21 +130,7 @@ _AGAIN = "calibrate again"
 
 
 def read_calibration(file: Hdf5File, place: str, name: str) -> Calibration:
-    """Read a calibration.
-
-    Parameters
-    ----------
-    file : Hdf5File
-    place : str
-        Of its group.
-    name : str
-        What to call it in messages.
-
-    Raises
-    ------
-    InputError
-        It is of another version, damaged, or lacks something.
-    """
+    """Read a calibration."""
     _check_version(file, place)
     camera = _read_camera(file, f"{place}/camera")
     found = {one: file.find(f"{place}/{GROUPS[one]}") for one in GROUPS}

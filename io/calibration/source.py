@@ -37,16 +37,7 @@ def differ(one: Size, other: Size) -> bool:
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
-    """Yield the parts that were made with another pixel size, and which; of some that is not known.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    pixel_size : (float, float)
-        As it is known now, mm along x and y.
-    parts : iterable of str
-        Which are looked at, by the names of a calibration's attributes.
-    """
+    """Yield the parts that were made with another pixel size, and which; of some that is not known."""
     there = calibration.parts()
     for part in parts:
         told = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
@@ -60,23 +51,7 @@ def outdated(
 def check_sizes(
     calibration: Calibration, pixel_size: Size | None, what: str, parts: Iterable[str] = SIZED
 ) -> None:
-    """Refuse parts that were made with another pixel size than the one that is known now.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    pixel_size : (float, float) or None
-        Millimetres along x and y; without it, nothing is refused.
-    what : str
-        What is to be read with it, for the message where the calibration has no scale.
-    parts : iterable of str
-        Which are needed, by the names of a calibration's attributes.
-
-    Raises
-    ------
-    InputError
-        Lengths of two scales would be mixed.
-    """
+    """Refuse parts that were made with another pixel size than the one that is known now."""
     if pixel_size is None:
         return
     for part, before in outdated(calibration, pixel_size, parts):
@@ -124,14 +99,6 @@ def cropped(calibration: Calibration, region: Region, pixel_size: tuple[float, f
     """Return what is left of a calibration for a part of its camera's picture.
 
     Maps are cut; places are told from the part's centre.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Of the whole picture.
-    region : Region
-    pixel_size : (float, float) or None
-        Millimetres; without it, places stay as they are.
     """
     picture = calibration.camera.shape
     if region == Region.whole(picture):

@@ -76,7 +76,7 @@ def calibrate(lab: Lab, apart: float = APART, every: int = 1) -> io.Calibration:
 
     The movement is found by every so manieth of them.
     """
-    taken = references.take_references(lab.flat(0.0, FLATS, 900), lab.flat(1.0, FLATS, 901))
+    taken = references.measure_references([lab.flat(0.0, FLATS, 900)], [lab.flat(1.0, FLATS, 901)]).references
     presses = nine_balls(lab, apart, 1)
     response = wall.fit_zenith(presses, BALL / 2, references=taken)
     pixel = lab.pixel_size, lab.pixel_size
@@ -191,7 +191,7 @@ def row_of_the_print(lab: Lab, calibration: io.Calibration) -> Row:
 def rows_of_the_gel(cache: Path) -> Iterator[Row]:
     """Learn a gel on the ball, and judge the heights of other balls, where both ways have an answer."""
     lab = replace(SOFT, cache=cache)
-    taken = references.take_references(lab.flat(0.0, FLATS, 900), lab.flat(1.0, FLATS, 901))
+    taken = references.measure_references([lab.flat(0.0, FLATS, 900)], [lab.flat(1.0, FLATS, 901)]).references
     plain = io.Calibration(io.CameraId("", lab.shape, np.dtype("uint8")), taken)
     learned = lab.pressed(scorer.ball(BALL), TRAVEL, 1, COMPLIANCE)
     onset = engine.reconstruct(learned, calibration=plain, fill=False)

@@ -1,4 +1,4 @@
-"""References taken from frames of pixels that are known, with defects put in."""
+"""References measured from frames of pixels that are known, with defects put in."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,22 @@ from reference_frames import SCALES, TOPS, expose, pixels, rolled, source
 
 from mirrorskin import io
 from mirrorskin.engine.calibration import references as module
-from mirrorskin.engine.calibration.references import measure_references, scale_top, take_references
+from mirrorskin.engine.calibration.references import measure_references, scale_top
 
-DTYPES = ["uint8", "uint16", "float32"]
 NOISE = 1.5
 
 
-def measure(dark, light, dtype="uint8", count=24, top=None, **options):
+def references(dark, bright, **options):
+    """Return the references of frames."""
+    return measure_references([source(dark, "dark")], [source(bright, "bright")], **options).references
+
+
+def measure(dark, light, dtype="uint8", count=24, top=None):
     """Measure pixels of which dark level and light are known, in a flat field."""
     noise = NOISE * SCALES[dtype]
     return measure_references(
-        source(expose(dark, noise, count, dtype, 11, top)),
-        source(expose(dark + light, 1.3 * noise, count, dtype, 12, top)),
-        **options,
+        [source(expose(dark, noise, count, dtype, 11, top))],
+        [source(expose(dark + light, 1.3 * noise, count, dtype, 12, top))],
     )
 
 
@@ -40,21 +43,17 @@ def with_defects(dtype, top):
     return dark, light, bits
 
 
-@pytest.mark.parametrize("top", [True, False])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("dtype", "top"), [("uint8", 255), ("uint16", 4095), ("float32", None)])
 def test_all_defects_are_found_and_no_sound_pixel_is(dtype, top):
-    limit = (TOPS[dtype] or 1023) if top else None
-    if limit is None and dtype != "float32":
-        limit = TOPS[dtype]
-    dark, light, bits = with_defects(dtype, limit)
-    found = measure(dark, light, dtype, top=limit).references
+    dark, light, bits = with_defects(dtype, top)
+    found = measure(dark, light, dtype, top=top).references
     np.testing.assert_array_equal(found.defects, bits)
     for one in (found.dark, found.bright, found.dark_sigma, found.bright_sigma):
         assert one.dtype == np.float32
         np.testing.assert_array_equal(np.isnan(one), bits != 0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_levels_are_right_and_their_errors_honest(dtype):
     dark, light = pixels(dtype=dtype)
     light = np.minimum(light, (TOPS[dtype] or 1e9) - 10 * SCALES[dtype] - dark)
@@ -76,9 +75,9 @@ def test_levels_are_right_and_their_errors_honest(dtype):
 def test_several_recordings_count_as_one():
     dark, light = pixels()
     frames = expose(dark, NOISE, 20), expose(dark + light, NOISE, 30)
-    whole = take_references(*(source(one) for one in frames))
-    parts = [[source(part) for part in np.array_split(one, 3)] for one in frames]
-    cut = take_references(*parts)
+    whole = references(*frames)
+    parts = ([source(part) for part in np.array_split(one, 3)] for one in frames)
+    cut = measure_references(*parts).references
     for name in ("dark", "bright", "dark_sigma", "bright_sigma", "defects"):
         np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5, err_msg=name)
 
@@ -95,62 +94,35 @@ def test_a_smooth_glow_and_a_field_that_ends_are_no_hot_pixels():
     assert np.count_nonzero(found.defects[~beyond]) == 0
 
 
-def test_a_column_that_is_dead_is_found_whole():
-    dark, light = pixels()
-    light[:, 20] = 0
-    found = measure(dark, light).references
-    assert np.all(found.defects[:, 20] == 2)
-    assert np.count_nonzero(found.defects) == len(found.defects)
-
-
-def test_a_pixel_that_flickers_in_the_dark_is_hot():
-    dark, light = pixels()
+def test_a_pixel_that_flickers_is_hot_and_one_that_never_changes_or_gives_no_numbers_is_dead():
+    dark, light = pixels(dtype="float32")
     noise = np.full(dark.shape, NOISE)
     noise[5, 6] = 12.0
-    found = take_references(source(expose(dark, noise, 24)), source(expose(dark + light, NOISE, 24)))
-    assert found.defects[5, 6] & 1
-    assert np.count_nonzero(found.defects) == 1
-
-
-def test_a_pixel_that_never_changes_is_dead():
-    dark, light = pixels()
-    frames = expose(dark, NOISE, 24), expose(dark + light, NOISE, 24)
+    frames = expose(dark, noise, 24, "float32"), expose(dark + light, NOISE, 24, "float32")
     for one in frames:
         one[:, 9, 9] = 21
-    found = take_references(*(source(one) for one in frames))
-    assert found.defects[9, 9] == 2
-
-
-def test_samples_that_are_no_numbers_are_left_out():
-    dark, light = pixels(dtype="float32")
-    frames = expose(dark, NOISE, 24, "float32"), expose(dark + light, NOISE, 24, "float32")
+        one[:, :, 20] = 18
     frames[0][::2, 3, 4] = np.nan
     frames[1][:, 8, 8] = np.nan
-    found = take_references(*(source(one) for one in frames))
+    found = references(*frames)
+    assert found.defects[5, 6] & 1
+    assert found.defects[9, 9] == found.defects[8, 8] == 2
+    assert np.all(found.defects[:, 20] == 2)
+    assert np.count_nonzero(found.defects) == 3 + len(dark)
     assert found.dark[3, 4] == pytest.approx(dark[3, 4], abs=5 * float(found.dark_sigma[3, 4]))
     assert found.dark_sigma[3, 4] == pytest.approx(1.41 * np.nanmedian(found.dark_sigma), rel=0.05)
-    assert found.defects[8, 8] == 2
-    assert np.count_nonzero(found.defects) == 1
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
 def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
     shape = 4, 5, 7
-    measured = measure_references(source(np.full(shape, 16, dtype)), source(np.full(shape, 200, dtype)))
+    measured = measure_references([source(np.full(shape, 16, dtype))], [source(np.full(shape, 200, dtype))])
     found = measured.references
     assert np.all(found.dark == 16)
     assert np.all(found.bright == 200)
     assert not found.defects.any()
-    rounding = 0.0 if dtype == "float32" else 12**-0.5
-    np.testing.assert_allclose(found.dark_sigma, rounding, rtol=1e-6)
+    np.testing.assert_allclose(found.dark_sigma, 0.0 if dtype == "float32" else 12**-0.5, rtol=1e-6)
     assert measured.dark.drift == 0
-
-
-def test_a_picture_of_one_pixel_has_references():
-    dark, light = np.full((1, 1), 16.0), np.full((1, 1), 150.0)
-    found = measure(dark, light).references
-    assert found.defects[0, 0] == 0
-    assert found.dark[0, 0] == pytest.approx(16, abs=1.5)
 
 
 @pytest.mark.parametrize(
@@ -163,46 +135,34 @@ def test_a_picture_of_one_pixel_has_references():
         ((8, 16), (8, 16), "no brighter"),
     ],
 )
-def test_frames_that_tell_nothing_are_refused(dark, bright, said):
+def test_frames_that_say_nothing_are_refused(dark, bright, said):
     frames = [np.full((count, 5, 7), level, np.uint8) for count, level in (dark, bright)]
     with pytest.raises(io.InputError, match=said):
-        measure_references(source(frames[0], "dark"), source(frames[1], "bright"))
+        references(*frames)
 
 
-def test_frames_of_nothing_but_nan_are_refused():
-    frames = np.full((4, 5, 7), np.nan, np.float32)
+def test_frames_of_nan_of_two_cameras_of_a_ball_and_of_light_are_refused():
+    nothing = np.full((4, 5, 7), np.nan, np.float32)
     with pytest.raises(io.InputError, match="no pixel"):
-        take_references(source(frames), source(frames + 1))
-
-
-def test_frames_of_two_cameras_are_refused():
+        references(nothing, nothing + 1)
     with pytest.raises(io.InputError, match=r"7 x 6 uint8 and dark of 7 x 5 uint8"):
-        take_references(
-            source(np.zeros((3, 5, 7), np.uint8), "dark"), source(np.zeros((3, 6, 7), np.uint8), "bright")
-        )
+        references(np.zeros((3, 5, 7), np.uint8), np.zeros((3, 6, 7), np.uint8))
     with pytest.raises(io.InputError, match="uint16"):
-        take_references(source(np.zeros((3, 5, 7), np.uint8)), source(np.zeros((3, 5, 7), np.uint16)))
-
-
-def test_a_ball_in_place_of_a_flat_field_is_refused():
+        references(np.zeros((3, 5, 7), np.uint8), np.zeros((3, 5, 7), np.uint16))
     dark, light = pixels((21, 33))
     with pytest.raises(io.InputError, match="--rolled"):
-        take_references(source(expose(dark, NOISE, 24)), source(rolled(dark, light, 60, 0.4, 0.1)))
-
-
-def test_dark_frames_that_see_light_are_refused():
-    dark, light = pixels((21, 33))
+        references(expose(dark, NOISE, 24), rolled(dark, light, 60, 0.4, 0.1))
     lit = dark.copy()
     lit[:, :5] += 0.8 * light[:, :5]
     with pytest.raises(io.InputError, match="lifted"):
-        take_references(source(expose(lit, NOISE, 24)), source(expose(dark + light, NOISE, 24)))
+        references(expose(lit, NOISE, 24), expose(dark + light, NOISE, 24))
 
 
-def test_a_drift_is_told():
+def test_a_drift_is_reported():
     dark, light = pixels()
     rising = np.linspace(0, 3, 40)[:, np.newaxis, np.newaxis]
     measured = measure_references(
-        source(expose(dark, NOISE, 40)), source(expose(dark + light + rising, NOISE, 40))
+        [source(expose(dark, NOISE, 40))], [source(expose(dark + light + rising, NOISE, 40))]
     )
     assert measured.bright.drift == pytest.approx(1.54, abs=0.05)
     assert measured.dark.drift == pytest.approx(0, abs=0.05)
@@ -214,82 +174,53 @@ def test_the_frames_that_are_missing_are_counted():
     assert level.missing(level.sigma) == 0
     more = level.missing(level.sigma / 2)
     assert more == pytest.approx(48, abs=2)
-    again = measure(dark, light, count=16 + more).dark
-    assert again.sigma == pytest.approx(level.sigma / 2, rel=0.02)
-
-
-def test_no_number_of_frames_takes_rounding_away():
-    dark, light = pixels()
-    level = measure_references(source(expose(dark, 0.1, 8)), source(expose(dark + light, 0.1, 8))).dark
+    assert measure(dark, light, count=16 + more).dark.sigma == pytest.approx(level.sigma / 2, rel=0.02)
+    level = measure_references([source(expose(dark, 0.1, 8))], [source(expose(dark + light, 0.1, 8))]).dark
     assert 0.1 < level.rounding < 0.29
     assert level.missing(0.9 * level.rounding) is None
     assert level.missing(1.0) == 0
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_a_rolled_ball_gives_full_light_without_bias(dtype):
-    dark, light = pixels(dtype=dtype)
-    measured = measure_references(
-        source(expose(dark, NOISE, 64, dtype)),
-        source(rolled(dark, light, 120, 0.35, 0.15, dtype=dtype)),
-        rolled=True,
-    )
+def test_a_rolled_ball_gives_full_light_without_bias():
+    dark, light = pixels()
+    light[4, 5] = 0
+    light[7, 8] = 260 - dark[7, 8]
+    frames = expose(dark, NOISE, 64), rolled(dark, light, 120, 0.35, 0.15)
+    measured = measure_references([source(frames[0])], [source(frames[1])], rolled=True)
     found = measured.references
-    error = (found.bright - dark - light)[found.defects == 0]
-    sigma = found.bright_sigma[found.defects == 0]
-    assert np.count_nonzero(found.defects) == 0
+    assert found.defects[4, 5] == 2
+    assert found.defects[7, 8] == 4
+    assert np.count_nonzero(found.defects) == 2
+    error, sigma = ((one)[found.defects == 0] for one in (found.bright - dark - light, found.bright_sigma))
     assert abs(error.mean()) < 0.1 * np.median(sigma)
     assert np.mean((error / sigma) ** 2) == pytest.approx(1, abs=0.08)
     assert measured.bright.frames == 120
     assert np.isnan(measured.bright.drift)
 
 
-def test_pixels_under_a_rolled_ball_that_are_dead_or_saturated_are_found():
-    dark, light = pixels((21, 33))
-    light[4, 5] = 0
-    light[7, 8] = 260 - dark[7, 8]
-    found = take_references(
-        source(expose(dark, NOISE, 64)), source(rolled(dark, light, 120, 0.35, 0.15)), rolled=True
-    )
-    assert found.defects[4, 5] == 2
-    assert found.defects[7, 8] == 4
-    assert np.count_nonzero(found.defects) == 2
-
-
 def test_a_rolled_ball_is_read_in_bands_where_memory_is_short(monkeypatch):
     dark, light = pixels((11, 13))
     frames = expose(dark, NOISE, 32), rolled(dark, light, 60, 0.4, 0.1)
-    whole = take_references(source(frames[0]), source(frames[1], again=True), rolled=True)
+    whole = references(*frames, rolled=True)
     monkeypatch.setattr(module, "_MEMORY", 60 * 13 * 4)
-    told = []
-    bands = measure_references(
-        source(frames[0]), source(frames[1], again=True), rolled=True, progress=told.append
-    ).references
-    assert told[-1] == 32 + 3 * 60
+    counts = []
+    again = [source(frames[1], again=True)]
+    bands = measure_references([source(frames[0])], again, rolled=True, progress=counts.append).references
+    assert counts[-1] == 32 + 3 * 60
     np.testing.assert_allclose(bands.bright, whole.bright, atol=0.6)
     with pytest.raises(io.InputError, match="record it first"):
-        take_references(source(frames[0]), source(frames[1]), rolled=True)
+        references(*frames, rolled=True)
+
+
+@pytest.mark.parametrize("highest", [255, 1023, 4095, 65535, 65520, 65472])
+def test_the_top_of_a_camera_is_known_by_its_bits(highest):
+    assert scale_top(highest, True) == highest
 
 
 @pytest.mark.parametrize(
-    ("highest", "whole", "top"),
-    [
-        (255, True, True),
-        (1023, True, True),
-        (4095, True, True),
-        (65535, True, True),
-        (65520, True, True),
-        (65472, True, True),
-        (200, True, False),
-        (240, True, False),
-        (127, True, False),
-        (254, True, False),
-        (1.0, False, True),
-        (1.0, True, False),
-        (4095.0, False, True),
-        (254.5, False, False),
-        (1e30, False, False),
-    ],
+    ("highest", "integer"),
+    [(200, True), (240, True), (127, True), (254, True), (1, True), (254.5, False), (1e30, False)],
 )
-def test_the_top_of_a_camera_is_known_by_its_bits(highest, whole, top):
-    assert scale_top(highest, whole) == (highest if top else None)
+def test_other_samples_are_no_top(highest, integer):
+    assert scale_top(highest, integer) is None
+    assert scale_top(1.0, False) == 1
