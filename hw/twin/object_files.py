@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.objects import difference_slope
 from mirrorskin.io.types import Floats, InputError, pixel_axes
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 HEIGHT_MAP_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 DEFAULT_SCALE = 0.001
@@ -228,7 +230,7 @@ def _check_surface(path: Path, triangles: Floats) -> None:
         raise InputError(f"{path}: is no surface: its triangles do not join; repair the mesh")
 
 
-def _read_mesh(path: Path) -> trimesh.Trimesh:
+def _read_mesh(path: Path) -> Trimesh:
     try:
         import trimesh
     except ImportError:
