@@ -32,15 +32,7 @@ class Group(TyperGroup):
 
 
 def lazy_group(package: str, purposes: Mapping[str, str]) -> type[TyperGroup]:
-    """Return the class of a group whose commands are modules with a function ``command``, or an ``app``.
-
-    Parameters
-    ----------
-    package : str
-        That the modules are in, called as the commands; a keyword of Python has an underscore behind it.
-    purposes : mapping of str to str
-        Commands in the order of the help, and what they are for.
-    """
+    """Return the class of a group whose commands are modules with a function ``command``, or an ``app``."""
 
     class LazyGroup(Group):
         def __init__(self, **given: Any) -> None:

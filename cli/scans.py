@@ -66,20 +66,7 @@ _OWN: Mapping[ScanName, tuple[str, ...]] = {
 
 
 def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
-    """Turn a command's options into a plan that the rig can do.
-
-    Parameters
-    ----------
-    words : mapping
-        The command's parameters by their names, as of `typer.Context.params`; None where not given.
-    settings : RigSettings
-        What the rig file says.
-
-    Raises
-    ------
-    InputError
-        An option belongs to the other motion, is missing, cannot be, or is more than the rig can do.
-    """
+    """Turn a command's options into a plan that the rig can do."""
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.io import InputError
 
@@ -100,13 +87,7 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
 def make_scan(
     rig: Rig, plan: Plan, settle: str | None, frames: int | None, turn_frames: int | None = None
 ) -> StepScan | SweepScan:
-    """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``.
-
-    Raises
-    ------
-    InputError
-        The plan goes beyond the rig's limits, or an option of steps was given and it has none.
-    """
+    """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``."""
     from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan

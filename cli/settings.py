@@ -27,20 +27,7 @@ _LONGEST = 40  # letters of a value that a message quotes
 
 
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
-    """Read what a batch does with every recording.
-
-    Parameters
-    ----------
-    path : Path or None
-        A file of TOML as ``docs/batch.md`` describes it; without one, everything is left to the recordings.
-    memory_limit : int
-        Bytes of host memory for frames on the move.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or says something that is not known or cannot be used.
-    """
+    """Read what a batch does with every recording."""
     said = {} if path is None else _read(path)
     _refuse_unknown(said, _TABLES, str(path), "table")
     stack, press, rotation = (

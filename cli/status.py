@@ -29,13 +29,7 @@ class Viewer(Protocol):
 
 
 class Newest:
-    """Hands updates to a viewer in a thread of its own: one that is slow misses some, and holds up nobody.
-
-    Parameters
-    ----------
-    viewer : Viewer
-        Used and closed by that thread alone.
-    """
+    """Hands updates to a viewer in a thread of its own: one that is slow misses some, and holds up nobody."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
@@ -108,13 +102,7 @@ class Board:
 
 @contextmanager
 def show_status() -> Iterator[Callable[[Status], None]]:
-    """Show a status on a terminal, and nothing in a pipe.
-
-    Yields
-    ------
-    callable
-        To be told each status.
-    """
+    """Show a status on a terminal, and nothing in a pipe."""
     board = Board()
     if not sys.stderr.isatty():
         yield board.tell

@@ -36,18 +36,7 @@ class Show(Protocol):
 
 @contextmanager
 def show_batch(total: int, as_json: bool) -> Iterator[Show]:
-    """Show how a batch of so many files goes.
-
-    Parameters
-    ----------
-    total : int
-    as_json : bool
-        Whether standard output is for JSON alone.
-
-    Yields
-    ------
-    Show
-    """
+    """Show how a batch of so many files goes."""
     if sys.stderr.isatty() and (as_json or sys.stdout.isatty()):
         from rich.console import Console
         from rich.live import Live

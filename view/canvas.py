@@ -84,22 +84,7 @@ def draw_image(
     extend: str = "neither",
     **colours: Any,
 ) -> AxesImage:
-    """Draw a map, pixel by pixel; what has no answer has a colour of its own.
-
-    Parameters
-    ----------
-    axes : Axes
-    values : ndarray, (H, W), (H, W, 3) or (H, W, 4)
-        NaN without an answer; or colours.
-    place : Extent, optional
-        Where it lies; without it, along pixels.
-    label : str
-        Quantity and unit beside its colours; without it, they are not explained.
-    extend : {"neither", "min", "max", "both"}
-        Ends of the colours that are exceeded.
-    **colours
-        As ``imshow`` has them: ``cmap``, ``vmin``, ``vmax``, ``norm``, ``interpolation``.
-    """
+    """Draw a map, pixel by pixel; what has no answer has a colour of its own."""
     axes.set_facecolor(MISSING)
     picture = axes.imshow(values, extent=place, **{"interpolation": "nearest", **colours})
     if label:
@@ -127,20 +112,7 @@ def draw_classes(
     place: Extent | None = None,
     interpolation: str = "nearest",
 ) -> AxesImage:
-    """Draw a map of classes, with those beside it that have a label.
-
-    Parameters
-    ----------
-    axes : Axes
-    classes : ndarray, (H, W), uint8
-        Numbers of colours.
-    colours : sequence of str
-    labels : mapping
-        What classes are called.
-    place : Extent, optional
-    interpolation : str
-        How pixels that are smaller than those of the figure become colours.
-    """
+    """Draw a map of classes, with those beside it that have a label."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 

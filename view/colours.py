@@ -27,13 +27,7 @@ _SHOWN = 0.2, 99.8  # per cent of the values that the colours tell apart
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
-    """Return the lowest and highest value but for a few pixels at the edge of visibility.
-
-    Parameters
-    ----------
-    values : ndarray
-        What is not finite does not count. Without any value, -1 and 0 come back.
-    """
+    """Return the lowest and highest value but for a few pixels at the edge of visibility."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
     return float(low), float(high)
@@ -46,16 +40,7 @@ def grey(values: NDArray[Any], low: float, high: float) -> Colours:
 
 
 def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
-    """Return colours from violet at ``low`` to yellow at ``high``; what has no answer has its own.
-
-    Parameters
-    ----------
-    values : ndarray, (H, W)
-
-    Returns
-    -------
-    ndarray, (H, W, 3), uint8
-    """
+    """Return colours from violet at ``low`` to yellow at ``high``; what has no answer has its own."""
     shades = cv2.applyColorMap(grey(values, low, high), cv2.COLORMAP_VIRIDIS)
     colours = np.asarray(cv2.cvtColor(shades, cv2.COLOR_BGR2RGB), np.uint8)
     colours[np.isnan(values)] = MISSING_RGB
@@ -63,17 +48,7 @@ def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
 
 
 def normal_colours(normals: NDArray[np.float32], edges: NDArray[np.uint8] | None = None) -> Colours:
-    """Return the customary colours: red, green and blue for x, y and z from -1 to 1; edges are black.
-
-    Parameters
-    ----------
-    normals : ndarray, (H, W, 3), float32
-    edges : ndarray, (H, W), uint8, optional
-
-    Returns
-    -------
-    ndarray, (H, W, 3), uint8
-    """
+    """Return the customary colours: red, green and blue for x, y and z from -1 to 1; edges are black."""
     colours: Colours = ((np.nan_to_num(normals) + 1) * 127.5).astype(np.uint8)
     colours[np.isnan(normals[..., 2])] = MISSING_RGB
     if edges is not None:

@@ -90,20 +90,7 @@ class LiveView:
 
 
 def section(height: NDArray[np.float32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the cross-section along the middle row, one line for each piece without a gap.
-
-    Parameters
-    ----------
-    height : ndarray, (H, W), float32
-        Millimetres.
-    x : ndarray, (W,), float64
-        Millimetres.
-
-    Returns
-    -------
-    list of ndarray, (n, 2), float64
-        x and, as pictures run down, minus the height.
-    """
+    """Return the cross-section along the middle row, one line for each piece without a gap."""
     row = height[height.shape[0] // 2].astype(np.float64)
     known = np.flatnonzero(np.isfinite(row))
     pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)

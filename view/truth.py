@@ -55,13 +55,7 @@ class Relief:
 
 
 def relief_of(result: Result, truth: Truth) -> Relief:
-    """Return a result's heights; components of unknown offset are moved to the truth's mean height there.
-
-    Raises
-    ------
-    InputError
-        The result has no heights or axes, is of one row or column, or not of the truth's size.
-    """
+    """Return a result's heights; components of unknown offset are moved to the truth's mean height there."""
     height, x, y = result.height, result.x, result.y
     if height is None or x is None or y is None or height.ndim != 2 or min(height.shape) < 2:
         raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")

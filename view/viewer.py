@@ -35,25 +35,7 @@ def load_rerun() -> Any:
 
 
 def open_stream(where: str | Path, option: str) -> Any:
-    """Open what pictures are logged to.
-
-    Parameters
-    ----------
-    where : str or Path
-        "window" starts rerun's own viewer, "browser" one in a browser; both are reached from this machine
-        only, and outlive this program. Anything else is a file to write, which ``rerun FILE`` shows.
-    option : str
-        What asked for it, for the remedy.
-
-    Returns
-    -------
-    rerun.RecordingStream
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        rerun is not installed or does not start, or the file cannot be written.
-    """
+    """Open what pictures are logged to."""
     check_place(where, option)
     stream = load_rerun().RecordingStream("mirrorskin", send_properties=False)
     if str(where) in (WINDOW, BROWSER):

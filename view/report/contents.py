@@ -44,24 +44,7 @@ class Group:
 
 
 def contents_of(result: Result, name: str, section: Ends | None, turn: int | None) -> dict[str, Any]:
-    """Return what the template of the page is told, by the names that it has there.
-
-    Parameters
-    ----------
-    result : Result
-        Of (H, W) maps.
-    name : str
-        What to call it.
-    section : ((float, float), (float, float)) or None
-        Ends of the cross-section, mm.
-    turn : int or None
-        Which turn these maps are of.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is a section, and no pixel size to place it by.
-    """
+    """Return what the template of the page is told, by the names that it has there."""
     surface = surface_data(result)
     parameters, provenance = told_process(result.process)
     contents = {
@@ -240,13 +223,7 @@ class Picture:
 
 
 def pictures_of(result: Result, name: str, section: Ends | None) -> list[Picture]:
-    """Draw all figures that a result has.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is a section, and no pixel size to place it by.
-    """
+    """Draw all figures that a result has."""
     from mirrorskin.view.result import figures_of, png_of
 
     figures = figures_of(result, name=name, section=section)
@@ -283,18 +260,7 @@ def _trimmed(pixels: Pixels) -> Pixels:
 
 
 def packed(pixels: Pixels) -> tuple[str, bytes]:
-    """Pack a picture into at most ``MOST_BYTES``: as it is if it can be, else nearly, else smaller.
-
-    Parameters
-    ----------
-    pixels : ndarray, (H, W, 3), uint8
-        Blue, green and red.
-
-    Returns
-    -------
-    kind : {"png", "webp"}
-    data : bytes
-    """
+    """Pack a picture into at most ``MOST_BYTES``: as it is if it can be, else nearly, else smaller."""
     png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()
     if len(png) <= MOST_BYTES:
         return "png", png

@@ -25,23 +25,7 @@ _FILLED_BIT = 0x8000
 
 
 def surface_data(result: Result) -> dict[str, Any] | None:
-    """Return the surface that a page shows in space, as its script reads it.
-
-    Parameters
-    ----------
-    result : Result
-        Of (H, W) maps.
-
-    Returns
-    -------
-    dict or None
-        ``x``, ``y`` (mm, or pixels from the centre, as ``unit`` says); ``lowest`` and ``highest`` height, mm;
-        ``heights``: as a share of 65535 from the lowest to the highest, uint16, little-endian, base64;
-        ``marks`` in the same form: 0 in a hole, else one more than the number of the piece, and 32768 more
-        where it was filled; ``shown``: heights at the ends of the ``colours``; ``stretch``: what a millimetre
-        of height is drawn as, in the unit of x and y; ``factor``: the exaggeration to begin with, of at most
-        ``most``. None where fewer than two rows or columns have heights.
-    """
+    """Return the surface that a page shows in space, as its script reads it."""
     if result.height is None or not np.isfinite(result.height).any():
         return None
     grid = sample(result)
@@ -128,12 +112,6 @@ def sample(result: Result, most: int = MOST) -> Grid:
     hole. Of a block that holds more than one piece, or measured and filled pixels, only those of the middle
     kind are taken, which is the most common one wherever one has more than half: heights of different kinds
     are never mixed.
-
-    Parameters
-    ----------
-    result : Result
-        Of (H, W) maps, with some heights; without pixel size, places are in pixels.
-    most : int
     """
     assert result.height is not None
     answered = np.isfinite(result.height)

@@ -104,18 +104,7 @@ Rows = list[tuple[str, str]]
 
 
 def told_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[str, Rows]]:
-    """Put what a result's process says into words.
-
-    Parameters
-    ----------
-    process : mapping
-        As of a ``Result``; of a fused one, names begin with the motion that they are of.
-
-    Returns
-    -------
-    parameters, provenance : dict
-        Names and values, under the movement that they are of; under an empty name what is of all.
-    """
+    """Put what a result's process says into words."""
     parameters: dict[str, Rows] = {}
     provenance: dict[str, Rows] = {}
     for name, value in process.items():

@@ -26,16 +26,7 @@ _EDGE = 0.1  # of the picture's width: room for a letter
 
 
 def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
-    """Draw heights as a lit surface, with a scale bar, and where the section runs.
-
-    Parameters
-    ----------
-    axes : Axes
-    sheet : Sheet
-        Of a result with heights.
-    cut : Section, optional
-        Drawn from A to B.
-    """
+    """Draw heights as a lit surface, with a scale bar, and where the section runs."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -147,23 +138,7 @@ def shaded(
     pixel: tuple[float, float],
     span: tuple[float, float],
 ) -> Colours:
-    """Return the colours of heights under a lamp at the upper left.
-
-    Parameters
-    ----------
-    height : ndarray, (H, W), float32
-        Millimetres; NaN has the colour of what has no answer.
-    filled : ndarray, (H, W), bool
-        Where heights were not measured: these have colours of their own.
-    pixel : (float, float)
-        Size of a pixel along x and y, mm.
-    span : (float, float)
-        Heights at the ends of the colours, mm.
-
-    Returns
-    -------
-    ndarray, (H, W, 3), uint8
-    """
+    """Return the colours of heights under a lamp at the upper left."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource, Normalize
 

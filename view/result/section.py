@@ -26,13 +26,6 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     """Draw heights along a section, with a band of one standard deviation either way.
 
     What was filled is dashed; a hole is a gap; the highest measured point is marked.
-
-    Parameters
-    ----------
-    axes : Axes
-    sheet : Sheet
-    cut : Section
-        Of the sheet's result.
     """
     measured = np.where(cut.filled, np.nan, cut.height)
     if np.isfinite(measured).any():

@@ -67,13 +67,7 @@ class Sheet:
 
 
 def sheet_of(result: Result) -> Sheet:
-    """Lay out a result.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        It has maps of several turns.
-    """
+    """Lay out a result."""
     result = select_turn(result, None)
     if result.x is not None and result.y is not None:
         return Sheet(result, result.x, result.y, "mm")
