@@ -14,34 +14,34 @@ from mirrorskin.io.os_errors import legible
 from mirrorskin.io.types import ProcessValue
 
 
-class Part(NamedTuple):
-    """A dataset: its name, what it holds, and how that is to be read."""
+class DatasetSpec(NamedTuple):
+    """A dataset: its name, what it holds, and its attributes."""
 
     name: str
     values: NDArray[Any]
     attributes: Mapping[str, str]
 
 
-def write_part(root: h5py.Group, part: Part) -> None:
+def write_dataset(root: h5py.Group, spec: DatasetSpec) -> None:
     """Write one in a piece, so that it lies there as it is in memory."""
-    root.create_dataset(part.name, data=part.values).attrs.update(part.attributes)
+    root.create_dataset(spec.name, data=spec.values).attrs.update(spec.attributes)
 
 
-def text_of(text: str) -> NDArray[Any]:
-    """Return a text as bytes, whose number is known."""
-    told = legible(text).encode() or b"\0"
-    return np.array(told, h5py.string_dtype("utf-8", len(told)))
+def fixed_text(text: str) -> NDArray[Any]:
+    """Return a text as UTF-8 of a fixed length, so that it lies in the file in one piece."""
+    encoded = legible(text).encode() or b"\0"
+    return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
 
 
-def parts_of_process(place: str, process: Mapping[str, ProcessValue]) -> Iterator[Part]:
-    """Yield what tells how something came about."""
+def process_specs(place: str, process: Mapping[str, ProcessValue]) -> Iterator[DatasetSpec]:
+    """Yield what says how something came about."""
     for name, value in process.items():
-        values = text_of(value) if isinstance(value, str) else np.asarray(value)
-        yield Part(f"{place}/{name}", values, {})
+        values = fixed_text(value) if isinstance(value, str) else np.asarray(value)
+        yield DatasetSpec(f"{place}/{name}", values, {})
 
 
 def read_process(file: Hdf5File, place: str, names: Iterable[str] | None = None) -> dict[str, ProcessValue]:
-    """Read how something came about, or only some of that; what is not told is missing."""
+    """Read how something came about, or only some of that; what is not there is missing."""
     group = file.find(place)
     wanted = file.names(place) if names is None else names
     found = {} if group is None else {name: file.walk(group, name) for name in wanted}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
@@ -12,12 +12,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import MAKE_ROOM, new_file, new_hdf5
-from mirrorskin.io.calibration.file import CARRIED, carried_by, datasets_of, groups_of
-from mirrorskin.io.dataset_specs import Part, parts_of_process, read_process, write_part
+from mirrorskin.io.atomic import new_hdf5
+from mirrorskin.io.calibration.file import CARRIED, carried_by, write_calibration
+from mirrorskin.io.dataset_specs import DatasetSpec, process_specs, read_process, write_dataset
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
-from mirrorskin.io.mould import Mould
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"
@@ -33,82 +31,58 @@ _DTYPES = (
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
 _VECTORS, _OFFSETS = "normals", "offset_unknown"
-# Where viewers look for the errors of a map, and which map they are.
-_ERRORS = {"height_errors": "height_sigma"}
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 _AGAIN = "reconstruct it again"
 
 
-# Of the forms of results that were written last.
-_moulds: dict[Hashable, Mould] = {}
-_MOST_MOULDS = 8
-
-
 def save_result(result: Result, path: str | Path) -> None:
-    """Write a result; the file exists whole or not at all.
+    """Write a result; the file exists whole or not at all (``docs/formats.md``).
+
+    Parameters
+    ----------
+    result : Result
+    path : str or Path
 
     Raises
     ------
     InputError
         It cannot be written there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import io
+    >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
     """
-    path, maps = Path(path), result.maps()
-    parts = [*_parts_of_maps(result, maps), *parts_of_process(_PROCESS, result.process)]
-    carried = {}
-    if result.calibration is not None:
-        parts += datasets_of(result.calibration, CARRIED)
-        carried = groups_of(result.calibration, CARRIED)
-    values = [part.values for part in parts]
-    form = tuple((part.name, part.values.dtype.str, part.values.shape) for part in parts)
-    mould = _moulds.get(form)
-    if mould is not None:
-        with new_file(path) as descriptor, as_input_error(f"{path} could not be written", MAKE_ROOM):
-            mould.pour(descriptor, values)
-        return
-    with new_hdf5(path) as new:
-        _write(new.root, parts, _plot_of(result, maps), carried)
-        places = [(new.root[part.name].id.get_offset() or 0, part.values.nbytes) for part in parts]
-        new.close()
-        new.check()
-        if len(_moulds) == _MOST_MOULDS:
-            _moulds.clear()
-        _moulds[form] = Mould.of(new.descriptor, places)
+    maps = result.maps()
+    with new_hdf5(Path(path)) as new:
+        new.root.attrs.update(NX_class="NXroot", default="entry")
+        entry = new.root.create_group("entry")
+        entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
+        shown = entry.create_group("result")
+        shown.attrs.update(NX_class="NXdata", **_plot(result, maps))
+        entry.create_group("process").attrs["NX_class"] = "NXprocess"
+        for spec in (*_map_specs(result, maps), *process_specs(_PROCESS, result.process)):
+            write_dataset(new.root, spec)
+        if result.calibration is not None:
+            write_calibration(new.root, result.calibration, CARRIED)
+        if "height_sigma" in shown:
+            shown["height_errors"] = h5py.SoftLink(f"{_RESULT}/height_sigma")  # where viewers look for them
 
 
-def _write(
-    file: h5py.File,
-    parts: Iterable[Part],
-    plot: Mapping[str, Any],
-    more: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Write a result's parts, what a viewer should plot of them unasked, and more groups for them."""
-    file.attrs.update(NX_class="NXroot", default="entry")
-    entry = file.create_group("entry")
-    entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
-    shown = entry.create_group("result")
-    shown.attrs.update(NX_class="NXdata", **plot)
-    entry.create_group("process").attrs["NX_class"] = "NXprocess"
-    for name, attributes in more.items():
-        file.create_group(name).attrs.update(attributes)
-    for part in parts:
-        write_part(file, part)
-    for name, target in _ERRORS.items():
-        if target in shown:
-            shown[name] = h5py.SoftLink(f"{_RESULT}/{target}")
-
-
-def _parts_of_maps(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Part]:
-    """Yield the maps, and what is known of a plot's axes: the turns, and where the pixels are."""
+def _map_specs(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[DatasetSpec]:
+    """Yield the maps and a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
-        said = {} if name == _VECTORS else {"interpretation": "image"}
-        yield Part(f"{_RESULT}/{name}", values, said | ({"units": UNITS[name]} if name in UNITS else {}))
+        attributes = {} if name == _VECTORS else {"interpretation": "image"}
+        attributes |= {"units": UNITS[name]} if name in UNITS else {}
+        yield DatasetSpec(f"{_RESULT}/{name}", values, attributes)
     if result.offset_unknown is not None:
-        yield Part(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
-    for name, positions in _axes_of(result, maps).items():
-        yield Part(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
+        yield DatasetSpec(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+    for name, positions in _axes(result, maps).items():
+        yield DatasetSpec(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 
 
-def _axes_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _axes(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     plotted = _plotted(maps)
     axes: dict[str, NDArray[Any]] = {}
     if plotted and maps[plotted[0]].ndim == 3:
@@ -118,9 +92,9 @@ def _axes_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDAr
     return axes
 
 
-def _plot_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return what tells a viewer what to plot unasked."""
-    plotted, axes = _plotted(maps), list(_axes_of(result, maps))
+def _plot(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the attributes that make a viewer plot the maps unasked."""
+    plotted, axes = _plotted(maps), list(_axes(result, maps))
     plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
     if axes:
         plot["axes"] = [*axes, *["."] * ((maps[plotted[0]].ndim if plotted else 0) - len(axes))]
@@ -128,11 +102,7 @@ def _plot_of(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]
 
 
 def _plotted(maps: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Name the maps that are plotted together.
-
-    They must be of one shape, so vectors are not among them. How to show those is left open: NeXus has no
-    word for a picture of vectors, and of one of colours viewers expect numbers from 0 to 1.
-    """
+    """Name the maps that are plotted together; NeXus has no picture of vectors."""
     return [name for name in maps if name != _VECTORS]
 
 

@@ -25,8 +25,8 @@ from mirrorskin.io.calibration.types import (
     stored,
     unit_of,
 )
-from mirrorskin.io.dataset_specs import Part as Dataset
-from mirrorskin.io.dataset_specs import parts_of_process, read_process, text_of, write_part
+from mirrorskin.io.dataset_specs import DatasetSpec as Dataset
+from mirrorskin.io.dataset_specs import fixed_text, process_specs, read_process, write_dataset
 from mirrorskin.io.hdf5 import Hdf5File, Node
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
 
@@ -57,12 +57,12 @@ def groups_of(calibration: Calibration, place: str) -> dict[str, dict[str, Any]]
 def datasets_of(calibration: Calibration, place: str) -> Iterator[Dataset]:
     """Yield all that is in these groups."""
     camera = calibration.camera
-    yield Dataset(f"{place}/camera/name", text_of(camera.name), {})
+    yield Dataset(f"{place}/camera/name", fixed_text(camera.name), {})
     yield Dataset(f"{place}/camera/shape", np.asarray(camera.shape, np.int64), {})
-    yield Dataset(f"{place}/camera/dtype", text_of(np.dtype(camera.dtype).name), {})
+    yield Dataset(f"{place}/camera/dtype", fixed_text(np.dtype(camera.dtype).name), {})
     for name, part in calibration.parts().items():
         yield from _datasets_of_part(part, f"{place}/{GROUPS[name]}", camera)
-    yield from parts_of_process(f"{place}/process", calibration.process)
+    yield from process_specs(f"{place}/process", calibration.process)
 
 
 def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> None:
@@ -70,7 +70,7 @@ def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> 
     for name, attributes in groups_of(calibration, place).items():
         file.require_group(name).attrs.update(attributes)
     for dataset in datasets_of(calibration, place):
-        write_part(file, dataset)
+        write_dataset(file, dataset)
 
 
 def size_of(calibration: Calibration) -> int:
@@ -100,9 +100,9 @@ def _datasets_of_part(part: Part, place: str, camera: CameraId) -> Iterator[Data
 
 def _values_of(value: Any, how: Stored) -> NDArray[Any]:
     if how.kind == "text":
-        return text_of(value)
+        return fixed_text(value)
     if how.kind == "names":
-        told = [text_of(one).tobytes() for one in value]
+        told = [fixed_text(one).tobytes() for one in value]
         return np.array(told, h5py.string_dtype("utf-8", max(map(len, told), default=1)))
     whole = how.kind in ("integer", "integers")
     return np.ascontiguousarray(value, np.int64 if whole else how.dtype).reshape(np.shape(value))
