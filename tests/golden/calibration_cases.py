@@ -46,9 +46,9 @@ def measure_references_of_flat_fields() -> Answer:
     random = np.random.default_rng(3)
     dark, light = random.normal(15, 1, (21, 33)), random.normal(180, 6, (21, 33))
     dark[3, 4], light[8, 9], light[12, 2] = 90, 0, 280
-    found = measure_references(still(dark, 24, 1, "dark"), still(dark + light, 24, 2, "bright"))
+    found = measure_references([still(dark, 24, 1, "dark")], [still(dark + light, 24, 2, "bright")])
     ball = np.where(random.random((60, 21, 33)) < 0.4, dark + light, dark + 0.3 * light)
-    rolled = measure_references(still(dark, 24, 1, "dark"), still(ball, 60, 4, "ball"), rolled=True)
+    rolled = measure_references([still(dark, 24, 1, "dark")], [still(ball, 60, 4, "ball")], rolled=True)
     told = {}
     for name, one in ("flat", found), ("rolled", rolled):
         maps = one.references
