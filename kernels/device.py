@@ -256,7 +256,14 @@ class Device:
 
 
 class Kernel:
-    """A compiled kernel, ready to run over so many items."""
+    """A compiled kernel, ready to run over so many items.
+
+    Attributes
+    ----------
+    name : str
+    arguments : tuple of str
+        Names of its arguments, in the order of the source.
+    """
 
     def __init__(
         self, device: Device, name: str, kernel: cl.Kernel, signature: Signature, group: int
@@ -265,6 +272,7 @@ class Kernel:
         self._device = device
         self._kernel = kernel
         self._signature = signature
+        self.arguments = tuple(name for name, _ in signature)
         self._group = group
 
     def __call__(
@@ -314,11 +322,11 @@ class Kernel:
 
     def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
         """Return arguments in the source's order, numbers in its types."""
-        names = [name for name, _ in self._signature]
+        names = self.arguments
         if arguments.keys() != set(names):
             missing = [name for name in names if name not in arguments]
             unknown = [name for name in arguments if name not in names]
-            raise TypeError(f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {names}")
+            raise TypeError(f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {[*names]}")
         values = []
         for name, convert in self._signature:
             value = arguments[name]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from launches import launch
 
 from mirrorskin.kernels import bilateral
 from mirrorskin.kernels.bilateral import DOWN, RIGHT
@@ -31,7 +32,7 @@ def run(device, name, shape, arguments, outputs, known=1):
     def put(values):
         values = np.asarray(values)
         if values.ndim == 0:
-            return np.float32(values)
+            return float(values)
         dtype = np.uint8 if values.dtype == np.uint8 else np.float32
         array = device.array("map", values.shape, dtype)
         array.host[...] = values
@@ -46,7 +47,7 @@ def run(device, name, shape, arguments, outputs, known=1):
         made.append(put(np.full(pieces, np.nan)))
     given = [put(one) for one in arguments]
     kernel = device.kernel("bilateral", f"bilateral_{name}", KNOWN=known)
-    kernel(items, *(np.int32(size) for size in shape), *given, *made, moved=0)
+    launch(kernel, items, *shape, *given, *made)
     return [array.download() for array in made]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from launches import launch
 
 from mirrorskin.engine.integration.graph import LinkRoom, Settler, find_components
 from mirrorskin.engine.integration.validation import check_inputs
@@ -80,7 +81,7 @@ def test_offsets_bring_means_to_0(device, pieces):
     offsets = device.given("offsets", np.full(pieces, 9.0))
     given = [device.given(name, values) for name, values in (("sums", sums), ("totals", totals))]
     kernel = device.kernel("components", "components_level", ONE=0, HEIGHTS=0)
-    kernel(pieces, np.int32(9), np.int32(pieces), *given, offsets, moved=0)
+    launch(kernel, pieces, 9, pieces, *given, offsets)
     expected = components.components_level(sums, totals)
     np.testing.assert_allclose(offsets.download(), expected, rtol=1e-5, atol=1e-6)
     assert offsets.download()[-1] == 0

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from launches import launch
 from numpy.typing import NDArray
 
 from mirrorskin.kernels import correlation
@@ -46,10 +47,10 @@ def fit_of(rows: NDArray[Any]) -> NDArray[np.float32]:
     return np.concatenate(table).astype(np.float32)
 
 
-def launch(device: Device, name: str, pixels: int, arguments: list[Any], wide: int, dtype: str) -> list[Any]:
+def run(device: Device, name: str, pixels: int, arguments: list[Any], wide: int, dtype: str) -> list[Any]:
     """Run a kernel; return its arrays as it leaves them."""
     arrays: list[Array] = []
-    values: list[Array | np.generic] = []
+    values: list[Any] = []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
             arrays.append(device.array("a", argument.shape, argument.dtype))
@@ -57,10 +58,10 @@ def launch(device: Device, name: str, pixels: int, arguments: list[Any], wide: i
             arrays[-1].upload()
             values.append(arrays[-1])
         else:
-            values.append(np.int32(argument) if isinstance(argument, int) else argument)
+            values.append(argument)
     bits = 8 * np.dtype(dtype).itemsize
     kernel = device.kernel("correlation", name, FRAME=C_TYPES[dtype], BITS=bits, WIDE=wide)
-    kernel(-(-pixels // device.layout.tile), *values, moved=1)
+    launch(kernel, -(-pixels // device.layout.tile), *values)
     return [array.download().copy() for array in arrays]
 
 
@@ -84,7 +85,7 @@ def test_a_window_moves_on(device: Device, dtype: str, pixels: int) -> None:
     ring, sums = np.zeros((window, stride), dtype), np.zeros((4, pixels), np.int64)
     shape = len(frames), pixels, stride, 1, window
     arrays = [ring, *sums.astype(width)]
-    found = launch(device, "correlation_slide", pixels, [frames, *shape, basis, *arrays], 0, dtype)[2:]
+    found = run(device, "correlation_slide", pixels, [frames, *shape, basis, *arrays], 0, dtype)[2:]
     correlation.correlation_slide(frames, 1, window, basis, ring[:, :pixels], *sums)
     np.testing.assert_array_equal(found[0], ring)
     np.testing.assert_array_equal(found[1:], sums)
@@ -103,7 +104,7 @@ def test_frames_are_added(device: Device, dtype: str, pixels: int, count: int) -
     place = np.arange(count, dtype=np.int32) * 5 % len(frames)
     sums = np.random.default_rng(1).integers(-(10**6), 10**6, (4, pixels))
     given = [frames, count, pixels, place, rows[place], *sums.copy()]
-    found = launch(device, "correlation_add", pixels, given, 1, dtype)[3:]
+    found = run(device, "correlation_add", pixels, given, 1, dtype)[3:]
     correlation.correlation_add(frames, place, rows[place], *sums)
     np.testing.assert_array_equal(found, sums)
 
@@ -118,7 +119,7 @@ def test_counts_tell_the_fit(device: Device, dtype: str, wide: int, pixels: int)
     known = len(rows), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
     fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
     given = [pixels, *known, *narrow, fit, *answers]
-    found = launch(device, "correlation_solve_counts", pixels, given, wide, dtype)[5:]
+    found = run(device, "correlation_solve_counts", pixels, given, wide, dtype)[5:]
     close(found, correlation.correlation_solve_counts(*known, *sums, fit), dtype)
 
 
@@ -133,7 +134,7 @@ def test_counts_become_pairs(device: Device, dtype: str, pixels: int, turns: int
     known = len(rows) * turns, *(np.int64(n) * turns for n in rows.astype(np.int64).sum(axis=0)[1:])
     unit = np.float32(1 / STEPS[dtype])
     given = [pixels, *known, unit, np.zeros(pixels, np.float32), *sums]
-    reference, *found = launch(device, "correlation_convert", pixels, given, 1, dtype)
+    reference, *found = run(device, "correlation_convert", pixels, given, 1, dtype)
     expected = correlation.correlation_convert(*known, unit, *sums)
     # A mean next to a half may be rounded either way: the sums of the samples themselves are the same.
     np.testing.assert_allclose(reference, expected[0], atol=1)
@@ -152,7 +153,7 @@ def test_samples_are_summed_as_in_float64(device: Device, dtype: str, pixels: in
     for fresh, place in ((1, [3, 1, 4]), (0, [0, 9])):
         which = np.array(place, np.int32)
         given = [frames, len(place), pixels, fresh, which, basis[place], *kept]
-        kept = launch(device, "correlation_sum", pixels, given, int(dtype != "float32"), dtype)[3:]
+        kept = run(device, "correlation_sum", pixels, given, int(dtype != "float32"), dtype)[3:]
         correlation.correlation_sum(frames, bool(fresh), which, basis[place], *state)
     np.testing.assert_array_equal(kept[0], frames[3])
     for one, other in zip(kept[1:], state[1:], strict=True):
@@ -169,12 +170,12 @@ def test_a_ring_is_summed_anew(device: Device, dtype: str, pixels: int) -> None:
     ring[order, :pixels] = frames
     if dtype == "float32":
         given = [frames, len(frames), pixels, stride, 3, len(frames), np.zeros_like(ring)]
-        kept = launch(device, "correlation_keep", pixels, given, 0, dtype)[1]
+        kept = run(device, "correlation_keep", pixels, given, 0, dtype)[1]
         np.testing.assert_array_equal(kept, ring)
 
     fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
     given = [ring, len(frames), pixels, stride, order, rows, fit, *answers]
-    found = launch(device, "correlation_window", pixels, given, 0, dtype)[4:]
+    found = run(device, "correlation_window", pixels, given, 0, dtype)[4:]
     expected = correlation.correlation_window(ring[:, :pixels], order, rows, fit)
     close(found, expected, dtype)
 
@@ -186,7 +187,7 @@ def test_a_ring_is_summed_anew(device: Device, dtype: str, pixels: int) -> None:
         for part, whole in zip(high, state, strict=True)
     ][1:]
     given = [pixels, high[0], *held, fit, *answers]
-    again = launch(device, "correlation_solve_pairs", pixels, given, int(dtype != "float32"), dtype)[6:]
+    again = run(device, "correlation_solve_pairs", pixels, given, int(dtype != "float32"), dtype)[6:]
     close(again, expected, dtype)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from launches import launch
 from numpy.polynomial.hermite_e import hermegauss
 from numpy.typing import NDArray
 from scipy import stats
@@ -32,10 +33,8 @@ def expose(device: Device, maps: list[NDArray[np.float32]], dtype: str, **how: f
     counts.upload()
     quarter = len(maps[0]) // 4
     modes = {"WHOLE": int(dtype != "float32"), "SHOT": int(given["grain"] > 0)}
-    keys = np.int32(quarter), np.uint64(given["frame"]), np.uint64(given["seed"])
-    amounts = [np.float32(given[name]) for name in ("read", "grain", "top")]
     kernel = device.kernel("exposure", "expose", FRAME=C_TYPES[dtype], **modes)
-    kernel(-(-quarter // device.layout.tile), *arrays, *keys, *amounts, counts, moved=counts.host.nbytes)
+    launch(kernel, -(-quarter // device.layout.tile), *arrays, quarter, *given.values(), counts)
     return counts.download().copy()
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from launches import launch
 
 from mirrorskin.bench.limits import CHAINS, CORES, LANES
 from mirrorskin.kernels import limits
@@ -19,7 +20,7 @@ def run(device, name, shape, words, count, *rest):
     macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
     last = [sums] if name == "read_all" else []
     kernel = device.kernel("limits", name, **macros)
-    kernel(shape.items(count), data, np.int32(count), *last, *rest, moved=words.nbytes)
+    launch(kernel, shape.items(count), data, count, *last, *rest)
     return data.download(), sums.download()
 
 
@@ -40,7 +41,7 @@ def test_reading_adds_up_all_words(device, shape, count):
 @pytest.mark.parametrize("count", [1, 130, 9001])
 def test_copy_and_triad_touch_only_their_target(device, shape, count):
     words = random_words(3 * count + 5, shape)
-    for name, rest in (("copy_all", []), ("triad_all", [np.uint32(2**31 + 3)])):
+    for name, rest in (("copy_all", []), ("triad_all", [2**31 + 3])):
         expected = words.copy()
         getattr(limits, name)(expected, count, *rest)
         found, _ = run(device, name, shape, words, count, *rest)
@@ -63,8 +64,7 @@ def test_multiply_adds_are_all_done(device, shape, count):
     kernel = device.kernel(
         "limits", "multiply_all", LANES=shape.lanes, WORDS=shape.words, STRIDE=shape.stride
     )
-    given = np.int32(7), np.float32(-2), np.float32(3)
-    kernel(shape.items(count), data, np.int32(count), *given, moved=0)
+    launch(kernel, shape.items(count), data, count, 7, -2, 3)
     limits.multiply_all(numbers, shape.stride, 7, -2.0, 3.0)
     np.testing.assert_array_equal(data.download(), numbers)
 

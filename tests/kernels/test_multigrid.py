@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from launches import launch
 
 from mirrorskin.engine.integration.hierarchy import part_of
 from mirrorskin.kernels import multigrid
@@ -73,15 +74,15 @@ PASSES = {
     "invert_odd": ((1, 7), *TABLE, "anchor", "inverse"),
     "begin_odd": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
     "smooth_odd": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
-    "leave_odd": ((2, 7), *TABLE, np.int32(1), "anchor", "inverse", "b", "x", "left"),
+    "leave_odd": ((2, 7), *TABLE, 1, "anchor", "inverse", "b", "x", "left"),
     "restrict_odd": ((0, ROWS), *TABLE, "left", "b"),
     "prolong_odd": ((3, 6), *TABLE, 0.0, "inverse", "e", "x", "smoother"),
     "solve": ((30,), "bottom", "matrix", "b", "x"),
     "direct": (FINE, 0.7, *GRAPH, "z", "before", "direction", "image", "parts"),
     "advance": (FINE, 0.3, "e", "before", "b", "x", "parts"),
-    "curve": (FINE, *GRAPH, "b", "z", "before", np.int32(PARTS), "curves"),
-    "follow": (FINE, np.int32(5), "weight_at", np.int32(PARTS), "plane", "z", "before", "x"),
-    "follow along one": (FINE, np.int32(5), "weight_at", np.int32(PARTS), "same", "z", "before", "x"),
+    "curve": (FINE, *GRAPH, "b", "z", "before", PARTS, "curves"),
+    "follow": (FINE, 5, "weight_at", PARTS, "plane", "z", "before", "x"),
+    "follow along one": (FINE, 5, "weight_at", PARTS, "same", "z", "before", "x"),
     "dot": (FINE, "e", "x", "parts"),
     "weigh": (FINE, "weight_at", "x", "parts"),
     "admit": ((13, 21, 32), "map_", "level"),
@@ -123,12 +124,8 @@ def test_a_pass_does_what_its_reference_says(device, name, anchored):
     width = 8 if device.layout.tile > 1 else 1
     part = 64 if name in SUMS else part_of(device)  # as the engine has it, so that it is compiled once
     kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=int(anchored), PART=part, WIDTH=width)
-    scalars = [np.int32(size) for size in sizes]
-    given = [
-        on_device[a] if isinstance(a, str) else a if isinstance(a, np.int32) else np.float32(a)
-        for a in arguments
-    ]
-    kernel(items_of(name, device), *scalars, *given, moved=0)
+    given = [on_device[a] if isinstance(a, str) else a for a in arguments]
+    launch(kernel, items_of(name, device), *sizes, *given)
     changed = [key for key in arrays if not np.array_equal(arrays[key], before[key])]
     assert changed
     for key in arrays:

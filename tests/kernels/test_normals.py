@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import rotations
+from launches import launch
 from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special, stats
 
@@ -94,13 +95,13 @@ class Answers:
             turn.limits.most - (turn.tilt if method == "exact" else 0),
             turn.limits.rest,
         )
-        whole = np.array([start, start, self.pixels, self.stride, self.turns], np.int32)
+        whole = start, start, self.pixels, self.stride, self.turns
         arrays = [self.put(stack), self.put(tables), self.put(scale)]
-        arguments = [*arrays, *whole, *np.array(reals, np.float32), *self.maps.values()]
+        arguments = [*arrays, *whole, *reals, *self.maps.values()]
         if method == "paper":
-            arguments += [*turn.spread.astype(np.float32)]
+            arguments += [*turn.spread]
         kernel, lanes = self.kernel(method, turn)
-        kernel(-(-self.pixels // (lanes * self.device.layout.words)), *arguments, moved=1)
+        launch(kernel, -(-self.pixels // (lanes * self.device.layout.words)), *arguments)
         return self
 
     def kernel(self, method, turn):

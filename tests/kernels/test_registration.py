@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from launches import launch
 from numpy.typing import NDArray
 
 from mirrorskin.kernels import registration
@@ -53,13 +54,13 @@ def device_frame(device: Device, frame, height, shift, offset, gain) -> Answer:
     rows, columns = frame.shape
     top = {"TOP": int(np.iinfo(frame.dtype).max)} if frame.dtype.kind == "u" else {}
     macros = {"FRAME": C_TYPES[frame.dtype.name], "LEVELS": int(offset is not ALIKE[0]), **top}
-    items, sizes = rows * -(-columns // device.layout.tile), (np.int32(rows), np.int32(columns))
+    items, sizes = rows * -(-columns // device.layout.tile), (rows, columns)
     for name, wanted in (
         ("registration_admit", "frame offset gain padded"),
         ("registration_resample", "padded height shift offset gain registered noise"),
     ):
         kernel = device.kernel("registration", name, **macros)
-        kernel(items, *sizes, *(arrays[argument] for argument in wanted.split()), moved=frame.nbytes)
+        launch(kernel, items, *sizes, *(arrays[argument] for argument in wanted.split()))
     return Answer(*(arrays[name].download().copy() for name in Answer._fields))
 
 
@@ -198,7 +199,7 @@ def test_mended_places_are_the_means_of_those_round_them(device: Device, count: 
     given = {"places": places, "padded": frame}
     arrays = {name: device.given(name, values, values.dtype) for name, values in given.items()}
     kernel = device.kernel("registration", "registration_mend", FRAME="uchar", LEVELS=1, TOP=255)
-    kernel(-(-count // device.layout.tile), np.int32(count), arrays["places"], arrays["padded"], moved=count)
+    launch(kernel, -(-count // device.layout.tile), count, arrays["places"], arrays["padded"])
     wanted = frame.copy()
     registration_mend(places, wanted)
     assert (wanted != frame).sum() == count

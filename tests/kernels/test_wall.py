@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from launches import launch
 
 from mirrorskin.kernels.wall import wall_light
 
@@ -83,14 +84,8 @@ def run(device, sheet, places, rays, table, gap, scatter, fade, lamps):
     }
     sizes = sheet.shape[1], len(rays), len(table) - 2, table.shape[1] - 2
     numbers = RADIUS, RIM, gap, INDEX, scatter, fade, *lamps
-    device.kernel("wall", "wall_light", **macros)(
-        -(-sheet.shape[1] // device.layout.tile),
-        *(np.int32(size) for size in sizes),
-        *arrays,
-        *(np.float32(number) for number in numbers),
-        light,
-        moved=light.host.nbytes,
-    )
+    kernel = device.kernel("wall", "wall_light", **macros)
+    launch(kernel, -(-sheet.shape[1] // device.layout.tile), *sizes, *arrays, *numbers, light)
     return light.download().copy()
 
 
