@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource, Result
 
+_ENDING = "SIGINT", "SIGTERM", "SIGHUP"
 _LATENCY = "100ms"
 _THRESHOLD, _HOLD = 0.5, 2
 # What would bring a map that is missing: keys of the rig file.
@@ -184,8 +188,57 @@ class _Live:
 
             mark = None if recorder is None else recorder.mark
             self._estimator = estimator
-            self._loop = Loop(source, estimator, latency=asked.latency, on_update=on_update, mark=mark)
-            self._loop.run()
+            guard = _Guard()
+            self._loop = Loop(
+                source, estimator, latency=asked.latency, on_update=on_update, mark=mark, guard=guard
+            )
+            gc.freeze()  # a collector that looks through all that was there before would hold up frames
+            try:
+                with guard.installed():
+                    self._loop.run()
+            finally:
+                gc.unfreeze()
+
+
+class _Guard:
+    """While frames are pushed, signals that end the program wait: what was pushed and counted agrees."""
+
+    def __init__(self) -> None:
+        self._handlers: dict[int, Any] = {}
+        self._busy = False
+        self._waiting: list[tuple[int, Any]] = []
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Take over the signals for a while."""
+        if threading.current_thread() is threading.main_thread():
+            numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+            self._handlers = {n: handler for n in numbers if callable(handler := signal.getsignal(n))}
+        for number in self._handlers:
+            signal.signal(number, self._handle)
+        try:
+            yield
+        finally:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        if self._busy:
+            self._waiting.append((number, frame))
+        else:
+            self._handlers[number](number, frame)
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Push in this context."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+        if self._waiting:
+            number, frame = self._waiting.pop(0)
+            self._handlers[number](number, frame)
 
 
 @contextmanager

@@ -80,13 +80,14 @@ def feed(source: Source, estimator: Estimator, frames: range, progress: Progress
             progress(done)
 
 
-def push_block(estimator: Estimator, block: Block) -> None:
-    """Push what a source yields: its frames and their positions."""
+def push_block(estimator: Estimator, block: Block, part: slice = slice(None)) -> None:
+    """Push what a source yields, or a part of it: frames and their positions."""
     if not hasattr(estimator, "position"):  # until every estimator follows the protocol
         estimator.push(block)
         return
-    where = {estimator.position: getattr(block, estimator.position)}
-    estimator.push(block.frames, **where, lent=block.lent)
+    where = getattr(block, estimator.position)
+    known = {estimator.position: None if where is None else where[part]}
+    estimator.push(block.frames[part], **known, lent=block.lent)
 
 
 def _read_in_place(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.live.types import SHOWN, Status, Update
+from mirrorskin.engine.live.status import SHOWN, Status, Update
 from mirrorskin.io import pixel_axes
 from mirrorskin.view.colours import Colours, grey, height_colours, normal_colours
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream

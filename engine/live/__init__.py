@@ -1,34 +1,5 @@
-"""Results while the body moves: the same accumulators as offline, within a bounded time."""
+"""Results while the body moves: the same estimators as offline, within a bounded time."""
 
-from mirrorskin.engine.live.estimator import LiveEstimator
-from mirrorskin.engine.live.loop import LATENCY, Loop, run
-from mirrorskin.engine.live.press import LivePress
-from mirrorskin.engine.live.rotation import LiveRotation, choose_window
-from mirrorskin.engine.live.types import (
-    PUSHED,
-    SHOWN,
-    STAGES,
-    UPDATED,
-    WAITED,
-    Latency,
-    Status,
-    Update,
-)
+import lazy_loader
 
-__all__ = [
-    "LATENCY",
-    "PUSHED",
-    "SHOWN",
-    "STAGES",
-    "UPDATED",
-    "WAITED",
-    "Latency",
-    "LiveEstimator",
-    "LivePress",
-    "LiveRotation",
-    "Loop",
-    "Status",
-    "Update",
-    "choose_window",
-    "run",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.live.types import Update
+from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.engine.press.press import finish_press
 from mirrorskin.engine.provenance import sign, told_level
 from mirrorskin.engine.reconstruction import undistorted
-from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
+from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _ROOM = 64  # frames that may wait to be taken at once
@@ -22,7 +22,7 @@ _ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
 
 
 class LivePress:
-    """Tell the heights of a press so far; the accumulator is ``OnsetSearch``.
+    """Heights of a press so far, by `OnsetSearch`; see `mirrorskin.engine.live.LiveEstimator`.
 
     Parameters
     ----------
@@ -33,19 +33,13 @@ class LivePress:
     fill : bool
         Whether to fill holes in the result; see ``reconstruct_press``.
 
-    Attributes
-    ----------
-    device : Device
-    every : int
-    most_updates : float
-        See ``LiveEstimator``.
-
     Raises
     ------
     mirrorskin.io.InputError
         The source is of another motion, or parameters cannot be used.
     """
 
+    position = "travel"
     every = 1
     most_updates = _UPDATES
 
@@ -85,66 +79,47 @@ class LivePress:
             device=device,
             memory_limit=2 * _ROOM * math.prod(shape) * source.dtype.itemsize,
         )
-        self.device = self._search.device
-        self._reset()
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W)."""
-        return self._search.room
+        self.device, self.room = self._search.device, self._search.room
 
     def warm(self) -> None:
         """Push frames of nothing, and forget them."""
-        frames = np.zeros((3, *self._source.shape[1:]), self._source.dtype)
-        for step in range(len(frames)):
-            self.push(Block(frames[step : step + 1], step, travel=np.array([float(step)])))
-            self.update()
-        self._search.reset()
-        self._reset()
+        for step in range(3):
+            self.push(np.zeros((1, *self._source.shape[1:]), self._source.dtype), travel=[float(step)])
+            self.maps()
+        self.reset()
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames; see ``OnsetSearch.push``."""
-        self._search.push(block.frames, travel=block.travel, lent=block.lent)
-        assert block.travel is not None
-        self._travel.append(block.travel)
-        self._frames += len(block.frames)
-        if block.time is not None:
-            self._time = float(block.time[-1])
-        self._latest = block.frames[-1]
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
+        """Take in the next frames; see `OnsetSearch.push`."""
+        self._search.push(frames, travel=travel, lent=lent)
 
-    def update(self) -> Update:
+    def maps(self) -> Maps:
         """Return the heights so far; none before the second frame."""
-        position = float(self._travel[-1][-1])
-        told = self._frames, self._time, self._source.motion, position, self._latest.copy()
-        if self._frames < 2:
-            return Update(*told)
+        if len(self._search.travel) < 2:
+            return {}
         onset = self._search.result()
         contact = np.asarray((onset.status == _ONSET) | (onset.status == _LIGHT_AT_START), np.uint8)
-        return Update(
-            *told, height=onset.height, contact=contact, contact_area=area_of(contact, self._source)
-        )
+        return {"height": onset.height, "contact": contact, "contact_area": area_of(contact, self._source)}
 
     def spare(self, seconds: float) -> None:
         """Do nothing: nothing can wait."""
 
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self._search.reset()
+
     def result(self) -> Result:
-        """Return the heights, with holes filled if that was asked, and how they were found.
+        """Return the heights, with holes filled if ``fill`` says so, and how they were found.
 
         Raises
         ------
         mirrorskin.io.InputError
             There were fewer than two frames.
         """
-        onset = self._search.result()
-        process = self._process | {"first_frame": 0, "frames": self._frames, "noise": onset.noise}
-        travel = np.concatenate(self._travel)
+        onset, travel = self._search.result(), self._search.travel
+        process = self._process | {"first_frame": 0, "frames": len(travel), "noise": onset.noise}
         result, done = finish_press(onset, self._source, travel, "onset", self._threshold, self._fill)
         signed = sign(result, self._source, self.device, process | done | {"live": True})
         return undistorted(signed, self._source)
-
-    def _reset(self) -> None:
-        self._frames, self._time = 0, math.nan
-        self._travel: list[NDArray[np.float64]] = []
 
 
 def area_of(contact: ArrayLike, source: LiveSource) -> float | None:

@@ -3,42 +3,48 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from mirrorskin.engine.integration.warm_start import Follower
-from mirrorskin.engine.live.edges import SpareEdges
 from mirrorskin.engine.live.press import area_of
-from mirrorskin.engine.live.types import Update
+from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.provenance import naming, sign, told, told_level
 from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator
 from mirrorskin.engine.rotation.design_matrix import LONGEST
-from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.edges import EdgeDrawing, find_edges
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import NormalMethod, options_from
 from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, integrate_normals
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.response import initial_response, wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _FEWEST = 3  # frames that determine a wave
 _PLACED = 8  # updates after which it is told anew how high the object stands
 _WARMING = 10  # updates after which every kernel has run
+_PARTS = 24  # of the longest kernel
+_HUNGRY = 0.1  # seconds after which a part is done whether or not there is time
+_GUESS = 0.005  # seconds that a part may take, where none was done yet
+_CALM = 0.7  # share of the longest part's time that is kept from part to part
 _NO_GAIN = "none: the source has no zenith gain"
 _NO_PIXEL_SIZE = "none: the source has no pixel size"
 
 
 def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int, int]:
-    """Return how many frames a window should have for one turn, and which so-manieth frame should be used.
+    """Return how many frames a window of one turn should have, and n, where every n-th frame is used.
 
     Parameters
     ----------
@@ -62,10 +68,10 @@ def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int,
 
 
 class LiveRotation:
-    """Tell normals, edges and heights of the last frames; the accumulator is ``NormalWindow``.
+    """Normals, edges and heights of the last frames; see `mirrorskin.engine.live.LiveEstimator`.
 
     Where the source's calibration says how bright a wall makes pixels look, that is used; how high the object
-    stands is then told from the heights so far, now and then.
+    stands is then estimated from the heights so far, now and then.
 
     Heights follow the normals by one step of a solver for each update: their error stays near what changes
     from one update to the next. Edges are drawn in the time that is left. Without a zenith gain there are
@@ -78,18 +84,11 @@ class LiveRotation:
     window : int
         Frames that count, 3 to 64: best those of one turn; see `choose_window`.
     every : int
-        Only frames whose number is a multiple of this are asked for.
+        Only frames whose number is a multiple of this are taken.
     method, noise, device
-        As for ``estimate_normals``. Noise is told from the first full window otherwise.
+        As for ``estimate_normals``. Noise is estimated from the first full window otherwise.
     integrate, edges : bool
-        Whether to tell heights and edges.
-
-    Attributes
-    ----------
-    device : Device
-    every : int
-    most_updates : float
-        See ``LiveEstimator``.
+        Whether to find heights and edges.
 
     Raises
     ------
@@ -97,6 +96,7 @@ class LiveRotation:
         The source is of another motion, or parameters cannot be used.
     """
 
+    position = "phase"
     most_updates = math.inf
 
     def __init__(
@@ -139,7 +139,7 @@ class LiveRotation:
         if integrate and known and header.pixel_size is not None:
             self._slopes = SlopeKernels(self.device, shape)
             self._heights = Follower(self.device, shape, header.pixel_size)
-        self._reset()
+        self.reset()
 
     @property
     def room(self) -> NDArray[Any]:
@@ -151,31 +151,23 @@ class LiveRotation:
         with suppress(InputError):  # what a plane does not tell
             for number in range(self._size + _WARMING):
                 phase = 2 * np.pi * number / self._size
-                self.push(Block(self._plane(phase), number, phase=np.array([phase])))
+                self.push(self._plane(phase), phase=np.array([phase]))
                 if number >= self._size:
-                    self.update()
+                    self.maps()
             if self._edges is not None and self._normals is not None:
                 self._edges.finish(self._normals)
-        self._frames_to.reset()
-        self._reset()
+        self.reset()
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames; see ``NormalWindow.push``."""
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`."""
         with naming(self._source):
-            self._frames_to.push(block)
-        assert block.phase is not None
-        self._frames += len(block.frames)
-        self._position = float(block.phase[-1])
-        if block.time is not None:
-            self._time = float(block.time[-1])
-        self._latest = block.frames[-1]
+            push_block(self._frames_to, Block(frames, 0, phase=np.asarray(phase), lent=lent))
 
-    def update(self) -> Update:
-        """Return what the last window tells; the newest picture alone, until one is full."""
-        told = self._frames, self._time, self._source.motion, self._position, self._latest.copy()
+    def maps(self) -> Maps:
+        """Return the maps of the last window; none until one is full."""
         normals = self._normals
         if normals is None or not normals.is_full:
-            return Update(*told)
+            return {}
         with naming(self._source):
             normals.estimate()
         self._follow(normals)
@@ -185,15 +177,14 @@ class LiveRotation:
         self._updates += 1
         if height is not None and self._updates % _PLACED == 1:
             self._place(height)
-        return Update(
-            *told,
-            height=height,
-            normals=vectors,
-            contact=contact,
-            edges=None if self._edges is None else self._edges.lines,
-            contact_area=area_of(contact, self._source),
-            offset_unknown=height is not None,
-        )
+        return {
+            "height": height,
+            "normals": vectors,
+            "contact": contact,
+            "edges": None if self._edges is None else self._edges.lines,
+            "contact_area": area_of(contact, self._source),
+            "offset_unknown": height is not None,
+        }
 
     def spare(self, seconds: float) -> None:
         """Go on with the edges."""
@@ -318,8 +309,9 @@ class LiveRotation:
             "frames": normals.frames,
         }
 
-    def _reset(self) -> None:
-        self._frames, self._time, self._position = 0, math.nan, math.nan
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self._frames_to.reset()
         self._has_estimate, self._updates = False, 0
         if self._response is not None and self._normals is not None:
             self._normals.place(self._response.planes[4])
@@ -328,3 +320,62 @@ class LiveRotation:
         if self._slopes is not None and self._heights is not None:
             self._slopes.typical = math.nan
             self._heights.restart()
+
+
+class SpareEdges:
+    """Edges of the last normals for which there was time.
+
+    Parameters
+    ----------
+    device : Device
+    shape : (int, int)
+        Rows and columns.
+
+    Attributes
+    ----------
+    lines : ndarray, (H, W), uint8, or None
+        See ``find_edges``; None until the first are drawn.
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        self._device = device
+        self._drawing = EdgeDrawing(device, shape)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was drawn."""
+        self.lines: NDArray[np.uint8] | None = None
+        self._steps: Iterator[None] | None = None
+        self._cost, self._last = _GUESS, -math.inf
+
+    def work(self, window: NormalWindow, seconds: float) -> None:
+        """Go on with the drawing for as long as there is time, at least a little now and then.
+
+        Parameters
+        ----------
+        window : NormalWindow
+            Whose last estimate is drawn next.
+        seconds : float
+        """
+        begun = now = time.perf_counter()
+        while begun + seconds - now > self._cost or now - self._last > _HUNGRY:
+            self._part(window)
+            self._last = time.perf_counter()
+            self._cost = max(self._last - now, _CALM * self._cost)
+            now = self._last
+
+    def finish(self, window: NormalWindow) -> None:
+        """Draw once from the beginning to the end."""
+        self._steps = None
+        self._part(window)
+        while self._steps is not None:
+            self._part(window)
+
+    def _part(self, window: NormalWindow) -> None:
+        """Begin a drawing, or do a part of it, or take what was drawn."""
+        if self._steps is None:
+            self._drawing.take(*(window.fetch(name) for name in ("vectors", "sigma", "contact")))
+            self._steps = self._drawing.steps(_PARTS)
+        elif next(self._steps, self) is self:
+            self.lines, self._steps = self._drawing.lines(), None
+        self._device.finish()

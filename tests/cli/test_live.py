@@ -251,3 +251,19 @@ def test_the_status_is_a_table_and_a_line():
     assert "12.3 ms from frame to map (99 % below 23.4 ms)" in summary(status)
     assert "101 frames at 50 Hz: 90 used, 11 skipped, 3 dropped; 50 updates" in summary(status)
     assert summary(Status()).startswith("0 frames")
+
+
+def test_ctrl_c_while_frames_are_pushed_comes_after_them():
+    guard, pushed = live._Guard(), []
+
+    def push():
+        with guard.installed():
+            with guard():
+                signal.raise_signal(signal.SIGINT)
+                pushed.append(1)
+            pushed.append(2)
+
+    with pytest.raises(KeyboardInterrupt):
+        push()
+    assert pushed == [1]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

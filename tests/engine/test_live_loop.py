@@ -1,15 +1,14 @@
 """The live loop's policy, on a clock that stands still unless someone works."""
 
 import math
-import signal
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from live_frames import Clock, paced, turn_header
 
-from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, Loop, Update, run
-from mirrorskin.engine.live.watch import Reservoir
+from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, run
+from mirrorskin.engine.live.status import RecentTimes
 from mirrorskin.io import InputError
 
 COUNT, RATE = 40, 100.0
@@ -30,26 +29,21 @@ class Slow:
     updates: list[int] = field(default_factory=list)
     spared: list[float] = field(default_factory=list)
 
+    position = "phase"
     room = np.empty((64, 2, 3), np.uint8)
 
-    def push(self, block):
-        assert np.array_equal(block.phase, PLACES[block.frames[:, 0, 0]])
-        assert block.index == block.frames[0, 0, 0]
-        self.pushed += block.frames[:, 0, 0].tolist()
+    def push(self, frames, *, phase, lent):
+        assert np.array_equal(phase, PLACES[frames[:, 0, 0]])
+        self.pushed += frames[:, 0, 0].tolist()
         self.clock.now += self.push_time
 
-    def update(self):
+    def maps(self):
         self.clock.now += self.update_time
         self.updates.append(len(self.pushed))
-        height = np.zeros((2, 3), np.float32)
-        return Update(len(self.pushed), 0.0, "axial", 0.0, FRAMES[0], height=height)
+        return {"height": np.zeros((2, 3), np.float32)}
 
     def spare(self, seconds):
         self.spared.append(seconds)
-
-    def warm(self): ...
-
-    def result(self): ...
 
 
 def make(slots=64, **how):
@@ -138,27 +132,16 @@ def test_it_stops_when_asked():
     assert slow.updates[-1] == 7
 
 
-def test_each_update_is_told_with_the_status_so_far():
+def test_each_update_has_the_newest_frame_and_the_status_so_far():
     source, slow = make()
-    told = []
-    run(source, slow, on_update=lambda update, status: told.append((update.frames, status.used)))
-    assert told == [(n, n) for n in range(1, COUNT + 1)]
-
-
-def test_ctrl_c_during_a_push_comes_after_it():
-    source, slow = make()
-    push = slow.push
-
-    def interrupted(block):
-        signal.raise_signal(signal.SIGINT)
-        push(block)
-
-    slow.push = interrupted
-    loop = Loop(source, slow)
-    with pytest.raises(KeyboardInterrupt):
-        loop.run()
-    assert slow.pushed == [0]
-    assert loop.status.used == 1
+    updates = []
+    run(source, slow, on_update=lambda *both: updates.append(both))
+    for number, (update, status) in enumerate(updates):
+        assert (update.frames, status.used) == (number + 1, number + 1)
+        assert (update.motion, update.position) == ("axial", PLACES[number])
+        np.testing.assert_array_equal(update.picture, FRAMES[number])
+    assert len(updates) == COUNT
+    assert np.all(np.diff([update.time for update, _ in updates]) > 0)
 
 
 @pytest.mark.parametrize("wrong", [{"latency": 0.0}, {"updates": -1.0}, {"latency": math.nan}])
@@ -169,7 +152,7 @@ def test_a_latency_or_rate_that_cannot_be_is_refused(wrong):
 
 
 def test_a_reservoir_tells_of_the_last_few_thousand():
-    times = Reservoir()
+    times = RecentTimes()
     assert math.isnan(times.latency().median)
     times.add(np.full(10_000, 5.0))
     times.add(np.arange(1, 4097) / 4096)

@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from live_frames import PIXEL, Clock, blocks, paced, phases, press_header, turn_frames, turn_header
+from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, turn_header
 
 from mirrorskin.bench.turns import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
 from mirrorskin.engine.live import LiveRotation, choose_window, run
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
-from mirrorskin.io import InputError, open_result, save_result
+from mirrorskin.engine.streaming import push_block
+from mirrorskin.io import Block, InputError, open_result, save_result
 
 SHAPE, WINDOW = (24, 40, 52), 8
 PHASE = phases(SHAPE[0])
@@ -27,9 +28,9 @@ def make(device=None, frames=None, header=None, **options):
 
 def feed(live, frames, cuts):
     updates = []
-    for block in blocks(frames, cuts, phase=PHASE):
-        live.push(block)
-        updates.append(live.update())
+    for part in np.split(np.arange(SHAPE[0]), np.cumsum(cuts)[:-1]):
+        live.push(frames[part], phase=PHASE[part])
+        updates.append(live.maps())
         live.spare(0.0)
     return updates
 
@@ -44,15 +45,13 @@ def test_an_update_tells_the_last_turn(device):
     frames, live = make(device)
     live.warm()
     updates = feed(live, frames, [1] * SHAPE[0])
-    assert all(update.normals is None and update.height is None for update in updates[: WINDOW - 1])
+    assert not any(updates[: WINDOW - 1])
     last = updates[-1]
     exact = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
-    np.testing.assert_array_equal(last.normals, exact.vectors)
-    np.testing.assert_array_equal(last.contact, exact.contact)
-    np.testing.assert_array_equal(last.picture, frames[-1])
-    assert last.contact_area == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
-    assert last.offset_unknown
-    assert (last.frames, last.position, last.time) == (SHAPE[0], PHASE[-1], 0.01 * (SHAPE[0] - 1))
+    np.testing.assert_array_equal(last["normals"], exact.vectors)
+    np.testing.assert_array_equal(last["contact"], exact.contact)
+    assert last["contact_area"] == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
+    assert last["offset_unknown"]
 
 
 def test_heights_follow_those_that_fit_best(device):
@@ -62,8 +61,8 @@ def test_heights_follow_those_that_fit_best(device):
         turn = slice(stop - WINDOW, stop)
         normals = estimate_normals(frames[turn], PHASE[turn], TILT, GAIN, OFFSET, noise=NOISE)
         best = best_heights(normals)
-        np.testing.assert_array_equal(np.isnan(update.height), np.isnan(best))
-        off = (update.height - best)[np.isfinite(best)]
+        np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
+        off = (update["height"] - best)[np.isfinite(best)]
         assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[np.isfinite(best)])
 
 
@@ -89,7 +88,7 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
     save_result(live.result(), tmp_path / "live.h5")
     result = open_result(tmp_path / "live.h5")
     correlator = Correlator(SHAPE[1:], "uint8", window=WINDOW)
-    correlator.push(blocks(frames, [SHAPE[0]], phase=PHASE)[0])
+    push_block(correlator, Block(frames, 0, phase=PHASE))
     np.testing.assert_array_equal(result.cosine, correlator.result().cosine)
     normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
     np.testing.assert_array_equal(result.normals, normals.vectors)
@@ -102,14 +101,14 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
 def test_edges_are_drawn_in_the_time_that_is_left(device):
     frames, live = make(device, integrate=False)
     feed(live, frames, [SHAPE[0]])
-    assert live.update().edges is None
+    assert live.maps()["edges"] is None
     for _ in range(400):
         live.spare(0.05)
-        if live.update().edges is not None:
+        if live.maps()["edges"] is not None:
             break
     normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
     exact = find_edges(normals.vectors, normals.sigma, normals.contact, device=device)
-    np.testing.assert_array_equal(live.update().edges, exact)
+    np.testing.assert_array_equal(live.maps()["edges"], exact)
     assert exact.any()
 
 
@@ -120,7 +119,7 @@ def test_a_sudden_change_is_followed_within_some_frames():
     update = feed(live, frames, [1] * SHAPE[0])[-1]
     normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
     best = best_heights(normals)
-    off = (update.height - best)[np.isfinite(best)]
+    off = (update["height"] - best)[np.isfinite(best)]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
 
 
@@ -129,15 +128,15 @@ def test_without_contact_there_are_no_heights_and_they_come_with_it():
     frames[: WINDOW + 2] = round(OFFSET)
     _, live = make(frames=frames)
     updates = feed(live, frames, [1] * SHAPE[0])
-    assert np.isnan(updates[WINDOW].height).all()
-    assert updates[WINDOW].contact_area == 0
-    assert np.isfinite(updates[-1].height).mean() > 0.3
+    assert np.isnan(updates[WINDOW]["height"]).all()
+    assert updates[WINDOW]["contact_area"] == 0
+    assert np.isfinite(updates[-1]["height"]).mean() > 0.3
 
 
 def test_without_a_gain_there_is_the_wave_alone():
     frames, live = make(header=turn_header(zenith_gain=None))
     update = feed(live, frames, [SHAPE[0]])[-1]
-    assert update.normals is None
+    assert not update
     result = live.result()
     assert result.normals is None
     assert np.isfinite(result.azimuth).mean() > 0.9
@@ -147,8 +146,8 @@ def test_without_a_gain_there_is_the_wave_alone():
 def test_without_a_pixel_size_there_are_no_heights():
     frames, live = make(header=turn_header(pixel_size=None))
     update = feed(live, frames, [SHAPE[0]])[-1]
-    assert update.height is None
-    assert update.contact_area is None
+    assert update["height"] is None
+    assert update["contact_area"] is None
     assert live.result().height is None
 
 

@@ -29,6 +29,7 @@ from mirrorskin.engine.calibration.tilt import BallTrack, PlateTrack, study_trac
 from mirrorskin.engine.calibration.tilt_tracks import Tilts
 from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.live import LivePress, LiveRotation
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.undistort import undistort
 
 
@@ -194,9 +195,9 @@ def live_press() -> Answer:
     for block in blocks(
         source.frames, [1, 1, 3, 2, 7], time=0.01 * np.arange(24), travel=source.series["travel"]
     ):
-        live.push(block)
-        update = live.update()
-    answers = {"contact": update.contact, "height": update.height}
+        push_block(live, block)
+        update = live.maps()
+    answers = {"contact": update.get("contact"), "height": update.get("height")}
     return named(update=answers, result=result_maps(live.result()))
 
 
@@ -207,12 +208,12 @@ def live_rotation() -> Answer:
     updates = {}
     series = {"time": 0.01 * np.arange(24), "phase": source.series["phase"]}
     for number, block in enumerate(blocks(source.frames, [1, 7, 1, 4, 8], **series)):
-        live.push(block)
-        update = live.update()
+        push_block(live, block)
+        update = live.maps()
         updates[f"update_{number}"] = {
-            "normals": update.normals,
-            "height": update.height,
-            "contact": update.contact,
+            "normals": update.get("normals"),
+            "height": update.get("height"),
+            "contact": update.get("contact"),
         }
         live.spare(0.0)
     known = {"result": result_maps(live.result())}

@@ -15,6 +15,7 @@ from mirrorskin import engine, hw, io
 from mirrorskin.engine.live import LiveRotation
 from mirrorskin.engine.rotation.registration import Registered, Sight
 from mirrorskin.engine.rotation.rotation import FirstTurn
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera
 from mirrorskin.hw.twin.movement import Axial
@@ -205,9 +206,8 @@ def test_a_uniform_pattern_leaves_the_wave_alone():
 def test_live_normals_are_those_of_the_calibration():
     source = scene().source()
     live = LiveRotation(source, window=8, noise=1.05, edges=False)
-    live.push(source.read(np.empty_like(scene().frames)))
-    update = live.update()
-    assert np.isfinite(update.normals).any()
+    push_block(live, source.read(np.empty_like(scene().frames)))
+    assert np.isfinite(live.maps()["normals"]).any()
     result = live.result()
     # The pivot is far from the ball, and live frames are not registered: this is no measure of errors.
     whole = engine.reconstruct(scene().source(pivot=None), noise=1.05)

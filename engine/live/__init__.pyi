@@ -1,0 +1,23 @@
+from .loop import LATENCY, LiveEstimator, Loop, run
+from .press import LivePress
+from .rotation import LiveRotation, choose_window
+from .status import PUSHED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
+
+__all__ = [
+    "LATENCY",
+    "PUSHED",
+    "SHOWN",
+    "STAGES",
+    "UPDATED",
+    "WAITED",
+    "Latency",
+    "LiveEstimator",
+    "LivePress",
+    "LiveRotation",
+    "Loop",
+    "Maps",
+    "Status",
+    "Update",
+    "choose_window",
+    "run",
+]
