@@ -243,8 +243,8 @@ FORMATS = {
     ".stl": Format(_stl),
     ".xyz": Format(_xyz),
     ".png": Format(_png, ("PIL", "Pillow")),
-    ".tif": Format(_tiff, ("tifffile", "tifffile")),
-    ".tiff": Format(_tiff, ("tifffile", "tifffile")),
+    ".tif": Format(_tiff),
+    ".tiff": Format(_tiff),
     ".npz": Format(_npz),
 }
 """By suffix."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
+import logging
 import re
 import struct
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -16,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.atomic import MAKE_ROOM, new_file
+from mirrorskin.io.atomic import write_new
 from mirrorskin.io.frames import FrameSequence, quiet_opencv
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.types import FRAME_DTYPES, Header, InputError
 
@@ -27,6 +27,11 @@ PICTURE_SUFFIXES = (".png", *TIFF_SUFFIXES)
 
 _DTYPES = [dtype.name for dtype in FRAME_DTYPES]
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
+_TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNG_HEAD = 33  # bytes of the mark and the first chunk, after which the pixels' size may be written
+_INCH = 0.0254  # m
+_FORMATS = {1: "uint", 2: "int", 3: "float"}  # of samples (TIFF 6.0, section 19)
+_UNDECODABLE = "cannot be decoded: it is damaged, or of a kind that OpenCV does not read"
 
 
 def read_picture(path: Path) -> NDArray[Any]:
@@ -47,12 +52,17 @@ def read_picture(path: Path) -> NDArray[Any]:
     ------
     InputError
         The file is damaged, neither PNG nor TIFF, of several pages, or of another type of sample.
+
+    Examples
+    --------
+    >>> read_picture(Path("dark.png")).shape  # doctest: +SKIP
+    (480, 640)
     """
     contents = _contents(path)
     encoded: bytes | mmap = contents
     if contents[:8] == _PNG_MARK:
         encoded = _essential_png(contents, path)
-    elif _check_pages(contents, path) != 1:
+    elif count_pages(path) != 1:
         raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
     with quiet_opencv() as cv2:
         try:
@@ -60,29 +70,52 @@ def read_picture(path: Path) -> NDArray[Any]:
         except cv2.error:
             picture = None
     if picture is None:
-        raise InputError(f"{path} cannot be decoded: it is damaged, or of a kind that OpenCV does not read")
+        raise InputError(f"{path} {_UNDECODABLE}")
     return _grey(picture)
 
 
 def count_pages(path: Path) -> int:
-    """Count the pages of a TIFF.
+    """Count the pages of a TIFF, all of samples that frames can have.
 
     Raises
     ------
     InputError
-        The file cannot be read, is no TIFF, is cut off, or has samples of another type.
+        The file cannot be read, is no TIFF, is damaged, or has samples of another type.
     """
-    return _check_pages(_contents(path), path)
+    import tifffile
+
+    remedy = "copy it again, or save it anew"
+    with _quiet_tifffile():
+        try:
+            with tifffile.TiffFile(path) as file:
+                pages: list[Any] = [file.pages.get(number) for number in range(len(file.pages))]
+                kinds = [
+                    (page.samplesperpixel, f"{_FORMATS.get(page.sampleformat, '')}{page.bitspersample}")
+                    for page in pages
+                ]
+                file.filehandle.seek(file.pages.next_page_offset or 0)
+                end = file.filehandle.read(file.tiff.offsetsize)
+                complete = len(end) == file.tiff.offsetsize and not any(end)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+        except Exception:  # of many kinds
+            complete = False
+    if not complete:
+        with path.open("rb") as unread:
+            known = unread.read(4) in _TIFF_MARKS
+        wrong = "is damaged or cut off" if known else "is neither a PNG nor a TIFF"
+        raise InputError(f"{path} {wrong}: {remedy}")
+    for number, (samples, dtype) in enumerate(kinds, 1):
+        if samples not in (1, 3, 4) or dtype not in _DTYPES:
+            raise InputError(
+                f"{path} (page {number}) has {samples} {dtype} a pixel: "
+                "save it in grey, as uint8, uint16 or float32"
+            )
+    return len(kinds)
 
 
 def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Read pages ``start`` to ``stop - 1`` of a TIFF, each with what to call it in messages.
-
-    Raises
-    ------
-    InputError
-        As for ``read_picture``.
-    """
+    """Read pages ``start`` to ``stop - 1`` of a TIFF, each with what to call it in messages."""
     with quiet_opencv() as cv2:
         try:
             _, pages = cv2.imreadmulti(str(path), start, stop - start, flags=cv2.IMREAD_UNCHANGED)
@@ -91,59 +124,19 @@ def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray
     for index in range(start, stop):
         label = f"{path} (page {index + 1})"
         if index - start >= len(pages):
-            raise InputError(
-                f"{label} cannot be decoded: it is damaged, or of a kind that OpenCV does not read"
-            )
+            raise InputError(f"{label} {_UNDECODABLE}")
         yield label, _grey(pages[index - start])
 
 
-def _contents(path: Path) -> mmap:
-    try:
-        with path.open("rb") as file:
-            return mmap(file.fileno(), 0, access=ACCESS_READ)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"{path} is empty: copy it again") from error
-
-
-def _essential_png(data: mmap, path: Path) -> bytes:
-    """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
-    kept, at, kind = [data[:8]], 8, b""
-    while kind != b"IEND":
-        size = int.from_bytes(data[at : at + 4], "big")
-        chunk, at = data[at : at + 12 + size], at + 12 + size
-        kind = chunk[4:8]
-        if at > len(data) or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
-            raise InputError(f"{path} is damaged or cut off: copy it again")
-        if kind[:1].isupper():
-            kept.append(chunk)
-    return b"".join(kept)
-
-
-def _check_pages(contents: mmap, path: Path) -> int:
-    """Count the pages of a TIFF, all of samples that frames can have."""
-    try:
-        pages = find_pages(contents)
-    except ValueError as error:
-        raise InputError(f"{path} {error}: copy it again, or save it anew") from error
-    for number, page in enumerate(pages, 1):
-        if page.samples not in (1, 3, 4) or page.dtype not in _DTYPES:
-            raise InputError(
-                f"{path} (page {number}) has {page.samples} {page.dtype} a pixel: "
-                "save it in grey, as uint8, uint16 or float32"
-            )
-    return len(pages)
-
-
-def _grey(picture: NDArray[Any]) -> NDArray[Any]:
-    if picture.ndim == 2:
-        return picture
-    first = picture[..., 0]
-    if all(np.array_equal(first, picture[..., channel], equal_nan=True) for channel in (1, 2)):
-        return first
+def save_print(picture: NDArray[np.uint8], path: str | Path, dots_per_inch: float) -> None:
+    """Write a grey picture (H, W) as a PNG that says how large its pixels are, whole or not at all."""
+    per_metre = round(dots_per_inch / _INCH)
     with quiet_opencv() as cv2:
-        return np.asarray(cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY))
+        _, encoded = cv2.imencode(".png", picture)
+    png = encoded.tobytes()
+    size = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
+    chunk = struct.pack(">I", len(size) - 4) + size + struct.pack(">I", zlib.crc32(size))
+    write_new(Path(path), [png[:_PNG_HEAD], chunk, png[_PNG_HEAD:]])
 
 
 class Pictures(FrameSequence):
@@ -276,110 +269,47 @@ def _kind(picture: NDArray[Any]) -> str:
     return f"{columns} x {rows} {picture.dtype}"
 
 
-# Tags, and what they are where they are absent (TIFF 6.0, sections 8 and 19).
-_BITS, _SAMPLES, _FORMAT = 258, 277, 339
-_ABSENT = {_BITS: 1, _SAMPLES: 1, _FORMAT: 1}
-
-_FORMATS = {1: "uint", 2: "int", 3: "float"}
-_INTEGERS = {1: "B", 3: "H", 4: "I", 16: "Q"}
-
-
-class Page(NamedTuple):
-    """How many samples a pixel of a page has, and their type, as in ``uint16``."""
-
-    samples: int
-    dtype: str
-
-
-def find_pages(data: mmap) -> list[Page]:
-    """Follow a TIFF's chain of directories, one a page.
-
-    Parameters
-    ----------
-    data : mmap
-        The file: classic or big, of either byte order.
-
-    Raises
-    ------
-    ValueError
-        It is no TIFF, damaged, or cut off; the message says which.
-    """
-    file = _File(data)
-    pages: list[Page] = []
-    seen: set[int] = set()
+def _contents(path: Path) -> mmap:
     try:
-        place = file.first
-        while (directory := file.number(file.offset, place)) and directory not in seen:
-            seen.add(directory)
-            tags = _ABSENT | dict(file.tags(directory))
-            pages.append(Page(tags[_SAMPLES], f"{_FORMATS.get(tags[_FORMAT], 'sample')}{tags[_BITS]}"))
-            place = file.end(directory)
-    except (struct.error, OverflowError) as error:
-        raise ValueError("is cut off") from error
-    if directory or not pages:
-        raise ValueError("is damaged")
-    return pages
+        with path.open("rb") as file:
+            return mmap(file.fileno(), 0, access=ACCESS_READ)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"{path} is empty: copy it again") from error
 
 
-class _File:
-    """Reads numbers by the layout that the file begins with."""
-
-    def __init__(self, data: mmap) -> None:
-        self._data = data
-        self._order = {b"II": "<", b"MM": ">"}.get(data[:2], "")
-        version = data[2:4].strip(b"\0")
-        if not self._order or version not in (b"*", b"+"):
-            raise ValueError("is neither a PNG nor a TIFF")
-        self.first, self._count, self.offset = (4, "H", "I") if version == b"*" else (8, "Q", "Q")
-        self._entry = 4 + 2 * struct.calcsize(self.offset)
-
-    def number(self, kind: str, place: int) -> int:
-        return int(struct.unpack_from(self._order + kind, self._data, place)[0])
-
-    def end(self, directory: int) -> int:
-        """Return where the offset of the next directory stands."""
-        return directory + struct.calcsize(self._count) + self._entry * self.number(self._count, directory)
-
-    def tags(self, directory: int) -> Iterator[tuple[int, int]]:
-        """Return the first value of each tag that matters here."""
-        for place in range(directory + struct.calcsize(self._count), self.end(directory), self._entry):
-            tag, kind = self.number("H", place), _INTEGERS.get(self.number("H", place + 2))
-            if tag in _ABSENT and kind is not None:
-                width = struct.calcsize(self.offset)
-                value = place + 4 + width
-                if self.number(self.offset, place + 4) * struct.calcsize(kind) > width:
-                    value = self.number(self.offset, value)
-                yield tag, self.number(kind, value)
+def _essential_png(data: mmap, path: Path) -> bytes:
+    """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
+    kept, at, kind = [data[:8]], 8, b""
+    while kind != b"IEND":
+        size = int.from_bytes(data[at : at + 4], "big")
+        chunk, at = data[at : at + 12 + size], at + 12 + size
+        kind = chunk[4:8]
+        if at > len(data) or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
+            raise InputError(f"{path} is damaged or cut off: copy it again")
+        if kind[:1].isupper():
+            kept.append(chunk)
+    return b"".join(kept)
 
 
-_HEAD = 33  # bytes of PNG's mark and its first chunk, after which the pixels' size may be told
-_INCH = 0.0254
+@contextmanager
+def _quiet_tifffile() -> Iterator[None]:
+    """Keep what tifffile says of damaged files off the terminal."""
+    logger = logging.getLogger("tifffile")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
-def save_print(picture: NDArray[np.uint8], path: str | Path, dots_per_inch: float) -> None:
-    """Write a grey picture as PNG; the file exists whole or not at all.
-
-    Parameters
-    ----------
-    picture : ndarray, (H, W), uint8
-    path : str or Path
-    dots_per_inch : float
-        That it is to be printed with.
-
-    Raises
-    ------
-    InputError
-        It cannot be written there.
-    """
-    path, per_metre = Path(path), round(dots_per_inch / _INCH)
+def _grey(picture: NDArray[Any]) -> NDArray[Any]:
+    if picture.ndim == 2:
+        return picture
+    first = picture[..., 0]
+    if all(np.array_equal(first, picture[..., channel], equal_nan=True) for channel in (1, 2)):
+        return first
     with quiet_opencv() as cv2:
-        _, encoded = cv2.imencode(".png", picture)
-    plain = encoded.tobytes()
-    size = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
-    chunk = struct.pack(">I", len(size) - 4) + size + struct.pack(">I", zlib.crc32(size))
-    with (
-        new_file(path) as descriptor,
-        as_input_error(f"{path} could not be written", MAKE_ROOM),
-        os.fdopen(descriptor, "wb", closefd=False) as file,
-    ):
-        file.write(plain[:_HEAD] + chunk + plain[_HEAD:])
+        return np.asarray(cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY))

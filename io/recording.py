@@ -242,9 +242,8 @@ def open_recording(
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, _along(given, shape[0]))
-        fetched: Stack = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
-        if live:
-            fetched = FrameSubset(fetched, chosen)
+        opened = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
+        fetched = FrameSubset(opened, chosen) if live else opened
         recording = Recording(file, stack, fetched, cut, header, positions, truth, told, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
