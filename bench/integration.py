@@ -171,7 +171,8 @@ def run_frames(case: IntegrationCase, device: Device, rounds: int) -> Case:
     def circle() -> NDArray[np.float32]:
         for dz_dx, dz_dy in frames:
             begun = time.perf_counter()
-            height = integrator.integrate(dz_dx, dz_dy, mask=mask).height
+            integrator.push(dz_dx, dz_dy, mask=mask)
+            height = integrator.result().height
             seconds.append(time.perf_counter() - begun)
         return height
 

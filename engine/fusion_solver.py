@@ -100,18 +100,18 @@ class Joint:
         longer = _extend(slopes, first, known, self._pixel_size)
         if longer is not slopes:
             self._slopes = longer
-            first = self._solve(*plain, start=first.height, sigma=False)
+            first = self._solve(*plain, initial_heights=first.height, sigma=False)
         self._start = first.height
         self._height, self._weight = _sharpen(first, known, slopes)
 
     def heights(self) -> NDArray[np.float32]:
         """Return the heights alone, which is faster."""
-        self._start = self._solve(self._height, self._weight, start=self._start, sigma=False).height
+        self._start = self._solve(self._height, self._weight, initial_heights=self._start, sigma=False).height
         return self._start
 
     def finish(self) -> Surface:
         """Return the whole surface, its holes filled."""
-        surface = self._solve(self._height, self._weight, start=self._start)
+        surface = self._solve(self._height, self._weight, initial_heights=self._start)
         return _join(_fill(_tell_lone(surface, self._weight), self._pixel_size))
 
     def _solve(self, height: Doubles, weight: Doubles, **options: Any) -> Surface:
@@ -120,9 +120,9 @@ class Joint:
             self._slopes.dz_dy,
             self._pixel_size,
             mask=self._slopes.known | (weight > 0),
-            weights=self._slopes.weights,
-            heights=np.where(weight > 0, height, np.nan),
-            height_weights=weight,
+            slope_weights=self._slopes.weights,
+            known_heights=np.where(weight > 0, height, np.nan),
+            known_height_weights=weight,
             robust=self._robust,
             device=self._device,
             **options,

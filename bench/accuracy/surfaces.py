@@ -96,7 +96,7 @@ def _noisy(device: Device, quick: bool) -> list[Target]:
     for _ in range(draws):
         noise = generator.normal(0, _NOISE, (2, *shape))
         given = known.dz_dx + noise[0], known.dz_dy + noise[1]
-        found = integrate(*given, _PIXEL, weights=1 / _NOISE**2, device=device)
+        found = integrate(*given, _PIXEL, slope_weights=1 / _NOISE**2, device=device)
         error = found.height - known.height
         square.append(np.mean(((error - error.mean()) / found.sigma) ** 2))
     return [

@@ -105,7 +105,8 @@ def scale_surface(device: Device, shape: Shape) -> Scaled:
     mask, integrator = make_mask(shape), Integrator(shape, PIXEL, device=device)
 
     def work() -> object:
-        integrator.restart()
-        return integrator.integrate(dz_dx, dz_dy, mask=mask, tolerance=_TOLERANCE)
+        integrator.reset()
+        integrator.push(dz_dx, dz_dy, mask=mask, tolerance=_TOLERANCE)
+        return integrator.result()
 
     return Scaled(work, _SURFACE * mask.size)

@@ -12,7 +12,7 @@ from mirrorskin.bench.harness import Work
 from mirrorskin.bench.slopes import PIXEL, noisy_slopes, random_cuts
 from mirrorskin.bench.sweep.scene import make_mask
 from mirrorskin.bench.sweep.sweep import MAPS_ONLY, Family, Job, Shape, agree, run_kernel
-from mirrorskin.engine.integration.graph import LEVEL, LinkRoom, Settler, find_components
+from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.validation import Inputs, check_inputs
 from mirrorskin.kernels import bilateral, components, links
 from mirrorskin.kernels.array import Array
@@ -38,8 +38,8 @@ def _inputs(shape: Shape) -> Inputs:
 
 def _make_links(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Job]:
     """Return flags and cuts, links with their right side, the misfit, and one step of smoothing."""
-    inputs, room = _inputs(shape), LinkRoom(device, shape)
-    flags = room.take(inputs).copy()
+    inputs, room = _inputs(shape), PixelGraph(device, shape)
+    flags = room.upload(inputs).copy()
     values = np.random.default_rng(1).standard_normal(shape, np.float32)
     relief = device.given("relief", values)
 
@@ -51,10 +51,10 @@ def _make_links(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, J
         told = links.links_flags(inputs.dz_dx, inputs.dz_dy, inputs.mask, None, None, None, None)
         assert inputs.edges is not None
         told = links.links_cut(inputs.dz_dx, inputs.dz_dy, inputs.edges, told)
-        agree("links_flags and links_cut", room.take(inputs), told)
+        agree("links_flags and links_cut", room.upload(inputs), told)
 
     def check_join() -> None:
-        found, expected = room.join(), links.links_join(*given)
+        found, expected = room.links(), links.links_join(*given)
         for name, exact in zip(("right", "down", "source"), (*expected[:2], expected[3]), strict=True):
             agree(f"links_join, {name}", getattr(found, name).download(), exact, 1e-4 * np.abs(exact).max())
 
@@ -71,8 +71,8 @@ def _make_links(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, J
         return Job(work, each * pixels, check, 0, operations * pixels)
 
     return {
-        "links_flags and links_cut": job(lambda: room.take(inputs), 8 + 1 + 1 + 1, 8, check_flags),
-        "links_join": job(run_kernel(device, room.join), 8 + 1 + 12, 18, check_join),
+        "links_flags and links_cut": job(lambda: room.upload(inputs), 8 + 1 + 1 + 1, 8, check_flags),
+        "links_join": job(run_kernel(device, room.links), 8 + 1 + 12, 18, check_join),
         "links_misfit": job(lambda: room.misfit(relief), 8 + 1 + 4, 14, check_misfit),
         "links_smooth": job(lambda: room.smooth(values, 1), 4 + 1 + 4, 8, check_smooth),
     }
@@ -80,16 +80,16 @@ def _make_links(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, J
 
 def _make_components(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Job]:
     """Return the sums over pieces and the heights that follow from them, and NumPy's."""
-    room = LinkRoom(device, shape)
-    flags = room.take(_inputs(shape)).copy()
+    room = PixelGraph(device, shape)
+    flags = room.upload(_inputs(shape)).copy()
     found = find_components(flags, cut=True)
     values = np.random.default_rng(1).standard_normal(shape, np.float32)
-    relief, settler = device.given("relief", values), Settler(room)
-    settler.take(found)
+    relief, settler = device.given("relief", values), Levelling(room)
+    settler.use(found)
     level = (0.0, 0.0, 0.0)
 
     def settle() -> NDArray[np.float32]:
-        return settler.settle(relief, LEVEL, 0.0)
+        return settler.level(relief, LEVEL, 0.0)
 
     def peer() -> Doubles:
         sums, shares = components.components_sum(flags, found.labels, values, level, None, None, found.count)

@@ -1,27 +1,17 @@
-"""The levels of a multigrid on a device: their links, and the tables of split aggregates."""
+"""The levels of a multigrid on a device: their links, and the tables of nodes that split aggregates add."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.levels import Level, cut_levels
-from mirrorskin.engine.integration.split_aggregates import (
-    Ints,
-    Lookup,
-    Odd,
-    Pairs,
-    Picture,
-    Step,
-    join,
-    nothing_odd,
-    step_over,
-)
+from mirrorskin.engine.integration.split_aggregates import Coarsening, ExtraNodes, Grid, Ints, Lookup, Pairs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, Kernel
 
@@ -33,36 +23,30 @@ _LEAST = 1e-12  # of a component's links: anchors that are weaker leave its offs
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Some rows of the tables of odd nodes, or some of these nodes.
-
-    Attributes
-    ----------
-    at, count : int
-        The first one, and how many.
-    """
+    """Some rows of the tables of extra nodes, or some of these nodes: the first one, and how many."""
 
     at: int = 0
     count: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class OddRows:
-    """What is odd at one level.
+@dataclass(slots=True)
+class ExtraRows:
+    """What the extra nodes of one level need.
 
     Attributes
     ----------
     nodes : Rows
-        The level's nodes without a place in its picture, up to a multiple of `WIDTH`.
+        The level's nodes without a place in its grid, up to a multiple of `WIDTH`.
     graph : Rows
-        The level's own links, of all nodes that are odd or have odd links.
+        The level's own links, of all nodes that are extra or linked with one.
     restrict, prolong : Rows
-        To the next level's odd blocks, and from them.
+        To the next level's split aggregates, and from them.
     """
 
-    nodes: Rows = Rows()
-    graph: Rows = Rows()
-    restrict: Rows = Rows()
-    prolong: Rows = Rows()
+    nodes: Rows = field(default_factory=Rows)
+    graph: Rows = field(default_factory=Rows)
+    restrict: Rows = field(default_factory=Rows)
+    prolong: Rows = field(default_factory=Rows)
 
 
 class Hierarchy:
@@ -79,13 +63,15 @@ class Hierarchy:
     Attributes
     ----------
     levels : list of Level
-    plain, nodes : int
-        Nodes of all pictures, behind which the odd ones lie, and room for all of them.
-    right, down, anchor, inverse : Array, float32
-        Links, known heights' weights, and one over the diagonal; see ``kernels/multigrid.cl``.
-    odd : list of OddRows
+    in_grids, nodes : int
+        Nodes of all grids, behind which the extra ones lie, and room for all of them.
+    graph : dict of Array, float32
+        Links right and down, and known heights' weights as anchor; see ``kernels/multigrid.cl``.
+    inverse : Array, float32
+        One over the diagonal.
+    extra : list of ExtraRows
         One a level.
-    table : tuple of Array
+    table : dict of Array
         Their rows' nodes, where each begins and the last ends, and of their entries the nodes and weights.
     bottom : (Array, Array)
         Nodes of the coarsest level, and the pseudo-inverse of its matrix.
@@ -94,30 +80,33 @@ class Hierarchy:
     def __init__(self, shape: tuple[int, int], anchored: bool, device: Device) -> None:
         self.device, self.anchored = device, anchored
         self.levels = cut_levels(shape)
-        self.plain = self.nodes = self.levels[-1].end
-        self.right = device.array("right", (self.plain,), np.float32)
-        self.down = device.array("down", (self.plain,), np.float32)
-        self._split = device.array("split", (self.plain,), np.float32)
-        for array in (self.right, self.down, self._split):
-            array.upload()
+        self.in_grids = self.nodes = self.levels[-1].end
+        self.graph: dict[str, Any] = {name: self.array(name, self.in_grids) for name in ("right", "down")}
+        self._split = self.array("split", self.in_grids)
         self._allocate()
-        self._lookup = Lookup(self.plain)
-        self._nothing = self._table([])
-        self.odd: list[OddRows] = []
+        self._lookup = Lookup(self.in_grids)
+        self._no_table = self._to_table([])
+        self.extra: list[ExtraRows] = []
+
+    def array(self, name: str, size: int) -> Array:
+        """Return an array on the device."""
+        array = self.device.array(name, (size,), np.float32)
+        array.upload()
+        return array
 
     def build(self, links: Links, *, plain: bool = False) -> None:
         """Take a graph of this shape; a plain one joins all that a block of pixels has."""
-        finest = self.levels[0]
         self._admit_graph(links)
         self._coarsen(range(1, len(self.levels)))
-        self.odd, self.table = [OddRows() for _ in self.levels], self._nothing
-        odd = nothing_odd()
+        self.extra, self.table = [ExtraRows() for _ in self.levels], self._no_table
+        extra = ExtraNodes.none()
         if not plain:
             split = self._split.download()
-            odd = self._put_right(split) if split[finest.end :].any() else odd
+            if split[self.levels[0].end :].any():
+                extra = self._split_aggregates(split)
             self._split.upload()
         self._invert()
-        self.bottom = self._solve_bottom(odd)
+        self.bottom = self._solve_bottom(extra)
 
     def follow(self, links: Links, *, deep: bool) -> None:
         """Take a graph that is nearly the one before, a plain one; nothing goes to the host.
@@ -129,7 +118,7 @@ class Hierarchy:
             self._coarsen(range(1, len(self.levels)))
             self._invert()
         else:
-            self._invert_level(self.levels[0])
+            self.over_grid("invert", self.levels[0], **self.graph, inverse=self.inverse)
 
     def kernel(self, name: str) -> Kernel:
         """Return a pass."""
@@ -137,179 +126,165 @@ class Hierarchy:
         macros = {"ANCHORED": int(self.anchored), "PART": part_of(self.device), "WIDTH": width}
         return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
-    def admit(self, map_: Array, to: Array) -> None:
-        """Copy a map of pixels to the finest level."""
-        self.kernel("admit")(*self.picture, map_, to, moved=8 * self.levels[0].nodes)
+    def over_grid(self, name: str, level: Level, **arguments: Any) -> None:
+        """Run a pass over the nodes of a level's grid."""
+        items = -(-level.nodes // self.device.layout.tile)
+        self.kernel(name)(items, **level.place, **arguments, moved=_bytes(level, arguments))
 
-    @property
-    def picture(self) -> tuple[int, np.int32, np.int32, np.int32]:
-        """Items and arguments of the passes that copy whole pictures."""
+    def over_extra(self, name: str, nodes: Rows, **arguments: Any) -> None:
+        """Run a pass over extra nodes, a multiple of `WIDTH`, as if they were rows of a grid."""
+        if nodes.count:
+            as_grid = Level(nodes.at - WIDTH, nodes.count // WIDTH, WIDTH, WIDTH)
+            self.over_grid(name, as_grid, **arguments)
+
+    def over_rows(self, name: str, rows: Rows, **arguments: Any) -> None:
+        """Run a pass over rows of the tables."""
+        if rows.count:
+            kernel = self.kernel(f"{name}_odd")
+            at = {"at": rows.at, "count": rows.count}
+            kernel(rows.count, **at, **self.table, **arguments, moved=64 * rows.count)
+
+    def over_blocks(self, name: str, number: int, **arguments: Any) -> None:
+        """Run a pass between a level and the next, an item a row of that."""
+        fine, coarse = self.levels[number : number + 2]
+        moved = _bytes(fine, arguments)
+        self.kernel(name)(coarse.rows, **fine.with_coarser(coarse), **arguments, moved=moved)
+
+    def over_parts(self, name: str, parts: Array, **arguments: Any) -> None:
+        """Run a pass over the finest level that adds up; ``parts`` gets partial sums."""
         level = self.levels[0]
-        return level.rows, np.int32(level.rows), np.int32(level.columns), np.int32(level.stride)
+        count = -(-level.nodes // part_of(self.device))
+        self.kernel(name)(count, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
+
+    def copy_picture(self, name: str, level: Array, map_: Array) -> None:
+        """Copy a map of pixels to ("admit") the finest level, or back ("release")."""
+        finest = self.levels[0]
+        sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
+        self.kernel(name)(finest.rows, **sizes, level=level, map=map_, moved=8 * finest.nodes)
 
     @property
-    def graph(self) -> tuple[Array, Array, Array]:
-        """The links and anchors."""
-        return self.right, self.down, self.anchor
+    def anchor(self) -> Array:
+        """Weights of known heights."""
+        return self.graph["anchor"]
 
     def _allocate(self) -> None:
-        """Make room for whatever each node has, odd ones included."""
-        self.anchor = self.device.array("anchor", (self.nodes if self.anchored else 1,), np.float32)
-        self.inverse = self.device.array("inverse", (self.nodes,), np.float32)
-        self.anchor.upload()
-        self.inverse.upload()
+        """Make room for whatever each node has, extra ones included."""
+        self.graph["anchor"] = self.array("anchor", self.nodes if self.anchored else 1)
+        self.inverse = self.array("inverse", self.nodes)
 
     def _admit_graph(self, links: Links) -> None:
-        """Copy links and anchors to the finest level."""
-        self.admit(links.right, self.right)
-        self.admit(links.down, self.down)
-        if links.anchor is not None:
-            self.admit(links.anchor, self.anchor)
+        for name in ("right", "down", "anchor"):
+            if (map_ := getattr(links, name)) is not None:
+                self.copy_picture("admit", self.graph[name], map_)
 
     def _coarsen(self, numbers: Iterable[int]) -> None:
-        kernel = self.kernel("coarsen")
+        coarse = {f"coarse_{name}": array for name, array in self.graph.items()}
         for number in numbers:
-            fine, coarse = self.levels[number - 1], self.levels[number]
-            kernel(
-                coarse.rows, *pair(fine, coarse), *self.graph, *self.graph, self._split, moved=11 * fine.nodes
-            )
+            self.over_blocks("coarsen", number - 1, **self.graph, **coarse, split=self._split)
 
     def _invert(self) -> None:
         for level in self.levels:
-            self._invert_level(level)
-        for rows in self.odd:
-            self.run_odd("invert", rows.graph, self.anchor, self.inverse)
+            self.over_grid("invert", level, **self.graph, inverse=self.inverse)
+        for rows in self.extra:
+            self.over_rows("invert", rows.graph, anchor=self.anchor, inverse=self.inverse)
 
-    def _invert_level(self, level: Level) -> None:
-        items = -(-level.nodes // self.device.layout.tile)
-        moved = 12 * level.nodes
-        self.kernel("invert")(items, *place(level), *self.graph, self.inverse, moved=moved)
-
-    def over_odd(self, name: str, odd: Rows, *args: Array) -> None:
-        """Run a pass over odd nodes, a multiple of `WIDTH`, as if they were rows of a picture."""
-        if odd.count:
-            level = Level(odd.at - WIDTH, odd.count // WIDTH, WIDTH, WIDTH)
-            items = -(-level.nodes // self.device.layout.tile)
-            self.kernel(name)(items, *place(level), *args, moved=12 * odd.count)
-
-    def run_odd(self, name: str, rows: Rows, *args: Array | np.generic) -> None:
-        """Run a pass over rows of the tables."""
-        if rows.count:
-            arguments = np.int32(rows.at), np.int32(rows.count), *self.table, *args
-            self.kernel(f"{name}_odd")(rows.count, *arguments, moved=64 * rows.count)
-
-    def _put_right(self, split: NDArray[np.float32]) -> Odd:
-        """Go through the levels again, and care for what is odd; return what is at the coarsest."""
-        right, down = self.right.download(), self.down.download()
-        odd, following = nothing_odd(), self.plain
-        tables: list[dict[str, Pairs]] = [{} for _ in self.levels]
-        places = [Rows() for _ in self.levels]
-        changed = odd.node
+    def _split_aggregates(self, split: NDArray[np.float32]) -> ExtraNodes:
+        """Go through the levels again, and split aggregates; return the coarsest level's extra nodes."""
+        right, down = (self.graph[name].download() for name in ("right", "down"))
+        extra, following = ExtraNodes.none(), self.in_grids
+        changed = extra.node
+        parts: list[tuple[Pairs, Ints]] = []
+        at = 0
         for number in range(1, len(self.levels)):
-            fine, coarse = (Picture(level, right, down) for level in self.levels[number - 1 : number + 1])
+            fine, coarse = (Grid(level, right, down) for level in self.levels[number - 1 : number + 1])
             marked = np.flatnonzero(split[coarse.level.base : coarse.level.end]) + coarse.level.base
-            step = step_over(fine, odd, changed, coarse, marked, following, self._lookup)
-            changed = step.blocks
-            tables[number - 1] |= {"restrict": step.restrict, "prolong": step.prolong}
-            odd = step.odd
-            room = -(-len(odd.node) // WIDTH) * WIDTH
-            places[number] = Rows(following, room)
+            step = Coarsening.of(fine, extra, changed, coarse, marked, following, self._lookup)
+            changed, extra = step.blocks, step.extra
+            room = -(-len(extra.node) // WIDTH) * WIDTH
+            self.extra[number].nodes = Rows(following, room)
             following += room
             self._make_room(following)
             if self.anchored and len(step.blocks):
-                self._put_anchors_right(step)
-            tables[number]["graph"] = step.graph
-        self.right.upload()
-        self.down.upload()
-        self._keep(tables, places)
-        return odd
+                self._split_anchors(step)
+            for owner, name in ((number - 1, "restrict"), (number - 1, "prolong"), (number, "graph")):
+                pairs = getattr(step, name).by_rows()
+                first = np.flatnonzero(np.diff(pairs.a, prepend=-1))
+                parts.append((pairs, first))
+                setattr(self.extra[owner], name, Rows(at, len(first)))
+                at += len(first)
+        for name in ("right", "down"):
+            self.graph[name].upload()
+        self.table = self._to_table(parts)
+        return extra
 
     def _make_room(self, nodes: int) -> None:
         if nodes > self.nodes:
-            self.nodes = -(-(2 * nodes - self.plain) // 16) * 16
+            self.nodes = -(-(2 * nodes - self.in_grids) // 16) * 16
             known = self.anchor.download()
             self._allocate()
             self.anchor.claim()
             self.anchor.host[: len(known)] = known
             self.anchor.upload()
 
-    def _put_anchors_right(self, step: Step) -> None:
+    def _split_anchors(self, step: Coarsening) -> None:
         anchor = self.anchor.download()
-        nodes, parts = step.members
-        anchor[step.blocks] = anchor[step.odd.node] = 0
-        np.add.at(anchor, parts, anchor[nodes])
+        nodes, owners = step.members
+        anchor[step.blocks] = anchor[step.extra.node] = 0
+        np.add.at(anchor, owners, anchor[nodes])
         self.anchor.upload()
 
-    def _keep(self, tables: list[dict[str, Pairs]], places: list[Rows]) -> None:
-        """Bring the matrices of odd nodes to the device, one after the other."""
-        parts: list[tuple[Pairs, Ints]] = []
-        at = 0
-        for level, named in enumerate(tables):
-            rows = {}
-            for name, pairs in named.items():
-                sorted_ = pairs.by_rows()
-                first = np.flatnonzero(np.diff(sorted_.a, prepend=-1))
-                parts.append((sorted_, first))
-                rows[name] = Rows(at, len(first))
-                at += len(first)
-            self.odd[level] = OddRows(places[level], **rows)
-        self.table = self._table(parts)
-
-    def _table(self, parts: list[tuple[Pairs, Ints]]) -> tuple[Array, Array, Array, Array]:
-        """Return rows of sparse matrices, each with where its rows begin."""
-        whole = join(nothing_odd().links, *(pairs for pairs, _ in parts))
+    def _to_table(self, parts: list[tuple[Pairs, Ints]]) -> dict[str, Any]:
+        """Bring sparse matrices to the device, one behind the other, each with where its rows begin."""
+        every = Pairs.join(Pairs.none(), *(pairs for pairs, _ in parts))
         ends = np.cumsum([0, *(len(pairs.a) for pairs, _ in parts)])
         nodes = [pairs.a[first] for pairs, first in parts]
         starts = [first + at for (_, first), at in zip(parts, ends, strict=False)]
-        return (
-            self.device.given("nodes", np.concatenate([np.zeros(0), *nodes]), np.int32),
-            self.device.given("starts", np.concatenate([*starts, ends[-1:]]), np.int32),
-            self.device.given("columns", whole.b, np.int32),
-            self.device.given("weights", whole.weight, np.float32),
-        )
+        given = self.device.given
+        return {
+            "node": given("nodes", np.concatenate([np.zeros(0), *nodes]), np.int32),
+            "start": given("starts", np.concatenate([*starts, ends[-1:]]), np.int32),
+            "column": given("columns", every.b, np.int32),
+            "weight": given("weights", every.weight, np.float32),
+        }
 
-    def _solve_bottom(self, odd: Odd) -> tuple[Array, Array]:
+    def _solve_bottom(self, extra: ExtraNodes) -> tuple[Array, Array]:
         """Return the coarsest level's nodes, and the pseudo-inverse of its matrix."""
         level = self.levels[-1]
-        picture = Picture(level, self.right.download(), self.down.download())
-        anchor = self.anchor.download()
-        plain = np.arange(level.first, level.end - level.stride)
-        links = join(picture.rightward(plain), picture.downward(plain), odd.links)
+        right, down, anchor = (self.graph[name].download() for name in ("right", "down", "anchor"))
+        grid, inside = Grid(level, right, down), np.arange(level.first, level.end - level.stride)
+        links = Pairs.join(grid.rightward(inside), grid.downward(inside), extra.links)
         links = links.where(links.weight > 0)
-        held = np.concatenate([plain, odd.node])
+        held = np.concatenate([inside, extra.node])
         held = held[anchor[held] > 0] if self.anchored else held[:0]
         node = np.unique(np.concatenate([links.a, links.b, held]))
         a, b = np.searchsorted(node, links.a), np.searchsorted(node, links.b)
+        pull = anchor[node] if self.anchored else np.zeros(len(node))
         matrix = np.zeros((len(node), len(node)))
         np.subtract.at(matrix, (a, b), links.weight)
         matrix += matrix.T
-        matrix[np.diag_indices_from(matrix)] = -matrix.sum(axis=1) + (anchor[node] if self.anchored else 0)
-        for array in (self.right, self.down, self.anchor):
+        matrix[np.diag_indices_from(matrix)] = -matrix.sum(axis=1) + pull
+        inverse = _pseudo_inverse(matrix, pull)
+        for array in self.graph.values():
             array.upload()
-        inverse = _pseudo_inverse(matrix, anchor[node] if self.anchored else np.zeros(len(node)))
-        return self.device.given("bottom", node, np.int32), self.device.given(
-            "pseudo-inverse", inverse, np.float32
-        )
+        given = self.device.given
+        return given("bottom", node, np.int32), given("pseudo-inverse", inverse, np.float32)
 
 
 def part_of(device: Device) -> int:
-    """Return how many nodes a part of a sum has."""
+    """Return how many nodes a partial sum has."""
     return 4096 if device.layout.tile > 1 else 64
 
 
-def place(level: Level) -> tuple[np.int32, np.int32, np.int32]:
-    """Return the arguments that tell where a level lies."""
-    return np.int32(level.base), np.int32(level.rows), np.int32(level.stride)
+def _bytes(level: Level, arguments: dict[str, Any]) -> int:
+    """Return the bytes of a level in all arrays."""
+    arrays = [one for one in arguments.values() if isinstance(one, Array)]
+    return sum(min(one.host.nbytes, 4 * level.nodes) for one in arrays)
 
 
-def pair(fine: Level, coarse: Level) -> tuple[np.int32, ...]:
-    """Return the arguments that tell where two levels lie."""
-    numbers = fine.base, fine.stride, coarse.base, coarse.rows, coarse.stride
-    return tuple(np.int32(number) for number in numbers)
-
-
-def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.floating]) -> NDArray[np.float64]:
     """Invert a matrix whose components' offsets are free, but for those that have an anchor."""
+    from scipy.sparse.csgraph import connected_components
+
     count, label = connected_components(matrix != 0, directed=False)
     members = np.bincount(label, minlength=count)
     free = np.bincount(label, anchor, count) <= _LEAST * np.bincount(label, np.diagonal(matrix), count)
@@ -322,12 +297,12 @@ def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.float64]) ->
 
 def _invert(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Invert a small positive definite matrix; OpenBLAS' threads would wait for each other much longer."""
-    whole = matrix.copy()
-    for k in range(len(whole)):
-        pivot = 1 / whole[k, k]
-        row = whole[k] * pivot
-        column = whole[:, k].copy()
-        whole -= np.multiply.outer(column, row)
-        whole[k], whole[:, k] = row, -column * pivot
-        whole[k, k] = pivot
-    return whole
+    inverse = matrix.copy()
+    for k in range(len(inverse)):
+        pivot = 1 / inverse[k, k]
+        row = inverse[k] * pivot
+        column = inverse[:, k].copy()
+        inverse -= np.multiply.outer(column, row)
+        inverse[k], inverse[:, k] = row, -column * pivot
+        inverse[k, k] = pivot
+    return inverse

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-SMALLEST = 2  # rows and columns of the coarsest level, at most
+COARSEST = 2  # rows and columns of the coarsest level, at most
 _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A picture of nodes among others in one array; see ``kernels/multigrid.cl``.
+    """A grid of nodes among others in one array; see ``kernels/multigrid.cl``.
 
     Attributes
     ----------
@@ -41,9 +41,15 @@ class Level:
         """Where it ends."""
         return self.base + (self.rows + 2) * self.stride
 
-    def coarser(self) -> Level:
-        """Return the next level, of a node for each block of two by two."""
-        return level_at(self.end, -(-self.rows // 2), -(-self.columns // 2))
+    @property
+    def place(self) -> dict[str, int]:
+        """Arguments of the passes over it."""
+        return {"base": self.base, "rows": self.rows, "stride": self.stride}
+
+    def with_coarser(self, coarse: Level) -> dict[str, int]:
+        """Return arguments of the passes between it and the next level."""
+        place = {f"coarse_{name}": number for name, number in coarse.place.items()}
+        return {"base": self.base, "stride": self.stride, **place}
 
 
 def level_at(base: int, rows: int, columns: int) -> Level:
@@ -52,8 +58,9 @@ def level_at(base: int, rows: int, columns: int) -> Level:
 
 
 def cut_levels(shape: tuple[int, int]) -> list[Level]:
-    """Return the levels of a picture, from the finest to the coarsest."""
+    """Return a picture's levels, the finest first; each node of the next stands for a block of two by two."""
     levels = [level_at(0, *shape)]
-    while max(levels[-1].rows, levels[-1].columns) > SMALLEST:
-        levels.append(levels[-1].coarser())
+    while max(levels[-1].rows, levels[-1].columns) > COARSEST:
+        fine = levels[-1]
+        levels.append(level_at(fine.end, -(-fine.rows // 2), -(-fine.columns // 2)))
     return levels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,14 +193,18 @@ class Rectangle:
         self._padded = 2 * self._lanes * self._items
         self._spectrum = self._make("spectrum", (len(plan.place) // HALF, self._padded, SLOTS))
         self._height = self._make("height", shape)
-        self._owns_room = self._lanes > 1 and plan.size <= _MOST_ROOM
-        room = (2, self._items, plan.size, self._lanes)
-        self._scratch = [] if self._owns_room else [self._make("scratch", room)]
+        self._scratch: dict[str, Any] = {}
+        if self._lanes == 1 or plan.size > _MOST_ROOM:
+            self._scratch["scratch"] = self._make("scratch", (2, self._items, plan.size, self._lanes))
         self._place = device.given("place", plan.place, np.int32)
         self._turns = device.given("turns", plan.turns)
         self._back = device.given("turns", plan.turns / (2 * length * self._across))
-        self._steps = device.given("steps", plan.steps, np.int32), device.given("factors", plan.factors)
-        self._chirp = [device.given("chirp", part) for part in (plan.chirp, plan.other) if part.size]
+        steps, factors = device.given("steps", plan.steps, np.int32), device.given("factors", plan.factors)
+        self._steps: dict[str, Any] = {"plan": steps, "factors": factors}
+        chirps = {"chirp": plan.chirp, "other": plan.other}
+        self._chirp: dict[str, Any] = {
+            name: device.given("chirp", part) for name, part in chirps.items() if part.size
+        }
         self._screening: float | None = None
 
     def solve(self, source: Array, screening: float = 0.0) -> Array:
@@ -208,8 +213,8 @@ class Rectangle:
         Parameters
         ----------
         source : Array, (H, W), float32
-            Right side b, on the device. Without screening it must sum to 0; what it sums to all the same is
-            taken from all pixels alike.
+            Right side b, on the device. Without screening it must sum to 0; a rest is taken from all pixels
+            alike.
         screening : float, optional
             On the diagonal of A, not negative.
 
@@ -222,41 +227,45 @@ class Rectangle:
             weights = self._along, self._across, screening
             reach, fading, ends = find_rates(self._plan.length, self._lines, *weights)
             given = self._device.given
-            self._rates = given("reach", reach, np.int32), given("fading", fading), given("ends", ends)
+            self._rates: dict[str, Any] = {
+                "reach": given("reach", reach, np.int32),
+                "fading": given("fading", fading),
+            }
+            self._rates["ends"] = given("ends", ends)
             self._screening = screening
         moved = source.host.nbytes + self._spectrum.host.nbytes
-        self._transform("rectangle_modes", source, self._turns, self._spectrum, moved)
+        spectrum: dict[str, Any] = {"spectrum": self._spectrum}
+        self._transform("rectangle_modes", moved, source=source, turns=self._turns, **spectrum)
         slots = self._spectrum.host.size // self._padded
         self._device.kernel("rectangle", "rectangle_columns", LANES=self._lanes)(
             slots if self._lanes == 1 else slots // SLOTS,
-            *map(np.int32, (self._lines, self._padded, slots, screening == 0)),
-            *(*self._rates, self._spectrum),
+            lines=self._lines,
+            padded=self._padded,
+            slots=slots,
+            level=screening == 0,
+            **self._rates,
+            **spectrum,
             moved=2 * self._spectrum.host.nbytes,
         )
-        self._transform("rectangle_heights", self._spectrum, self._back, self._height, moved)
+        self._transform("rectangle_heights", moved, turns=self._back, height=self._height, **spectrum)
         return self._height
 
-    def _transform(self, name: str, given: Array, turns: Array, found: Array, moved: int) -> None:
+    def _transform(self, name: str, moved: int, **arguments: Any) -> None:
         """Run one of the two kernels that go between points and modes."""
-        macros = {
-            "LANES": self._lanes,
-            "ROOM": _MOST_ROOM if self._owns_room else 0,
-            "CHIRP": int(bool(self._chirp)),
-        }
-        plan = self._plan
-        sizes = [np.int32(n) for n in (self._is_along, self._lines, self._padded, plan.length, plan.size)]
-        steps = np.int32(len(plan.steps)), *self._steps
-        kernel = self._device.kernel("rectangle", name, **macros)
-        kernel(
+        room = 0 if self._scratch else _MOST_ROOM
+        macros = {"LANES": self._lanes, "ROOM": room, "CHIRP": int(bool(self._chirp))}
+        sizes = {"along": self._is_along, "lines": self._lines, "padded": self._padded}
+        self._device.kernel("rectangle", name, **macros)(
             self._items,
-            *sizes,
-            given,
-            self._place,
-            turns,
-            *steps,
-            *self._chirp,
-            found,
-            *self._scratch,
+            **sizes,
+            length=self._plan.length,
+            size=self._plan.size,
+            place=self._place,
+            steps=len(self._plan.steps),
+            **self._steps,
+            **self._chirp,
+            **self._scratch,
+            **arguments,
             moved=moved,
         )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.graph import Graph, Links
+from mirrorskin.engine.integration.graph import Links, Plane
 from mirrorskin.engine.integration.validation import Flags, Inputs
 from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels.array import Array
@@ -35,7 +35,7 @@ class Robust:
     Attributes
     ----------
     relief : Array, (H, W), float32
-        Heights above the graph's plane, mm; of no meaning where there is no pixel.
+        Heights above the plane, mm; of no meaning where there is no pixel.
     links : Links
         The graph that they solve: its weights are those that the heights ask for.
     flags : ndarray, (H, W), uint8
@@ -74,8 +74,10 @@ class _Descent:
 
 def solve_robust(
     inputs: Inputs,
-    graph: Graph,
-    k: float,
+    links: Links,
+    flags: Flags,
+    plane: Plane,
+    sharpness: float,
     *,
     start: NDArray[np.floating[Any]] | None = None,
     tolerance: float = 1e-5,
@@ -110,13 +112,17 @@ def solve_robust(
     Parameters
     ----------
     inputs : Inputs
-    graph : Graph
-        Their links; only these can be cut.
-    k : float
+    links : Links
+        Of the plane; only these can be cut.
+    flags : ndarray, (H, W), uint8
+        What the pixels are; see ``mirrorskin.kernels.links``.
+    plane : (float, float, float)
+        What heights are relative to, besides the inputs' datum.
+    sharpness : float
         How misfits are told from noise, 1/pixel^2: a link is cut where it misses the slopes by well above the
-        square root of 1 / k, seen across the surface.
+        square root of its inverse, seen across the surface.
     start : ndarray, (H, W), optional
-        Heights above the graph's plane, mm: the only start then.
+        Heights above the plane, mm: the only start then.
     tolerance : float
         Residual of the least squares that the last weights make.
     limit : int
@@ -124,35 +130,33 @@ def solve_robust(
     deadline : float, optional
         Of ``time.perf_counter``: no step is begun after it.
     """
-    search = _Search(inputs, graph, limit, deadline)
+    search = _Search(_Bound(inputs, links, flags, plane), limit, deadline)
     starts = [(search.given(start), 1.0)] if start is not None else search.starts()
     found, steps = [], 0
     for relief, factor in starts:
         if factor != 1.0:
-            first = search.descend(relief, factor * k, _ROUGH)
+            first = search.descend(relief, factor * sharpness, _ROUGH)
             relief, steps = first.relief, steps + len(first.energies) - 1
-        found.append(search.descend(relief, k, _REST))
+        found.append(search.descend(relief, sharpness, _REST))
         steps += len(found[-1].energies) - 1
-    return search.conclude(min(found, key=lambda one: one.energies[-1]), k, tolerance, steps)
+    return search.conclude(min(found, key=lambda one: one.energies[-1]), sharpness, tolerance, steps)
 
 
 class _Search:
     """Descents of the energy of ``mirrorskin.kernels.bilateral`` on a device."""
 
-    def __init__(self, inputs: Inputs, graph: Graph, limit: int, deadline: float | None) -> None:
-        self._bound = _Bound(inputs, graph)
-        self._device = graph.links.device
-        self._limit, self._deadline = limit, deadline
-        self._zero = self._device.given("zero", np.zeros(graph.links.shape))
+    def __init__(self, bound: _Bound, limit: int, deadline: float | None) -> None:
+        self._bound, self._limit, self._deadline = bound, limit, deadline
+        self._zero = bound.given("zero", np.zeros(bound.flags.shape))
         self._bound.share(0.0, self._zero)
         self._solver = Multigrid(self._bound.link(self._zero))
 
     def given(self, relief: NDArray[np.floating[Any]]) -> Array:
         """Return a start that was given."""
-        return self._device.given("start", np.where(np.isfinite(relief), relief, 0.0))
+        return self._bound.given("start", np.where(np.isfinite(relief), relief, 0.0))
 
     def starts(self) -> list[tuple[Array, float]]:
-        """Return reliefs to begin with, and by what k is multiplied at first."""
+        """Return reliefs to begin with, and by what the sharpness is multiplied at first."""
         plain = self._solve(self._zero, _TIGHT)
         curl = self._bound.curl()
         sizes = np.abs(curl.download())
@@ -166,48 +170,48 @@ class _Search:
         opened = self._solve(self._zero, _TIGHT)
         return [(opened, 1.0), (opened, _EAGER), (plain, 1.0)]
 
-    def descend(self, relief: Array, k: float, rest: float) -> _Descent:
+    def descend(self, relief: Array, sharpness: float, rest: float) -> _Descent:
         """Lower the energy of a relief until it rests."""
-        descent = _Descent(relief, [self._bound.share(k, relief)])
+        descent = _Descent(relief, [self._bound.share(sharpness, relief)])
         while len(descent.energies) <= self._limit and not descent.converged:
             if self._deadline is not None and time.perf_counter() > self._deadline:
                 break
             before = descent.energies[-1]
-            lower = self._lower(descent, k)
+            lower = self._lower(descent, sharpness)
             descent.converged = lower is None or lower > (1 - rest) * before
             if lower is not None:
                 descent.energies.append(lower)
         return descent
 
-    def _lower(self, descent: _Descent, k: float) -> float | None:
+    def _lower(self, descent: _Descent, sharpness: float) -> float | None:
         """Take a step that lowers the energy, and return that; None where rounding leaves none."""
         for tolerance, part in ((_LOOSE, _BEYOND), (_TIGHT, 1.0)):
             self._solver.rebuild(self._bound.link(descent.relief))
             stepped = self._solve(descent.relief, tolerance, part)
-            energy = self._bound.share(k, stepped)
+            energy = self._bound.share(sharpness, stepped)
             if energy < descent.energies[-1]:
                 descent.relief = stepped
                 return energy
-            self._bound.share(k, descent.relief)
+            self._bound.share(sharpness, descent.relief)
         return None
 
     def _solve(self, relief: Array, tolerance: float, part: float = 1.0) -> Array:
         """Return a relief that goes so much of the way to that which solves the last graph, about."""
         return self._bound.step(relief, self._solver.solve(tolerance=tolerance).height, part)
 
-    def conclude(self, best: _Descent, k: float, tolerance: float, steps: int) -> Robust:
+    def conclude(self, best: _Descent, sharpness: float, tolerance: float, steps: int) -> Robust:
         """Solve the last graph to the tolerance, and tell what was found."""
         bound, relief = self._bound, best.relief
         bound.share(0.0, relief)
         full = bound.weights(relief)
-        bound.share(k, relief)
+        bound.share(sharpness, relief)
         wanted, left = (self._norm(bound.link(one)) for one in (self._zero, relief))
         residual, met = left / wanted if wanted else 0.0, best.converged
         self._solver.rebuild(bound.link(relief))
         last = self._solver.solve(tolerance=min(1.0, tolerance / residual) if residual else 1.0)
         solved = bound.step(relief, last.height)
         weights = bound.weights(solved)
-        energy = bound.share(k, solved)
+        energy = bound.share(sharpness, solved)
         if energy < best.energies[-1]:
             best.energies.append(energy)
             # The solver's own residual: that of float32 heights has a floor of their rounding.
@@ -243,47 +247,53 @@ def _cut(flags: Flags, weights: _Weights, full: _Weights) -> tuple[Flags, Flags]
 
 
 class _Bound:
-    """The energy of a relief, and the least squares that bound it, on the graph's device."""
+    """The energy of a relief, and the least squares that bound it, on the links' device."""
 
-    def __init__(self, inputs: Inputs, graph: Graph) -> None:
-        self.flags = graph.flags
-        self._device, self._shape = graph.links.device, graph.links.shape
-        self._size = tuple(np.float32(size) for size in inputs.pixel_size)
-        self._unit = inputs.typical
-        self._maps = (self._device.given("flags", graph.flags, np.uint8), *self._slopes(inputs, graph.plane))
-        self._sure = self._confidence(inputs)
-        self._anchor = graph.links.anchor
-        self._held = self._heights(inputs, graph)
-        names = "share x", "share y", "right", "down", "pull x", "pull y", "source"
-        rooms = [self._room(name) for name in names]
-        self._shares, self._links, self._source = rooms[:2], rooms[2:6], rooms[6]
+    def __init__(self, inputs: Inputs, links: Links, flags: Flags, plane: Plane) -> None:
+        self.flags = flags
+        self._device, self._shape = links.device, links.shape
+        self._size = dict(zip(("width", "height"), inputs.pixel_size, strict=True))
+        self._unit = inputs.typical_weight
+        self._maps = {"flags": self._device.given("flags", flags, np.uint8), **self._slopes(inputs, plane)}
+        self._confidence = self._find_confidence(inputs)
+        self._anchor = links.anchor
+        self._known = self._find_known(inputs, plane)
+        names = "share_x", "share_y", "right", "down", "pull_x", "pull_y", "source"
+        rooms = {name: self._room(name) for name in names}
+        self._source = rooms.pop("source")
+        self._shares = {name: rooms.pop(name) for name in ("share_x", "share_y")}
+        self._links = rooms
         rows, columns = self._shape
         self._pieces = rows * -(-columns // min(self._device.layout.tile, 256))
         self._sums = self._room("sums", (self._pieces,))
 
-    def share(self, k: float, relief: Array) -> float:
+    def given(self, name: str, values: NDArray[np.floating[Any]]) -> Array:
+        """Return an array that holds values."""
+        return self._device.given(name, values)
+
+    def share(self, sharpness: float, relief: Array) -> float:
         """Divide the pixels' weights between their links; return the energy."""
-        known = self._held[:2]
-        terms: list[Array | np.generic] = [*self._maps, *self._sure, *known, relief, np.float32(k)]
-        self._run("shares", self._pieces, *terms, *self._size, *self._shares, self._sums)
+        terms = {**self._maps, **self._confidence, **self._known, **self._size, **self._shares}
+        self._run("shares", **terms, heights=relief, k=sharpness, sums=self._sums)
         energy = float(self._sums.download().sum(dtype=np.float64))
         self._sums.upload()
         return self._unit * energy
 
     def link(self, relief: Array, curl: Array | None = None, level: float = 0.0) -> Links:
         """Return the graph that the shares make, for a step from a relief; it may open at curl."""
-        terms = [*self._maps, *self._sure, *self._shares, relief]
-        self._run("links", self._pieces, *terms, *self._size, *self._links)
+        terms = {**self._maps, **self._confidence, **self._shares, **self._size}
+        self._run("links", **terms, heights=relief, **self._links)
         if curl is not None:
-            self._run("open", self._pieces, curl, np.float32(level), *self._links)
-        known = (self._anchor, self._held[1], relief) if self._anchor is not None else ()
-        self._run("left", self._pieces, *self._links[2:], *known, self._source)
+            self._run("open", curl=curl, level=level, **self._links)
+        known = {**self._known, "anchor": self._anchor, "heights": relief} if self._known else {}
+        pulls = {name: self._links[name] for name in ("pull_x", "pull_y")}
+        self._run("left", **pulls, **known, left=self._source)
         return self.last
 
     @property
     def last(self) -> Links:
         """The last graph, for the step from the relief on that it was made for."""
-        right, down = self._links[:2]
+        right, down = self._links["right"], self._links["down"]
         return Links(self._device, self._shape, right, down, self._anchor, self._source)
 
     def weights(self, relief: Array) -> _Weights:
@@ -295,18 +305,18 @@ class _Bound:
         return found
 
     def curl(self) -> Array:
-        """Return what does not close of the slopes."""
+        """Return the curl of the slopes: what does not add up round four pixels."""
         found = self._room("curl")
-        width, height = self._size
+        width, height = np.float32(self._size["width"]), np.float32(self._size["height"])
         mean = np.sqrt(width * height)
-        self._run("curl", self._pieces, *self._maps[:3], width / mean, height / mean, found)
+        maps = {name: self._maps[name] for name in ("flags", "slope_x", "slope_y")}
+        self._run("curl", **maps, width=width / mean, height=height / mean, curl=found)
         return found
 
     def step(self, relief: Array, change: Array, part: float = 1.0) -> Array:
         """Return a relief changed by so much of a change."""
         found = self._room("relief")
-        items = -(-self.flags.size // self._device.layout.tile)
-        self._run("step", items, relief, change, np.float32(part), found)
+        self._run("step", heights=relief, step=change, part=part, stepped=found)
         return found
 
     def _room(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
@@ -314,40 +324,41 @@ class _Bound:
         array.upload()
         return array
 
-    def _run(self, name: str, items: int, *arguments: Array | np.generic) -> None:
-        sizes = [np.int32(size) for size in self._shape]
-        moved = sum(one.host.nbytes for one in arguments if isinstance(one, Array))
-        kernel = self._device.kernel("bilateral", f"bilateral_{name}", KNOWN=int(bool(self._held)))
-        kernel(items, *sizes, *arguments, moved=moved)
+    def _run(self, name: str, **arguments: Any) -> None:
+        items = -(-self.flags.size // self._device.layout.tile) if name == "step" else self._pieces
+        rows, columns = self._shape
+        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
+        kernel = self._device.kernel("bilateral", f"bilateral_{name}", KNOWN=int(bool(self._known)))
+        kernel(items, rows=rows, columns=columns, **arguments, moved=moved)
 
-    def _slopes(self, inputs: Inputs, plane: tuple[float, float, float]) -> tuple[Array, Array, Array]:
+    def _slopes(self, inputs: Inputs, plane: Plane) -> dict[str, Array]:
         """Return slopes relative to the plane, to the right and down, and the squared z of the normals."""
         x, y = inputs.dz_dx, inputs.dz_dy
         good = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(good, x, np.float32(0)), np.where(good, y, np.float32(0))
-        return (
-            self._device.given("slope x", x - np.float32(plane[0])),
-            self._device.given("slope y", np.float32(plane[1]) - y),
-            self._device.given("steep", 1 / (1 + x * x + y * y)),
-        )
+        return {
+            "slope_x": self._device.given("slope x", x - np.float32(plane[0])),
+            "slope_y": self._device.given("slope y", np.float32(plane[1]) - y),
+            "steep": self._device.given("steep", 1 / (1 + x * x + y * y)),
+        }
 
-    def _confidence(self, inputs: Inputs) -> tuple[Array, Array]:
-        """Return inverse variances along x and y, relative to what is typical."""
-        factor = inputs.weight / inputs.typical
+    def _find_confidence(self, inputs: Inputs) -> dict[str, Array]:
+        """Return inverse variances along x and y, relative to the typical one."""
+        factor = inputs.weight / inputs.typical_weight
         one = np.ones(self._shape, np.float32) if inputs.weight_x is None else inputs.weight_x
-        first = self._device.given("sure x", factor * one)
-        if inputs.weight_y is None:
-            return first, first
-        return first, self._device.given("sure y", factor * inputs.weight_y)
+        first = second = self._device.given("sure x", factor * one)
+        if inputs.weight_y is not None:
+            second = self._device.given("sure y", factor * inputs.weight_y)
+        return {"sure_x": first, "sure_y": second}
 
-    def _heights(self, inputs: Inputs, graph: Graph) -> tuple[Array, ...]:
-        """Return weights of known heights, relative to what is typical, and these; nothing without any."""
-        if inputs.heights is None or self._anchor is None:
-            return ()
+    def _find_known(self, inputs: Inputs, plane: Plane) -> dict[str, Array]:
+        """Return known heights, and their weights relative to the typical one; nothing without any."""
+        if inputs.known_heights is None or self._anchor is None:
+            return {}
         row, column = np.indices(self._shape, np.float32)
-        rise, fall = graph.plane[0] * inputs.pixel_size[0], graph.plane[1] * inputs.pixel_size[1]
-        relief = inputs.heights - (graph.plane[2] + rise * column - fall * row)
+        rise, fall = plane[0] * inputs.pixel_size[0], plane[1] * inputs.pixel_size[1]
+        relief = inputs.known_heights - (plane[2] + rise * column - fall * row)
         weight = self._anchor.download() / np.float32(inputs.pixel_size[0] * inputs.pixel_size[1])
         self._anchor.upload()
         known = np.where(weight > 0, relief, 0)
-        return self._device.given("held", weight), self._device.given("known", known)
+        return {"anchor": self._device.given("held", weight), "known": self._device.given("known", known)}

@@ -1,8 +1,8 @@
-"""The nodes of a coarse level that have no place in its picture, since their block has several parts.
+"""Blocks of two by two whose nodes do not hang together, as on either side of a cut, and their parts.
 
-A block of two by two whose nodes do not hang together by strong links, as on either side of a cut, becomes
-a coarse node for each of its parts. The largest takes the block's place in the picture, the others are odd:
-they and their links are kept in sparse matrices.
+Such an aggregate becomes a coarse node for each of its parts that strong links connect. The largest part
+takes the block's place in the coarse grid; the others are extra nodes: they and their links are kept in
+sparse matrices.
 """
 
 from __future__ import annotations
@@ -17,59 +17,54 @@ from mirrorskin.engine.integration.levels import Level
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
-STRENGTH = 0.25
-"""A link is strong from this share of the geometric mean of its nodes' greatest links on."""
+_STRONG = 0.25  # of the geometric mean of its nodes' greatest links, from which on a link is strong
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Links, or a sparse matrix's entries: from a to b with a weight.
-
-    Attributes
-    ----------
-    a, b : ndarray, (n,), int64
-        Nodes.
-    weight : ndarray, (n,), float32
-    """
+    """Links, or a sparse matrix's entries: from node a to node b with a weight, (n,) each."""
 
     a: Ints
     b: Ints
     weight: Floats
 
+    @classmethod
+    def none(cls) -> Pairs:
+        """Return no pair."""
+        return cls(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
+
+    @classmethod
+    def join(cls, *parts: Pairs) -> Pairs:
+        """Return all of some pairs."""
+        return cls(
+            np.concatenate([part.a for part in parts]),
+            np.concatenate([part.b for part in parts]),
+            np.concatenate([part.weight for part in parts]),
+        )
+
     def both_ways(self) -> Pairs:
         """Return each twice, from either end."""
-        a, b = np.concatenate([self.a, self.b]), np.concatenate([self.b, self.a])
-        return Pairs(a, b, np.concatenate([self.weight, self.weight]))
+        return Pairs.join(self, Pairs(self.b, self.a, self.weight))
 
-    def where(self, chosen: Mask) -> Pairs:
+    def where(self, chosen: Mask | Ints) -> Pairs:
         """Return some of them."""
         return Pairs(self.a[chosen], self.b[chosen], self.weight[chosen])
 
     def by_rows(self) -> Pairs:
         """Return them sorted by a."""
-        order = np.argsort(self.a)
-        return Pairs(self.a[order], self.b[order], self.weight[order])
-
-
-def join(*parts: Pairs) -> Pairs:
-    """Return all of some pairs."""
-    return Pairs(
-        np.concatenate([part.a for part in parts]),
-        np.concatenate([part.b for part in parts]),
-        np.concatenate([part.weight for part in parts]),
-    )
+        return self.where(np.argsort(self.a))
 
 
 @dataclass(frozen=True, slots=True)
-class Odd:
-    """What is odd at one level.
+class ExtraNodes:
+    """Nodes of one level without a place in its grid.
 
     Attributes
     ----------
     node : ndarray, (n,), int64
-        Nodes without a place in the picture, one number after the other.
+        Consecutive numbers.
     block : ndarray, (n, 2), int64
-        Row and column of the block that each stands for.
+        Row and column of the block that each belongs to.
     links : Pairs
         Each link once that has such a node at an end.
     """
@@ -78,49 +73,21 @@ class Odd:
     block: Ints
     links: Pairs
 
-
-def nothing_odd() -> Odd:
-    """Return what is odd at a level where nothing is."""
-    none = np.empty(0, np.int64)
-    return Odd(none, none.reshape(0, 2), Pairs(none, none, np.empty(0, np.float32)))
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """How one level goes over into the next where that is odd.
-
-    Attributes
-    ----------
-    odd : Odd
-        Of the coarse level.
-    blocks : ndarray, (n,), int64
-        Nodes of the coarse picture whose blocks are odd.
-    members : (ndarray, ndarray), (m,), int64
-        Fine nodes in odd blocks, and the coarse ones that they belong to.
-    restrict : Pairs
-        From coarse nodes to the fine ones that they are told of: whole rows.
-    prolong : Pairs
-        From fine nodes to the coarse ones that tell them: whole rows.
-    graph : Pairs
-        From coarse nodes that are odd or have odd links to all that they are linked with: whole rows.
-    """
-
-    odd: Odd
-    blocks: Ints
-    members: tuple[Ints, Ints]
-    restrict: Pairs
-    prolong: Pairs
-    graph: Pairs
+    @classmethod
+    def none(cls) -> ExtraNodes:
+        """Return no node."""
+        none = np.empty(0, np.int64)
+        return cls(none, none.reshape(0, 2), Pairs.none())
 
 
-class Picture:
-    """One level's plain links, as the host sees them."""
+class Grid:
+    """One level's nodes that have a place, and their links, on the host."""
 
     def __init__(self, level: Level, right: Floats, down: Floats) -> None:
         self.level, self.right, self.down = level, right, down
 
     def holds(self, node: Ints) -> Mask:
-        """Tell which nodes have a place in the picture, rather than none at all."""
+        """Tell which nodes have a place in the grid."""
         inside: Mask = node < self.level.end
         return inside
 
@@ -134,9 +101,8 @@ class Picture:
         return row, column
 
     def greatest(self, node: Ints) -> Floats:
-        """Return the greatest plain link of nodes in the picture."""
-        above = node - self.level.stride
-        sides = self.right[node], self.right[node - 1], self.down[node], self.down[above]
+        """Return the greatest link of nodes in the grid."""
+        sides = self.right[node], self.right[node - 1], self.down[node], self.down[node - self.level.stride]
         greatest: Floats = np.maximum.reduce(sides)
         return greatest
 
@@ -149,29 +115,28 @@ class Picture:
         return Pairs(node, node + self.level.stride, self.down[node])
 
     def around(self, node: Ints) -> Pairs:
-        """Return all plain links of nodes, seen from them."""
+        """Return all links of nodes in the grid, seen from them."""
         before, above = node - 1, node - self.level.stride
         backward = Pairs(node, before, self.right[before]), Pairs(node, above, self.down[above])
-        found = join(self.rightward(node), self.downward(node), *backward)
+        found = Pairs.join(self.rightward(node), self.downward(node), *backward)
         return found.where(found.weight > 0)
 
     def blocks(self, coarse: Level, nodes: Ints) -> Pairs:
-        """Return each plain link once that blocks, given as coarse nodes, have within and to others."""
+        """Return each link once that blocks, given as coarse nodes, have within and to others."""
         row, column = np.divmod(nodes - coarse.first, coarse.stride)
         a = self.node(2 * row, 2 * column)
         b, c, stride = a + 1, a + self.level.stride, self.level.stride
         d = c + 1
-        chosen = np.zeros(coarse.end - coarse.base, bool)
-        chosen[nodes - coarse.base] = True
+        chosen = _marks(coarse, nodes)
         left, above = ~chosen[nodes - coarse.base - 1], ~chosen[nodes - coarse.base - coarse.stride]
         flat = np.concatenate([a, b, c, d, a[left] - 1, c[left] - 1])
         steep = np.concatenate([a, b, c, d, a[above] - stride, b[above] - stride])
-        found = join(self.rightward(flat), self.downward(steep))
+        found = Pairs.join(self.rightward(flat), self.downward(steep))
         return found.where(found.weight > 0)
 
 
 class Lookup:
-    """Numbers of nodes in a list, by node; room for it is kept."""
+    """Numbers of nodes in a list, by node; its memory is kept."""
 
     def __init__(self, nodes: int) -> None:
         self._number = np.zeros(nodes, np.int32)
@@ -201,51 +166,139 @@ class Lookup:
             self._number = np.concatenate([self._number, np.zeros(most, np.int32)])
 
 
-class _Parts:
-    """To which coarse nodes the fine ones of odd blocks belong.
+@dataclass(frozen=True, slots=True)
+class Coarsening:
+    """How one level goes over into the next where aggregates are split.
 
-    Parameters
+    Attributes
     ----------
-    fine : Picture
-    odd : Odd
-        Of the fine level.
-    coarse : Level
+    extra : ExtraNodes
+        Of the coarse level.
     blocks : ndarray, (n,), int64
-        Nodes of the coarse picture whose blocks are odd.
-    following : int
-        The first number for parts that have no place in the picture.
-    lookup : Lookup
+        Nodes of the coarse grid whose blocks are split.
+    members : (ndarray, ndarray), (m,), int64
+        Fine nodes in split blocks, and the coarse ones that they belong to.
+    restrict, prolong, graph : Pairs
+        Complete rows of sparse matrices: from coarse nodes to the fine ones that restriction takes, from fine
+        nodes to the coarse ones that prolongation takes, and from coarse nodes that are extra or linked with
+        one to all that they are linked with.
     """
 
+    extra: ExtraNodes
+    blocks: Ints
+    members: tuple[Ints, Ints]
+    restrict: Pairs
+    prolong: Pairs
+    graph: Pairs
+
+    @classmethod
+    def of(
+        cls,
+        fine: Grid,
+        extra: ExtraNodes,
+        changed: Ints,
+        coarse: Grid,
+        split: Ints,
+        following: int,
+        lookup: Lookup,
+    ) -> Coarsening:
+        """Split aggregates, and correct the coarse grid's links around them in place.
+
+        Parameters
+        ----------
+        fine : Grid
+        extra : ExtraNodes
+            Of the fine level.
+        changed : ndarray, (n,), int64
+            Nodes of the fine grid whose links are others than the device's pass knew.
+        coarse : Grid
+            As the device's pass left it.
+        split : ndarray, (n,), int64
+            Nodes of the coarse grid whose blocks have several parts by their links in the grid.
+        following : int
+            Number of the first extra node of the coarse level.
+        lookup : Lookup
+        """
+        blocks = split
+        if len(extra.node) or len(changed):
+            blocks = lookup.distinct(np.concatenate([split, _blocks_near(fine, extra, changed, coarse)]))
+        if not len(blocks):
+            none = ExtraNodes.none()
+            return cls(none, none.node, (none.node, none.node), none.links, none.links, none.links)
+        parts = _Parts(fine, extra, coarse.level, blocks, following, lookup)
+        links = _write_grid(coarse, blocks, parts.coarse_links())
+        row, column = coarse.place(parts.extra_block)
+        found = ExtraNodes(parts.extra_node, np.stack([row, column], axis=1), links)
+        members, restrict, prolong = parts.members(), parts.restriction(), parts.prolongation()
+        return cls(found, blocks, members, restrict, prolong, _complete_rows(coarse, found, lookup))
+
+
+def _blocks_near(fine: Grid, extra: ExtraNodes, changed: Ints, coarse: Grid) -> Ints:
+    """Return the coarse nodes of blocks with extra or changed nodes, and of those beside."""
+    ends = np.concatenate([extra.links.a, extra.links.b])
+    stride = fine.level.stride
+    beside = [changed - 1, changed + 1, changed - stride, changed + stride]
+    nodes = np.concatenate([ends[fine.holds(ends)], changed, *beside])
+    row, column = np.concatenate([fine.place(nodes), extra.block.T], axis=1) // 2
+    inside = (row >= 0) & (row < coarse.level.rows) & (column < coarse.level.columns)
+    return coarse.node(row[inside], column[inside])
+
+
+def _write_grid(coarse: Grid, blocks: Ints, links: Pairs) -> Pairs:
+    """Write the links that have a place in the grid; return the others."""
+    stride = coarse.level.stride
+    coarse.right[blocks] = coarse.right[blocks - 1] = coarse.down[blocks] = coarse.down[blocks - stride] = 0
+    placed = coarse.holds(links.b)  # the greater of the two
+    flat, steep = placed & (links.b - links.a == 1), placed & (links.b - links.a == stride)
+    coarse.right[links.a[flat]] = links.weight[flat]
+    coarse.down[links.a[steep]] = links.weight[steep]
+    return links.where(~placed)
+
+
+def _complete_rows(grid: Grid, extra: ExtraNodes, lookup: Lookup) -> Pairs:
+    """Return all links of nodes linked with extra ones, seen from them; for each extra node one of 0."""
+    ends = lookup.distinct(np.concatenate([extra.links.a, extra.links.b]))
+    alone = Pairs(extra.node, extra.node, np.zeros(len(extra.node), np.float32))
+    return Pairs.join(grid.around(ends[grid.holds(ends)]), extra.links.both_ways(), alone)
+
+
+def _marks(level: Level, nodes: Ints) -> Mask:
+    """Mark nodes of a level's grid, counted from where it begins."""
+    marks = np.zeros(level.end - level.base, bool)
+    marks[nodes - level.base] = True
+    return marks
+
+
+class _Parts:
+    """To which coarse nodes the fine ones of split blocks belong; arguments as for `Coarsening.of`."""
+
     def __init__(
-        self, fine: Picture, odd: Odd, coarse: Level, blocks: Ints, following: int, lookup: Lookup
+        self, fine: Grid, extra: ExtraNodes, coarse: Level, blocks: Ints, following: int, lookup: Lookup
     ) -> None:
-        self._fine, self._odd, self._level, self._lookup = fine, odd, coarse, lookup
-        self.links = join(fine.blocks(coarse, blocks), odd.links)
+        self._fine, self._extra, self._level, self._lookup = fine, extra, coarse, lookup
+        self.links = Pairs.join(fine.blocks(coarse, blocks), extra.links)
         self.nodes = lookup.distinct(np.concatenate([self.links.a, self.links.b]))
         lookup.take(self.nodes)
         self._a, self._b = lookup.find(self.links.a)[0], lookup.find(self.links.b)[0]
         self._block = self._block_of(self.nodes)
-        chosen = np.zeros(coarse.end - coarse.base, bool)
-        chosen[blocks - coarse.base] = True
-        self.within = chosen[self._block - coarse.base]
+        self.within = _marks(coarse, blocks)[self._block - coarse.base]
         self._greatest = self._greatest_links()
         self._number(self._label(), following)
 
     def _greatest_links(self) -> Floats:
         greatest = np.zeros(len(self.nodes), np.float32)
-        plain = self._fine.holds(self.nodes)
-        greatest[plain] = self._fine.greatest(self.nodes[plain])
-        for ends in (self._odd.links.a, self._odd.links.b):
-            np.maximum.at(greatest, self._lookup.find(ends)[0], self._odd.links.weight)
+        placed = self._fine.holds(self.nodes)
+        greatest[placed] = self._fine.greatest(self.nodes[placed])
+        for ends in (self._extra.links.a, self._extra.links.b):
+            np.maximum.at(greatest, self._lookup.find(ends)[0], self._extra.links.weight)
         return greatest
 
     def _label(self) -> Ints:
-        """Tell the parts of odd blocks apart: what hangs together by strong links within them."""
-        bound = STRENGTH * np.sqrt(self._greatest[self._a] * self._greatest[self._b])
+        """Label the parts of split blocks: what strong links within them connect."""
+        bound = _STRONG * np.sqrt(self._greatest[self._a] * self._greatest[self._b])
         same = self.within[self._a] & (self._block[self._a] == self._block[self._b])
         strong = same & (self.links.weight >= bound)
-        return _first_of_each(len(self.nodes), self._a[strong], self._b[strong])
+        return _first_connected(len(self.nodes), self._a[strong], self._b[strong])
 
     def _number(self, label: Ints, following: int) -> None:
         """Give the largest part of a block its place, and numbers to the others."""
@@ -255,30 +308,25 @@ class _Parts:
         other = np.zeros(len(order), bool)
         other[1:] = self._block[order[1:]] == self._block[order[:-1]]
         others = order[other]
-        number = self._block.copy()  # nodes beyond odd blocks belong to their own block
+        number = self._block.copy()  # nodes beyond split blocks belong to their own block
         number[others] = following + np.arange(len(others))
         self._coarse = number[label]
-        self.odd_node, self.odd_block = number[others], self._block[others]
+        self.extra_node, self.extra_block = number[others], self._block[others]
 
     def _block_of(self, nodes: Ints) -> Ints:
-        """Return the coarse picture's node of the blocks that nodes lie in."""
+        """Return the coarse grid's node of the blocks that nodes lie in."""
         row, column = self._fine.place(nodes)
-        if len(self._odd.node):
-            odd = ~self._fine.holds(nodes)
-            row[odd], column[odd] = self._odd.block[nodes[odd] - self._odd.node[0]].T
+        if len(self._extra.node):
+            extra = ~self._fine.holds(nodes)
+            row[extra], column[extra] = self._extra.block[nodes[extra] - self._extra.node[0]].T
         return self._level.first + (row // 2) * self._level.stride + column // 2
 
-    def coarse_of(self, nodes: Ints) -> Ints:
-        """Return the coarse nodes that any fine ones belong to."""
-        number, known = self._lookup.find(nodes)
-        return np.where(known, self._coarse[number], self._block_of(nodes))
-
     def members(self) -> tuple[Ints, Ints]:
-        """Return the fine nodes in odd blocks, and the coarse ones that they belong to."""
+        """Return the fine nodes in split blocks, and the coarse ones that they belong to."""
         return self.nodes[self.within], self._coarse[self.within]
 
     def coarse_links(self) -> Pairs:
-        """Return the coarse links that odd blocks have, each once."""
+        """Return the coarse links that split blocks have, each once."""
         a, b = self._coarse[self._a], self._coarse[self._b]
         crossing = np.flatnonzero(a != b)
         ends = 0.5 / self._greatest[self._a[crossing]] + 0.5 / self._greatest[self._b[crossing]]
@@ -292,29 +340,29 @@ class _Parts:
         return Pairs(key[first] >> 32, key[first] & 0xFFFFFFFF, total.astype(np.float32))
 
     def restriction(self) -> Pairs:
-        """Return what the coarse nodes of odd blocks are told: whole rows."""
-        links = self.links
-        one, other = self.within[self._a], self.within[self._b]
-        return Pairs(
-            np.concatenate([self._coarse[self._a[one]], self._coarse[self._b[other]]]),
-            np.concatenate([links.b[one], links.a[other]]),
-            np.concatenate([links.weight[one], links.weight[other]]),
+        """Return what the coarse nodes of split blocks take from fine ones: complete rows."""
+        links, forth, back = self.links, self.within[self._a], self.within[self._b]
+        return Pairs.join(
+            Pairs(self._coarse[self._a[forth]], links.b[forth], links.weight[forth]),
+            Pairs(self._coarse[self._b[back]], links.a[back], links.weight[back]),
         )
 
     def prolongation(self) -> Pairs:
-        """Return what tells fine nodes that are in odd blocks, or beside odd parts: whole rows."""
+        """Return what fine nodes in split blocks, or beside their parts, take: complete rows."""
         both = self.links.both_ways()
         a, b = np.concatenate([self._a, self._b]), np.concatenate([self._b, self._a])
         inside = self.within[a]
-        told = Pairs(both.a[inside], self._coarse[b[inside]], both.weight[inside])
+        taken = Pairs(both.a[inside], self._coarse[b[inside]], both.weight[inside])
         beside = self._lookup.distinct(both.a[~inside & (self._coarse[b] >= self._level.end)])
         self._lookup.take(self.nodes)
         around = self._fine.around(beside)
-        return join(told, Pairs(around.a, self.coarse_of(around.b), around.weight))
+        number, known = self._lookup.find(around.b)
+        coarse = np.where(known, self._coarse[number], self._block_of(around.b))
+        return Pairs.join(taken, Pairs(around.a, coarse, around.weight))
 
 
-def _first_of_each(count: int, a: Ints, b: Ints) -> Ints:
-    """Return of each node the first that it hangs together with; chains of links are short."""
+def _first_connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return of each node the first that it is connected with; chains of links are short."""
     label = np.arange(count)
     while True:
         lower = np.minimum(label[a], label[b])
@@ -325,62 +373,3 @@ def _first_of_each(count: int, a: Ints, b: Ints) -> Ints:
         if np.array_equal(found, label):
             return label
         label = found
-
-
-def step_over(
-    fine: Picture, odd: Odd, changed: Ints, coarse: Picture, split: Ints, following: int, lookup: Lookup
-) -> Step:
-    """Put the coarse level right where blocks are odd, and tell what cannot be said in its picture.
-
-    Parameters
-    ----------
-    fine : Picture
-    odd : Odd
-        Of the fine level.
-    changed : ndarray, (n,), int64
-        Nodes of the fine picture whose links are others than the plain pass knew.
-    coarse : Picture
-        As the plain pass left it; its links round odd blocks are put right.
-    split : ndarray, (n,), int64
-        Nodes of the coarse picture whose blocks' plain links say that they have several parts.
-    following : int
-        Number of the first odd node of the coarse level.
-    lookup : Lookup
-    """
-    blocks = split
-    if len(odd.node) or len(changed):
-        ends = np.concatenate([odd.links.a, odd.links.b])
-        stride = fine.level.stride
-        beside = [changed - 1, changed + 1, changed - stride, changed + stride]
-        nodes = np.concatenate([ends[fine.holds(ends)], changed, *beside])
-        row, column = np.concatenate([fine.place(nodes), odd.block.T], axis=1) // 2
-        inside = (row >= 0) & (row < coarse.level.rows) & (column < coarse.level.columns)
-        near = coarse.node(row[inside], column[inside])
-        blocks = lookup.distinct(np.concatenate([split, near]))
-    if not len(blocks):
-        none = nothing_odd()
-        return Step(none, none.node, (none.node, none.node), none.links, none.links, none.links)
-    parts = _Parts(fine, odd, coarse.level, blocks, following, lookup)
-    links = _write_plain(coarse, blocks, parts.coarse_links())
-    row, column = coarse.place(parts.odd_block)
-    found = Odd(parts.odd_node, np.stack([row, column], axis=1), links)
-    members, restrict, prolong = parts.members(), parts.restriction(), parts.prolongation()
-    return Step(found, blocks, members, restrict, prolong, _whole_rows(coarse, found, lookup))
-
-
-def _write_plain(coarse: Picture, blocks: Ints, links: Pairs) -> Pairs:
-    """Write the links that have a place in the picture; return the others."""
-    stride = coarse.level.stride
-    coarse.right[blocks] = coarse.right[blocks - 1] = coarse.down[blocks] = coarse.down[blocks - stride] = 0
-    plain = coarse.holds(links.b)  # the greater of the two
-    flat, steep = plain & (links.b - links.a == 1), plain & (links.b - links.a == stride)
-    coarse.right[links.a[flat]] = links.weight[flat]
-    coarse.down[links.a[steep]] = links.weight[steep]
-    return links.where(~plain)
-
-
-def _whole_rows(picture: Picture, odd: Odd, lookup: Lookup) -> Pairs:
-    """Return all links of the nodes that have odd ones, seen from them; one of nothing for each odd node."""
-    ends = lookup.distinct(np.concatenate([odd.links.a, odd.links.b]))
-    alone = Pairs(odd.node, odd.node, np.zeros(len(odd.node), np.float32))
-    return join(picture.around(ends[picture.holds(ends)]), odd.links.both_ways(), alone)

@@ -1,9 +1,10 @@
-"""What is integrated: slopes, where and how sure they are, and known heights; all of it checked."""
+"""What is integrated: slopes, where and how sure they are, and known heights; all of it checked, once."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,12 +14,11 @@ from mirrorskin.io import InputError
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
-
 LEAST, MOST = 1e-4, 1e3
 """Of the median, between which weights of slopes count: float32 solves no more."""
 
 _FIRMEST = 1e4  # of a link's weight, above which a known height does not count more
-_SAMPLES = 65536  # pixels that tell the median
+_SAMPLES = 65536  # pixels that the median is taken of
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +35,13 @@ class Inputs:
         ``weight_y`` is None where it is ``weight_x``; both are where all have the same.
     weight : float
         That same weight, else 1.
-    typical : float
-        A weight as there are many.
-    absolute : bool
+    typical_weight : float
+        The median weight.
+    weights_given : bool
         Whether the weights of the slopes were given, and are to be taken for inverse variances.
-    heights, height_weights : ndarray, (H, W), float32, or None
+    known_heights, known_height_weights : ndarray, (H, W), float32, or None
         Heights relative to ``datum``; weights None where all have the same.
-    height_weight : float
+    known_height_weight : float
         That same weight, else 1.
     datum : float
         What the known heights are relative to, mm.
@@ -50,17 +50,17 @@ class Inputs:
     dz_dx: Floats
     dz_dy: Floats
     pixel_size: tuple[float, float]
-    mask: Flags | None
-    edges: Flags | None
-    weight_x: Floats | None
-    weight_y: Floats | None
-    weight: float
-    typical: float
-    absolute: bool
-    heights: Floats | None
-    height_weights: Floats | None
-    height_weight: float
-    datum: float
+    mask: Flags | None = None
+    edges: Flags | None = None
+    weight_x: Floats | None = None
+    weight_y: Floats | None = None
+    weight: float = 1.0
+    typical_weight: float = 1.0
+    weights_given: bool = True
+    known_heights: Floats | None = None
+    known_height_weights: Floats | None = None
+    known_height_weight: float = 1.0
+    datum: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,53 +75,46 @@ def check_inputs(
     pixel_size: ArrayLike,
     *,
     mask: ArrayLike | None = None,
-    weights: ArrayLike | None = None,
+    slope_weights: ArrayLike | None = None,
     edges: ArrayLike | None = None,
-    heights: ArrayLike | None = None,
-    height_weights: ArrayLike | None = None,
+    known_heights: ArrayLike | None = None,
+    known_height_weights: ArrayLike | None = None,
 ) -> Inputs:
-    """Return the arguments of ``integrate`` as maps of one size.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        They do not fit each other, or are no weights, or no size.
-    """
+    """Return the arguments of ``integrate`` as maps of one size; InputError where they cannot be."""
     x, y = np.asarray(dz_dx), np.asarray(dz_dy)
     if x.ndim != 2 or x.shape != y.shape or 0 in x.shape:
         raise InputError(
             f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W) are needed"
         )
-    shape = x.shape
-    weight, planes = _split_weights("weights", weights, shape)
-    height_weight, height_planes = _split_weights("height_weights", height_weights, shape, 1)
+    shape, size = x.shape, check_pixel_size(pixel_size)
+    weight, planes = _split_weights("slope_weights", slope_weights, shape)
+    height_weight, height_planes = _split_weights("known_height_weights", known_height_weights, shape, 1)
     known, datum = None, 0.0
-    if heights is not None and height_weight:
-        counted = np.ones(shape, bool) if mask is None else np.asarray(fitting("mask", mask, shape)) != 0
+    if known_heights is not None and height_weight:
+        counted = np.ones(shape, bool) if mask is None else check_map("mask", mask, shape) != 0
         for plane in height_planes:
             counted &= plane > 0
-        known, datum = _relative(fitting("heights", heights, shape), counted)
+        known, datum = _relative(check_map("known_heights", known_heights, shape), counted)
     if not weight:
         planes = [np.zeros(shape, np.float32)]
-    size = check_pixel_size(pixel_size)
-    typical = _typical(planes) if planes else weight
+    typical = _median(planes) if planes else weight
     planes = [_bounded(plane, typical * LEAST, typical * MOST) for plane in planes]
     firmest = _FIRMEST * typical / min(size) ** 2
     height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
     return Inputs(
-        dz_dx=_floats(x),
-        dz_dy=_floats(y),
+        dz_dx=np.asarray(x, np.float32),
+        dz_dy=np.asarray(y, np.float32),
         pixel_size=size,
         mask=_marks("mask", mask, shape),
         edges=_marks("edges", edges, shape),
         weight_x=planes[0] if planes else None,
         weight_y=planes[1] if len(planes) > 1 else None,
         weight=weight or 1.0,
-        typical=typical,
-        absolute=weights is not None,
-        heights=known,
-        height_weights=height_planes[0] if height_planes and known is not None else None,
-        height_weight=min(height_weight, firmest),
+        typical_weight=typical,
+        weights_given=slope_weights is not None,
+        known_heights=known,
+        known_height_weights=height_planes[0] if height_planes and known is not None else None,
+        known_height_weight=min(height_weight, firmest),
         datum=datum,
     )
 
@@ -142,7 +135,7 @@ def check_above_zero(**numbers: float | None) -> None:
             raise InputError(f"{name} {number}: a number above 0 is needed")
 
 
-def fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
+def check_map(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return a map that has the shape of the slopes."""
     given = np.asarray(values)
     if given.shape != shape:
@@ -150,15 +143,11 @@ def fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
     return given
 
 
-def _floats(values: NDArray[np.generic]) -> Floats:
-    return np.asarray(values, np.float32)
-
-
 def _marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Flags | None:
     """Return a map of bytes that are 0 where the values are, or are no number."""
     if values is None:
         return None
-    given = fitting(name, values, shape)
+    given = check_map(name, values, shape)
     if given.dtype in (np.bool_, np.uint8):
         return given.view(np.uint8)
     return np.asarray((given != 0) & (given == given)).view(np.uint8)  # NaN marks nothing
@@ -183,11 +172,10 @@ def _split_weights(
         raise InputError(
             f"{name}: some are negative or no number; give inverse variances, 0 where nothing is known"
         )
-    planes = [given] if given.ndim == 2 else list(given)
-    return 1.0, [_floats(plane) for plane in planes]
+    return 1.0, [np.asarray(plane, np.float32) for plane in ([given] if given.ndim == 2 else given)]
 
 
-def _typical(planes: list[Floats]) -> float:
+def _median(planes: list[Floats]) -> float:
     """Return the median of weights above 0, of evenly spread pixels, or 1."""
     step = max(1, math.isqrt(planes[0].size // _SAMPLES))
     some = np.concatenate([plane[step // 2 :: step, step // 2 :: step].ravel() for plane in planes])
@@ -203,7 +191,7 @@ def _bounded(plane: Floats, least: float, most: float) -> Floats:
     return np.where(positive, np.clip(plane, least, most), 0).astype(np.float32)
 
 
-def _relative(heights: NDArray[np.generic], counted: NDArray[np.bool_]) -> tuple[Floats | None, float]:
+def _relative(heights: NDArray[Any], counted: NDArray[np.bool_]) -> tuple[Floats | None, float]:
     """Return heights less the mean of those that count, which would cost float32 its digits, and that mean.
 
     Others are NaN; None where none counts.

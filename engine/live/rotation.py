@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from mirrorskin.engine.integration.warm_start import Follower
+from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.provenance import naming, sign, told, told_level
@@ -138,7 +138,7 @@ class LiveRotation:
         self._slopes = self._heights = None
         if integrate and known and header.pixel_size is not None:
             self._slopes = SlopeKernels(self.device, shape)
-            self._heights = Follower(self.device, shape, header.pixel_size)
+            self._heights = WarmStartIntegrator(self.device, shape, header.pixel_size)
         self.reset()
 
     @property
@@ -173,7 +173,7 @@ class LiveRotation:
         self._follow(normals)
         self._has_estimate = True
         vectors, contact = normals.glance("vectors"), normals.glance("contact")  # while heights are found
-        height = None if self._heights is None else self._heights.end()
+        height = None if self._heights is None else self._heights.result()
         self._updates += 1
         if height is not None and self._updates % _PLACED == 1:
             self._place(height)
@@ -273,7 +273,7 @@ class LiveRotation:
             return
         maps = {name: normals.whole(name) for name in ("vectors", "sigma", "contact")}
         self._slopes.find(normals.tilt, maps, self._heights.maps)
-        self._heights.begin(self._slopes.typical)
+        self._heights.push(self._slopes.typical)
 
     def _plane(self, phase: float) -> NDArray[Any]:
         """Return a frame of a plane whose zenith lies in the middle of what can be seen."""
@@ -319,7 +319,7 @@ class LiveRotation:
             self._edges.reset()
         if self._slopes is not None and self._heights is not None:
             self._slopes.typical = math.nan
-            self._heights.restart()
+            self._heights.reset()
 
 
 class SpareEdges:

@@ -78,7 +78,7 @@ def coarse_heights(
         lasting * north[tuple(nearest)],
         size,
         mask=region,
-        weights=np.where(known, 1.0, _FILLED),
+        slope_weights=np.where(known, 1.0, _FILLED),
         sigma=False,
         tolerance=_TOLERANCE,
         device=device,

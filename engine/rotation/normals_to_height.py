@@ -244,7 +244,7 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         slopes.dz_dy,
         pixel_size,
         mask=slopes.known,
-        weights=slopes.weights,
+        slope_weights=slopes.weights,
         robust=robust,
         budget=_FOREVER,
         device=device,

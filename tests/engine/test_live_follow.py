@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import integrate
-from mirrorskin.engine.integration.warm_start import MAPS, Follower
+from mirrorskin.engine.integration.warm_start import MAPS, WarmStartIntegrator
 
 PIXEL = 0.1, 0.05
 
@@ -28,12 +28,15 @@ def follow(follower, maps):
         array.claim()
         array.host[...] = values
         array.upload()
-    return follower.follow(1.0)
+    follower.push(1.0)
+    return follower.result()
 
 
 def best(maps):
     dz_dx, dz_dy, *weights = maps
-    return integrate(dz_dx, dz_dy, PIXEL, mask=weights[0] > 0, weights=np.stack(weights), tolerance=1e-5)
+    return integrate(
+        dz_dx, dz_dy, PIXEL, mask=weights[0] > 0, slope_weights=np.stack(weights), tolerance=1e-5
+    )
 
 
 def miss(height, exact):
@@ -44,7 +47,7 @@ def miss(height, exact):
 
 @pytest.mark.parametrize("shape", [(48, 64), (37, 131), (150, 90)])
 def test_they_come_near_at_once_and_nearer_with_each_step(device, shape):
-    maps, follower = scene(shape), Follower(device, shape, PIXEL)
+    maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)
     exact = best(maps)
     misses = [miss(follow(follower, maps), exact.height) for _ in range(10)]
     assert misses[0] < 2e-2
@@ -54,7 +57,7 @@ def test_they_come_near_at_once_and_nearer_with_each_step(device, shape):
 
 def test_what_changes_little_is_followed(device):
     shape = (60, 80)
-    follower, start, end = Follower(device, shape, PIXEL), scene(shape), scene(shape, seed=1)
+    follower, start, end = WarmStartIntegrator(device, shape, PIXEL), scene(shape), scene(shape, seed=1)
     for share in np.linspace(0, 1, 30):
         maps = [(1 - share) * one + share * other for one, other in zip(start, end, strict=True)]
         height = follow(follower, [one.astype(np.float32) for one in maps])
@@ -65,7 +68,7 @@ def test_what_changes_little_is_followed(device):
 
 def test_each_piece_has_the_mean_0(device):
     shape = (50, 70)
-    maps, follower = scene(shape), Follower(device, shape, PIXEL)
+    maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)
     component = best(maps).component
     height = follow(follower, maps)
     for piece in range(component.max() + 1):
@@ -74,7 +77,7 @@ def test_each_piece_has_the_mean_0(device):
 
 def test_another_surface_is_found_within_some_steps(device):
     shape = (60, 80)
-    maps, follower = scene(shape), Follower(device, shape, PIXEL)
+    maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)
     for _ in range(3):
         follow(follower, maps)
     other = scene(shape, blobs=False)
@@ -86,7 +89,7 @@ def test_another_surface_is_found_within_some_steps(device):
 
 def test_nothing_has_no_heights_and_does_not_stay(device):
     shape = (20, 30)
-    maps, follower = scene(shape), Follower(device, shape, PIXEL)
+    maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)
     nothing = [np.full(shape, np.nan, np.float32)] * 2 + [np.zeros(shape, np.float32)] * 2
     exact = best(maps).height
     for _ in range(2):

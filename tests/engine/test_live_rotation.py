@@ -38,7 +38,7 @@ def feed(live, frames, cuts):
 def best_heights(normals):
     slopes = find_slopes(normals.vectors, normals.sigma, normals.contact, normals.tilt)
     weights = slopes.weights
-    return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, weights=weights).height
+    return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, slope_weights=weights).height
 
 
 def test_an_update_tells_the_last_turn(device):

@@ -556,8 +556,8 @@ def integrate_masks() -> Answer:
 def integrate_weights() -> Answer:
     weights = np.random.default_rng(4).uniform(10, 1000, (41, 57))
     return named(
-        alone=integrated((41, 57), weights=weights),
-        masked=integrated((41, 57), weights=weights, mask=disc((41, 57))),
+        alone=integrated((41, 57), slope_weights=weights),
+        masked=integrated((41, 57), slope_weights=weights, mask=disc((41, 57))),
     )
 
 
@@ -572,9 +572,13 @@ def integrate_known_heights() -> Answer:
     weights = np.where(pick(shape, 0.5, 12), 4e4, 1e4)
     slopes = np.full(shape, 1e4)
     return named(
-        alone=integrated(shape, heights=some_heights(shape)),
+        alone=integrated(shape, known_heights=some_heights(shape)),
         weighed=integrated(
-            shape, weights=slopes, heights=some_heights(shape), height_weights=weights, mask=disc(shape)
+            shape,
+            slope_weights=slopes,
+            known_heights=some_heights(shape),
+            known_height_weights=weights,
+            mask=disc(shape),
         ),
     )
 
@@ -595,7 +599,9 @@ def integrate_robustly() -> Answer:
     along_x = along_x + np.where((np.abs(x - 0.5) < 0.03) & (y > 0), 5.0, 0.0)
     return named(
         ridge=surface_maps(engine.integrate(along_x, along_y, PIXEL, robust=True)),
-        bare=surface_maps(engine.integrate(along_x, along_y, PIXEL, robust=True, k=4.0, sigma=False)),
+        bare=surface_maps(
+            engine.integrate(along_x, along_y, PIXEL, robust=True, bilateral_sharpness=4.0, sigma=False)
+        ),
         dome=integrated((37, 49), robust=True, mask=disc((37, 49))),
     )
 
@@ -607,9 +613,8 @@ def integrate_live() -> Answer:
     for number in range(3):
         along_x, along_y = dome(shape, 0.2 + 0.05 * number)[1:]
         mask = disc(shape) if number else np.ones(shape, bool)
-        answers[f"frame_{number}"] = surface_maps(
-            integrator.integrate(along_x, along_y, mask=mask, tolerance=1e-5)
-        )
+        integrator.push(along_x, along_y, mask=mask, tolerance=1e-5)
+        answers[f"frame_{number}"] = surface_maps(integrator.result())
     return named(**answers)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from launches import launch
 
-from mirrorskin.engine.integration.graph import LinkRoom, Settler, find_components
+from mirrorskin.engine.integration.graph import Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.kernels import components
 from mirrorskin.kernels.links import SLOPE
@@ -29,33 +29,33 @@ def test_kernels_and_reference_settle_alike(device, shape, heights, pieces):
         np.zeros(shape),
         (0.5, 0.25),
         mask=wanted | (pieces == "one"),
-        heights=known if heights else None,
-        height_weights=share if heights == 2 else None,
+        known_heights=known if heights else None,
+        known_height_weights=share if heights == 2 else None,
     )
-    room = LinkRoom(device, shape)
-    flags = room.take(inputs).copy()
+    room = PixelGraph(device, shape)
+    flags = room.upload(inputs).copy()
     found = find_components(flags, cut=False)
     assert min(shape) < 9 or (found.count > 20) == (pieces == "many")
     relief = random.normal(0, 1, shape).astype(np.float32)
     array = device.array("relief", shape, np.float32)
     array.host[...] = relief
     array.upload()
-    settler = Settler(room)
-    settler.take(found)
+    settler = Levelling(room)
+    settler.use(found)
 
     rise = PLANE[0] * 0.5, -PLANE[1] * 0.25, PLANE[2]
     given = flags, found.labels, relief, rise
     offsets = np.zeros(found.count)
     for some, maps in (
         (found.offset_unknown, (None, None)),
-        (~found.offset_unknown, (inputs.heights, inputs.height_weights)),
+        (~found.offset_unknown, (inputs.known_heights, inputs.known_height_weights)),
     ):
         if some.any():
             total, share = components.components_sum(*given, *maps, found.count)
             offsets[some] = -(total[some] / share[some])
     offsets[~found.offset_unknown] += 5.0
     exact = components.components_settle(*given, offsets)
-    np.testing.assert_allclose(settler.settle(array, PLANE, 5.0), exact, atol=1e-5)
+    np.testing.assert_allclose(settler.level(array, PLANE, 5.0), exact, atol=1e-5)
     assert np.isnan(exact).sum() == np.sum(found.labels < 0)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.graph import LinkRoom
+from mirrorskin.engine.integration.graph import PixelGraph
 from mirrorskin.engine.integration.validation import Inputs, check_inputs
 from mirrorskin.kernels import links
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
@@ -39,10 +39,10 @@ class Scene:
             dz_dy,
             SIZE,
             mask=random.random(shape) > 0.1 if self.mask else None,
-            weights=[None, some[0], some[:2]][self.weights],
+            slope_weights=[None, some[0], some[:2]][self.weights],
             edges=random.random(shape) < 0.1 if self.edges else None,
-            heights=known if self.heights else None,
-            height_weights=some[2] if self.heights == 2 else None,
+            known_heights=known if self.heights else None,
+            known_height_weights=some[2] if self.heights == 2 else None,
         )
 
 
@@ -60,7 +60,7 @@ scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def told(inputs):
     """The flags, by the reference."""
     maps = inputs.dz_dx, inputs.dz_dy
-    rest = inputs.weight_x, inputs.weight_y, inputs.heights, inputs.height_weights
+    rest = inputs.weight_x, inputs.weight_y, inputs.known_heights, inputs.known_height_weights
     flags = links.links_flags(*maps, inputs.mask, *rest)
     return flags if inputs.edges is None else links.links_cut(*maps, inputs.edges, flags)
 
@@ -68,7 +68,7 @@ def told(inputs):
 def arguments(inputs, flags, scale):
     """What goes over links is given, by the reference."""
     weights = scale / SIZE[0] ** 2, scale / SIZE[1] ** 2, scale
-    rest = inputs.weight_x, inputs.weight_y, inputs.heights, inputs.height_weights
+    rest = inputs.weight_x, inputs.weight_y, inputs.known_heights, inputs.known_height_weights
     return inputs.dz_dx, inputs.dz_dy, flags, *rest, weights, SIZE, PLANE
 
 
@@ -87,24 +87,24 @@ def near(device_map, exact):
 @pytest.mark.parametrize("shape", SHAPES)
 @scenes
 def test_kernels_and_reference_build_the_same_graph(device, shape, scene):
-    inputs, room = scene.inputs(shape), LinkRoom(device, shape)
+    inputs, room = scene.inputs(shape), PixelGraph(device, shape)
     flags = told(inputs)
-    np.testing.assert_array_equal(room.take(inputs), flags)
+    np.testing.assert_array_equal(room.upload(inputs), flags)
     right, down, anchor, source = links.links_join(*arguments(inputs, flags, room.scale))
-    found = room.join(PLANE)
+    found = room.links(PLANE)
     near(found.right.download(), right)
     near(found.down.download(), down)
     near(found.source.download(), source)
-    assert (found.anchor is None) == (inputs.heights is None)
+    assert (found.anchor is None) == (inputs.known_heights is None)
     if found.anchor is not None:
         near(found.anchor.download(), anchor)
-    near(room.ask(PLANE).download(), source)
+    near(room.source(PLANE).download(), source)
 
 
 @scenes
 def test_kernels_and_reference_find_the_same_misfit(device, scene):
-    inputs, room = scene.inputs((23, 37)), LinkRoom(device, (23, 37))
-    flags = room.take(inputs).copy()
+    inputs, room = scene.inputs((23, 37)), PixelGraph(device, (23, 37))
+    flags = room.upload(inputs).copy()
     relief = np.random.default_rng(1).normal(0, 1, room.shape).astype(np.float32)
     exact = links.links_misfit(*arguments(inputs, flags, room.scale), relief)
     assert exact > 1
@@ -112,18 +112,18 @@ def test_kernels_and_reference_find_the_same_misfit(device, scene):
 
 
 def test_links_may_have_weights_of_their_own(device):
-    inputs, room = SCENES["heights"].inputs((23, 37)), LinkRoom(device, (23, 37))
-    flags = room.take(inputs).copy()
-    joined = room.join(PLANE)
+    inputs, room = SCENES["heights"].inputs((23, 37)), PixelGraph(device, (23, 37))
+    flags = room.upload(inputs).copy()
+    joined = room.links(PLANE)
     own = [np.random.default_rng(n).random(room.shape).astype(np.float32) for n in (1, 2)]
     for array, values in zip((joined.right, joined.down), own, strict=True):
         array.claim()
         array.host[...] = values
         array.upload()
-    maps = (*own, inputs.heights, inputs.height_weights)
+    maps = (*own, inputs.known_heights, inputs.known_height_weights)
     numbers = (1.0, 1.0, room.scale), SIZE, PLANE
     given = inputs.dz_dx, inputs.dz_dy, flags, *maps, *numbers
-    near(room.ask(PLANE, joined).download(), links.links_join(*given, owned=True)[3])
+    near(room.source(PLANE, joined).download(), links.links_join(*given, owned=True)[3])
     relief = np.random.default_rng(3).normal(0, 1, room.shape).astype(np.float32)
     exact = links.links_misfit(*given, relief, owned=True)
     assert room.misfit(put(room, relief), PLANE, joined) * room.scale == pytest.approx(exact, rel=1e-5)
@@ -131,8 +131,8 @@ def test_links_may_have_weights_of_their_own(device):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_kernel_and_reference_smooth_alike(device, shape):
-    inputs, room = SCENES["heights"].inputs(shape), LinkRoom(device, shape)
-    flags = room.take(inputs).copy()
+    inputs, room = SCENES["heights"].inputs(shape), PixelGraph(device, shape)
+    flags = room.upload(inputs).copy()
     values = np.random.default_rng(1).random(shape).astype(np.float32)
     exact = values
     for _ in range(3):
@@ -183,7 +183,7 @@ def test_a_pixel_is_told_by_its_maps():
     nan, one = np.nan, 1.0
     dz = np.array([[one, nan, one, one, nan]], np.float32)
     inputs = check_inputs(
-        dz, np.ones_like(dz), SIZE, weights=[[1, 1, 0, 1, 0]], heights=[[nan, 2, nan, 3, nan]]
+        dz, np.ones_like(dz), SIZE, slope_weights=[[1, 1, 0, 1, 0]], known_heights=[[nan, 2, nan, 3, nan]]
     )
     assert told(inputs).tolist() == [[SLOPE, LOST | KNOWN, 0, SLOPE | KNOWN, 0]]
 
@@ -205,6 +205,6 @@ def test_a_pixel_among_others_on_edges_is_alone():
 
 def test_known_and_unknown_pixels_are_not_smoothed_together():
     heights = np.array([[1.0, 1.0, np.nan, np.nan]])
-    flags = told(flat((1, 4), heights=heights))
+    flags = told(flat((1, 4), known_heights=heights))
     smoothed = links.links_smooth(flags, np.array([[1.0, 0.0, 4.0, 0.0]]))
     np.testing.assert_allclose(smoothed, [[0.8, 0.2, 3.2, 0.8]])

@@ -30,10 +30,10 @@ class Problem:
     dz_dy: Map
     pixel_size: tuple[float, float] = (1.0, 1.0)
     mask: Mask | None = None
-    weights: ArrayLike | None = None
+    slope_weights: ArrayLike | None = None
     edges: Mask | None = None
-    heights: Map | None = None
-    height_weights: ArrayLike | None = None
+    known_heights: Map | None = None
+    known_height_weights: ArrayLike | None = None
 
     @property
     def arguments(self) -> tuple[Map, Map, tuple[float, float]]:
@@ -43,7 +43,7 @@ class Problem:
     @property
     def options(self) -> dict[str, object]:
         """What has a name, where it is given."""
-        names = ("mask", "weights", "edges", "heights", "height_weights")
+        names = ("mask", "slope_weights", "edges", "known_heights", "known_height_weights")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
@@ -78,7 +78,7 @@ def build(problem: Problem, whole: tuple[Mask, Mask] | None = None) -> Graph:
     shape = slopes.shape[1:]
     mask = np.ones(shape, bool) if problem.mask is None else np.asarray(problem.mask) != 0
     weights = np.broadcast_to(
-        np.asarray(1.0 if problem.weights is None else problem.weights, float), slopes.shape
+        np.asarray(1.0 if problem.slope_weights is None else problem.slope_weights, float), slopes.shape
     )
     has = mask & np.isfinite(slopes).all(axis=0) & (weights > 0)  # (2, H, W)
     known, pull = _known_heights(problem, mask)
@@ -177,7 +177,7 @@ def propagation(problem: Problem, best: bool = False) -> Map:
 
 def variance(problem: Problem) -> Map:
     """Return the variances of all dz_dx and then all dz_dy, (2 H W,); 1 where there is no slope."""
-    weights = np.asarray(1.0 if problem.weights is None else problem.weights, float)
+    weights = np.asarray(1.0 if problem.slope_weights is None else problem.slope_weights, float)
     weights = np.broadcast_to(weights, (2, *problem.dz_dx.shape)).reshape(-1)
     return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1), 1.0)
 
@@ -190,11 +190,11 @@ def height_variance(problem: Problem, best: bool = False) -> Map:
 
 def _known_heights(problem: Problem, mask: Mask) -> tuple[Map, Map]:
     """Return known heights, 0 where there are none, and their weights, 0 where there are none."""
-    if problem.heights is None:
+    if problem.known_heights is None:
         return np.zeros(mask.shape), np.zeros(mask.shape)
-    weights = np.asarray(1.0 if problem.height_weights is None else problem.height_weights, float)
-    pull = np.where(mask & np.isfinite(problem.heights), np.broadcast_to(weights, mask.shape), 0.0)
-    return np.where(pull > 0, problem.heights, 0.0).astype(float), pull
+    weights = np.asarray(1.0 if problem.known_height_weights is None else problem.known_height_weights, float)
+    pull = np.where(mask & np.isfinite(problem.known_heights), np.broadcast_to(weights, mask.shape), 0.0)
+    return np.where(pull > 0, problem.known_heights, 0.0).astype(float), pull
 
 
 def _cut(marked: Mask, slopes: Map, across: Mask, down: Mask) -> None:

@@ -17,15 +17,15 @@ DISC = np.hypot(COLUMN - 0.5, ROW - 0.5) < 0.4
 SOME = np.where(RANDOM.random(SHAPE) < 0.1, 1.0, np.nan)
 CASES = [
     {},
-    {"weights": 4.0},
-    {"weights": 9.0},
+    {"slope_weights": 4.0},
+    {"slope_weights": 9.0},
     {"mask": DISC},
-    {"mask": DISC, "weights": 4.0},
-    {"mask": DISC, "heights": SOME},
-    {"mask": DISC, "heights": SOME, "height_weights": 5.0},
+    {"mask": DISC, "slope_weights": 4.0},
+    {"mask": DISC, "known_heights": SOME},
+    {"mask": DISC, "known_heights": SOME, "known_height_weights": 5.0},
     {"mask": DISC, "robust": True},
-    {"mask": DISC, "weights": 1 + DISC},
-    {"heights": np.ones(SHAPE), "height_weights": 2.0},
+    {"mask": DISC, "slope_weights": 1 + DISC},
+    {"known_heights": np.ones(SHAPE), "known_height_weights": 2.0},
     {"edges": np.eye(*SHAPE)},
 ]
 
@@ -89,12 +89,14 @@ def test_a_full_picture_in_between_is_not_taken_for_the_one_before():
 @pytest.mark.parametrize("factor", [1e20, 1e3, np.nan])
 def test_a_frame_that_is_wrong_does_not_spoil_the_next(factor):
     live = engine.Integrator(SHAPE, 0.1)
-    first = live.integrate(*SLOPES, mask=DISC, tolerance=1e-5)
+    live.push(*SLOPES, mask=DISC, tolerance=1e-5)
+    first = live.result()
     wrong = SLOPES[0].copy()
     wrong[20, 20] *= factor
     with contextlib.suppress(engine.NotConverged):
-        live.integrate(wrong, SLOPES[1], mask=DISC)
-    again = live.integrate(*SLOPES, mask=DISC)
+        live.push(wrong, SLOPES[1], mask=DISC)
+    live.push(*SLOPES, mask=DISC)
+    again = live.result()
     assert again.converged
     np.testing.assert_allclose(again.height, first.height, atol=2e-3 * np.ptp(first.height[DISC]))
 
@@ -104,7 +106,7 @@ def test_one_height_however_sure_only_moves_the_surface(alone, weight):
     pinned = np.full(SHAPE, np.nan)
     pinned[20, 20] = 5.0
     found = engine.integrate(
-        *SLOPES, 0.1, mask=DISC, heights=pinned, height_weights=weight, sigma=False
+        *SLOPES, 0.1, mask=DISC, known_heights=pinned, known_height_weights=weight, sigma=False
     ).height
     moved = alone[3] - alone[3][20, 20] + 5
     np.testing.assert_allclose(found, moved, atol=1e-4 * np.ptp(moved[DISC]))
@@ -114,21 +116,23 @@ def test_one_height_however_sure_only_moves_the_surface(alone, weight):
 def test_one_weight_however_odd_changes_little(alone, weight):
     weights = np.ones(SHAPE)
     weights[20, 20] = weight
-    found = engine.integrate(*SLOPES, 0.1, mask=DISC, weights=weights, sigma=False).height
+    found = engine.integrate(*SLOPES, 0.1, mask=DISC, slope_weights=weights, sigma=False).height
     np.testing.assert_allclose(found, alone[3], atol=0.02)
 
 
 def test_weights_that_fade_away_are_solved():
     weights = np.exp(-((COLUMN - 0.5) ** 2 + (ROW - 0.5) ** 2) * 150)
-    found = engine.integrate(*SLOPES, 0.1, weights=weights, sigma=False)
+    found = engine.integrate(*SLOPES, 0.1, slope_weights=weights, sigma=False)
     assert found.converged
     assert np.isfinite(found.height).all()
 
 
 def test_heights_without_weight_do_not_matter():
     some = np.where(DISC, 1.0, -1e5)
-    without = engine.integrate(*SLOPES, 0.1, heights=np.where(DISC, 1.0, np.nan), sigma=False).height
-    found = engine.integrate(*SLOPES, 0.1, heights=some, height_weights=1.0 * DISC, sigma=False).height
+    without = engine.integrate(*SLOPES, 0.1, known_heights=np.where(DISC, 1.0, np.nan), sigma=False).height
+    found = engine.integrate(
+        *SLOPES, 0.1, known_heights=some, known_height_weights=1.0 * DISC, sigma=False
+    ).height
     np.testing.assert_allclose(found, without, atol=1e-4 * np.ptp(without))
 
 
@@ -137,7 +141,13 @@ def test_pieces_of_one_pixel_with_a_height_are_solved():
     specks = random.random(SHAPE) < 0.25
     known = random.normal(size=SHAPE)
     found = engine.integrate(
-        *SLOPES, 0.1, mask=specks, weights=60.0, heights=known, height_weights=6.0, sigma=False
+        *SLOPES,
+        0.1,
+        mask=specks,
+        slope_weights=60.0,
+        known_heights=known,
+        known_height_weights=6.0,
+        sigma=False,
     )
     assert found.converged
     assert not found.offset_unknown.any()

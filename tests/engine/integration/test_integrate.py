@@ -37,20 +37,23 @@ def uneven(count=1):
 
 PROBLEMS = {
     "a full picture": {},
-    "heights known everywhere": {"heights": np.ones(SHAPE) + noise(8)[0], "height_weights": 300.0},
+    "heights known everywhere": {
+        "known_heights": np.ones(SHAPE) + noise(8)[0],
+        "known_height_weights": 300.0,
+    },
     "a mask with two parts": {"mask": disc() | (np.indices(SHAPE)[1] < 4)},
     "salt": {"mask": ~spots(1, 0.2)},
-    "weights": {"weights": uneven() * 1e5},
-    "weights of each axis": {"weights": uneven(2) * 1e-5},
+    "slope_weights": {"slope_weights": uneven() * 1e5},
+    "weights of each axis": {"slope_weights": uneven(2) * 1e-5},
     "edges": {"mask": disc(), "edges": spots(2, 0.1)},
-    "some heights": {"heights": known(), "height_weights": 1e3},
-    "heights far below": {"heights": known(-300.0)},
+    "some heights": {"known_heights": known(), "known_height_weights": 1e3},
+    "heights far below": {"known_heights": known(-300.0)},
     "all at once": {
         "mask": disc(),
-        "weights": uneven(2),
+        "slope_weights": uneven(2),
         "edges": spots(2, 0.1),
-        "heights": known(-300.0),
-        "height_weights": uneven() * 1e3,
+        "known_heights": known(-300.0),
+        "known_height_weights": uneven() * 1e3,
     },
 }
 
@@ -58,7 +61,7 @@ PROBLEMS = {
 @pytest.mark.parametrize("options", PROBLEMS.values(), ids=PROBLEMS)
 def test_heights_are_those_of_a_direct_solve_in_float64(device, options):
     slopes = noise(7)
-    if "mask" in options or "weights" in options:
+    if "mask" in options or "slope_weights" in options:
         slopes[:, spots(9, 0.1)] = np.nan
     problem = Problem(*slopes, SIZE, **options)
     exact = solve(problem)
@@ -70,7 +73,10 @@ def test_heights_are_those_of_a_direct_solve_in_float64(device, options):
     assert found.height.dtype == np.float32
     assert found.converged
     assert found.residual <= 1e-5
-    whole = options.keys() <= {"heights", "height_weights"} and np.isfinite(options.get("heights", 0)).all()
+    whole = (
+        options.keys() <= {"known_heights", "known_height_weights"}
+        and np.isfinite(options.get("known_heights", 0)).all()
+    )
     assert found.method == ("direct" if whole else "multigrid")
 
 
@@ -99,7 +105,7 @@ def test_what_is_wanted_but_has_no_slope_is_counted():
 def test_a_height_that_is_known_needs_no_slope():
     slopes, heights = noise(7), np.full(SHAPE, np.nan)
     slopes[:, 5, 5], heights[5, 5] = np.nan, -2.0
-    found = engine.integrate(*slopes, 0.03, heights=heights, sigma=False)
+    found = engine.integrate(*slopes, 0.03, known_heights=heights, sigma=False)
     assert found.height[5, 5] == -2.0
     assert found.component[5, 5] == 1
     assert found.offset_unknown.tolist() == [True, False]
@@ -108,18 +114,21 @@ def test_a_height_that_is_known_needs_no_slope():
 
 def test_heights_alone_are_taken_as_they_are():
     heights = np.where(spots(3, 0.1), np.indices(SHAPE)[0], np.nan)
-    found = engine.integrate(*noise(7), 0.03, weights=0, heights=heights, sigma=False)
+    found = engine.integrate(*noise(7), 0.03, slope_weights=0, known_heights=heights, sigma=False)
     np.testing.assert_allclose(found.height, heights, rtol=3e-7)
     assert not found.offset_unknown.any()
     whole = engine.integrate(
-        [[1, 1, 1]], [[0, 0, 0]], 1, heights=[[2, 4, 5]], height_weights=1e6, sigma=False
+        [[1, 1, 1]], [[0, 0, 0]], 1, known_heights=[[2, 4, 5]], known_height_weights=1e6, sigma=False
     )
     np.testing.assert_allclose(whole.height, [[2, 4, 5]], atol=1e-4)
 
 
 def test_heights_that_tell_nothing_are_as_good_as_none():
     plain = engine.integrate(*noise(7), 0.03, sigma=False)
-    for options in ({"heights": np.full(SHAPE, np.nan)}, {"heights": np.ones(SHAPE), "height_weights": 0}):
+    for options in (
+        {"known_heights": np.full(SHAPE, np.nan)},
+        {"known_heights": np.ones(SHAPE), "known_height_weights": 0},
+    ):
         other = engine.integrate(*noise(7), 0.03, sigma=False, **options)
         np.testing.assert_array_equal(other.height, plain.height)
         assert other.offset_unknown.tolist() == [True]
@@ -130,7 +139,9 @@ def test_a_pixel_without_neighbours_is_a_piece():
     assert found.height.tolist() == [[0.0]]
     assert found.component.tolist() == [[0]]
     assert found.offset_unknown.tolist() == [True]
-    known_one = engine.integrate([[0.5]], [[0.1]], 0.03, heights=[[7.0]], height_weights=4.0, weights=1.0)
+    known_one = engine.integrate(
+        [[0.5]], [[0.1]], 0.03, known_heights=[[7.0]], known_height_weights=4.0, slope_weights=1.0
+    )
     assert known_one.height.tolist() == [[7.0]]
     assert known_one.sigma.tolist() == [[0.5]]
 
@@ -152,7 +163,7 @@ def test_types_of_all_kinds_are_taken():
 def test_what_was_given_stays_as_it_was():
     slopes, heights, mask = noise(7), known(), disc()
     kept = slopes.copy(), heights.copy(), mask.copy()
-    engine.integrate(*slopes, 0.03, heights=heights, mask=mask)
+    engine.integrate(*slopes, 0.03, known_heights=heights, mask=mask)
     for before, after in zip(kept, (slopes, heights, mask), strict=True):
         np.testing.assert_array_equal(before, after)
 
@@ -161,7 +172,7 @@ def test_a_start_does_not_change_the_answer():
     slopes = noise(7)
     plain = engine.integrate(*slopes, SIZE, mask=disc(), sigma=False, tolerance=1e-5)
     start = plain.height + 40
-    again = engine.integrate(*slopes, SIZE, mask=disc(), sigma=False, tolerance=1e-5, start=start)
+    again = engine.integrate(*slopes, SIZE, mask=disc(), sigma=False, tolerance=1e-5, initial_heights=start)
     np.testing.assert_allclose(again.height, plain.height, atol=2e-5)
     assert again.iterations <= plain.iterations
 
@@ -212,21 +223,21 @@ BAD = {
     "pixel size (0.1, -1)": {"pixel_size": (0.1, -1)},
     "mask: shape (40, 53)": {"mask": MAP[1:]},
     "edges: shape (40, 53)": {"edges": MAP[1:]},
-    "heights: shape (40, 53)": {"heights": MAP[1:]},
-    "start: shape (40, 53)": {"start": MAP[1:]},
-    "weights: shape (3, 41, 53)": {"weights": np.ones((3, *SHAPE))},
-    "height_weights: shape (2, 41, 53)": {"heights": MAP, "height_weights": np.ones((2, *SHAPE))},
-    "weights: some are negative": {"weights": MAP - 1},
-    "weights: some are negative or no": {"weights": np.where(disc(), np.nan, 1)},
-    "height_weights: some": {"heights": MAP, "height_weights": np.full(SHAPE, np.inf)},
-    "weights -1.0": {"weights": -1},
-    "height_weights nan": {"heights": MAP, "height_weights": np.nan},
-    "k 0": {"robust": True, "k": 0},
+    "heights: shape (40, 53)": {"known_heights": MAP[1:]},
+    "initial_heights: shape (40, 53)": {"initial_heights": MAP[1:]},
+    "weights: shape (3, 41, 53)": {"slope_weights": np.ones((3, *SHAPE))},
+    "height_weights: shape (2, 41, 53)": {"known_heights": MAP, "known_height_weights": np.ones((2, *SHAPE))},
+    "weights: some are negative": {"slope_weights": MAP - 1},
+    "weights: some are negative or no": {"slope_weights": np.where(disc(), np.nan, 1)},
+    "height_weights: some": {"known_heights": MAP, "known_height_weights": np.full(SHAPE, np.inf)},
+    "weights -1.0": {"slope_weights": -1},
+    "height_weights nan": {"known_heights": MAP, "known_height_weights": np.nan},
+    "bilateral_sharpness 0": {"robust": True, "bilateral_sharpness": 0},
     "tolerance -0.1": {"tolerance": -0.1},
     "budget 0": {"budget": 0},
     "nothing to integrate": {"mask": MAP},
     "nothing to integrate: no pixel": {"dz_dx": MAP * np.nan},
-    "nothing to integrate: no pixel that": {"weights": 0},
+    "nothing to integrate: no pixel that": {"slope_weights": 0},
 }
 
 

@@ -131,13 +131,13 @@ def test_weights_are_as_in_the_direct_solve(device, mask):
     weights = uneven()
     weights[:, 20:23, 5:40] = 0
     weights[1, 30:40, 8] = 0  # a slope along x alone
-    asked = problem(CURVED["bump"], 0.2, mask=MASKS[mask], weights=weights)
+    asked = problem(CURVED["bump"], 0.2, mask=MASKS[mask], slope_weights=weights)
     assert apart(integrated(asked, device), asked) <= 1e-4
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e12])
 def test_only_the_ratio_of_weights_matters(device, scale):
-    asked = problem(CURVED["bump"], 0.2, mask=MASKS["disc"], weights=scale * uneven())
+    asked = problem(CURVED["bump"], 0.2, mask=MASKS["disc"], slope_weights=scale * uneven())
     assert apart(integrated(asked, device), asked) <= 1e-4
 
 
@@ -169,14 +169,14 @@ def test_known_heights_are_as_in_the_direct_solve(device, mask, share):
     row, column = np.argwhere(MASKS[mask])[100]
     heights[row, column] = 0.1
     pull = np.exp(generator.normal(0, 1, SHAPE)) * 30
-    asked = problem(CURVED["bump"], 0.1, mask=MASKS[mask], heights=heights, height_weights=pull)
+    asked = problem(CURVED["bump"], 0.1, mask=MASKS[mask], known_heights=heights, known_height_weights=pull)
     assert apart(integrated(asked, device), asked) <= 1e-4
 
 
 @pytest.mark.parametrize("pull", [1e-4, 1.0, 1e4, 1e8])
 def test_a_rectangle_that_is_held_everywhere_alike(device, pull):
     heights = truth(CURVED["bump"]) + np.random.default_rng(6).normal(0, 0.02, SHAPE)
-    asked = problem(CURVED["bump"], 0.1, heights=heights, height_weights=pull)
+    asked = problem(CURVED["bump"], 0.1, known_heights=heights, known_height_weights=pull)
     assert apart(integrated(asked, device), asked) <= 1e-4
 
 
@@ -185,7 +185,7 @@ def test_a_rectangle_that_is_held_everywhere_alike(device, pull):
 def test_heights_far_from_zero_lose_nothing(device, offset, mask):
     heights = offset + truth(CURVED["bump"], (0.3, 0.5))
     heights[np.random.default_rng(7).random(SHAPE) > 0.05] = np.nan
-    asked = problem(CURVED["bump"], 0.1, pixel_size=(0.3, 0.5), mask=MASKS[mask], heights=heights)
+    asked = problem(CURVED["bump"], 0.1, pixel_size=(0.3, 0.5), mask=MASKS[mask], known_heights=heights)
     assert apart(integrated(asked, device), asked) <= 1e-4
 
 
@@ -194,7 +194,7 @@ def test_each_component_is_held_by_its_own_known_heights(device):
     heights = np.full(SHAPE, np.nan)
     right = mask & (surfaces.places(SHAPE)[0] > 0)
     heights[right] = 5 + truth(EXACT["bowl"])[right]
-    asked = problem(EXACT["bowl"], mask=mask, heights=heights)
+    asked = problem(EXACT["bowl"], mask=mask, known_heights=heights)
     found = integrated(asked, device)
     assert not found.offset_unknown[found.component[24, 46]]
     assert found.offset_unknown[found.component[24, 15]]
@@ -208,7 +208,7 @@ def test_a_known_height_without_a_slope_stands_alone(device):
     dz_dx[10, 10] = np.nan
     heights = np.full(SHAPE, np.nan)
     heights[10, 10] = 7.0
-    asked = Problem(dz_dx, dz_dy, PIXEL, mask=mask, heights=heights)
+    asked = Problem(dz_dx, dz_dy, PIXEL, mask=mask, known_heights=heights)
     found = integrated(asked, device)
     assert found.height[10, 10] == pytest.approx(7, abs=1e-5)
     assert found.offset_unknown.astype(bool).tolist() == [True, False]
@@ -241,7 +241,7 @@ REGIONS = {
 def spread(region, weighing):
     """Return a problem, and how its noise goes through the best linear unbiased estimate."""
     weights = {"even": None, "uneven": 400 * uneven(NOISY)}[weighing]
-    asked = Problem(np.zeros(NOISY), np.zeros(NOISY), PIXEL, mask=REGIONS[region], weights=weights)
+    asked = Problem(np.zeros(NOISY), np.zeros(NOISY), PIXEL, mask=REGIONS[region], slope_weights=weights)
     return asked, slope_oracle.propagation(asked, best=True), np.sqrt(slope_oracle.variance(asked))
 
 
@@ -336,7 +336,7 @@ def test_a_picture_of_one_pixel(device):
     found = engine.integrate(one, one, 0.1, device=device)
     assert found.height.tolist() == [[0.0]]
     assert found.offset_unknown.astype(bool).tolist() == [True]
-    known = engine.integrate(one, one, 0.1, heights=np.array([[4.25]]), device=device)
+    known = engine.integrate(one, one, 0.1, known_heights=np.array([[4.25]]), device=device)
     assert known.height.tolist() == [[4.25]]
     assert known.offset_unknown.astype(bool).tolist() == [False]
 
@@ -358,7 +358,7 @@ def test_nothing_to_answer_is_refused(device, why):
     elif why == "all NaN":
         dz_dx = np.full(SHAPE, np.nan)
     else:
-        options["weights"] = 0.0
+        options["slope_weights"] = 0.0
     with pytest.raises(io.InputError) as told:
         engine.integrate(dz_dx, dz_dy, PIXEL, **options, device=device)
     assert "\n" not in str(told.value)
@@ -389,7 +389,7 @@ def test_pixels_of_any_size(device, pixel, mask):
     size = pixel, 1.6 * pixel
     heights = truth(CURVED["bump"], size)
     heights[np.random.default_rng(11).random(SHAPE) > 0.02] = np.nan
-    for options in ({}, {"heights": heights, "height_weights": 100 / pixel**2}):
+    for options in ({}, {"known_heights": heights, "known_height_weights": 100 / pixel**2}):
         asked = problem(CURVED["bump"], 0.1, pixel_size=size, mask=MASKS[mask], **options)
         assert apart(integrated(asked, device), asked) <= 1e-4
 
@@ -413,7 +413,7 @@ def test_any_array_will_do(device, mask):
 
 def test_the_same_call_gives_the_same_bits(device):
     edges = surfaces.random_cuts(SHAPE, 8)
-    asked = problem(CURVED["waves"], 0.2, mask=MASKS["20 % holes"], edges=edges, weights=uneven())
+    asked = problem(CURVED["waves"], 0.2, mask=MASKS["20 % holes"], edges=edges, slope_weights=uneven())
     first, second = (integrated(asked, device) for _ in range(2))
     for name in ("height", "component", "offset_unknown"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)

@@ -8,7 +8,7 @@ import pytest
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.hierarchy import Hierarchy
 from mirrorskin.engine.integration.levels import cut_levels
-from mirrorskin.engine.integration.vcycle import Cycle, Multigrid
+from mirrorskin.engine.integration.vcycle import Multigrid, VCycle
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -170,12 +170,12 @@ def test_half_cycles_in_one_pass_do_what_single_passes_do(kind, anchored):
         links = links_of(device, graph)
         hierarchy = Hierarchy(graph.right.shape, anchored, device)
         hierarchy.build(links)
-        cycle = Cycle(hierarchy)
+        cycle = VCycle(hierarchy)
         cycle.prepare()
-        hierarchy.admit(links.source, cycle.full_b)
+        hierarchy.copy_picture("admit", cycle.full_b, links.source)
         to = given(device, "to", np.zeros(hierarchy.levels[0].end))
         cycle.start(to)
-        hierarchy.admit(links.source, cycle.b)
+        hierarchy.copy_picture("admit", cycle.b, links.source)
         product = cycle.run()
         finest = hierarchy.levels[0].end
         answers.append((product, to.download().copy(), cycle.x.download()[:finest].copy()))

@@ -9,7 +9,7 @@ import pytest
 from bilateral import Weighed
 
 from mirrorskin import engine
-from mirrorskin.engine.integration.graph import Graph, LinkRoom
+from mirrorskin.engine.integration.graph import PixelGraph
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.kernels.device import open_device
@@ -49,14 +49,15 @@ def bump(size=48, sigma=8.0, peak=6.0):
 def search(slopes, device, k=2.0, pixel_size=1.0, start=None, limit=100, deadline=None, **known):
     """Return what the search itself tells, and its heights."""
     inputs = check_inputs(*slopes, pixel_size, **known)
-    room = LinkRoom(device, inputs.shape)
-    flags, plane = room.take(inputs), room.lean()
-    graph = Graph(room.join(plane), flags, room.scale, plane)
+    graph = PixelGraph(device, inputs.shape)
+    flags, leaning = graph.upload(inputs), graph.mean_plane()
     width, height = inputs.pixel_size
     row, column = np.indices(slopes[0].shape)
-    plane = graph.plane[2] + graph.plane[0] * width * column - graph.plane[1] * height * row
+    plane = leaning[2] + leaning[0] * width * column - leaning[1] * height * row
     begin = None if start is None else start - plane - inputs.datum
-    found = solve_robust(inputs, graph, k, start=begin, limit=limit, deadline=deadline)
+    found = solve_robust(
+        inputs, graph.links(leaning), flags, leaning, k, start=begin, limit=limit, deadline=deadline
+    )
     return found, found.relief.download() + plane + inputs.datum
 
 
@@ -135,7 +136,7 @@ def test_weights_and_known_heights_count_as_in_float64(device):
     width, _ = pixel_size = (0.03, 0.05)
     _, slopes, _, sure, known, sure_z = uneven(20, 7.0)
     slopes, known, sure_z = slopes * [[[1.0]], [[width / pixel_size[1]]]], width * known, sure_z / width**2
-    given = {"weights": sure, "heights": known, "height_weights": sure_z}
+    given = {"slope_weights": sure, "known_heights": known, "known_height_weights": sure_z}
     found, height = search(slopes, device, 2.0, pixel_size, **given)
     mask = np.ones(height.shape, bool)
     problem = Weighed(*slopes, pixel_size, mask, *sure, known, sure_z)
@@ -150,9 +151,9 @@ def test_known_heights_lift_a_ball_off_its_plane():
     surface = engine.integrate(
         *slopes,
         1.0,
-        weights=sure,
-        heights=known,
-        height_weights=sure_z,
+        slope_weights=sure,
+        known_heights=known,
+        known_height_weights=sure_z,
         robust=True,
         sigma=False,
     )
@@ -168,7 +169,7 @@ def test_known_heights_lift_a_ball_off_its_plane():
 def test_what_is_cut_all_round_is_a_piece_of_its_own(device):
     truth, slopes, on = ball()
     surface = engine.integrate(
-        *noisy(slopes, 0.01), 1.0, robust=True, start=truth, sigma=False, device=device
+        *noisy(slopes, 0.01), 1.0, robust=True, initial_heights=truth, sigma=False, device=device
     )
     assert surface.offset_unknown.tolist() == [True, True]
     np.testing.assert_array_equal(surface.component, on)

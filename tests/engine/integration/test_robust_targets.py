@@ -35,7 +35,7 @@ def reference(name, k=K):
 @cache
 def found(name, k=K):
     case, slopes, _ = asked(name)
-    options = {"mask": case.mask, "robust": True, "k": k, "sigma": False}
+    options = {"mask": case.mask, "robust": True, "bilateral_sharpness": k, "sigma": False}
     return engine.integrate(*slopes, case.pixel_size, **options)
 
 

@@ -23,7 +23,9 @@ def exact_variance(problem):
     for label in np.flatnonzero(graph.free):
         member = (graph.label == label).astype(float)
         matrix += np.outer(member, member)
-    weights = np.broadcast_to(1.0 if problem.weights is None else problem.weights, (2, *SHAPE)).reshape(-1)
+    weights = np.broadcast_to(
+        1.0 if problem.slope_weights is None else problem.slope_weights, (2, *SHAPE)
+    ).reshape(-1)
     moves = difference.T @ (graph.weight[:, None] * reading) / np.sqrt(np.where(weights > 0, weights, 1))
     moves = np.hstack([moves, np.diag(np.sqrt(graph.pull))])
     found = np.sum(centred(graph, np.linalg.solve(matrix, moves)) ** 2, axis=1)
@@ -35,15 +37,15 @@ def exact_variance(problem):
 SCENES = {
     "rectangle": ({}, 0.06),
     "annulus": ({"mask": (DISTANCE < 15) & (DISTANCE > 7)}, 0.15),
-    "heights known on the left": ({"heights": LEFT, "height_weights": 4.0}, 0.15),
-    "uneven": ({"weights": np.exp(np.random.default_rng(1).normal(0, 0.5, SHAPE) + COLUMN / 18)}, 0.12),
+    "heights known on the left": ({"known_heights": LEFT, "known_height_weights": 4.0}, 0.15),
+    "uneven": ({"slope_weights": np.exp(np.random.default_rng(1).normal(0, 0.5, SHAPE) + COLUMN / 18)}, 0.12),
 }
 
 
 @pytest.mark.parametrize(("options", "doubtful"), SCENES.values(), ids=SCENES)
 def test_sigma_is_that_of_the_noise(options, doubtful):
     problem = Problem(FLAT, FLAT, (1.0, 1.0), **options)
-    sigma = engine.integrate(FLAT, FLAT, 1.0, **{"weights": 1.0, **options}).sigma
+    sigma = engine.integrate(FLAT, FLAT, 1.0, **{"slope_weights": 1.0, **options}).sigma
     ratio = exact_variance(problem) / sigma**2
     ratio = ratio[np.isfinite(ratio)]
     assert len(ratio) > 500
@@ -55,7 +57,7 @@ def test_sigma_is_that_of_the_noise(options, doubtful):
 
 def test_noise_that_nobody_told_is_found():
     slopes = np.random.default_rng(2).normal(0, 0.07, (2, *SHAPE))
-    told = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, weights=1 / 0.07**2)
+    told = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, slope_weights=1 / 0.07**2)
     found = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15)
     np.testing.assert_array_equal(np.isnan(told.sigma), DISTANCE >= 15)
     np.testing.assert_array_equal(np.isnan(found.sigma), DISTANCE >= 15)
@@ -75,12 +77,12 @@ def test_sigma_is_the_same_each_time():
 def test_where_nothing_contradicts_nothing_tells_the_noise():
     found = engine.integrate(np.ones((1, 9)), np.ones((1, 9)), 1.0)
     assert np.isnan(found.sigma).all()
-    assert np.isfinite(engine.integrate(np.ones((1, 9)), np.ones((1, 9)), 1.0, weights=4.0).sigma).all()
+    assert np.isfinite(engine.integrate(np.ones((1, 9)), np.ones((1, 9)), 1.0, slope_weights=4.0).sigma).all()
 
 
 def test_sigma_goes_with_pixel_size_and_noise():
     flat = np.zeros((9, 11))
-    first = engine.integrate(flat, flat, 0.5, weights=1.0).sigma
-    second = engine.integrate(flat, flat, 0.05, weights=4e6).sigma
+    first = engine.integrate(flat, flat, 0.5, slope_weights=1.0).sigma
+    second = engine.integrate(flat, flat, 0.05, slope_weights=4e6).sigma
     np.testing.assert_allclose(second, first / 10 / 2000, rtol=1e-4)
     assert engine.integrate(flat, flat, 0.5, sigma=False).sigma is None
