@@ -19,9 +19,12 @@ on the pixels' graph: a link from i to j has the weight (share+_i c_i a_i^2 + sh
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -36,19 +39,8 @@ equations are hard to solve, for an offset that means nothing. By it a link cost
 def bilateral_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, height: float) -> Doubles:
     """Return by how much four links about a corner of pixels fail to close, in slopes.
 
-    Parameters
-    ----------
-    flags : ndarray, (H, W), uint8
-        Which links there are.
-    slope_x, slope_y : ndarray, (H, W), float32
-        Slopes to the right and *down* the picture; finite everywhere.
-    width, height : float
-        Of a pixel, in units of their geometric mean.
-
-    Returns
-    -------
-    ndarray, (H, W), float64
-        Of the corner right and below of each pixel; 0 where one of the links is missing.
+    It is that of the corner right and below of each pixel; 0 where a link is missing. Slopes are to the right
+    and *down* the picture; width and height are a pixel's, in units of their geometric mean.
     """
     curl = np.zeros(flags.shape)
     across = (slope_x[:, 1:].astype(np.float64) + slope_x[:, :-1]) / 2
@@ -60,45 +52,15 @@ def bilateral_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float,
     return curl
 
 
-def bilateral_shares(
-    flags: Flags,
-    slope_x: Floats,
-    slope_y: Floats,
-    steep: Floats,
-    sure_x: Floats,
-    sure_y: Floats,
-    anchor: Floats,
-    known: Floats,
-    heights: Floats,
-    k: float,
-    width: float,
-    height: float,
-) -> tuple[Doubles, Doubles, float]:
-    """Return the shares of the links to the right and down in what their pixels ask, and the energy.
+def bilateral_shares(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, sure_x: Floats,
+                     sure_y: Floats, anchor: Floats, known: Floats, heights: Floats, k: float, width: float,
+                     height: float) -> tuple[Doubles, Doubles, float]:  # fmt: skip
+    """Return the shares of the links to the right and down in what their pixels require, and the energy.
 
-    Parameters
-    ----------
-    flags, slope_x, slope_y
-        See ``bilateral_curl``.
-    steep : ndarray, (H, W), float32
-        Square a^2 of the normal's z.
-    sure_x, sure_y : ndarray, (H, W), float32
-        Inverse variances c of the slopes along x and y.
-    anchor, known : ndarray, (H, W), float32
-        Inverse variances h of known heights, 0 where none is; and these. The kernel may be told none.
-    heights : ndarray, (H, W), float32
-        Heights u; finite everywhere.
-    k : float
-        0 for equal shares: the energy is plain least squares then.
-    width, height : float
-        Of a pixel, in the unit of the heights.
-
-    Returns
-    -------
-    share_x, share_y : ndarray, (H, W), float64
-        The links to the left and up have what is missing to 1.
-    energy : float
-        The kernel writes a sum of each of its items.
+    Links to the left and up have what is missing to 1. ``steep`` is a^2, ``sure_x`` and ``sure_y`` are c,
+    ``anchor`` is h, 0 where no height is known, and ``heights`` are u, finite everywhere; a ``k`` of 0 gives
+    equal shares, plain least squares. The kernel writes an energy for each of its items, and may have no
+    known heights.
     """
     u = heights.astype(np.float64)
     share_x, cost_x = _share(flags & RIGHT != 0, slope_x, steep, u, k, width)
@@ -122,29 +84,13 @@ def _share(
     return np.where(both, share, ~before), np.where(both, soft, lone)
 
 
-def bilateral_links(
-    flags: Flags,
-    slope_x: Floats,
-    slope_y: Floats,
-    steep: Floats,
-    sure_x: Floats,
-    sure_y: Floats,
-    share_x: NDArray[np.floating],
-    share_y: NDArray[np.floating],
-    heights: Floats,
-    width: float,
-    height: float,
-) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-    """Return the weights that the shares give to the links, and how hard these pull.
+def bilateral_links(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, sure_x: Floats,
+                    sure_y: Floats, share_x: Array, share_y: Array, heights: Floats, width: float,
+                    height: float) -> tuple[Doubles, Doubles, Doubles, Doubles]:  # fmt: skip
+    """Return weights of the links to the right and down, by their shares, and how hard these pull.
 
-    The parameters are those of ``bilateral_shares``, and what it returns.
-
-    Returns
-    -------
-    right, down : ndarray, (H, W), float64
-        Weights of the links to the right and down, in units of one over a pixel's area; 0 without one.
-    pull_x, pull_y : ndarray, (H, W), float64
-        Weight times what the difference of the two heights is too large by.
+    Weights are in units of one over a pixel's area, 0 without a link; a pull is the weight times what the
+    difference of the two heights is too large by.
     """
     u = heights.astype(np.float64)
     right, pull_x = _link(flags & RIGHT != 0, slope_x, steep * sure_x, share_x, u, width)
@@ -153,12 +99,7 @@ def bilateral_links(
 
 
 def _link(
-    linked: NDArray[np.bool_],
-    slope: Floats,
-    weight: Floats,
-    share: NDArray[np.floating],
-    u: Doubles,
-    size: float,
+    linked: NDArray[np.bool_], slope: Floats, weight: Floats, share: Array, u: Doubles, size: float
 ) -> tuple[Doubles, Doubles]:
     here, there = weight * share, np.roll(weight * (1 - share), -1, axis=1)
     rise = (np.roll(u, -1, axis=1) - u) / size
@@ -171,14 +112,7 @@ def bilateral_open(
 ) -> tuple[Doubles, Doubles, Doubles, Doubles]:
     """Return weights and pulls of links that give way where the curl on one of their sides is high.
 
-    Parameters
-    ----------
-    curl : ndarray, (H, W), float32
-        Of ``bilateral_curl``.
-    level : float
-        Curl that takes three quarters of a weight.
-    right, down, pull_x, pull_y : ndarray, (H, W)
-        Of ``bilateral_links``; the kernel changes them in place.
+    A curl of ``level`` takes three quarters of a weight. The kernel changes the four in place.
     """
     kept = 1 / (1 + (curl.astype(np.float64) / level) ** 2) ** 2
     above, before = np.ones(curl.shape), np.ones(curl.shape)
@@ -190,20 +124,11 @@ def bilateral_open(
 def bilateral_left(
     pull_x: Doubles, pull_y: Doubles, anchor: Floats, known: Floats, heights: Floats
 ) -> Doubles:
-    """Return what heights leave over of the equations, b - A u, (H, W).
-
-    Parameters
-    ----------
-    pull_x, pull_y : ndarray, (H, W)
-        Of ``bilateral_links``, for these heights.
-    anchor, known, heights : ndarray, (H, W), float32
-        See ``bilateral_shares``, but the anchors in the unit of the links' weights. The kernel may be told
-        none.
-    """
+    """Return the residual of the equations, b - A u, with the anchors in the unit of the links' weights."""
     left = pull_x - np.roll(pull_x, 1, axis=1) + pull_y - np.roll(pull_y, 1, axis=0)
     return np.asarray(left + anchor * (known - heights.astype(np.float64)))
 
 
 def bilateral_step(heights: Floats, step: Floats, part: float) -> Doubles:
-    """Return heights, (H, W), that went a part of a step on."""
+    """Return heights that went a part of a step on."""
     return heights.astype(np.float64) + part * step

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
 INVALID = -2
@@ -35,19 +36,9 @@ SPREAD = 0.3  # of that way: by so much a pixel's own levels may differ from tho
 SINGLE, RAMP = 1 / 3, 1 / 5  # prior odds, against a sudden change, of one frame under way and of a ramp
 
 
-def changepoint_scan(
-    frames: NDArray[Any],
-    first: int,
-    level: int,
-    least: int,
-    quiet: np.float32,
-    dark: NDArray[np.float32],
-    gain: NDArray[np.float32],
-    start: NDArray[np.int32],
-    excess: NDArray[np.int32],
-    below: NDArray[np.int32],
-    ring: NDArray[Any],
-) -> None:
+def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: np.float32, dark: Array,
+                     gain: Array, start: Array, excess: Array, below: Array,
+                     ring: Array) -> None:  # fmt: skip
     """Go through a block of frames for a change between known levels; the maps are changed in place.
 
     Page's form of the cumulative sum: the excess over the level is added up and never falls below zero; the
@@ -56,27 +47,17 @@ def changepoint_scan(
 
     Parameters
     ----------
-    frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples; the kernel is told ``n`` and ``P`` after it.
-    first : int
-        Number of the block's first frame in the stack.
-    level : int
-        Units, of ``UNIT`` from dark to bright, at which a pixel is light.
-    least : int
-        Units of excess that decide a change; so does an excess that lasts for ``REACH`` frames.
-    quiet : float32
-        Square counts; times the square of the gain, the excess that noise makes up.
-    dark, gain : ndarray, (P,), float32
-        Counts without light, and one over the counts from dark to bright; of a release, counts with full
-        light, and one over the counts from there to dark.
-    start : ndarray, (P,), int32
-        First frame after the change; ``INVALID`` after a sample that is no number.
-    excess : ndarray, (P,), int32
-        Units so far; ``DECIDED`` once the change is certain.
-    below : ndarray, (P,), int32
-        Last frame in which the sample was nearer to dark than to the level.
-    ring : ndarray, (SLOTS, P), as frames
-        Samples of the frames around the change, each at its number modulo ``SLOTS``.
+    frames : (n, P), uint8, uint16 or float32
+    first : number of the block's first frame in the stack
+    level : units, of ``UNIT`` from dark to bright, at which a pixel is light
+    least : units of excess that decide a change; so does an excess that lasts for ``REACH`` frames
+    quiet : square counts; times the square of the gain, the excess that noise makes up
+    dark, gain : (P,), counts without light, and one over the counts from dark to bright; of a release, counts
+        with full light, and one over the counts from there to dark
+    start : (P,), first frame after the change; ``INVALID`` after a sample that is no number
+    excess : (P,), units so far; ``DECIDED`` once the change is certain
+    below : (P,), last frame in which the sample was nearer to dark than to the level
+    ring : (SLOTS, P), samples of the frames around the change, each at its number modulo ``SLOTS``
     """
     alarm = np.maximum(least, excess_of_noise(quiet, gain))
     for number, frame in enumerate(frames, start=first):
@@ -95,31 +76,14 @@ def changepoint_scan(
         start[taken & ~np.isfinite(frame)] = INVALID
 
 
-def changepoint_sum(frames: NDArray[Any], total: Floats) -> None:
-    """Add up a block of frames.
-
-    Parameters
-    ----------
-    frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples; the kernel is told ``n`` and ``P`` after it.
-    total : ndarray, (P,), float64
-        Counts so far, changed in place; the kernel holds it as the sum of two floats.
-    """
+def changepoint_sum(frames: Array, total: Floats) -> None:
+    """Add a block of frames to totals, which the kernel holds as sums of two floats."""
     for frame in frames:
         total += frame
 
 
-def changepoint_split(
-    frames: NDArray[Any],
-    first: int,
-    mean: Floats,
-    weight: NDArray[np.float32],
-    total: Floats,
-    start: NDArray[np.int32],
-    since: NDArray[np.int32],
-    score: NDArray[np.float32],
-    ring: NDArray[Any],
-) -> None:
+def changepoint_split(frames: Array, first: int, mean: Floats, weight: Array, total: Floats, start: Array,
+                      since: Array, score: Array, ring: Array) -> None:  # fmt: skip
     """Go through a block of frames for a change between unknown levels; the maps are changed in place.
 
     Splitting T frames into k and T - k explains D^2 T / (k (T - k)) of the square deviations, with D the sum
@@ -128,25 +92,14 @@ def changepoint_split(
 
     Parameters
     ----------
-    frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples; the kernel is told ``n`` and ``P`` after it.
-    first : int
-        Number of the block's first frame in the stack.
-    mean : ndarray, (P,), float64
-        Counts, of all frames; the kernel takes it as the sum of two floats.
-    weight : ndarray, (T + 1,), float32
-        1 / sqrt(k (T - k)) for each k, or its negative if the second level should be the lower one; 0 at
-        both ends.
-    total : ndarray, (P,), float64
-        Sum of the deviations so far, counts; the kernel holds it as the sum of two floats.
-    start : ndarray, (P,), int32
-        First frame after the best split so far.
-    since : ndarray, (P,), int32
-        Frame from which on the ring lacks none.
-    score : ndarray, (P,), float32
-        -D times the weight, of the best split.
-    ring : ndarray, (SLOTS, P), as frames
-        Samples of the frames around it, each at its number modulo ``SLOTS``.
+    frames, first, ring : as of ``changepoint_scan``
+    mean : (P,), counts, of all frames; of the kernel's as of ``total`` the sum of two floats
+    weight : (T + 1,), 1 / sqrt(k (T - k)) for each k, or its negative if the second level should be the lower
+        one; 0 at both ends
+    total : (P,), sum of the deviations so far, counts
+    start : (P,), first frame after the best split so far
+    since : (P,), frame from which on the ring lacks none
+    score : (P,), -D times the weight, of the best split
     """
     for number, frame in enumerate(frames, start=first):
         total += frame - mean
@@ -159,53 +112,27 @@ def changepoint_split(
         ring[number % SLOTS, taken] = frame[taken]
 
 
-def changepoint_heights(
-    start: NDArray[np.int32],
-    excess: NDArray[np.int32],
-    below: NDArray[np.int32],
-    since: NDArray[np.int32],
-    dark: NDArray[np.float32],
-    gain: NDArray[np.float32],
-    ring: NDArray[Any],
-    travel: Floats,
-    noise: float,
-    quiet: np.float32,
-    level: float,
-    own: bool,
-) -> tuple[Floats, Floats, NDArray[np.uint8]]:
-    """Turn changes into heights, from the samples around them.
+def changepoint_heights(start: Array, excess: Array, below: Array, since: Array, dark: Array, gain: Array,
+                        ring: Array, travel: Floats, noise: float, quiet: np.float32, level: float,
+                        own: bool) -> tuple[Floats, Floats, Array]:  # fmt: skip
+    """Turn changes into heights, standard deviations (mm) and status, from the samples around them.
 
     Each hypothesis says which of these samples lie on the dark level, which are under way, and which lie on
-    the light level. The levels may differ from those given; the samples under way lie on a straight line
-    that meets both levels between the frames where it should. Each tells when the level was crossed, and how
-    likely the samples are. The answer is the mean over all hypotheses, and the standard deviation that of
-    the answers they give: the Bayes estimate, whose mean square error is the least.
-    A pixel may also hover about its level, and noise say when it passes: where the samples do not rise, the
-    change may be anywhere since the last frame that was nearer to dark.
+    the light level. The levels may differ from those given; the samples under way lie on a straight line that
+    meets both levels between the frames where it should. Each says when the level was crossed, and how likely
+    the samples are. The answer is the mean over all hypotheses, and the standard deviation that of the
+    answers they give: the Bayes estimate, whose mean square error is the least. A pixel may also hover about
+    its level, and noise say when it passes: where the samples do not rise, the change may be anywhere since
+    the last frame that was nearer to dark.
 
     Parameters
     ----------
-    start, excess, below, dark, gain, ring : ndarray, (P,) or (SLOTS, P)
-        As ``changepoint_scan`` leaves them; the kernel is told ``P`` and the number of frames before them.
-    since : ndarray, (P,), int32
-        Frame from which on the ring lacks none.
-    travel : ndarray, (T,), float64
-        Millimetres, one a frame; the kernel takes each as the sum of two floats.
-    noise : float
-        Standard deviation of a sample, counts.
-    quiet : float32
-        As for ``changepoint_scan``.
-    level : float
-        Share of the way from dark to bright whose crossing is looked for.
-    own : bool
-        Whether that is the way between the pixel's own levels instead.
-
-    Returns
-    -------
-    height, sigma : ndarray, (P,), float64
-        Millimetres, NaN where there is no onset.
-    status : ndarray, (P,), uint8
-        0 invalid input, 1 onset, 2 never light, 3 light at start.
+    start, excess, below, since, dark, gain, ring : as the passes leave them
+    travel : (T,), mm, one a frame; the kernel takes each as the sum of two floats
+    noise : standard deviation of a sample, counts
+    quiet : as of ``changepoint_scan``
+    level : share of the way from dark to bright whose crossing is looked for
+    own : whether that is the way between the pixel's own levels instead
     """
     never = excess <= excess_of_noise(quiet, gain)
     status = np.select([start == INVALID, never, start == 0], [0, 2, 3], 1).astype(np.uint8)
@@ -233,7 +160,7 @@ def changepoint_heights(
     return height, sigma, status
 
 
-def excess_of_noise(quiet: np.float32, gain: NDArray[np.float32]) -> NDArray[np.int32]:
+def excess_of_noise(quiet: np.float32, gain: Array) -> Array:
     """Return the units of excess that are nothing but noise; the kernel does this in passing."""
     share = np.minimum(quiet * gain * gain, np.float32(1000))
     return np.asarray(np.rint(share * np.float32(UNIT)), np.int32)
@@ -243,18 +170,18 @@ def excess_of_noise(quiet: np.float32, gain: NDArray[np.float32]) -> NDArray[np.
 class _Samples:
     """Samples about each change: running sums, (SLOTS + 1, P), and which there are, [low, high)."""
 
-    low: NDArray[np.intp]
-    high: NDArray[np.intp]
+    low: Array
+    high: Array
     values: Floats
     moments: Floats
     squares: Floats
 
     @property
-    def freedom(self) -> NDArray[np.intp]:
+    def freedom(self) -> Array:
         """Samples less the numbers that a ramp takes from them."""
         return np.asarray(np.maximum(self.high - self.low - 4, 1), np.intp)
 
-    def total(self, start: NDArray[np.intp] | int, stop: NDArray[np.intp] | int) -> tuple[Floats, Floats]:
+    def total(self, start: Array | int, stop: Array | int) -> tuple[Floats, Floats]:
         """Return the sum of the values, and of their squares, of the slots from start to stop."""
         every = np.arange(self.low.size)
         values, squares = (part[stop, every] - part[start, every] for part in (self.values, self.squares))
@@ -271,7 +198,7 @@ class _Levels:
     unsure: Floats
 
 
-def _share(frame: NDArray[Any], dark: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.float32]:
+def _share(frame: Array, dark: Array, gain: Array) -> Array:
     """Return the share of the way from dark to bright; a saturated sample is light."""
     share = (frame.astype(np.float32) - dark) * gain
     if frame.dtype.kind == "f":
@@ -281,12 +208,7 @@ def _share(frame: NDArray[Any], dark: NDArray[np.float32], gain: NDArray[np.floa
 
 
 def _gather(
-    start: NDArray[np.int32],
-    since: NDArray[np.int32],
-    ring: NDArray[Any],
-    dark: NDArray[np.float32],
-    gain: NDArray[np.float32],
-    count: int,
+    start: Array, since: Array, ring: Array, dark: Array, gain: Array, count: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the samples about each change, (SLOTS, P), in whole steps, and which of them there are."""
     number = start + np.arange(-REACH, REACH + 1)[:, np.newaxis]

@@ -5,41 +5,25 @@ A solver tells the relief: heights above a plane, up to an offset of each piece.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.links import KNOWN, Doubles, Flags, Triple
 
+Array = NDArray[Any]
 Labels = NDArray[np.int32]
 
 
-def components_sum(
-    flags: Flags,
-    labels: Labels,
-    relief: NDArray[np.floating],
-    plane: Triple,
-    heights: NDArray[np.floating] | None,
-    height_weights: NDArray[np.floating] | None,
-    pieces: int,
-) -> tuple[Doubles, Doubles]:
+def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, heights: Array | None,
+                   height_weights: Array | None, pieces: int) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Return of each piece a sum of heights, and what to divide it by for their mean; (pieces,) each.
 
-    With known heights it is the mean of what the others are above these, weighted like them.
-
-    Parameters
-    ----------
-    flags : ndarray, (H, W), uint8
-        See `mirrorskin.kernels.links`.
-    labels : ndarray, (H, W), int32
-        To which piece a pixel belongs; -1 without an answer.
-    relief : ndarray, (H, W)
-        Heights above the plane, mm.
-    plane : (float, float, float)
-        How much it rises from column to column and from row to row, and its height in the top left pixel, mm.
-    heights, height_weights : ndarray, (H, W), or None
-        See `mirrorskin.kernels.links`.
-    pieces : int
-        How many there are. The kernel is told before it of how many rows each of its items makes a sum.
+    With known heights it is the mean of what the others are above these, weighted like them. ``labels`` say
+    to which piece a pixel belongs, -1 without an answer; ``plane`` is how much it rises from column to column
+    and from row to row, and its height in the top left pixel, mm. Each of the kernel's items sums over a
+    strip of rows.
     """
     risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
     if heights is not None:
@@ -52,29 +36,14 @@ def components_sum(
     return np.asarray(sums, np.float64), np.asarray(totals, np.float64)
 
 
-def components_settle(
-    flags: Flags, labels: Labels, relief: NDArray[np.floating], plane: Triple, offsets: NDArray[np.floating]
-) -> Doubles:
-    """Return heights: relief, plane, and the offset of the piece; NaN without an answer.
-
-    Parameters
-    ----------
-    flags, labels, relief, plane
-        See ``components_sum``.
-    offsets : ndarray, (pieces,)
-        Millimetres.
-    """
+def components_settle(flags: Flags, labels: Labels, relief: Array, plane: Triple, offsets: Array) -> Doubles:
+    """Return heights: relief, plane, and the offset of the piece, mm; NaN without an answer."""
     height = relief + _level(plane, flags.shape) + np.asarray(offsets, np.float64)[labels]
     return np.where(labels >= 0, height, np.nan)
 
 
-def components_level(sums: NDArray[np.floating], totals: NDArray[np.floating]) -> Doubles:
-    """Return the offset of each piece, (pieces,), that brings its mean to 0; see ``components_sum``.
-
-    Parameters
-    ----------
-    sums, totals : ndarray, (strips, pieces)
-    """
+def components_level(sums: Array, totals: Array) -> Doubles:
+    """Return the offset of each piece that brings its mean to 0, by sums and totals of strips."""
     total = np.sum(totals, axis=0, dtype=np.float64)
     sum_ = np.sum(sums, axis=0, dtype=np.float64)
     return np.asarray(-np.divide(sum_, total, out=np.zeros(total.shape), where=total > 0))

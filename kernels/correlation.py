@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Counts = NDArray[np.int64]
+Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Answers = tuple[Floats, Floats, Floats, Floats]
 
@@ -38,35 +39,20 @@ WINDOW = 64
 """Frames that a sliding window can hold."""
 
 
-def correlation_slide(
-    frames: NDArray[Any],
-    first: int,
-    window: int,
-    basis: NDArray[np.int32],
-    ring: NDArray[Any],
-    total: Counts,
-    cosine: Counts,
-    sine: Counts,
-    square: Counts,
-) -> None:
+def correlation_slide(frames: Array, first: int, window: int, basis: Array, ring: Array, total: Counts,
+                      cosine: Counts, sine: Counts, square: Counts) -> None:  # fmt: skip
     """Move a sliding window on over some frames: add them, and take away those that they replace.
 
     Parameters
     ----------
-    frames : ndarray, (n, P), uint8 or uint16
-        Samples; the kernel is told ``n``, ``P`` and the pixels from plane to plane of the ring after it.
-    first : int
-        Number of the first of these frames since the window was empty.
-    window : int
-        Frames that it holds.
-    basis : ndarray, (n, 6), int32
-        Of each new frame its weight, 0 or 1, and the weight times cosine and sine, in units; and the same of
-        the frame that it replaces.
-    ring : ndarray, (window, P), as frames
-        The samples that are in the window, each frame at its number modulo ``window``.
-    total, cosine, sine, square : ndarray, (P,), int64
-        The sums: of the samples, of their products with cosine and sine, in units, and of their squares. The
-        kernel's are int32 for uint8.
+    frames : (n, P), uint8 or uint16
+    first : number of the first of these frames since the window was empty
+    window : frames that it holds
+    basis : (n, 6), of each new frame its weight, 0 or 1, and the weight times cosine and sine, in units; and
+        the same of the frame that it replaces
+    ring : (window, P), the samples that are in the window, each frame at its number modulo ``window``
+    total, cosine, sine, square : (P,), sums of the samples, of their products with cosine and sine, in units,
+        and of their squares; the kernel's are int32 for uint8
     """
     for number, frame in enumerate(frames, start=first):
         row = basis[number - first].astype(np.int64)
@@ -79,27 +65,9 @@ def correlation_slide(
 
 
 def correlation_add(
-    frames: NDArray[Any],
-    place: NDArray[np.int32],
-    basis: NDArray[np.int32],
-    total: Counts,
-    cosine: Counts,
-    sine: Counts,
-    square: Counts,
+    frames: Array, place: Array, basis: Array, total: Counts, cosine: Counts, sine: Counts, square: Counts
 ) -> None:
-    """Add some frames, of weight 1 each, to the sums so far.
-
-    Parameters
-    ----------
-    frames : ndarray, (n, P), uint8 or uint16
-        Samples; the kernel is told the number of places and ``P`` after it.
-    place : ndarray, (m,), int32
-        Which of the frames are to be added.
-    basis : ndarray, (m, 3), int32
-        Of each of them 1, and cosine and sine of its phase in units.
-    total, cosine, sine, square
-        The sums, as for ``correlation_slide``, but of any number of frames.
-    """
+    """Add frames of weight 1 to sums: those at ``place``, (m,); ``basis`` is 1, cosine and sine, (m, 3)."""
     for number, (_, along, across) in zip(place, basis.astype(np.int64), strict=True):
         sample = frames[number].astype(np.int64)
         total += sample
@@ -108,92 +76,33 @@ def correlation_add(
         square += sample**2
 
 
-def correlation_solve_counts(
-    frames: int,
-    cosines: int,
-    sines: int,
-    total: Counts,
-    cosine: Counts,
-    sine: Counts,
-    square: Counts,
-    fit: NDArray[np.float32],
-) -> Answers:
-    """Return mean, cosine, sine and residual that integer sums tell.
+def correlation_solve_counts(frames: int, cosines: int, sines: int, total: Counts, cosine: Counts,
+                             sine: Counts, square: Counts, fit: Array) -> Answers:  # fmt: skip
+    """Return mean, cosine, sine and residual, counts, by integer sums over so many frames.
 
-    Parameters
-    ----------
-    frames : int
-        Frames in the sums; the kernel is told ``P`` before it.
-    cosines, sines : int
-        Sums of their cosines and sines, units.
-    total, cosine, sine, square : ndarray, (P,), int64
-        As for ``correlation_slide`` or ``correlation_add``.
-    fit : ndarray, (28,), float32
-        See the module.
-
-    Returns
-    -------
-    mean, cosine, sine, residual : ndarray, (P,), float64
-        Counts.
+    ``cosines`` and ``sines`` are the sums of the frames' own, units; for ``fit`` see the module.
     """
     return _solve(_centre(frames, cosines, sines, total, cosine, sine, square), fit)
 
 
-def correlation_convert(
-    frames: int,
-    cosines: int,
-    sines: int,
-    unit: float,
-    total: Counts,
-    cosine: Counts,
-    sine: Counts,
-    square: Counts,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Turn integer sums into those that ``correlation_sum`` goes on with; the kernel does so in place.
+def correlation_convert(frames: int, cosines: int, sines: int, unit: float, total: Counts, cosine: Counts,
+                        sine: Counts,
+                        square: Counts) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
+    """Return the reference and the sums with which ``correlation_sum`` goes on; the kernel works in place.
 
-    Parameters
-    ----------
-    frames, cosines, sines, total, cosine, sine, square
-        As for ``correlation_solve_counts``; the kernel is told ``P`` before them.
-    unit : float
-        What cosines and sines were rounded to multiples of.
-
-    Returns
-    -------
-    reference, total, cosine, sine, square : ndarray, (P,), float64
+    ``unit`` is what cosines and sines were rounded to multiples of.
     """
     reference, *sums = _centre(frames, cosines, sines, total, cosine, sine, square)
     return reference, sums[0], unit * sums[1], unit * sums[2], sums[3]
 
 
-def correlation_sum(
-    frames: NDArray[Any],
-    fresh: bool,
-    place: NDArray[np.int32],
-    basis: NDArray[np.float32],
-    reference: NDArray[np.floating],
-    total: Floats,
-    cosine: Floats,
-    sine: Floats,
-    square: Floats,
-) -> None:
+def correlation_sum(frames: Array, fresh: bool, place: Array, basis: Array, reference: Array, total: Floats,
+                    cosine: Floats, sine: Floats, square: Floats) -> None:  # fmt: skip
     """Add some frames of any weights to the sums so far.
 
-    Parameters
-    ----------
-    frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples; the kernel is told the number of places and ``P`` after it.
-    fresh : bool
-        Whether there are no sums so far.
-    place : ndarray, (m,), int32
-        Which of the frames are to be added.
-    basis : ndarray, (m, 3), float32
-        Of each of them its weight, and the weight times cosine and sine of its phase.
-    reference : ndarray, (P,), float32
-        The very first sample, which is subtracted from all.
-    total, cosine, sine, square : ndarray, (P,), float64
-        Weighted sums of the samples, of their products with cosine and sine, and of their squares; the kernel
-        holds each as the sum of two floats.
+    ``fresh`` says that there are none; then the first sample becomes the reference, which is subtracted from
+    all. ``basis``, (m, 3), holds of each frame its weight, and the weight times cosine and sine of its phase.
+    The kernel holds each sum as that of two floats.
     """
     if fresh:
         reference[:] = frames[place[0]]
@@ -208,51 +117,20 @@ def correlation_sum(
 
 
 def correlation_solve_pairs(
-    reference: NDArray[np.floating],
-    total: Floats,
-    cosine: Floats,
-    sine: Floats,
-    square: Floats,
-    fit: NDArray[np.float32],
+    reference: Array, total: Floats, cosine: Floats, sine: Floats, square: Floats, fit: Array
 ) -> Answers:
-    """Return mean, cosine, sine and residual that the sums of ``correlation_sum`` tell.
-
-    The kernel is told ``P`` before all.
-    """
+    """Return mean, cosine, sine and residual, counts, by the sums of ``correlation_sum``."""
     return _solve(np.stack([reference.astype(np.float64), total, cosine, sine, square]), fit)
 
 
-def correlation_keep(frames: NDArray[Any], first: int, window: int, ring: NDArray[Any]) -> None:
-    """Put frames into the ring of a sliding window whose samples are summed anew each time.
-
-    Parameters
-    ----------
-    frames, first, window, ring
-        As for ``correlation_slide``, but float32.
-    """
+def correlation_keep(frames: Array, first: int, window: int, ring: Array) -> None:
+    """Put frames into the ring of a sliding window whose samples are summed anew each time."""
     for number, frame in enumerate(frames, start=first):
         ring[number % window] = frame
 
 
-def correlation_window(
-    ring: NDArray[Any], place: NDArray[np.int32], basis: NDArray[np.float32], fit: NDArray[np.float32]
-) -> Answers:
-    """Return mean, cosine, sine and residual of the frames in a ring, summed anew.
-
-    Parameters
-    ----------
-    ring : ndarray, (window, P), uint8, uint16 or float32
-        Samples; the kernel is told the number of places, ``P`` and the pixels from plane to plane after it.
-    place, basis
-        As for ``correlation_sum``.
-    fit : ndarray, (28,), float32
-        See the module.
-
-    Returns
-    -------
-    mean, cosine, sine, residual : ndarray, (P,), float64
-        Counts.
-    """
+def correlation_window(ring: Array, place: Array, basis: Array, fit: Array) -> Answers:
+    """Return mean, cosine, sine and residual, counts, of the frames in a ring, summed anew."""
     reference, total, cosine, sine, square = sums = np.zeros((5, ring.shape[1]))
     correlation_sum(ring, True, place, basis, *sums)
     return correlation_solve_pairs(reference, total, cosine, sine, square, fit)
@@ -269,7 +147,7 @@ def _centre(
     return np.stack(parts).astype(np.float64)
 
 
-def _solve(sums: Floats, fit: NDArray[np.float32]) -> Answers:
+def _solve(sums: Floats, fit: Array) -> Answers:
     """Return mean, cosine, sine and residual; the sums are (5, P), the reference first."""
     table = fit.astype(np.float64)
     parts = (table[:9] + table[9:18]).reshape(3, 3) @ sums[1:4]

@@ -11,10 +11,12 @@ clear; the last looks where they are not, and not across the lines that are draw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -86,15 +88,12 @@ class Limits:
     lowest: float
 
 
-def pairs(chosen: Pass) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def pairs(chosen: Pass) -> tuple[Array, Array]:
     """Return where the pairs of a pass lie.
 
-    Returns
-    -------
-    places : ndarray, (WAYS, 3, steps, 2), int32
-        Columns to the right and rows down, of three lines side by side; the other place is the negative.
-    distances : ndarray, (WAYS, 3, steps), float32
-        From the pixel along the direction; 0 for a place that is there already.
+    ``places``, (WAYS, 3, steps, 2), are columns to the right and rows down, of three lines side by side; the
+    other place is the negative. ``distances``, (WAYS, 3, steps), are those from the pixel along the
+    direction; 0 for a place that is there already.
     """
     angle = np.pi / WAYS * np.arange(WAYS)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, np.newaxis, np.newaxis]
@@ -111,7 +110,7 @@ def pairs(chosen: Pass) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     return places, distances
 
 
-def edges_clean(contact: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def edges_clean(contact: Array) -> Array:
     """Turn over the flags, (H, W), that a pixel's neighbours contradict.
 
     A pixel out of contact needs three quarters of them in contact to be so, too: of eight, six, which fills
@@ -126,23 +125,11 @@ def edges_clean(contact: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(np.where(contact != 0, stays, fills), np.uint8)
 
 
-def edges_cells(
-    vectors: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    contact: NDArray[np.uint8],
-    clean: NDArray[np.uint8],
-) -> Doubles:
+def edges_cells(vectors: Array, sigma: Array, contact: Array, clean: Array) -> Doubles:
     """Return the cells of one pixel each, (6, H + 2 MARGIN, W + 2 MARGIN), nothing known in the margin.
 
-    Parameters
-    ----------
-    vectors : ndarray, (H, W, 3), float32
-        Unit normals; NaN where there is none.
-    sigma : ndarray, (H, W), float32
-        Their standard error, radians.
-    contact, clean : ndarray, (H, W), uint8
-        1 where there is contact. A normal counts only where both say so: what is flagged along a crease saw
-        both of its sides in turn.
+    Vectors are unit normals, NaN where there is none, sigma their standard error, radians. A normal counts
+    only where contact and clean contact say so: what is flagged along a crease saw both of its sides in turn.
     """
     known = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
     known &= sigma < np.inf
@@ -152,7 +139,7 @@ def edges_cells(
     return np.concatenate([cells, np.ones((1, *cells.shape[1:]))])
 
 
-def edges_join(cells: Doubles, edges: NDArray[np.uint8]) -> Doubles:
+def edges_join(cells: Doubles, edges: Array) -> Doubles:
     """Return cells of 3 x 3 pixels about each pixel, from those of one pixel and the lines so far."""
     known, drawn = cells[4], np.pad(edges != 0, MARGIN)
     joined = np.zeros_like(cells)
@@ -168,25 +155,12 @@ def edges_join(cells: Doubles, edges: NDArray[np.uint8]) -> Doubles:
     return joined
 
 
-def edges_jumps(
-    cells: Doubles, chosen: Pass, limits: Limits, doubt: NDArray[np.uint8]
-) -> tuple[Doubles, NDArray[np.uint8]]:
-    """Look for jumps of the normal; ``doubt`` is changed in place.
+def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> tuple[Doubles, Array]:
+    """Look for jumps of the normal, and return their strengths and directions.
 
-    Parameters
-    ----------
-    cells : ndarray, (6, H + 2 MARGIN, W + 2 MARGIN), float64
-    chosen : Pass
-    limits : Limits
-    doubt : ndarray, (H, W), uint8
-        1 where the passes so far are not quiet enough to decide; pixels without doubt have no jump.
-
-    Returns
-    -------
-    strength : ndarray, (H, W), float64
-        Jump in standard errors, in the direction where that is largest; 0 where it is no edge.
-    way : ndarray, (H, W), uint8
-        Number of that direction, clockwise from x as seen in the picture.
+    The strength is the jump in standard errors, in the direction where that is largest; 0 where it is no
+    edge. The direction is counted clockwise from x as seen in the picture. ``doubt``, (H, W), is changed in
+    place: 1 where the passes so far are not quiet enough to decide; pixels without doubt have no jump.
     """
     strength, way = np.zeros(doubt.shape), np.zeros(doubt.shape, np.uint8)
     jump, error, least = np.zeros(doubt.shape), np.zeros(doubt.shape), np.full(doubt.shape, np.inf)
@@ -208,7 +182,7 @@ def edges_jumps(
 
 
 def _fit(
-    cells: Doubles, chosen: Pass, places: NDArray[np.int32], distances: NDArray[np.float32], floor: float
+    cells: Doubles, chosen: Pass, places: Array, distances: Array, floor: float
 ) -> tuple[Doubles, Doubles, Mask]:
     """Fit the jump in one direction: return it, its standard error, and where it is one and no bend."""
     rows, columns = (size - 2 * MARGIN for size in cells.shape[1:])
@@ -262,24 +236,11 @@ def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask
     return np.sqrt(square), u2 / spread, usable, real
 
 
-def edges_thin(
-    strength: Doubles, way: NDArray[np.uint8], chosen: Pass, edges: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
+def edges_thin(strength: Doubles, way: Array, chosen: Pass, edges: Array) -> Array:
     """Add lines, where the strength is highest across them, to those drawn so far.
 
     A pixel is not drawn where a line of the passes before lies within ``guard`` of it, in the direction of
     its jump or up to 45 degrees from that: it would be the same one.
-
-    Parameters
-    ----------
-    strength, way : ndarray, (H, W)
-        Of ``edges_jumps``.
-    chosen : Pass
-    edges : ndarray, (H, W), uint8
-
-    Returns
-    -------
-    ndarray, (H, W), uint8
     """
     added = np.array(edges)
     for row, column in np.argwhere(strength > 0):
@@ -297,12 +258,12 @@ def edges_thin(
     return added
 
 
-def _value(values: NDArray[np.generic], row: int, column: int) -> float:
+def _value(values: Array, row: int, column: int) -> float:
     inside = 0 <= row < values.shape[0] and 0 <= column < values.shape[1]
     return float(values[row, column]) if inside else 0.0
 
 
-def _guarded(edges: NDArray[np.uint8], row: int, column: int, cosine: float, sine: float, guard: int) -> bool:
+def _guarded(edges: Array, row: int, column: int, cosine: float, sine: float, guard: int) -> bool:
     """Tell whether a line lies beside a pixel, or on it."""
     for down in range(-guard, guard + 1):
         for right in range(-guard, guard + 1):
@@ -314,7 +275,7 @@ def _guarded(edges: NDArray[np.uint8], row: int, column: int, cosine: float, sin
     return False
 
 
-def edges_bound(clean: NDArray[np.uint8], edges: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def edges_bound(clean: Array, edges: Array) -> Array:
     """Draw the pixels in contact with one of four neighbours out of it; what is next to them makes way."""
     touched = np.pad(clean != 0, 1, constant_values=True)
     inner = touched[:-2, 1:-1] & touched[2:, 1:-1] & touched[1:-1, :-2] & touched[1:-1, 2:]

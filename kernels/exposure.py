@@ -25,23 +25,12 @@ _STEPS = (0x9E3779B9, 0xBB67AE85)  # Weyl's constants: of the golden ratio, and 
 _LOW = 0xFFFFFFFF
 
 Words = NDArray[np.uint32]
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
 
 def philox(counter: Words, key: tuple[int, int]) -> Words:
-    """Return the random words of some counters, by Philox4x32 in ten rounds.
-
-    Parameters
-    ----------
-    counter : ndarray, (4, n), uint32
-        Words of the counter, the lowest one first.
-    key : (int, int)
-        Words of the key, the lower one first.
-
-    Returns
-    -------
-    ndarray, (4, n), uint32
-    """
+    """Return random words of counters, (4, n), the lowest word first, by Philox4x32 in ten rounds."""
     a, b, c, d = counter.astype(np.uint64)
     for number in range(10):
         near, far = ((word + number * step) & _LOW for word, step in zip(key, _STEPS, strict=True))
@@ -72,14 +61,8 @@ def direction(word: Words) -> tuple[Doubles, Doubles]:
 def normals(quarter: int, frame: int, seed: int) -> Doubles:
     """Return the standard normal numbers, (4 * quarter,), of one frame.
 
-    Counter n serves the pixels n, n + quarter, n + 2 quarter and n + 3 quarter.
-
-    Parameters
-    ----------
-    quarter : int
-        Counters.
-    frame, seed : int
-        Whole numbers from 0 to 2^64 - 1: the counter's upper half, and the key.
+    Counter n serves the pixels n, n + quarter, n + 2 quarter and n + 3 quarter. Frame and seed, whole numbers
+    from 0 to 2^64 - 1, are the counter's upper half, and the key.
     """
     counter = np.zeros((4, quarter), np.uint32)
     counter[0], counter[2], counter[3] = np.arange(quarter), frame & _LOW, frame >> 32
@@ -90,18 +73,10 @@ def normals(quarter: int, frame: int, seed: int) -> Doubles:
 
 
 def noise(signal: Doubles, normal: Doubles, read: float, grain: float) -> Doubles:
-    """Return what noise adds to a signal.
+    """Return what noise adds to a signal, counts above dark, by standard normal numbers.
 
-    Parameters
-    ----------
-    signal : ndarray, (P,)
-        Counts above dark; where they are negative, there is no shot noise.
-    normal : ndarray, (P,)
-        Standard normal numbers.
-    read : float
-        Standard deviation of the read noise, counts.
-    grain : float
-        Counts of one electron; 0 for no shot noise.
+    ``read`` is the standard deviation of the read noise, counts; ``grain`` the counts of one electron, 0 for
+    no shot noise. Where the signal is negative, there is no shot noise.
     """
     shot = np.maximum(signal, 0) * grain
     variance = read**2 + shot
@@ -111,33 +86,12 @@ def noise(signal: Doubles, normal: Doubles, read: float, grain: float) -> Double
     return np.asarray(np.sqrt(np.maximum(variance - 2 * bend**2, 0)) * normal + bend * (normal**2 - 1))
 
 
-def expose(
-    light: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    span: NDArray[np.float32],
-    frame: int,
-    seed: int,
-    read: float,
-    grain: float,
-    top: float,
-    counts: NDArray[Any],
-) -> None:
+def expose(light: Array, offset: Array, span: Array, frame: int, seed: int, read: float, grain: float,
+           top: float, counts: Array) -> None:  # fmt: skip
     """Write the counts of one frame.
 
-    Parameters
-    ----------
-    light : ndarray, (P,), float32
-        0 to 1; P is a multiple of four, and the kernel is told a quarter of it after the maps.
-    offset, span : ndarray, (P,), float32
-        Counts without light, and how many more there are in full light.
-    frame, seed : int
-        See ``normals``.
-    read, grain : float
-        See ``noise``.
-    top : float
-        The largest count: integer types are rounded, half to even, and clipped to 0 ... top.
-    counts : ndarray, (P,), uint8, uint16 or float32
-        Where to write.
+    ``light`` is 0 to 1, ``offset`` the counts without light, and ``span`` how many more there are in full
+    light; (P,), P a multiple of four. Integer types are rounded, half to even, and clipped to 0 ... ``top``.
     """
     signal = span.astype(np.float64) * light
     exact = offset + signal + noise(signal, normals(len(light) // 4, frame, seed), read, grain)

@@ -11,10 +11,12 @@ per link, so that it is 0 in all on every connected component without a known he
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Flags = NDArray[np.uint8]
@@ -28,32 +30,14 @@ LOST = 16
 """It was wanted, but its slopes are no numbers."""
 
 
-def links_flags(
-    dz_dx: NDArray[np.float32],
-    dz_dy: NDArray[np.float32],
-    mask: NDArray[np.uint8] | None,
-    weight_x: NDArray[np.float32] | None,
-    weight_y: NDArray[np.float32] | None,
-    heights: NDArray[np.float32] | None,
-    height_weights: NDArray[np.float32] | None,
-) -> Flags:
+def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array | None,
+                weight_y: Array | None, heights: Array | None,
+                height_weights: Array | None) -> Flags:  # fmt: skip
     """Return what the pixels are and which are linked, (H, W), a sum of the flags above.
 
-    Neighbours are linked where the slopes of both count along the link.
-
-    Parameters
-    ----------
-    dz_dx, dz_dy : ndarray, (H, W), float32
-        Slopes; not finite where there is none.
-    mask : ndarray, (H, W), uint8, or None
-        0 where no answer is wanted. None for nowhere.
-    weight_x, weight_y : ndarray, (H, W), float32, or None
-        Confidence of the slopes; 0 where there is none. None for the same everywhere; ``weight_y`` None where
-        it is ``weight_x``.
-    heights : ndarray, (H, W), float32, or None
-        Known heights; not finite where there is none.
-    height_weights : ndarray, (H, W), float32, or None
-        Their confidence; 0 where there is none. None for the same everywhere.
+    Neighbours are linked where the slopes of both count along the link. Slopes and known heights are not
+    finite where there is none, weights and the mask are 0; all but the slopes may be None: for the same
+    everywhere, or ``weight_y`` for that it is ``weight_x``.
     """
     wanted = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
     along_x = wanted if weight_x is None else wanted & (weight_x > 0)
@@ -71,21 +55,11 @@ def links_flags(
     return np.asarray(flags + RIGHT * right + DOWN * down, np.uint8)
 
 
-def links_cut(
-    dz_dx: NDArray[np.float32], dz_dy: NDArray[np.float32], edges: NDArray[np.uint8], flags: Flags
-) -> Flags:
+def links_cut(dz_dx: Array, dz_dy: Array, edges: Array, flags: Flags) -> Flags:
     """Return the flags without the links that lead across edges.
 
     A pixel on an edge keeps one link, to that neighbour off the edge whose slopes are the most similar; among
     equals to the one on the right, on the left, below, above, in this order.
-
-    Parameters
-    ----------
-    dz_dx, dz_dy : ndarray, (H, W), float32
-    edges : ndarray, (H, W), uint8
-        Not 0 on an edge.
-    flags : ndarray, (H, W), uint8
-        Of ``links_flags``.
     """
     cut, marked = flags.copy(), edges != 0
     for row, column in np.argwhere(marked):
@@ -112,7 +86,7 @@ def _links_of(
 
 
 def _most_alike(
-    dz_dx: NDArray[np.float32], dz_dy: NDArray[np.float32], marked: Mask, flags: Flags, row: int, column: int
+    dz_dx: Array, dz_dy: Array, marked: Mask, flags: Flags, row: int, column: int
 ) -> tuple[int, int] | None:
     """Return the linked neighbour off the edge whose slopes are nearest to a pixel's."""
     best, least = None, np.inf
@@ -123,20 +97,10 @@ def _most_alike(
     return best
 
 
-def links_join(
-    dz_dx: NDArray[np.float32],
-    dz_dy: NDArray[np.float32],
-    flags: Flags,
-    weight_x: NDArray[np.float32] | None,
-    weight_y: NDArray[np.float32] | None,
-    heights: NDArray[np.float32] | None,
-    height_weights: NDArray[np.float32] | None,
-    weights: Triple,
-    size: tuple[float, float],
-    plane: Triple,
-    *,
-    owned: bool = False,
-) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+def links_join(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, weight_y: Array | None,
+               heights: Array | None, height_weights: Array | None, weights: Triple,
+               size: tuple[float, float], plane: Triple, *,
+               owned: bool = False) -> tuple[Doubles, Doubles, Doubles, Doubles]:  # fmt: skip
     """Return right, down, anchor and source of `mirrorskin.engine.integration.graph.Links`, (H, W) each.
 
     The slope of a link is (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line, where links lead
@@ -168,21 +132,10 @@ def links_join(
     return right, down, anchor, source + anchor * above
 
 
-def links_misfit(
-    dz_dx: NDArray[np.float32],
-    dz_dy: NDArray[np.float32],
-    flags: Flags,
-    weight_x: NDArray[np.float32] | None,
-    weight_y: NDArray[np.float32] | None,
-    heights: NDArray[np.float32] | None,
-    height_weights: NDArray[np.float32] | None,
-    weights: Triple,
-    size: tuple[float, float],
-    plane: Triple,
-    relief: NDArray[np.floating],
-    *,
-    owned: bool = False,
-) -> float:
+def links_misfit(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, weight_y: Array | None,
+                 heights: Array | None, height_weights: Array | None, weights: Triple,
+                 size: tuple[float, float], plane: Triple, relief: Array, *,
+                 owned: bool = False) -> float:  # fmt: skip
     """Return the sum that heights are to make least, of ``relief``, (H, W), the heights above the plane.
 
     The other parameters are those of ``links_join``. The kernel returns a sum of each of its items.
@@ -200,7 +153,7 @@ def links_misfit(
     return float(sum(sums))
 
 
-def links_smooth(flags: Flags, values: NDArray[np.floating]) -> Doubles:
+def links_smooth(flags: Flags, values: Array) -> Doubles:
     """Return values, (H, W), each with a fifth of the way to each linked neighbour's gone.
 
     Pixels whose heights are known and such whose heights are not give each other nothing.
@@ -214,17 +167,9 @@ def links_smooth(flags: Flags, values: NDArray[np.floating]) -> Doubles:
     return smoothed
 
 
-def _steps(
-    dz_dx: NDArray[np.float32],
-    dz_dy: NDArray[np.float32],
-    flags: Flags,
-    weight_x: NDArray[np.float32] | None,
-    weight_y: NDArray[np.float32] | None,
-    weights: Triple,
-    size: tuple[float, float],
-    plane: Triple,
-    owned: bool,
-) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]]:
+def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, weight_y: Array | None,
+           weights: Triple, size: tuple[float, float], plane: Triple,
+           owned: bool) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]]:  # fmt: skip
     """Return the weight of each link and the height that it should lead up; to the right, and down."""
     map_x = np.ones(flags.shape) if weight_x is None else weight_x.astype(np.float64)
     map_y = map_x if weight_y is None else weight_y.astype(np.float64)
@@ -237,7 +182,7 @@ def _steps(
     )
 
 
-def _slopes(slope: NDArray[np.float32], linked: Mask) -> Doubles:
+def _slopes(slope: Array, linked: Mask) -> Doubles:
     """Return the slopes of the links to the next column."""
     ends = linked | np.roll(linked, 1, axis=1)
     known, found = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
@@ -256,14 +201,8 @@ def _harmonic(weight: Doubles) -> Doubles:
     return joined
 
 
-def _anchors(
-    flags: Flags,
-    heights: NDArray[np.float32] | None,
-    height_weights: NDArray[np.float32] | None,
-    weights: Triple,
-    size: tuple[float, float],
-    plane: Triple,
-) -> tuple[Doubles, Doubles]:
+def _anchors(flags: Flags, heights: Array | None, height_weights: Array | None, weights: Triple,
+             size: tuple[float, float], plane: Triple) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Return the weight of each known height, and how high it is above the plane."""
     known = flags & KNOWN != 0
     row, column = np.indices(flags.shape)

@@ -82,19 +82,8 @@ def multigrid_invert(
     inverse[part] = _inverse(_diagonal(part, stride, right, down, anchor))
 
 
-def multigrid_begin(
-    base: int,
-    rows: int,
-    stride: int,
-    omega: float,
-    then: float,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    inverse: Array,
-    b: Array,
-    x: Array,
-) -> None:
+def multigrid_begin(base: int, rows: int, stride: int, omega: float, then: float, right: Array, down: Array,
+                    anchor: Array, inverse: Array, b: Array, x: Array) -> None:  # fmt: skip
     """Do two steps of Jacobi's method from heights of zero."""
     part = _picture(base, rows, stride)
     first = np.zeros(part.stop + stride)
@@ -103,51 +92,23 @@ def multigrid_begin(
     x[part] = first[part] + then * inverse[part] * left
 
 
-def multigrid_smooth(
-    base: int,
-    rows: int,
-    stride: int,
-    omega: float,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    b: Array,
-    x: Array,
-    smoother: Array,
-) -> None:
+def multigrid_smooth(base: int, rows: int, stride: int, omega: float, right: Array, down: Array,
+                     anchor: Array, b: Array, x: Array, smoother: Array) -> None:  # fmt: skip
     """Do a step of Jacobi's method."""
     part = _picture(base, rows, stride)
     left = b[part] + _flow(part, stride, right, down, anchor, x)
     smoother[part] = x[part] + omega * left * _inverse(_diagonal(part, stride, right, down, anchor))
 
 
-def multigrid_residual(
-    base: int,
-    rows: int,
-    stride: int,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    b: Array,
-    x: Array,
-    left: Array,
-) -> None:
+def multigrid_residual(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array,
+                       b: Array, x: Array, left: Array) -> None:  # fmt: skip
     """Write what is left over."""
     part = _picture(base, rows, stride)
     left[part] = b[part] + _flow(part, stride, right, down, anchor, x)
 
 
-def multigrid_leave(
-    base: int,
-    rows: int,
-    stride: int,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    b: Array,
-    x: Array,
-    left: Array,
-) -> None:
+def multigrid_leave(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array, b: Array,
+                    x: Array, left: Array) -> None:  # fmt: skip
     """Write what is left over, over the diagonal."""
     part = _picture(base, rows, stride)
     rest = b[part] + _flow(part, stride, right, down, anchor, x)
@@ -195,17 +156,8 @@ def _neighbours(node: Array, stride: int, right: Array, down: Array) -> list[tup
     return [(weights[at].astype(np.float64), node + step) for weights, at, step in links]
 
 
-def multigrid_restrict(
-    base: int,
-    stride: int,
-    coarse_base: int,
-    coarse_rows: int,
-    coarse_stride: int,
-    right: Array,
-    down: Array,
-    left: Array,
-    b: Array,
-) -> None:
+def multigrid_restrict(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
+                       right: Array, down: Array, left: Array, b: Array) -> None:  # fmt: skip
     """Write the coarse right side: what is left over, spread by a step of Jacobi's method, of each block."""
     corner, steps = _blocks(base, stride, coarse_rows)
     whole = np.zeros(corner.shape)
@@ -216,13 +168,7 @@ def multigrid_restrict(
 
 
 def multigrid_gather(
-    base: int,
-    stride: int,
-    coarse_base: int,
-    coarse_rows: int,
-    coarse_stride: int,
-    fine: Array,
-    b: Array,
+    base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int, fine: Array, b: Array
 ) -> None:
     """Write the coarse right side of full multigrid where no block is odd: the sum of each block."""
     corner, steps = _blocks(base, stride, coarse_rows)
@@ -230,20 +176,9 @@ def multigrid_gather(
     b[_coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)] = whole
 
 
-def multigrid_prolong(
-    base: int,
-    stride: int,
-    coarse_base: int,
-    coarse_rows: int,
-    coarse_stride: int,
-    keep: float,
-    right: Array,
-    down: Array,
-    inverse: Array,
-    e: Array,
-    x: Array,
-    corrected: Array,
-) -> None:
+def multigrid_prolong(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
+                      keep: float, right: Array, down: Array, inverse: Array, e: Array, x: Array,
+                      corrected: Array) -> None:  # fmt: skip
     """Add the coarse answer, spread by a step of Jacobi's method, to so much of heights."""
     corner, steps = _blocks(base, stride, coarse_rows)
     for step in steps:
@@ -255,20 +190,9 @@ def multigrid_prolong(
         corrected[node] = keep * x[node].astype(np.float64) + inverse[node] * told
 
 
-def multigrid_coarsen(
-    base: int,
-    stride: int,
-    coarse_base: int,
-    coarse_rows: int,
-    coarse_stride: int,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    coarse_right: Array,
-    coarse_down: Array,
-    coarse_anchor: Array,
-    split: Array,
-) -> None:
+def multigrid_coarsen(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
+                      right: Array, down: Array, anchor: Array, coarse_right: Array, coarse_down: Array,
+                      coarse_anchor: Array, split: Array) -> None:  # fmt: skip
     """Write the coarse links and anchors, and 1 where a block does not hang together by strong links."""
     corner, _ = _blocks(base, stride, coarse_rows)
     a, b, c, d = corner, corner + 1, corner + stride, corner + stride + 1
@@ -311,75 +235,34 @@ def _rows(
     return sums
 
 
-def multigrid_invert_odd(
-    at: int,
-    count: int,
-    node: Array,
-    start: Array,
-    column: Array,
-    weight: Array,
-    anchor: Array,
-    inverse: Array,
-) -> None:
+def multigrid_invert_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                         anchor: Array, inverse: Array) -> None:  # fmt: skip
     """Write one over the diagonal of odd nodes."""
     i = node[at : at + count]
     inverse[i] = _inverse(_rows(at, count, (node, start, column, weight)) + anchor[i])
 
 
-def multigrid_begin_odd(
-    at: int,
-    count: int,
-    node: Array,
-    start: Array,
-    column: Array,
-    weight: Array,
-    omega: float,
-    then: float,
-    anchor: Array,
-    inverse: Array,
-    b: Array,
-    x: Array,
-) -> None:
+def multigrid_begin_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                        omega: float, then: float, anchor: Array, inverse: Array, b: Array,
+                        x: Array) -> None:  # fmt: skip
     """Do two steps of Jacobi's method from heights of zero, at odd nodes."""
     i, first = node[at : at + count], omega * b.astype(np.float64) * inverse
     flow = _rows(at, count, (node, start, column, weight), first, first) - anchor[i] * first[i]
     x[i] = first[i] + then * inverse[i] * (b[i] + flow)
 
 
-def multigrid_smooth_odd(
-    at: int,
-    count: int,
-    node: Array,
-    start: Array,
-    column: Array,
-    weight: Array,
-    omega: float,
-    anchor: Array,
-    inverse: Array,
-    b: Array,
-    x: Array,
-    smoother: Array,
-) -> None:
+def multigrid_smooth_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                         omega: float, anchor: Array, inverse: Array, b: Array, x: Array,
+                         smoother: Array) -> None:  # fmt: skip
     """Do a step of Jacobi's method at odd nodes."""
     i = node[at : at + count]
     flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
     smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow)
 
 
-def multigrid_leave_odd(
-    at: int,
-    count: int,
-    node: Array,
-    start: Array,
-    column: Array,
-    weight: Array,
-    divide: int,
-    anchor: Array,
-    inverse: Array,
-    b: Array,
-    x: Array,
-    left: Array,
-) -> None:
+def multigrid_leave_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                        divide: int, anchor: Array, inverse: Array, b: Array, x: Array,
+                        left: Array) -> None:  # fmt: skip
     """Write what is left over at odd nodes, over the diagonal or not."""
     i = node[at : at + count]
     flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
@@ -393,19 +276,9 @@ def multigrid_restrict_odd(
     b[node[at : at + count]] = _rows(at, count, (node, start, column, weight), left)
 
 
-def multigrid_prolong_odd(
-    at: int,
-    count: int,
-    node: Array,
-    start: Array,
-    column: Array,
-    weight: Array,
-    keep: float,
-    inverse: Array,
-    e: Array,
-    x: Array,
-    corrected: Array,
-) -> None:
+def multigrid_prolong_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                          keep: float, inverse: Array, e: Array, x: Array,
+                          corrected: Array) -> None:  # fmt: skip
     """Add the coarse answer to heights of nodes that odd parts tell."""
     i = node[at : at + count]
     told = _rows(at, count, (node, start, column, weight), e)
@@ -418,20 +291,9 @@ def multigrid_solve(count: int, bottom: Array, matrix: Array, b: Array, x: Array
     x[nodes] = matrix.reshape(-1)[: count**2].reshape(count, count).astype(np.float64) @ b[nodes]
 
 
-def multigrid_direct(
-    base: int,
-    rows: int,
-    stride: int,
-    beta: float,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    z: Array,
-    before: Array,
-    direction: Array,
-    image: Array,
-    parts: Array,
-) -> None:
+def multigrid_direct(base: int, rows: int, stride: int, beta: float, right: Array, down: Array,
+                     anchor: Array, z: Array, before: Array, direction: Array, image: Array,
+                     parts: Array) -> None:  # fmt: skip
     """Write the next direction of conjugate gradients, the matrix times it, and their product."""
     part = _picture(base, rows, stride)
     whole = slice(part.start - stride, part.stop + stride)
@@ -443,17 +305,8 @@ def multigrid_direct(
     parts[0] = np.sum(p[part] * image[part])
 
 
-def multigrid_advance(
-    base: int,
-    rows: int,
-    stride: int,
-    alpha: float,
-    direction: Array,
-    image: Array,
-    b: Array,
-    x: Array,
-    parts: Array,
-) -> None:
+def multigrid_advance(base: int, rows: int, stride: int, alpha: float, direction: Array, image: Array,
+                      b: Array, x: Array, parts: Array) -> None:  # fmt: skip
     """Take a step along it; write the square of what is left over in the first part."""
     part = _picture(base, rows, stride)
     x[part] = _double(x, part) + alpha * direction[part]
@@ -462,19 +315,8 @@ def multigrid_advance(
     parts[0] = np.sum(_double(b, part) ** 2)
 
 
-def multigrid_curve(
-    base: int,
-    rows: int,
-    stride: int,
-    right: Array,
-    down: Array,
-    anchor: Array,
-    b: Array,
-    z: Array,
-    p: Array,
-    count: int,
-    parts: Array,
-) -> None:
+def multigrid_curve(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array, b: Array,
+                    z: Array, p: Array, count: int, parts: Array) -> None:  # fmt: skip
     """Write, of two directions, z A z, z A p, p A p and b p, each in the first of its parts."""
     part = _picture(base, rows, stride)
     z_image, p_image = (-_flow(part, stride, right, down, anchor, one) for one in (z, p))
@@ -483,18 +325,8 @@ def multigrid_curve(
     parts[::count] = [np.sum(one) for one in (*products, _double(b, part) * _double(p, part))]
 
 
-def multigrid_follow(
-    base: int,
-    rows: int,
-    stride: int,
-    products: int,
-    product: Array,
-    count: int,
-    parts: Array,
-    z: Array,
-    p: Array,
-    x: Array,
-) -> None:
+def multigrid_follow(base: int, rows: int, stride: int, products: int, product: Array, count: int,
+                     parts: Array, z: Array, p: Array, x: Array) -> None:  # fmt: skip
     """Take the best step in the plane of z and p, or along z where both are nearly one; p becomes it."""
     part = _picture(base, rows, stride)
     bz = np.sum(_double(product, slice(products)))

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
 MORE = 12
@@ -114,33 +115,18 @@ class Answer:
 
 
 def normals_exact(
-    frames: NDArray[Any],
-    turn: Doubles,
-    scale: Doubles,
-    tilt: float,
-    noise: Variance,
-    limits: Limits,
+    frames: Array, turn: Doubles, scale: Doubles, tilt: float, noise: Variance, limits: Limits
 ) -> Answer:
     """Find the most likely normals.
 
     Parameters
     ----------
-    frames : ndarray, (N, n), uint8, uint16 or float32
-        Samples of n pixels. Whole counts at the ends of their type are clipped: their likelihood is that of
-        being beyond. A NaN is a missing sample.
-    turn : ndarray, (6, N), float64
-        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
-    scale : ndarray, (4,) or (4, n), float64
-        Counts at zenith 0, radians per count, and the zeniths between which brightness is linear. What is
-        expected out of them tells nothing of the direction.
-    tilt : float
-        Radians.
-    noise : Variance
-    limits : Limits
-
-    Returns
-    -------
-    Answer
+    frames : (N, n), samples of n pixels. Whole counts at the ends of their type are clipped: their likelihood
+        is that of being beyond. A NaN is a missing sample
+    turn : (6, N), cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine
+    scale : (4,) or (4, n), counts at zenith 0, radians per count, and the zeniths between which brightness is
+        linear. What is expected out of them tells nothing of the direction
+    tilt : radians
     """
     samples = Samples(frames, turn, scale, noise)
     normal = _start(samples, turn, tilt)
@@ -162,27 +148,13 @@ def normals_exact(
 
 
 def normals_paper(
-    frames: NDArray[Any],
-    turn: Doubles,
-    scale: Doubles,
-    noise: Variance,
-    limits: Limits,
-    spread: Doubles,
+    frames: Array, turn: Doubles, scale: Doubles, noise: Variance, limits: Limits, spread: Doubles
 ) -> Answer:
     """Find normals by the paper's approximation: the mean is the zenith, the wave's phase the azimuth.
 
-    Parameters
-    ----------
-    frames, turn, scale, noise, limits
-        As for `normals_exact`; nothing is known of clipped and missing samples here.
-    spread : ndarray, (4,), float64
-        Variances of mean and cosine, covariance of cosine and sine, and variance of the sine, in those of a
-        sample.
-
-    Returns
-    -------
-    Answer
-        The standard errors are those by noise; the approximation's own error comes on top.
+    Nothing is known of clipped and missing samples here. ``spread`` holds the variances of mean and cosine,
+    the covariance of cosine and sine, and the variance of the sine, in those of a sample. The standard errors
+    are those by noise; the approximation's own error comes on top.
     """
     samples = Samples(frames, turn, scale, noise)
     zenith, c, s = samples.mean, samples.cosine, samples.sine
@@ -205,15 +177,7 @@ def normals_paper(
 
 
 def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
-    """Take another turn into the mean of those before it.
-
-    Parameters
-    ----------
-    before, now : Answer
-        Normals are averaged with the inverses of their variances as weights.
-    turns : int
-        How many they are with this one.
-    """
+    """Take a turn into the mean of the ``turns`` - 1 before it, normals weighted by inverse variances."""
     own, theirs = (np.where(np.isnan(one.sigma), 0.0, 1 / one.sigma**2) for one in (now, before))
     sums = own[:, np.newaxis] * np.nan_to_num(now.vectors) + theirs[:, np.newaxis] * np.nan_to_num(
         before.vectors
@@ -239,7 +203,7 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
 class Samples:
     """Samples as zeniths, and their fit with one wave a turn."""
 
-    def __init__(self, frames: NDArray[Any], turn: Doubles, scale: Doubles, noise: Variance) -> None:
+    def __init__(self, frames: Array, turn: Doubles, scale: Doubles, noise: Variance) -> None:
         count, pixels = frames.shape
         self.offset, per_count, self.low, self.high = np.broadcast_to(scale.reshape(4, -1), (4, pixels))
         self.per_count = per_count
@@ -265,33 +229,13 @@ class Samples:
         self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
 
-def conclude(
-    normal: Doubles,
-    sums: Sums,
-    samples: Samples,
-    plain: NDArray[np.int_],
-    tilt: float,
-    limits: Limits,
-    model: float | Doubles,
-    rest: NDArray[np.bool_],
-) -> Answer:
-    """Say how sure a direction is, and whether it is one of a lasting contact.
+def conclude(normal: Doubles, sums: Sums, samples: Samples, plain: Array, tilt: float, limits: Limits,
+             model: float | Doubles, rest: NDArray[np.bool_]) -> Answer:  # fmt: skip
+    """Say how certain a direction is, and whether it is one of a lasting contact.
 
-    Parameters
-    ----------
-    normal : ndarray, (n, 3), float64
-    sums : Sums
-        At the direction, or next to it.
-    samples : Samples
-    plain : ndarray, (n,), int
-        How many samples are whole and within their range.
-    tilt : float
-        Radians.
-    limits : Limits
-    model : float or ndarray, (n,), float64
-        Sum of squares that the model may leave out, in the unit of the samples, squared.
-    rest : ndarray, (n,), bool
-        Where the sheet is at rest.
+    The sums are those at the direction, or next to it; ``plain`` counts the samples that are whole and within
+    their range; ``model`` is the sum of squares that the model may leave out, in the unit of the samples,
+    squared; ``rest`` is where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):

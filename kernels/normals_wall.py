@@ -32,6 +32,8 @@ from mirrorskin.kernels.normals import (
 )
 from mirrorskin.kernels.response import light_slopes, wall_light
 
+Array = NDArray[Any]
+
 STEPS = 3
 """Gauss-Newton steps of all pixels: one more moves the answer by less than a tenth of its standard error."""
 
@@ -76,29 +78,13 @@ class Wall(NamedTuple):
 
 
 def normals_wall(
-    frames: NDArray[Any],
-    turn: Doubles,
-    scale: Doubles,
-    wall: Wall,
-    tilt: float,
-    noise: Variance,
-    limits: Limits,
+    frames: Array, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, noise: Variance, limits: Limits
 ) -> Answer:
-    """Find the most likely normals.
+    """Find the most likely normals; samples that are expected out of range tell nothing of the direction.
 
-    Parameters
-    ----------
-    frames, turn, tilt, noise, limits
-        As for ``normals_exact``. What the model may leave out is an angle of the meridian here as well.
-    scale : ndarray, (5, n), float64
-        Counts without light; light per count; x and y from the wall's axis on the rest plane, and z of the
-        object in the mean pose, mm.
-    wall : Wall
-
-    Returns
-    -------
-    Answer
-        Samples that are expected out of range tell nothing of the direction.
+    The arguments are those of ``normals_exact``, but for ``scale``, (5, n): counts without light; light per
+    count; x and y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. What the
+    model may leave out is an angle of the meridian here as well.
     """
     ends = np.broadcast_to(np.array(wall.ends)[:, np.newaxis], (2, scale.shape[1]))
     samples = Samples(frames, turn, np.concatenate([scale[:2], ends]), noise)
@@ -148,13 +134,7 @@ def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
 
 
 def _look(
-    normal: Doubles,
-    samples: Samples,
-    turn: Doubles,
-    scale: Doubles,
-    wall: Wall,
-    tilt: float,
-    closely: bool,
+    normal: Doubles, samples: Samples, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, closely: bool
 ) -> tuple[Sums, NDArray[np.bool_]]:
     """Form the normal equations at a direction, and tell which samples are expected within range."""
     turning, tilting = _rotations(turn, tilt)

@@ -16,44 +16,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
+
 DARK = -1
 INVALID = -2
 
 
-def complement(samples: NDArray[Any]) -> NDArray[Any]:
+def complement(samples: Array) -> Array:
     """Exchange dark and light: the distance to the type's largest number, or the negative of a float."""
     return -samples if samples.dtype.kind == "f" else ~samples
 
 
 def onset_levels(
-    bright: NDArray[np.float32],
-    dark: NDArray[np.float32],
-    threshold: float,
-    dtype: np.dtype[Any],
-    release: bool = False,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]:
-    """Turn a share of the way from dark to bright into counts.
+    bright: Array, dark: Array, threshold: float, dtype: np.dtype[Any], release: bool = False
+) -> tuple[Array, Array, Array]:
+    """Turn a share of the way from dark to bright into counts: level, plateau and light.
 
-    Parameters
-    ----------
-    bright, dark : ndarray, (P,), float32
-        Counts with full light and without.
-    threshold : float
-        Share at which a pixel counts as light; the kernel is told it as the sum of two floats.
-    dtype : dtype
-        Type of a sample.
-    release : bool
-        Whether to complement the answers.
-
-    Returns
-    -------
-    level : ndarray, (P,), float32
-        The smallest float32 that reaches the threshold; NaN where bright is not above dark.
-    plateau : ndarray, (P,), float32
-        Counts without light; with light, complemented, for a release.
-    light : ndarray, (P,), dtype
-        Smallest sample that is light; saturated ones always are. For a release, the smallest complemented
-        sample that is not.
+    ``level`` is the smallest float32 that reaches the threshold, NaN where bright is not above dark;
+    ``plateau`` the counts without light; ``light`` the smallest sample that is light, as saturated ones
+    always are. For a release all are complemented: the plateau is that with light, and ``light`` the smallest
+    complemented sample that is not.
     """
     low, high = dark.astype(np.float64), bright.astype(np.float64)
     with np.errstate(invalid="ignore"):
@@ -73,7 +55,7 @@ def onset_levels(
     return level, dark, light
 
 
-def onset_sure(level: NDArray[np.float32], light: NDArray[Any], tolerance: float) -> NDArray[Any]:
+def onset_sure(level: Array, light: Array, tolerance: float) -> Array:
     """Return the smallest samples, (P,), that miss the level by less than the tolerance, counts.
 
     Below them a sample is surely dark. They are never above `light`, and `light` itself where the level is
@@ -87,40 +69,22 @@ def onset_sure(level: NDArray[np.float32], light: NDArray[Any], tolerance: float
     return np.asarray(np.minimum(above, light), light.dtype)
 
 
-def onset_scan(
-    frames: NDArray[Any],
-    first: int,
-    hold: int,
-    light: NDArray[Any],
-    sure: NDArray[Any],
-    onset: NDArray[np.int32],
-    below: NDArray[np.int32],
-    last: NDArray[Any],
-    before: NDArray[Any],
-    at: NDArray[Any],
-    after: NDArray[Any],
-) -> None:
+def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, onset: Array, below: Array,
+               last: Array, before: Array, at: Array, after: Array) -> None:  # fmt: skip
     """Go through a block of frames; the maps are the state, changed in place.
 
     Parameters
     ----------
-    frames : ndarray, (n, P), uint8, uint16 or float32
-        Samples.
-    first : int
-        Number of the block's first frame in the stack.
-    hold : int
-        Light frames in a row that make an onset.
-    light, sure : ndarray, (P,), as frames
-        Smallest sample that is light, and smallest that is not surely dark.
-    onset : ndarray, (P,), int32
-        Frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no number.
-    below : ndarray, (P,), int32
-        Last frame before the run that was surely dark; the first frame is taken for dark. The kernel keeps it
-        only where it is not the last frame before the run.
-    last : ndarray, (P,), as frames
-        The sample before the block.
-    before, at, after : ndarray, (P,), as frames
-        Samples one before and at the onset, and the lesser of the two that follow it.
+    frames : (n, P), uint8, uint16 or float32
+    first : number of the block's first frame in the stack
+    hold : light frames in a row that make an onset
+    light, sure : (P,), smallest sample that is light, and smallest that is not surely dark
+    onset : (P,), frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no
+        number
+    below : (P,), last frame before the run that was surely dark; the first frame is taken for dark. The
+        kernel keeps it only where it is not the last frame before the run
+    last : (P,), the sample before the block
+    before, at, after : (P,), samples one before and at the onset, and the lesser of the two that follow it
     """
     for number, frame in enumerate(frames, start=first):
         undecided = (onset == DARK) | ((onset >= 0) & (number - onset < hold))
@@ -143,56 +107,29 @@ def onset_scan(
         last[:] = frame
 
 
-def onset_heights(
-    onset: NDArray[np.int32],
-    below: NDArray[np.int32],
-    before: NDArray[Any],
-    at: NDArray[Any],
-    after: NDArray[Any],
-    level: NDArray[np.float32],
-    dark: NDArray[np.float32],
-    travel: NDArray[np.float64],
-    noise: float,
-    dark_tolerance: float,
-    light_tolerance: float,
-    subframe: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
-    """Turn onsets into heights.
+def onset_heights(onset: Array, below: Array, before: Array, at: Array, after: Array, level: Array,
+                  dark: Array, travel: NDArray[np.float64], noise: float, dark_tolerance: float,
+                  light_tolerance: float,
+                  subframe: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], Array]:  # fmt: skip
+    """Turn onsets into heights, standard deviations (mm) and status.
 
-    The crossing lies between the frame before the onset and the onset. Where both samples sit on the
-    pixel's plateaus, nothing is known but that interval: its middle is the unbiased guess, and its
-    half-width over sqrt(3) the standard deviation. Elsewhere the samples tell where the level was
-    crossed, as well as the noise allows if the change was under way in both of them; a sample on a plateau
-    does not tell when the change began or ended, so with one of them there the interval's share is added.
-    A pixel may also hover about its level and cross it when noise says so: its step is within the noise, or
-    it was near the level for longer than its step would take. It may have crossed at any time since the last
-    frame in which it was surely dark.
-    Without `subframe` the height is that of the paper's equation 4, at the onset itself, which is wrong by
-    half a step on average and by up to a whole one.
+    The crossing lies between the frame before the onset and the onset. Where both samples sit on the pixel's
+    plateaus, nothing is known but that interval: its middle is the unbiased guess, and its half-width over
+    sqrt(3) the standard deviation. Elsewhere the samples tell where the level was crossed, as well as the
+    noise allows if the change was under way in both of them; a sample on a plateau does not tell when the
+    change began or ended, so with one of them there the interval's share is added. A pixel may also hover
+    about its level and cross it when noise says so: its step is within the noise, or it was near the level
+    for longer than its step would take. It may have crossed at any time since the last frame in which it was
+    surely dark. Without `subframe` the height is that of the paper's equation 4, at the onset itself, which
+    is wrong by half a step on average and by up to a whole one.
 
     Parameters
     ----------
-    onset, below, before, at, after : ndarray, (P,)
-        As ``onset_scan`` leaves them.
-    level : ndarray, (P,), float32
-        Counts at which a pixel turns light.
-    dark : ndarray, (P,), float32
-        Counts of the dark plateau.
-    travel : ndarray, (T,), float64
-        Millimetres, one a frame.
-    noise : float
-        Standard deviation of a sample, counts.
-    dark_tolerance, light_tolerance : float
-        Counts by which a sample on a plateau may differ from it.
-    subframe : bool
-        Whether to look inside the interval.
-
-    Returns
-    -------
-    height, sigma : ndarray, (P,), float64
-        Millimetres, NaN where there is no onset.
-    status : ndarray, (P,), uint8
-        0 invalid input, 1 onset, 2 never light, 3 light at start.
+    onset, below, before, at, after : as ``onset_scan`` leaves them
+    level, dark : (P,), counts at which a pixel turns light, and of the dark plateau
+    travel : (T,), mm, one a frame
+    noise : standard deviation of a sample, counts
+    dark_tolerance, light_tolerance : counts by which a sample on a plateau may differ from it
     """
     status = np.select([onset == INVALID, onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height = np.full(onset.shape, np.nan)

@@ -19,8 +19,12 @@ The kernels are told sizes besides, and go about the Fourier transforms by the t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+
+Array = NDArray[Any]
 
 Floats = NDArray[np.floating]
 
@@ -30,13 +34,7 @@ _HALF = 8
 def rectangle_modes(source: Floats, turns: Floats, spectrum: Floats) -> None:
     """Write twice the cosine modes of lines, by their Fourier transform (Makhoul 1980).
 
-    Parameters
-    ----------
-    source : ndarray, (lines, length)
-    turns : ndarray, (modes, 2)
-        Cosine and sine of pi k / (2 length).
-    spectrum : ndarray, (strips, padded, 16)
-        Where to write, for the first ``lines`` of ``padded``.
+    ``turns``, (modes, 2), are cosine and sine of pi k / (2 length).
     """
     lines, length = source.shape
     points = np.concatenate([source[:, ::2], source[:, 1::2][:, ::-1]], axis=1).astype(np.float64)
@@ -47,28 +45,14 @@ def rectangle_modes(source: Floats, turns: Floats, spectrum: Floats) -> None:
     spectrum[:, :lines] = np.concatenate([low, high], axis=2)
 
 
-def rectangle_columns(
-    level: bool,
-    reach: NDArray[np.integer],
-    fading: Floats,
-    ends: Floats,
-    spectrum: Floats,
-) -> None:
+def rectangle_columns(level: bool, reach: Array, fading: Floats, ends: Floats, spectrum: Floats) -> None:
     """Solve across the lines for each slot, in place; by elimination, and substitution backwards.
 
-    Parameters
-    ----------
-    level : bool
-        Whether mode 0 has no level of its own: then its mean becomes 0, and that of its right side is taken
-        for 0.
-    reach : ndarray, (strips, 2), int
-        Where a strip begins in ``fading``, and how many lines it has there; all others are like the last one.
-    fading : ndarray, (N, 16)
-        1 - c_r / c_(r+1) of line r.
-    ends : ndarray, (strips, 16)
-        By what the last line goes beyond the picture.
-    spectrum : ndarray, (strips, lines, 16)
-        Right sides; then heights, times the weight across.
+    ``level`` says that mode 0 has no level of its own: then its mean becomes 0, and that of its right side is
+    taken for 0. ``reach``, (strips, 2), is where a strip begins in ``fading``, and how many lines it has
+    there: all others are like the last one; ``fading``, (N, 16), is 1 - c_r / c_(r+1) of line r; ``ends``,
+    (strips, 16), by what the last line goes beyond the picture. The spectrum holds right sides; then heights,
+    times the weight across.
     """
     lines = spectrum.shape[1]
     for number, ((begin, depth), end) in enumerate(zip(reach, ends, strict=True)):
@@ -89,13 +73,7 @@ def rectangle_columns(
 def rectangle_heights(spectrum: Floats, turns: Floats, height: Floats) -> None:
     """Write the points of lines, given their cosine modes.
 
-    Parameters
-    ----------
-    spectrum : ndarray, (strips, padded, 16)
-    turns : ndarray, (modes, 2)
-        Cosine and sine of pi k / (2 length), both divided by whatever the heights are to be divided by.
-    height : ndarray, (lines, length)
-        Where to write.
+    ``turns`` are those of ``rectangle_modes``, divided by whatever the heights are to be divided by.
     """
     lines, length = height.shape
     low, high = (_modes(part, length)[:lines] for part in np.split(spectrum, 2, axis=2))

@@ -20,28 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
+
 BORDER = 2
 """Samples without a number round a padded frame: whoever needs one of them gets none."""
 
 
-def registration_admit(
-    frame: NDArray[Any],
-    offset: NDArray[np.float32],
-    gain: NDArray[np.float32],
-    padded: NDArray[np.float32],
-) -> None:
-    """Write what of a frame can be used, on a scale that all pixels share.
+def registration_admit(frame: Array, offset: Array, gain: Array, padded: Array) -> None:
+    """Write the part of a frame that can be used, on a scale that all pixels share, into a padded map.
 
-    Parameters
-    ----------
-    frame : ndarray, (H, W), uint8, uint16 or float32
-        Raw counts.
-    offset, gain : ndarray, (H, W) or (1, 1), float32
-        Counts of each pixel where the shared scale is 0, and for each unit of it; 0 and 1, (1, 1), where all
-        pixels are alike.
-    padded : ndarray, (H + 4, W + 4), float32
-        Where to write, within its border of NaN; NaN also where counts are clipped, at either end of an
-        integer type, or not finite.
+    ``offset`` and ``gain`` are the counts of each pixel where the shared scale is 0, and for each unit of it;
+    0 and 1, (1, 1), where all pixels are alike. The border is NaN, and so are counts that are clipped or not
+    finite.
     """
     value = (frame.astype(np.float64) - offset) / gain
     if frame.dtype.kind == "u":
@@ -51,16 +41,11 @@ def registration_admit(
     padded[BORDER:-BORDER, BORDER:-BORDER] = np.where(usable, value, np.nan)
 
 
-def registration_mend(places: NDArray[np.int32], padded: NDArray[np.float32]) -> None:
-    """Put the mean of samples round them in the places of those that tell nothing in any frame.
+def registration_mend(places: Array, padded: Array) -> None:
+    """Put the mean of four samples in place of each that never has a number.
 
-    Parameters
-    ----------
-    places : ndarray, (n, 5), int32
-        Where in the padded frame, row by row, and the four samples of which it is made. None of these is
-        mended itself.
-    padded : ndarray, (H + 4, W + 4), float32
-        See ``registration_admit``.
+    ``places``, (n, 5), are those places in the padded frame, row by row, and the four samples, none of which
+    is mended.
     """
     flat = padded.reshape(-1)
     flat[places[:, 0]] = flat[places[:, 1:]].astype(np.float64).mean(axis=1)
@@ -80,34 +65,21 @@ def weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def registration_resample(
-    padded: NDArray[np.float32],
-    height: NDArray[np.float32],
-    shift: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    gain: NDArray[np.float32],
-    registered: NDArray[np.float32],
-    noise: NDArray[np.float32],
+    padded: Array, height: Array, shift: Array, offset: Array, gain: Array, registered: Array, noise: Array
 ) -> None:
     """Write the frame in which each pixel sees its own point of the object.
 
     Parameters
     ----------
-    padded : ndarray, (H + 4, W + 4), float32
-        See ``registration_admit``.
-    height : ndarray, (H, W), float32
-        Of the object's points, mm; NaN where unknown.
-    shift : ndarray, (2, 4) or (2, 7), float32
-        How many pixels to the right, and how many down, the point of a pixel is to be found: a number, and
-        what is added for each column, row and millimetre of height; perhaps also for the column's square,
-        the column times the row, and the row's square.
-    offset, gain : ndarray, (H, W) or (1, 1), float32
-        See ``registration_admit``.
-    registered : ndarray, (H, W), float32
-        Where to write: counts on the scale of the pixel that they come to, NaN where one of the 16 samples
-        is missing.
-    noise : ndarray, (2, H, W), float32
-        Sums over the frames: of the squared factors by which the noise of a sample is scaled, and of the
-        samples. Both are added to where there is a sample.
+    padded, offset, gain : as of ``registration_admit``
+    height : (H, W), of the object's points, mm; NaN where unknown
+    shift : (2, 4) or (2, 7), how many pixels to the right, and how many down, the point of a pixel is to be
+        found: a number, and what is added for each column, row and millimetre of height; perhaps also for the
+        column's square, the column times the row, and the row's square
+    registered : (H, W), counts on the scale of the pixel that they come to, NaN where one of the 16 samples
+        is missing
+    noise : (2, H, W), sums over the frames: of the squared factors by which the noise of a sample is scaled,
+        and of the samples; both are added to where there is a sample
     """
     rows, columns = height.shape
     column, row = np.meshgrid(np.arange(float(columns)), np.arange(float(rows)))
@@ -129,7 +101,7 @@ def registration_resample(
 
 def _split(
     start: NDArray[np.float64], shift: NDArray[np.float64], length: int
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[Array, NDArray[np.float64]]:
     """Return the sample before a place, and how far it is from there to the place, 0 to 1.
 
     A place that is unknown or far outside becomes one whose samples are not all in the picture.

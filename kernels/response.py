@@ -17,11 +17,12 @@ of a mirror at the centre that shows it is pi/4 - atan(q). The light is what the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
 
@@ -41,39 +42,22 @@ class _Ray(NamedTuple):
     q: Doubles
 
 
-def wall_light(
-    place: ArrayLike,
-    normals: ArrayLike,
-    geometry: Sequence[float],
-    lamps: Sequence[float],
-    curve: ArrayLike,
-    reach: Sequence[float],
-) -> tuple[Doubles, NDArray[np.bool_]]:
-    """Return how bright mirrors look, and where that is known.
+def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
+               curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, NDArray[np.bool_]]:  # fmt: skip
+    """Return how bright mirrors look, (N, n), in shares of full light, and where that is known.
+
+    It is known where q is within reach and the two rays meet the wall that the scatter turns up and down
+    most. Out of reach the curve goes on straight.
 
     Parameters
     ----------
-    place : array_like, (5, n) or (5, N, n), float64
-        x and y on the rest plane from the body's axis, mm; height z of the mirror, mm; by how much the line
-        of sight moves along x and y for each millimetre of z.
-    normals : array_like, (N, n, 3), float64
-        Unit vectors in the body's frame.
-    geometry : (float, float, float)
-        Radius of the body and height of the wall, mm; half-angle of the scatter, radians.
-    lamps : (float, float)
-        By what share of the mean the lamps light the side at x and at y more.
-    curve : array_like, (n <= 12,), float64
-        Polynomial in q, from the lowest power on.
-    reach : (float, float)
-        Lowest and highest q at which the curve is known.
-
-    Returns
-    -------
-    light : ndarray, (N, n), float64
-        Shares of full light. Out of reach the curve goes on straight.
-    within : ndarray, (N, n), bool
-        Whether q is within reach, and all scattered rays meet the wall: they do if the two do that are turned
-        up and down by the scatter.
+    place : (5, n) or (5, N, n), x and y on the rest plane from the body's axis, mm; height z of the mirror,
+        mm; by how much the line of sight moves along x and y for each millimetre of z
+    normals : (N, n, 3), unit vectors in the body's frame
+    geometry : radius of the body and height of the wall, mm; half-angle of the scatter, radians
+    lamps : by what share of the mean the lamps light the side at x and at y more
+    curve : polynomial in q, from the lowest power on
+    reach : lowest and highest q at which the curve is known
     """
     ray = _follow(place, normals, geometry[0])
     lamp = 1 + (lamps[0] * ray.at[0] + lamps[1] * ray.at[1]) / geometry[0]
@@ -81,14 +65,8 @@ def wall_light(
     return light, _within(ray, np.asarray(place, np.float64)[2], geometry, reach)
 
 
-def light_slopes(
-    place: ArrayLike,
-    normals: ArrayLike,
-    geometry: Sequence[float],
-    lamps: Sequence[float],
-    curve: ArrayLike,
-    reach: Sequence[float] = (-np.inf, np.inf),
-) -> Doubles:
+def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
+                 curve: ArrayLike, reach: Sequence[float] = (-np.inf, np.inf)) -> Doubles:  # fmt: skip
     """Return how the light of `wall_light` changes with the normals' three parts, (N, n, 3).
 
     By the formula as it stands, which takes the normals for unit vectors: only the parts across a normal
@@ -122,14 +100,8 @@ def reflect(sight: Doubles, normal: Doubles) -> Doubles:
 def way_to_wall(along: Doubles, across: Doubles, room: Doubles) -> tuple[Doubles, Doubles]:
     """Return how far it is to the wall, and the ray's cosine to the wall's normal times the radius.
 
-    Parameters
-    ----------
-    along : ndarray
-        A: the place times the ray, across the axis, mm.
-    across : ndarray
-        The square of the ray's part across the axis.
-    room : ndarray
-        What is left to the wall: the radius squared less the place squared, mm^2.
+    ``along`` is A, ``across`` the square of the ray's part across the axis, ``room`` the radius squared less
+    the place squared.
     """
     cosine = np.sqrt(along**2 + across * room)
     return room / (along + cosine), cosine

@@ -7,10 +7,12 @@ tilt, in two steps as kernels take them.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
 _STEEPEST = math.cos(math.radians(80.0))
@@ -19,25 +21,10 @@ _AROUND = 2
 _LEAST = float(np.finfo(np.float32).tiny)
 
 
-def slopes_find(
-    least: float, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
-) -> tuple[Doubles, ...]:
-    """Find slopes.
+def slopes_find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
+    """Return the slopes, NaN where nothing is known, and the squares of the normal's parts, 0 there.
 
-    Parameters
-    ----------
-    least : float
-        Squared sine of the tilt.
-    vectors : ndarray, (H, W, 3)
-    sigma : ndarray, (H, W)
-    contact : ndarray, (H, W)
-
-    Returns
-    -------
-    dz_dx, dz_dy : ndarray, (H, W), float64
-        NaN where nothing is known.
-    squares_x, squares_y : ndarray, (H, W)
-        Of the normal's parts along x and y; 0 where nothing is known.
+    ``least`` is the squared sine of the tilt.
     """
     x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
     with np.errstate(invalid="ignore"):
@@ -48,32 +35,9 @@ def slopes_find(
     return (*slopes, x * x, y * y)
 
 
-def slopes_weigh(
-    least: float,
-    lowest: float,
-    highest: float,
-    sigma: NDArray[np.float32],
-    dz_dx: Doubles,
-    squares_x: Doubles,
-    squares_y: Doubles,
-) -> tuple[Doubles, Doubles]:
-    """Weigh slopes by their inverse variances along x and y.
-
-    Parameters
-    ----------
-    least : float
-        Squared sine of the tilt.
-    lowest, highest : float
-        Bounds of a weight.
-    sigma : ndarray, (H, W)
-    dz_dx, squares_x, squares_y : ndarray, (H, W)
-        See `slopes_find`.
-
-    Returns
-    -------
-    weight_x, weight_y : ndarray, (H, W), float64
-        0 where nothing is known.
-    """
+def slopes_weigh(least: float, lowest: float, highest: float, sigma: Array, dz_dx: Doubles,
+                 squares_x: Doubles, squares_y: Doubles) -> tuple[Doubles, Doubles]:  # fmt: skip
+    """Return inverse variances of the slopes along x and y, within bounds; 0 where nothing is known."""
     known = np.isfinite(dz_dx)
     variance = np.where(known, sigma.astype(np.float64), 1.0) ** 2
     flat = squares_x + squares_y

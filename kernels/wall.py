@@ -16,9 +16,12 @@ so that it passes below the rim where ray_z <= (rim - z) q, and above the rest p
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
 _TINY = 1e-20
@@ -26,56 +29,31 @@ _LEAST = 1e-6  # one over a way that no ray goes, mm
 _HARD = 1e30
 
 
-def wall_light(
-    sheet: NDArray[np.floating],
-    places: NDArray[np.floating],
-    rays: NDArray[np.floating],
-    table: NDArray[np.floating],
-    radius: float,
-    rim: float,
-    gap: float,
-    index: float,
-    scatter: float,
-    fade: float,
-    asymmetry_x: float,
-    asymmetry_y: float,
-) -> NDArray[np.float32]:
-    """Return the light that comes from the wall by way of the sheet.
+def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: float, rim: float,
+               gap: float, index: float, scatter: float, fade: float, asymmetry_x: float,
+               asymmetry_y: float) -> Array:  # fmt: skip
+    """Return the share of the light, where radiance is 1 and lamps are brightest, by way of the sheet.
+
+    Dark is what comes from beyond the rim, from below the rest plane, by total reflection at the body's side,
+    or to a pixel outside the body.
 
     Parameters
     ----------
-    sheet : ndarray, (3, P)
-        Height of the sheet, mm, and its slopes along x and y, at what each pixel sees.
-    places : ndarray, (2, P) or (4, P)
-        x and y of each pixel on the rest plane, mm; by how much the line of sight moves along x and y for
-        each millimetre of z, if it is not straight.
-    rays : ndarray, (S, 3)
-        How the sheet spreads a mirrored ray: parts of unit vectors along that ray, along the direction in
-        which the ray's height at the wall changes fastest, and across both.
-    table : ndarray, (rows + 2, columns + 2)
-        The wall's radiance, unrolled from inside: its rows go down from the rim to the rest plane, its
-        columns counter-clockwise from azimuth -pi to pi. They are told at the middle of ``rows`` by
-        ``columns`` equal pieces and once beyond each edge, so that every place on the wall lies between
-        four.
-    radius, rim, gap : float
-        Of the body; of the wall's upper edge above the rest plane; between body and wall: mm.
-    index : float
-        Refractive index of the body.
-    scatter : float
-        Largest angle between a ray and the mirrored one, radians. It tells the kernel which pixels are dark
-        without a look at their rays; nothing else depends on it.
-    fade : float
-        Angle over which a ray fades at the rim and at the rest plane, so that few rays make no visible steps,
-        radians; 0 for hard edges.
-    asymmetry_x, asymmetry_y : float
-        By what share of the mean the lamps light the wall's side at x and at y more.
-
-    Returns
-    -------
-    ndarray, (P,), float32
-        Share of the light where radiance is 1 and lamps are brightest. Dark is what comes from beyond the
-        rim, from below the rest plane, by total reflection at the body's side, or to a pixel outside the
-        body.
+    sheet : (3, P), height of the sheet, mm, and its slopes along x and y, at the points that the pixels see
+    places : (2, P) or (4, P), x and y of each pixel on the rest plane, mm; by how much the line of sight
+        moves along x and y for each millimetre of z, if it is not straight
+    rays : (S, 3), how the sheet spreads a mirrored ray: parts of unit vectors along that ray, along the
+        direction in which the ray's height at the wall changes fastest, and across both
+    table : (rows + 2, columns + 2), the wall's radiance, unrolled from inside: its rows go down from the rim
+        to the rest plane, its columns counter-clockwise from azimuth -pi to pi; at the middle of ``rows`` by
+        ``columns`` equal pieces and once beyond each edge, so that every place on the wall lies between four
+    radius, rim, gap : of the body; of the wall's upper edge above the rest plane; between body and wall: mm
+    index : refractive index of the body
+    scatter : largest angle between a ray and the mirrored one, radians, by which the kernel knows dark pixels
+        at a glance
+    fade : angle over which a ray fades at the rim and at the rest plane, so that few rays make no visible
+        steps, radians; 0 for hard edges
+    asymmetry_x, asymmetry_y : by what share of the mean the lamps light the wall's side at x and at y more
     """
     z, slope_x, slope_y = sheet.astype(np.float64)
     view_x, view_y = places[2:].astype(np.float64) if len(places) == 4 else np.zeros((2, z.size))
@@ -125,16 +103,8 @@ def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
     return _unit(np.where(known, steepest, np.array([[1.0], [0.0], [0.0]])))
 
 
-def _cross_gap(
-    x: Floats,
-    y: Floats,
-    ray: Floats,
-    cosine: Floats,
-    per_way: Floats,
-    radius: float,
-    gap: float,
-    index: float,
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Floats, radius: float,
+               gap: float, index: float) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
     """Return where a ray meets the wall, one over a way that rises as far, and what share of it arrives.
 
     Without a gap nothing is lost. With one, the ray is refracted at the body's side (Snell), some of it is
@@ -157,13 +127,7 @@ def _cross_gap(
 
 
 def _seen(
-    z: Floats,
-    ray: Floats,
-    cosine: Floats,
-    per_way: Floats,
-    radius: float,
-    rim: float,
-    fade: float,
+    z: Floats, ray: Floats, cosine: Floats, per_way: Floats, radius: float, rim: float, fade: float
 ) -> Floats:
     """Return 1 for a ray below the rim and above the rest plane, 0 beyond, and fade in between."""
     edge = (rim - z) * per_way
@@ -173,7 +137,7 @@ def _seen(
     return np.asarray(np.clip(0.5 + sharpness * np.minimum(below, above), 0, 1))
 
 
-def _look_up(table: NDArray[np.floating], height: Floats, azimuth: Floats) -> Floats:
+def _look_up(table: Array, height: Floats, azimuth: Floats) -> Floats:
     """Return the wall's radiance, bilinear between the table's samples; height is a share of the rim's."""
     rows, columns = table.shape[0] - 2, table.shape[1] - 2
     row = rows * (1 - height) + 0.5
