@@ -8,16 +8,17 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.io import Calibrated, InputError, ProcessValue, Recording, Result, Source, pixel_axes
-from mirrorskin.kernels.device import Device
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from mirrorskin.io import ProcessValue, Result, Source
+    from mirrorskin.kernels.device import Device
 
 
 @functools.cache
@@ -27,59 +28,67 @@ def program_version() -> str:
 
 
 def signature() -> dict[str, str]:
-    """Return what everything that is made says of its maker: program, version and date."""
+    """Return what every file that is written says of its maker: program, version and date."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return {"program": "mirrorskin", "version": program_version(), "date": date}
 
 
-def sign(result: Result, source: Source, device: Device, process: dict[str, ProcessValue]) -> Result:
-    """Add where the pixels are, and how the maps came about; and the calibration, if there is one."""
+def attach_provenance(
+    result: Result, source: Source, device: Device, process: dict[str, ProcessValue]
+) -> Result:
+    """Return a result with the pixels' places, how its maps came about, and the calibration if there is one.
+
+    Parameters
+    ----------
+    result : Result
+    source : Source
+        What it was made from.
+    device : Device
+        On which.
+    process : dict
+        Method and parameters.
+    """
+    own = source.source if isinstance(source, io.Calibrated) else source
+    known: dict[str, ProcessValue] = {
+        **signature(),
+        "device": device.info.title,
+        "driver": device.info.driver,
+        "source": source.name,
+    }
     x = y = None
-    own = source.source if isinstance(source, Calibrated) else source
-    if source.header.pixel_size is not None:
-        x, y = _places(own, source.header.pixel_size)
-    origin: dict[str, ProcessValue] = {"source": source.name}
-    if isinstance(own, Recording):
-        origin |= {
+    if source.header.pixel_size is not None:  # from the centre of the whole picture
+        shape = own.full_shape if isinstance(own, io.Recording) else own.shape
+        x, y = io.pixel_axes(shape[1:], source.header.pixel_size)
+    if isinstance(own, io.Recording):
+        if x is not None and y is not None:
+            (row, column), (_, rows, columns) = own.origin, own.shape
+            x, y = x[column : column + columns], y[row : row + rows]
+        known |= {
             "dataset": own.dataset,
             "source_fingerprint": own.fingerprint(),
             "source_modified": own.modified,
             "source_region": own.region.text,
             "source_frames": own.which,
         }
-    if isinstance(source, Calibrated):
-        origin |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
+    if isinstance(source, io.Calibrated):
+        known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = replace(result, calibration=source.whole)
-    made: dict[str, ProcessValue] = {
-        **signature(),
-        "device": device.info.title,
-        "driver": device.info.driver,
-    }
-    return replace(result, x=x, y=y, process=made | origin | process)
+    return replace(result, x=x, y=y, process=known | process)
 
 
-def _places(source: Source, pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Place the pixels from the centre of the whole picture, of which a recording may give a part."""
-    if not isinstance(source, Recording):
-        return pixel_axes(source.shape[1:], pixel_size)
-    (row, column), (_, rows, columns) = source.origin, source.shape
-    x, y = pixel_axes(source.full_shape[1:], pixel_size)
-    return x[column : column + columns], y[row : row + rows]
-
-
-def told_level(
+def level_origin(
     source: Source, name: Literal["dark", "bright"], given: ArrayLike | None = None
 ) -> ProcessValue:
-    """Say in a word where the level of dark or bright pixels came from."""
-    references = source.calibration.references if isinstance(source, Calibrated) else None
+    """Return where the level of dark or bright pixels came from; see `parameter_origin`."""
+    references = source.calibration.references if isinstance(source, io.Calibrated) else None
     whose = "recording" if references is None else "calibration"
-    return told(given, getattr(source.header, name), "range of the type", whose)
+    return parameter_origin(given, getattr(source.header, name), "range of the type", whose)
 
 
-def told(
+def parameter_origin(
     given: ArrayLike | None, own: ArrayLike | None, otherwise: str, whose: str = "recording"
 ) -> ProcessValue:
-    """Say in a word where a number or a map came from."""
+    """Return a parameter's value, or in a word where it came from: given, the source's own, or a default."""
     if given is not None:
         return float(given) if np.ndim(given) == 0 else "map given"  # type: ignore[arg-type]
     if own is None:
@@ -89,11 +98,14 @@ def told(
 
 @contextmanager
 def naming(source: Source) -> Iterator[None]:
-    """Name the source in complaints about what it holds."""
+    """Name the source in errors about what it holds."""
     try:
         yield
-    except InputError as error:
+    except io.InputError as error:
         message = str(error)
-        raise (error if source.name in message else InputError(f"{source.name}: {message}")) from error
+        raise (error if source.name in message else io.InputError(f"{source.name}: {message}")) from error
     except NotConverged as error:
         raise NotConverged(f"{source.name}: {error}") from error
+
+
+sign, told, told_level = attach_provenance, parameter_origin, level_origin  # until all say the new names

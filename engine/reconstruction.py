@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mirrorskin.io import Calibrated, Calibration, InputError, Recording, Result, Source, open_calibration
+from mirrorskin import io
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Calibration, Result, Source
 
 
 def reconstruct(
@@ -33,8 +36,9 @@ def reconstruct(
     Examples
     --------
     >>> from mirrorskin import engine, hw
-    >>> engine.reconstruct(hw.Twin(hw.Sphere(5.0), hw.VerticalMotion())).height.shape  # doctest: +SKIP
-    (240, 240)
+    >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26)
+    >>> engine.reconstruct(press).height.shape
+    (40, 40)
     """
     known = calibrated(source, calibration)
     if source.motion == "vertical":
@@ -46,7 +50,7 @@ def reconstruct(
 
         result = reconstruct_rotation(known, **options)
     else:
-        raise InputError(
+        raise io.InputError(
             f"{source.name} is of {source.motion} motion: only vertical and axial ones can be reconstructed"
         )
     return undistorted(result, known)
@@ -67,18 +71,18 @@ def calibrated(source: Source, calibration: Calibration | str | Path | None = No
     mirrorskin.io.InputError
         The calibration is of another camera, or the file is none.
     """
-    if isinstance(source, Calibrated):
+    if isinstance(source, io.Calibrated):
         return source
     if calibration is None:
-        calibration = source.carried if isinstance(source, Recording) else None
-    elif not isinstance(calibration, Calibration):
-        calibration = open_calibration(calibration)
-    return source if calibration is None else Calibrated(source, calibration)
+        calibration = source.carried if isinstance(source, io.Recording) else None
+    elif not isinstance(calibration, io.Calibration):
+        calibration = io.open_calibration(calibration)
+    return source if calibration is None else io.Calibrated(source, calibration)
 
 
 def undistorted(result: Result, source: Source) -> Result:
     """Undistort a result's maps if its source's calibration has a lens: the last step of every method."""
-    if not isinstance(source, Calibrated) or source.whole.lens is None:
+    if not isinstance(source, io.Calibrated) or source.whole.lens is None:
         return result
     from mirrorskin.engine.undistort import undistort
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.engine.press.press import finish_press
-from mirrorskin.engine.provenance import sign, told_level
+from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
@@ -63,8 +63,8 @@ class LivePress:
             "threshold": threshold,
             "hold": hold,
             "subframe": subframe,
-            "dark": told_level(source, "dark"),
-            "bright": told_level(source, "bright"),
+            "dark": level_origin(source, "dark"),
+            "bright": level_origin(source, "bright"),
         }
         shape = source.shape[1:]
         self._search = OnsetSearch(
@@ -118,7 +118,7 @@ class LivePress:
         onset, travel = self._search.result(), self._search.travel
         process = self._process | {"first_frame": 0, "frames": len(travel), "noise": onset.noise}
         result, done = finish_press(onset, self._source, travel, "onset", self._threshold, self._fill)
-        signed = sign(result, self._source, self.device, process | done | {"live": True})
+        signed = attach_provenance(result, self._source, self.device, process | done | {"live": True})
         return undistorted(signed, self._source)
 
 

@@ -16,7 +16,7 @@ from scipy import ndimage
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.status import Maps
-from mirrorskin.engine.provenance import naming, sign, told, told_level
+from mirrorskin.engine.provenance import attach_provenance, level_origin, naming, parameter_origin
 from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator
@@ -237,7 +237,7 @@ class LiveRotation:
         return self._signed(replace(result, **maps), process | relief.process)
 
     def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
-        return undistorted(sign(result, self._source, self.device, process), self._source)
+        return undistorted(attach_provenance(result, self._source, self.device, process), self._source)
 
     @property
     def _frames_to(self) -> NormalWindow | Correlator:
@@ -291,10 +291,10 @@ class LiveRotation:
         """Say what the normals were made with."""
         header = self._header
         scale: dict[str, ProcessValue] = {
-            "zenith_gain": told(None, header.zenith_gain, "none"),
-            "zenith_offset": told(None, header.zenith_offset, "0"),
-            "low": told_level(self._source, "dark"),
-            "high": told_level(self._source, "bright"),
+            "zenith_gain": parameter_origin(None, header.zenith_gain, "none"),
+            "zenith_offset": parameter_origin(None, header.zenith_offset, "0"),
+            "low": level_origin(self._source, "dark"),
+            "high": level_origin(self._source, "bright"),
         }
         if self._response is not None:
             scale = {"zenith": "calibrated"}

@@ -102,7 +102,7 @@ def threshold_at(gel: Gel, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -> Do
 def correct_press(
     result: Result,
     source: Source,
-    travel: NDArray[np.float64] | None,
+    deepest: float,
     threshold: float,
     gel: Gel | None,
 ) -> tuple[Result, str]:
@@ -114,8 +114,8 @@ def correct_press(
         With height, its sigma and status, not filled yet.
     source : Source
         Which tells the pixels' size.
-    travel : ndarray, (T,), or None
-        Of the frames that it was made of, mm; None where that is not known: the deepest onset stands for it.
+    deepest : float
+        Greatest travel of the frames that it was made of, mm.
     threshold : float
         Share of the way from dark to bright that was taken for light: as of what the gel was learned from.
     gel : Gel or None
@@ -143,7 +143,7 @@ def correct_press(
             result.status,
             pixel_size,
             gel,
-            deepest=None if travel is None else float(np.max(travel)),
+            deepest=deepest,
         )
     except NotConverged as error:
         return result, f"none: {error}"

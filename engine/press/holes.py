@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
@@ -220,6 +219,8 @@ def _in_hull(region: Mask, groups: NDArray[np.int32]) -> bool:
     around = np.isin(groups, touched[touched > 0])
     if not around.any():
         return False
+    import cv2  # a tenth of a second to load
+
     corners = cv2.convexHull(np.argwhere(around)[:, ::-1].astype(np.int32))
     hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1)
     return not np.any(region & (hull == 0))

@@ -5,7 +5,7 @@ import pytest
 from stacks import MadeUp, record, sphere
 
 from mirrorskin import io
-from mirrorskin.engine.provenance import naming, sign, told
+from mirrorskin.engine.provenance import attach_provenance, naming, parameter_origin
 from mirrorskin.kernels.device import open_device
 
 
@@ -31,7 +31,7 @@ def made_up(**header):
     ],
 )
 def test_a_number_is_told_and_a_map_is_named(given, own, expected):
-    value = told(given, own, "range of the type")
+    value = parameter_origin(given, own, "range of the type")
     assert value == expected
     assert isinstance(value, str | float)
 
@@ -56,7 +56,7 @@ def test_other_errors_and_none_pass():
 
 def test_a_result_is_signed_with_its_source_and_its_device(device):
     bare = io.Result(mean=np.zeros((3, 5), np.float32))
-    signed = sign(bare, made_up(pixel_size=(0.1, 0.2)), device, {"method": "exact", "tilt": 0.1})
+    signed = attach_provenance(bare, made_up(pixel_size=(0.1, 0.2)), device, {"method": "exact", "tilt": 0.1})
     assert signed.mean is bare.mean
     np.testing.assert_allclose(signed.x, [-0.2, -0.1, 0, 0.1, 0.2], atol=1e-12)
     np.testing.assert_allclose(signed.y, [0.2, 0, -0.2], atol=1e-12)
@@ -68,7 +68,7 @@ def test_a_result_is_signed_with_its_source_and_its_device(device):
 
 
 def test_pixels_of_unknown_size_have_no_place():
-    signed = sign(io.Result(), made_up(), open_device(None), {})
+    signed = attach_provenance(io.Result(), made_up(), open_device(None), {})
     assert signed.x is None
     assert signed.y is None
 
@@ -76,7 +76,7 @@ def test_pixels_of_unknown_size_have_no_place():
 def test_a_recording_is_told_by_its_hash(tmp_path):
     path = record(sphere(), tmp_path / "ball.h5")
     with io.open_recording(path) as recording:
-        process = sign(io.Result(), recording, open_device(None), {}).process
+        process = attach_provenance(io.Result(), recording, open_device(None), {}).process
         assert process["source_fingerprint"] == recording.fingerprint()
         assert process["source_modified"] == recording.modified
         assert process["dataset"] == recording.dataset
@@ -86,11 +86,11 @@ def test_a_recording_is_told_by_its_hash(tmp_path):
 def test_pixels_of_a_part_lie_where_they_do_in_the_whole_picture(tmp_path):
     path = record(sphere(), tmp_path / "ball.h5")
     with io.open_recording(path) as recording:
-        whole = sign(io.Result(), recording, open_device(None), {})
+        whole = attach_provenance(io.Result(), recording, open_device(None), {})
         count, rows, columns = recording.shape
     part = io.Region((1, rows - 1), (2, columns - 1))
     with io.open_recording(path, region=part, frames=(2, 5)) as recording:
-        signed = sign(io.Result(), recording, open_device(None), {})
+        signed = attach_provenance(io.Result(), recording, open_device(None), {})
     np.testing.assert_array_equal(signed.x, whole.x[2:-1])
     np.testing.assert_array_equal(signed.y, whole.y[1:-1])
     assert signed.process["source_region"] == f"2,1,{columns - 3}x{rows - 2}"

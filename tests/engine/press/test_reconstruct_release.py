@@ -35,7 +35,7 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
         for event, part in (("onset", slice(0, 31)), ("release", slice(29, 60))):
             options = {"method": method, "fill": False, "memory_limit": 7 * 160 * 160}
             result = engine.reconstruct(recording, event=event, **options)
-            given = find(frames[part], STROKE[part], header.dark, header.bright, event=event)
+            given = find(frames[part], STROKE[part], dark=header.dark, bright=header.bright, event=event)
             np.testing.assert_array_equal(result.height, given.height)
             np.testing.assert_array_equal(result.height_sigma, given.sigma)
             np.testing.assert_array_equal(result.status, given.status)
