@@ -72,14 +72,7 @@ def is_locked(path: Path) -> bool:
 
 
 class NewHdf5:
-    """An HDF5 file in the making.
-
-    Attributes
-    ----------
-    root : h5py.File
-    descriptor : int
-        Of the file on disk.
-    """
+    """An HDF5 file in the making."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -101,18 +94,7 @@ class NewHdf5:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[int]:
-    """Make a file under a temporary name beside ``path``, and rename it when all went well.
-
-    Yields
-    ------
-    int
-        The empty file's descriptor, to write to.
-
-    Raises
-    ------
-    InputError
-        It cannot be made; an older file of that name is left as it was.
-    """
+    """Make a file under a temporary name beside ``path``, and rename it when all went well."""
     check_output(path)
     # Its name is known before there is a file: whenever the program is ended, it is removed.
     part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
@@ -132,13 +114,7 @@ def new_file(path: Path) -> Iterator[int]:
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[NewHdf5]:
-    """Write an HDF5 file as ``new_file`` does.
-
-    Raises
-    ------
-    InputError
-        It cannot be written; an older file of that name is left as it was.
-    """
+    """Write an HDF5 file as ``new_file`` does."""
     with new_file(path) as descriptor:
         new = NewHdf5(path, descriptor)
         try:
@@ -152,11 +128,6 @@ def remove_leftovers(folder: Path) -> list[Path]:
     """Remove the half-written files of a folder whose writers are gone, as those that were killed.
 
     A file that is being written is locked, and stays. Where a file system has no locks, all stay.
-
-    Returns
-    -------
-    list of Path
-        The files that were removed.
     """
     removed = []
     for part in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
@@ -217,13 +188,7 @@ def _umask() -> int:
 
 
 def write_new(path: Path, parts: Sequence[bytes]) -> None:
-    """Write the parts of a file, which exists whole or not at all.
-
-    Raises
-    ------
-    InputError
-        It cannot be written there.
-    """
+    """Write the parts of a file, which exists whole or not at all."""
     with (
         new_file(path) as descriptor,
         as_input_error(f"{path} could not be written", MAKE_ROOM),
@@ -237,17 +202,7 @@ _UNABLE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 
 
 class Reserve:
-    """The bytes of a file that the disk has promised.
-
-    Parameters
-    ----------
-    path : Path
-        What to call the file in messages.
-    descriptor : int
-        Of the open file; it is grown.
-    step : int
-        Bytes that are asked for at once, if there are so many.
-    """
+    """The bytes of a file that the disk has promised."""
 
     def __init__(self, path: Path, descriptor: int, step: int) -> None:
         self._path, self._descriptor, self._step = path, descriptor, step
@@ -257,11 +212,6 @@ class Reserve:
         """See that the file can be written up to some byte.
 
         A disk that cannot promise anything is believed to have room.
-
-        Raises
-        ------
-        InputError
-            The disk is full, or no file may be so large.
         """
         if self._end < math.inf:
             self._end = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off

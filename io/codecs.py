@@ -46,23 +46,7 @@ def find_codecs(dataset: h5py.Dataset) -> list[Codec] | str:
 
 
 def decode(codecs: list[Codec], left_out: int, packed: Bytes, out: Bytes) -> None:
-    """Unpack a chunk.
-
-    Parameters
-    ----------
-    codecs : list of callable
-        What undoes each filter, in the order of writing.
-    left_out : int
-        A bit for each filter that the chunk did not go through, because it gained nothing.
-    packed : ndarray, (n,), uint8
-    out : ndarray, (m,), uint8
-        Room for just what is in it.
-
-    Raises
-    ------
-    ValueError
-        It is damaged.
-    """
+    """Unpack a chunk."""
     steps = [codec for bit, codec in enumerate(codecs) if not left_out >> bit & 1] or [_copy]
     for codec in steps[:0:-1]:
         between = np.empty_like(out)

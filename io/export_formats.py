@@ -21,18 +21,7 @@ _TOLD = {SOURCE: "source", DATE: "date", "turn": "turn"}
 
 
 def notes_of(result: Result) -> dict[str, str]:
-    """Tell where heights come from, from where they count, and how many were not measured.
-
-    Parameters
-    ----------
-    result : Result
-        With heights, (H, W).
-
-    Returns
-    -------
-    dict of str
-        One line each; what nobody knows is missing.
-    """
+    """Tell where heights come from, from where they count, and how many were not measured."""
     process = result.process
     maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
     notes = {name: _line(process[key]) for name, key in _TOLD.items() if key in process}
@@ -73,21 +62,7 @@ def grid_of(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
 
 
 def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
-    """Return columns, one value a point.
-
-    Parameters
-    ----------
-    result : Result
-        With heights, (H, W), and places.
-    pixels : ndarray, (N,), int64, optional
-        Which, as indices into the flattened map; by default all whose heights are known.
-
-    Returns
-    -------
-    dict of ndarray
-        ``x, y, z``, and of what the result has ``nx, ny, nz`` (unit normal), ``sigma`` (standard deviation of
-        z), all float32, and ``filled`` (1 where z was not measured), uint8; NaN where there is no answer.
-    """
+    """Return columns, one value a point."""
     height, x, y = grid_of(result)
     chosen = np.flatnonzero(np.isfinite(height)) if pixels is None else pixels
     row, column = np.unravel_index(chosen, height.shape)
@@ -111,19 +86,7 @@ _FLAT = 1e-6  # mm a count, where all heights are one
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """A map of heights in 16 bits: its height is ``offset + step * counts``.
-
-    Attributes
-    ----------
-    values : ndarray, (H, W), uint16
-        1 at the lowest height, 65535 at the highest, 0 where there is no answer.
-    offset, step : float
-        Millimetres: the height at count 0, and of one count.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    first : (float, float)
-        Millimetres: x and y of the first pixel's centre, at the top left.
-    """
+    """A map of heights in 16 bits: its height is ``offset + step * counts``."""
 
     values: NDArray[np.uint16]
     offset: float
@@ -141,18 +104,7 @@ class Counts:
 
 
 def counts_of(result: Result) -> Counts:
-    """Spread the known heights of a result over 16 bits.
-
-    Parameters
-    ----------
-    result : Result
-        With heights, (H, W), some of them known, and places.
-
-    Raises
-    ------
-    InputError
-        There is one pixel alone.
-    """
+    """Spread the known heights of a result over 16 bits."""
     height, x, y = grid_of(result)
     known = np.isfinite(height)
     heights = np.where(known, height, np.nan).astype(np.float64)
@@ -177,22 +129,7 @@ _NAMES = {"f4": "float", "u1": "uchar"}
 def ply(
     columns: Mapping[str, NDArray[Any]], faces: NDArray[np.int32] | None, notes: Mapping[str, str]
 ) -> list[bytes]:
-    """Encode a surface, or points alone.
-
-    Parameters
-    ----------
-    columns : mapping of ndarray, (N,), float32 or uint8
-        A vertex's properties: ``x, y, z``, and others.
-    faces : ndarray, (M, 3), int32, or None
-        Numbers of vertices.
-    notes : mapping of str
-        Comments, one line each.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
-    """
+    """Encode a surface, or points alone."""
     vertices = np.empty(
         len(columns["x"]), [(name, f"<{values.dtype.str[1:]}") for name, values in columns.items()]
     )
@@ -219,19 +156,7 @@ _HEAD = 80  # bytes of free text, which must not begin with "solid": that would 
 
 
 def stl(mesh: Mesh, title: str) -> list[bytes]:
-    """Encode a surface.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    title : str
-        What the head says, cut at 80 bytes; the format has no other place for a unit.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
-    """
+    """Encode a surface."""
     normals = face_vectors(mesh)
     triangles = np.zeros(
         len(normals), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
@@ -248,22 +173,7 @@ _TOGETHER = 1 << 16  # rows
 def xyz(
     columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], notes: Mapping[str, str]
 ) -> list[bytes]:
-    """Encode points, one a line, after comments that begin with ``#``; the last names the columns.
-
-    Parameters
-    ----------
-    columns : mapping of ndarray, (N,), float32 or uint8
-        ``x, y, z``, and others.
-    units : mapping of str
-        Of the columns that have one.
-    notes : mapping of str
-        Comments, one line each.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
-    """
+    """Encode points, one a line, after comments that begin with ``#``; the last names the columns."""
     names = [f"{name}[{units[name]}]" if name in units else name for name in columns]
     head = [*(f"{name}: {said}" for name, said in notes.items()), " ".join(names)]
     parts = ["".join(f"# {line}\n" for line in head).encode()]
@@ -285,17 +195,6 @@ def png(counts: Counts, notes: Mapping[str, str]) -> list[bytes]:
 
     Its resolution is told in pixels a metre, and the scale of heights in texts: for people, in numbers, and
     under the keys that Gwyddion documents for pictures of 16 bits.
-
-    Parameters
-    ----------
-    counts : Counts
-    notes : mapping of str
-        More texts.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -347,17 +246,6 @@ def tiff(counts: Counts, notes: Mapping[str, str]) -> list[bytes]:
 
     Its resolution is told in pixels a centimetre, holes by GDAL's tag, and the scale of heights in a
     description of lines that ImageJ reads, so that it shows millimetres.
-
-    Parameters
-    ----------
-    counts : Counts
-    notes : mapping of str
-        More lines of the description.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
     """
     import tifffile
 
@@ -401,11 +289,6 @@ def npz(result: Result) -> list[bytes]:
     """Encode the maps, where the pixels are, and as JSON their units and how they came about.
 
     Nothing in it needs ``allow_pickle``.
-
-    Returns
-    -------
-    list of bytes
-        The file's parts.
     """
     arrays: dict[str, Any] = dict(result.maps())
     more = {"x": result.x, "y": result.y, "offset_unknown": result.offset_unknown}

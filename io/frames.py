@@ -64,32 +64,7 @@ if TYPE_CHECKING:
 
 
 class FrameSequence(Closing, ABC):
-    """A source of other people's frames, read in order and rewindable.
-
-    Parameters
-    ----------
-    name : str
-        What to call it in messages.
-    header : Header
-        What holds for all frames; the files themselves say nothing of the movement.
-    shape : (int, int, int)
-        Frames, rows and columns.
-    dtype : dtype
-        uint8, uint16 or float32.
-    travel, phase : Positions or array_like, (T,), optional
-        Millimetres and radians, one a frame, or ``Steps``, which count the frames that were lost, too.
-    time : ndarray, (T,), float64, optional
-        Seconds since the first frame.
-    lost : sequence of int, (T,), optional
-        Frames lost just before each frame; the first is 0.
-    left_out : tuple of str
-        Names of files beside the frames that are none of them.
-
-    Raises
-    ------
-    InputError
-        Travel or phase does not fit the frames.
-    """
+    """A source of other people's frames, read in order and rewindable."""
 
     rewindable = True
 
@@ -116,25 +91,7 @@ class FrameSequence(Closing, ABC):
         self._next = 0
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the next frames.
-
-        Parameters
-        ----------
-        out : ndarray, (n, H, W), optional
-            Room for the frames, of the source's dtype; without it one frame is allocated.
-
-        Returns
-        -------
-        Block or None
-            At most ``n`` frames, a view of ``out``, with none lost between them; None at the end.
-
-        Raises
-        ------
-        ValueError
-            ``out`` does not fit the frames.
-        InputError
-            A frame cannot be read, or is unlike the first.
-        """
+        """Read the next frames."""
         if out is None:
             out = np.empty((1, *self.shape[1:]), self.dtype)
         if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):

@@ -25,19 +25,7 @@ _AT_ONCE = 1 << 14  # rows for which there is room at once
 
 
 class Column:
-    """A dataset with one row a frame, to which rows are appended.
-
-    Parameters
-    ----------
-    file : h5py.File
-    name : str
-    unit : str or None
-    dtype : dtype
-    expected : int
-        How many rows there will be; there may be more.
-    width : tuple of int, optional
-        Shape of a row.
-    """
+    """A dataset with one row a frame, to which rows are appended."""
 
     def __init__(
         self,
@@ -82,13 +70,7 @@ class Column:
 
 
 class Marks:
-    """Whether each frame was used, which may be told of frames that were written already, or are yet to be.
-
-    Parameters
-    ----------
-    column : Column
-        Of one byte a frame.
-    """
+    """Whether each frame was used; it may be marked before or after the frame is written."""
 
     def __init__(self, column: Column) -> None:
         self._column = column
@@ -123,30 +105,6 @@ class GrowingRecording(Closing):
     """A recording to which frames are appended; from ``publish`` on others can watch.
 
     Raw frames follow each other without a gap as long as there are no more of them than expected.
-
-    Parameters
-    ----------
-    path : Path
-        What to call it in messages.
-    descriptor : int
-        Of an empty file that is locked; it may be closed afterwards, and stays locked.
-    header : Header
-    shape : (int, int, int)
-        Frames that are expected, rows and columns.
-    dtype : dtype
-    compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-    calibration : Calibration, optional
-        What it carries a copy of.
-
-    Attributes
-    ----------
-    count : int
-        Frames so far.
-
-    Raises
-    ------
-    InputError
-        The disk is full.
     """
 
     def __init__(
@@ -183,13 +141,7 @@ class GrowingRecording(Closing):
             self._exit = opening.pop_all()
 
     def append(self, block: Block) -> None:
-        """Write frames, and keep what is known of each until the next ``flush``.
-
-        Raises
-        ------
-        InputError
-            The disk is full; the frames before are sound.
-        """
+        """Write frames, and keep what is known of each until the next ``flush``."""
         frames, n = block.frames, len(block.frames)
         self._hold(n * (self._frame + self._frame // 8 + _PAGE))
         self._frames.resize(self.count + n, axis=0)
@@ -209,13 +161,7 @@ class GrowingRecording(Closing):
         self._marks.mark(index, used)
 
     def flush(self) -> None:
-        """Hand everything to the system, so that it can be read and outlives this process.
-
-        Raises
-        ------
-        InputError
-            The disk is full; nothing was lost.
-        """
+        """Hand everything to the system, so that it can be read and outlives this process."""
         self._hold(0)
         self._flush()
 
@@ -227,15 +173,7 @@ class GrowingRecording(Closing):
             fcntl.flock(self._descriptor, fcntl.LOCK_SH)
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
-        """Write what is known only now.
-
-        Parameters
-        ----------
-        positions : mapping
-            By name, better ones than those that came with the frames; these stay beside them.
-        state : str
-            What becomes of ``/entry/state``.
-        """
+        """Write what is known only now."""
         if self._frames.shape[0] > self.count:  # it failed to write some
             self._frames.resize(self.count, axis=0)
         self._flush()

@@ -23,25 +23,7 @@ _LINKS_DEEP = 16
 
 
 class Hdf5File(Closing):
-    """An HDF5 file to read, and the files in its own folder that it refers to.
-
-    Parameters
-    ----------
-    path : Path
-    memory_limit : int, optional
-        Bytes that HDF5 may have to unpack at once.
-
-    Attributes
-    ----------
-    path : Path
-    memory_limit : int or None
-    root : h5py.File
-
-    Raises
-    ------
-    InputError
-        There is no such file, it is no HDF5, or it is damaged.
-    """
+    """An HDF5 file to read, and the files in its own folder that it refers to."""
 
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
         self.path = path
@@ -62,13 +44,7 @@ class Hdf5File(Closing):
         return f"{self.path if filename == self.root.filename else filename}: {node.name}"
 
     def find(self, name: str) -> Node | None:
-        """Return an object, or None where it is simply not there.
-
-        Raises
-        ------
-        InputError
-            A link on the way leads nowhere, in a circle, or out of the file's folder.
-        """
+        """Return an object, or None where it is simply not there."""
         if name in self._groups:
             return self._groups[name]
         group, _, last = name.rpartition("/")
@@ -128,25 +104,7 @@ class Hdf5File(Closing):
         remedy: str = "",
         rows: int | None = None,
     ) -> NDArray[Any]:
-        """Read numbers, once it is sure that they are there.
-
-        Parameters
-        ----------
-        node : h5py.Dataset
-        *shapes : tuple of int
-            The shapes that it may have.
-        unit : str, optional
-            The unit to return; the attribute ``units`` is obeyed, and without one it is in this unit.
-        remedy : str, optional
-            The end of the message if it does not fit.
-        rows : int, optional
-            How many rows are wanted of a dataset that may have more by now.
-
-        Raises
-        ------
-        InputError
-            No numbers, another shape, an unknown unit, or a file that does not hold what it claims.
-        """
+        """Read numbers, once it is sure that they are there."""
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
@@ -301,23 +259,7 @@ _VIRTUAL_DEEP = 4
 
 
 def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
-    """Refuse a dataset that HDF5 could not deliver, or would make up with fill values.
-
-    Parameters
-    ----------
-    file : Hdf5File
-        Knows where it may look for what is stored elsewhere.
-    dataset : h5py.Dataset
-    depth : int, optional
-        How many virtual datasets led here.
-    frames : int, optional
-        How many there must be, along the first axis, where more are yet to be written.
-
-    Raises
-    ------
-    InputError
-        A filter that is not installed, chunks too large to unpack, or less data than the shape says.
-    """
+    """Refuse a dataset that HDF5 could not deliver, or would make up with fill values."""
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")

@@ -38,20 +38,7 @@ UNDER_WAY, COMPLETE, CUT_SHORT = "under way", "complete", "cut short: "
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """How a recording was taken.
-
-    Attributes
-    ----------
-    count : int
-        Frames of which all is known. While a recording is written, frames and what is said of each grow
-        one after the other.
-    state : str
-        "under way", "complete", or "cut short: " and why; every stack of other programs is complete.
-    used : ndarray, (count,), bool, or None
-        Whether a live reconstruction used a frame.
-    dropped : ndarray, (count,), int, or None
-        How many frames were lost before a frame.
-    """
+    """How a recording was taken."""
 
     count: int
     state: str = COMPLETE
@@ -88,18 +75,7 @@ def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
 
 
 class Layout:
-    """What a file says of its stack; of a file that is not ours, nothing.
-
-    Parameters
-    ----------
-    file : Hdf5File
-    ours : bool
-        Whether the file has our layout.
-    shape : (int, int, int)
-        Frames, rows and columns of the stack.
-    cut : Selection
-        What is wanted of it; all series and maps are cut as well.
-    """
+    """What a file says of its stack; of a file that is not ours, nothing."""
 
     def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], cut: Selection) -> None:
         self._file = file
@@ -135,14 +111,7 @@ class Layout:
         )
 
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
-        """Read where the body was in each frame, and when; travel or phase may be given; check it.
-
-        Returns
-        -------
-        dict
-            "time", s, if it is known, and what the motion has: "travel", mm, "phase", radians,
-            "displacement", mm, or "twist", radians.
-        """
+        """Read where the body was in each frame, and when; travel or phase may be given; check it."""
         found = {"time": self._cut_series("time", (self._count,))}
         if motion == "vertical":
             found["travel"] = self._travel(given)

@@ -12,31 +12,14 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.selection import Place, Selection
 
-SPARE = 64
+PADDING = 64
 """Bytes behind the last sample that must be there, too: kernels load their last word whole."""
 
 
 class MappedStack:
-    """Frames in one piece, whole ones lent where they lie.
+    """Frames in one piece, from some byte of an open file on; whole ones are lent where they lie.
 
-    Parameters
-    ----------
-    file : int
-        Descriptor of the open file; it may be closed afterwards.
-    place : Place
-    offset : int
-        Where the first frame begins, bytes.
-    shape : (int, int, int)
-        Frames, rows and columns that lie there.
-    dtype : dtype
-    cut : Selection
-        What is wanted of them.
-    how : str, optional
-
-    Raises
-    ------
-    OSError
-        The file is too short, or cannot be mapped.
+    OSError: the file is too short, or cannot be mapped. The descriptor may be closed afterwards.
     """
 
     def __init__(
@@ -46,27 +29,26 @@ class MappedStack:
         offset: int,
         shape: tuple[int, int, int],
         dtype: np.dtype[Any],
-        cut: Selection,
+        part: Selection,
         how: str = "mapped",
     ) -> None:
-        self.shape, self.dtype, self.how = cut.shape, dtype, how
-        self._place, self._first = place, cut.frames[0]
+        self.shape, self.dtype, self.how = part.shape, dtype, how
+        self._place, self._first = place, part.frames[0]
         self._end = offset + math.prod(shape) * dtype.itemsize
         size = os.fstat(file).st_size
         _check_length(size, self._end)
         base = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
-        length = min(size, self._end + SPARE) - base
+        length = min(size, self._end + PADDING) - base
         pages = mmap.mmap(file, length, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ, offset=base)
         self._map: mmap.mmap | None = pages
         self._offset = offset - base
         self._frame = math.prod(shape[1:]) * dtype.itemsize
         whole = np.ndarray(shape, dtype, pages, self._offset)
-        self._frames = whole[slice(*cut.frames), *cut.region.slices]
+        self._frames = whole[slice(*part.frames), *part.region.slices]
         # Whole pages are mapped, to the end of the last.
         reach = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
-        self._lendable = (reach - SPARE - self._offset) // self._frame if whole.flags.aligned else 0
-        if cut.region.shape != shape[1:]:
-            self._lendable = 0
+        lendable = whole.flags.aligned and part.region.shape == shape[1:]
+        self._lendable = (reach - PADDING - self._offset) // self._frame if lendable else 0
         self._used = self._dropped = 0
 
     def end(self, start: int, stop: int) -> int:
@@ -74,13 +56,13 @@ class MappedStack:
         return stop
 
     def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
-        """Lend frames, or copy them into ``out``; see ``Stack.read``."""
+        """Lend frames, or copy them into ``out``."""
         first, last = self._first + start, self._first + stop
         with self._place.reading(first, last):
             if self._map is None:
                 raise ValueError("(it is closed)")
             _check_length(self._map.size(), self._end)
-            self._forget(self._map, start)
+            self._drop_pages(self._map, start)
         frames = self._frames[start:stop]
         if last <= self._lendable:
             return frames
@@ -93,7 +75,7 @@ class MappedStack:
         self._frames = np.empty((0, *self.shape[1:]), self.dtype)  # a view would hold the mapping
         self._map = None
 
-    def _forget(self, pages: mmap.mmap, start: int) -> None:
+    def _drop_pages(self, pages: mmap.mmap, start: int) -> None:
         """Take the pages before the block before out of this process, whose memory they count to."""
         behind = self._offset + (self._first + min(self._used, start)) * self._frame
         behind -= behind % mmap.PAGESIZE

@@ -71,18 +71,7 @@ def face_vectors(mesh: Mesh) -> Floats:
 
 
 def normals_around(mesh: Mesh, vertices: NDArray[np.bool_]) -> Floats:
-    """Return the unit normals of some vertices: of the triangles around, in proportion to their areas.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    vertices : ndarray, (N,), bool
-        Which K of its vertices.
-
-    Returns
-    -------
-    ndarray, (K, 3), float64
-    """
+    """Return the unit normals of some vertices: of the triangles around, in proportion to their areas."""
     near = replace(mesh, faces=mesh.faces[vertices[mesh.faces].any(axis=1)])
     vectors = face_vectors(near)
     sums = np.zeros_like(mesh.vertices)

@@ -16,15 +16,7 @@ _LONGEST = 100
 
 
 def as_input_error(what: str | Callable[[], str], remedy: str = "") -> AbstractContextManager[None]:
-    """Turn what goes wrong with a file into an InputError of one line.
-
-    Parameters
-    ----------
-    what : str or callable
-        The line's beginning: the file, and what was to be done with it; or what tells, if it comes to that.
-    remedy : str, optional
-        The line's end: what to do about it.
-    """
+    """Turn what goes wrong with a file into an InputError of one line."""
     return _AsInputError(what, remedy)
 
 

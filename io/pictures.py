@@ -75,13 +75,7 @@ def read_picture(path: Path) -> NDArray[Any]:
 
 
 def count_pages(path: Path) -> int:
-    """Count the pages of a TIFF, all of samples that frames can have.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is no TIFF, is damaged, or has samples of another type.
-    """
+    """Count the pages of a TIFF, all of samples that frames can have."""
     import tifffile
 
     remedy = "copy it again, or save it anew"
@@ -146,26 +140,6 @@ class Pictures(FrameSequence):
     and they come in its order: ``image2.png`` before ``image10.png``. Numbers may start anywhere; one that is
     missing is a frame that was lost, so the block after it says ``dropped``. A TIFF's pages are in order.
     Colour becomes grey as in ``picture_files.read_picture``.
-
-    Parameters
-    ----------
-    path : str or Path
-        A folder, or a TIFF with one page a frame.
-    header : Header
-    travel, phase : Positions or array_like, (T,), optional
-        Millimetres and radians, one a frame, or ``Steps``, which count the frames that were lost, too.
-
-    Attributes
-    ----------
-    left_out : tuple of str
-        Names of the folder's files that are no frames.
-
-    Raises
-    ------
-    InputError
-        There is no such folder or TIFF; it holds no sequence, or several; two files have the same number; the
-        first picture cannot be read; travel or phase does not fit. A later picture that cannot be read, or is
-        unlike the first, is found when it is read.
     """
 
     def __init__(

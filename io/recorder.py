@@ -116,22 +116,7 @@ _Source = TypeVar("_Source", bound=Source)
 
 
 class TeeSource(Generic[_Source]):
-    """A source whose frames are written as they go by.
-
-    Parameters
-    ----------
-    source : Source
-    path : str or Path
-        Of the recording.
-    compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-    calibration : Calibration, optional
-        What the recording is to carry a copy of.
-
-    Raises
-    ------
-    InputError
-        Nobody knows the compression.
-    """
+    """A source whose frames are written as they go by."""
 
     rewindable = False
 

@@ -11,7 +11,7 @@ from typing import Self
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
 
-Span = tuple[int, int]
+Span = tuple[int, int]  # first and end
 
 _TEXT = re.compile("([0-9]{1,9}),([0-9]{1,9}),([1-9][0-9]{0,8})x([1-9][0-9]{0,8})")
 
@@ -24,15 +24,38 @@ class Region:
     ----------
     rows, columns : (int, int)
         First and end.
+
+    Examples
+    --------
+    >>> Region.read("100,50,640x480").rows
+    (50, 530)
     """
 
-    rows: tuple[int, int]
-    columns: tuple[int, int]
+    rows: Span
+    columns: Span
 
     @classmethod
     def whole(cls, picture: tuple[int, int]) -> Self:
         """Return all of a picture of so many rows and columns."""
         return cls((0, picture[0]), (0, picture[1]))
+
+    @classmethod
+    def read(cls, text: str) -> Self | None:
+        """Return the region that the property ``text`` wrote; None of anything else."""
+        found = _TEXT.fullmatch(text)
+        if found is None:
+            return None
+        column, row, columns, rows = map(int, found.groups())
+        return cls((row, row + rows), (column, column + columns))
+
+    @property
+    def text(self) -> str:
+        """Its first column and row, and how many of each, as in ``100,50,640x480``."""
+        (rows, columns), (row, column) = self.shape, self.origin
+        return f"{column},{row},{columns}x{rows}"
+
+    def __str__(self) -> str:
+        return f"rows {self.rows[0]}:{self.rows[1]} and columns {self.columns[0]}:{self.columns[1]}"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -48,24 +71,6 @@ class Region:
     def slices(self) -> tuple[slice, slice]:
         """What cuts it out of a map."""
         return slice(*self.rows), slice(*self.columns)
-
-    @classmethod
-    def read(cls, text: str) -> Self | None:
-        """Return the region that ``text`` tells as the property ``text`` does; None of anything else."""
-        found = _TEXT.fullmatch(text)
-        if found is None:
-            return None
-        column, row, columns, rows = map(int, found.groups())
-        return cls((row, row + rows), (column, column + columns))
-
-    @property
-    def text(self) -> str:
-        """Its first column and row, and how many of each, as in ``100,50,640x480``."""
-        (rows, columns), (row, column) = self.shape, self.origin
-        return f"{column},{row},{columns}x{rows}"
-
-    def __str__(self) -> str:
-        return f"rows {self.rows[0]}:{self.rows[1]} and columns {self.columns[0]}:{self.columns[1]}"
 
     def holds(self, other: Region) -> bool:
         """Tell whether another region lies within this."""
@@ -87,8 +92,9 @@ class Region:
 
     def check(self, picture: tuple[int, int], name: str) -> None:
         """Raise InputError if it does not lie within a picture of so many rows and columns."""
-        for axis, (start, stop), count in zip(
-            ("rows", "columns"), (self.rows, self.columns), picture, strict=True
+        for axis, (start, stop), count in (
+            ("rows", self.rows, picture[0]),
+            ("columns", self.columns, picture[1]),
         ):
             if not 0 <= start < stop <= count:
                 raise InputError(
@@ -98,29 +104,19 @@ class Region:
 
 
 def source_region(process: Mapping[str, object]) -> Region | None:
-    """Return the part of the picture that a result says it was made of; None where it says nothing.
+    """Return the part of the picture that a result was made of, from its process; None if that is not known.
 
-    Parameters
-    ----------
-    process : mapping
-        Of the result; one of 'fuse' tells the part of both recordings, which is the same.
+    A result of 'fuse' tells the part of both recordings, which is the same.
     """
-    told = (Region.read(str(process.get(name, ""))) for name in ("source_region", "vertical_source_region"))
-    return next((region for region in told if region is not None), None)
+    texts = (str(process.get(name, "")) for name in ("source_region", "vertical_source_region"))
+    return next((region for region in map(Region.read, texts) if region is not None), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is wanted of a dataset.
+    """What is wanted of a dataset: the frames, first and end, and the region of the picture."""
 
-    Attributes
-    ----------
-    frames : (int, int)
-        First frame and end.
-    region : Region
-    """
-
-    frames: tuple[int, int]
+    frames: Span
     region: Region
 
     @property
@@ -141,7 +137,7 @@ class Selection:
         return Selection(frames, Region(rows, columns))
 
     def within(self, outer: Selection) -> tuple[slice, slice, slice]:
-        """Return what cuts this out of an array that holds another cut."""
+        """Return what cuts this out of an array that holds another selection."""
         frames, rows, columns = (
             slice(a - c, b - c) for (a, b), (c, _) in zip(self.spans, outer.spans, strict=True)
         )
@@ -150,14 +146,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where frames come from, for messages.
-
-    Attributes
-    ----------
-    path : str
-        As the user calls the file.
-    dataset : str
-    """
+    """Where frames come from, for messages: the file, as the user calls it, and the dataset."""
 
     path: str
     dataset: str

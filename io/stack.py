@@ -1,4 +1,9 @@
-"""The frames of a dataset: the best way to fetch them, and some of them as if there were no others."""
+"""The frames of a dataset, or a part of them, numbered from 0: the best way to fetch them.
+
+A stack has `shape`, `dtype` and `how` (in words); `end(start, stop)` says where a read had better end; and
+`read(start, stop, out)` returns frames in ``out`` or in memory of its own, which nobody writes to as long as
+someone refers to it.
+"""
 
 from __future__ import annotations
 
@@ -17,47 +22,30 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.selection import Place, Selection
 from mirrorskin.io.types import InputError
 
-_LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is said
+_LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is given
 
 
 def open_stack(
     dataset: h5py.Dataset,
     path: str,
-    cut: Selection,
+    part: Selection,
     memory_limit: int | None = None,
     threads: int | None = None,
     frames: int | None = None,
 ) -> MappedStack | ChunkedStack:
-    """Open the frames of a dataset.
+    """Open a part of a dataset (T, H, W) whose claims were checked.
 
-    Parameters
-    ----------
-    dataset : h5py.Dataset, (T, H, W)
-        What it claims was checked.
-    path : str
-        What to call the file in messages.
-    cut : Selection
-        What is wanted of it.
-    memory_limit : int, optional
-        Bytes that unpacked frames may take which are kept for later reads.
-    threads : int, optional
-        How many unpack chunks; as many as there are cores by default.
-    frames : int, optional
-        How many of its frames there are, if it is yet to be finished.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, or cannot be opened.
+    ``path`` is what messages call the file; ``memory_limit`` are bytes of unpacked frames to keep; so many
+    ``threads`` unpack chunks, by default one a core; a dataset that still grows has so many ``frames``.
     """
     place, limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
     with as_input_error(f"{path}: {dataset.name}"):
-        why = _only_hdf5(dataset)
+        why = _why_only_hdf5(dataset)
         offset = None if why or dataset.chunks else dataset.id.get_offset()
         if not why and not dataset.chunks and offset is None:
             why = "in its header"
         if why:
-            return ChunkedStack(Hdf5Reader(dataset, place, why), place, cut, limit)
+            return ChunkedStack(Hdf5Reader(dataset, place, why), place, part, limit)
         shape = (frames or dataset.shape[0], *dataset.shape[1:])
         file = _open_again(dataset.file)
         try:
@@ -65,9 +53,9 @@ def open_stack(
                 chunks = _open_chunks(dataset, shape, file, place, _threads(dataset, threads, limit))
                 if not isinstance(chunks, int):
                     file = -1 if isinstance(chunks, ChunkReader) else file
-                    return ChunkedStack(chunks, place, cut, limit)
+                    return ChunkedStack(chunks, place, part, limit)
                 offset = chunks
-            return MappedStack(file, place, offset, shape, dataset.dtype, cut)
+            return MappedStack(file, place, offset, shape, dataset.dtype, part)
         finally:
             if file >= 0:
                 os.close(file)
@@ -84,12 +72,12 @@ def _open_again(opened: h5py.File) -> int:
 
 
 def _threads(dataset: h5py.Dataset, threads: int | None, limit: int) -> int:
-    """Return how many threads unpack chunks: as asked for or as cores, if a quarter of the room is enough."""
+    """Return how many threads unpack chunks: so many that a quarter of the memory is enough for them."""
     size: int = math.prod(dataset.chunks) * dataset.dtype.itemsize
     return min(threads or len(os.sched_getaffinity(0)), max(1, limit // (4 * size)))
 
 
-def _only_hdf5(dataset: h5py.Dataset) -> str:
+def _why_only_hdf5(dataset: h5py.Dataset) -> str:
     """Return what only HDF5 can read: elsewhere, or in another form than in memory; nothing if we can."""
     if dataset.is_virtual:
         return "virtual"
@@ -112,21 +100,14 @@ def _open_chunks(
         return Hdf5Reader(dataset, place, index)
     if not codecs:
         index = index.frame_by_frame(dataset.dtype.itemsize)
-        start = index.piece(shape)
+        start = index.contiguous_offset(shape)
         if start is not None:
             return start
     return ChunkReader(file, place, shape, dataset.dtype, index, codecs, threads)
 
 
 class FrameSubset:
-    """The frames of a stack that were chosen, numbered from 0; those between are not read.
-
-    Parameters
-    ----------
-    stack : Stack
-    frames : ndarray, (n,), int
-        Their numbers in the stack, which increase.
-    """
+    """Some frames of a stack, in order, as if there were no others; those between are not read."""
 
     def __init__(self, stack: MappedStack | ChunkedStack, frames: NDArray[np.intp]) -> None:
         self.shape, self.dtype = (len(frames), *stack.shape[1:]), stack.dtype
@@ -148,7 +129,7 @@ class FrameSubset:
         return start + self._stack.end(first, first + min(stop, self._ends[start]) - start) - first
 
     def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
-        """Return frames of one run; see ``Stack.read``."""
+        """Return frames of one run."""
         first = self._frames[start]
         return self._stack.read(first, first + stop - start, out)
 

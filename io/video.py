@@ -26,19 +26,6 @@ class Video(FrameSequence):
     luma of ITU-R BT.601 of what a player shows, in full range (0 to 255); a rotation that the file asks
     for is applied, so ``shape`` is that of the upright picture. ``time`` is what the file says of each
     frame, from the first; where that does not increase, the frame's number over the frame rate.
-
-    Parameters
-    ----------
-    path : str or Path
-    header : Header
-    travel, phase : Positions or array_like, (T,), optional
-        Millimetres and radians, one a frame, or ``Steps``.
-
-    Raises
-    ------
-    InputError
-        The file is missing, no video, damaged, cut off, without frames, or deeper than 8 bits; travel or
-        phase does not fit. Damage that a codec covers up within a frame is not seen.
     """
 
     def __init__(

@@ -87,13 +87,7 @@ class _Batch:
 
     @contextmanager
     def enlisted(self, jobs: list[Job]) -> Iterator[None]:
-        """Let workers take part that can, also those that come later; at the end, forget what is not begun.
-
-        Raises
-        ------
-        InputError
-            A worker that is there cannot take part.
-        """
+        """Let workers take part that can, also those that come later; at the end, drop what is not begun."""
         from mirrorskin.engine.batch.worker import RESOURCE, Enlist, look_around
 
         sizes = _one_of_each_folder(job.source.absolute() for job in jobs)
@@ -168,13 +162,7 @@ class _Batch:
         return outcome
 
     def _look(self) -> None:
-        """See that there is a scheduler and workers, and clear away what lost workers had begun to write.
-
-        Raises
-        ------
-        InputError
-            The scheduler is lost, or all workers that can take part are.
-        """
+        """See that there is a scheduler and workers, and clear away what lost workers had begun to write."""
         now = time.monotonic()
         if now - self._looked < _LOOK:
             return

@@ -23,13 +23,7 @@ class _Stopped(BaseException):  # no Exception: nobody may take it for a recordi
 
 
 def default_devices() -> list[Device]:
-    """Open the devices that a batch uses unasked: the default one, or all GPUs if that is one.
-
-    Raises
-    ------
-    mirrorskin.kernels.errors.DeviceError
-        There is none, or one cannot run a kernel.
-    """
+    """Open the devices that a batch uses unasked: the default one, or all GPUs if that is one."""
     first = open_device()
     if first.info.kind != "gpu" or "PYOPENCL_CTX" in os.environ:
         return [first]

@@ -31,17 +31,7 @@ _NUMBERS = f"\0mirrorskin-{os.getuid()}-worker-"  # of sockets that are in no fo
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What a worker has of its machine.
-
-    Attributes
-    ----------
-    device : Device
-        One of the GPUs in turn, else all workers' CPU.
-    cores : int
-        For decoding, and for a CPU device.
-    number : int
-        Descriptor of a socket whose name says which of the machine's workers it is; held as long as it lives.
-    """
+    """What a worker has of its machine."""
 
     device: Device
     cores: int
@@ -49,17 +39,7 @@ class Share:
 
 
 class Enlist(WorkerPlugin):
-    """Finds out whether a worker can take part: those that are there, and those that come later.
-
-    Parameters
-    ----------
-    program : str
-        Version of mirrorskin.
-    sizes : mapping of Path to int
-        Recordings, and how many bytes they have.
-    trace : Path
-        A file that lies, for now, where results will be written.
-    """
+    """Finds out whether a worker can take part: those that are there, and those that come later."""
 
     def __init__(self, program: str, sizes: Mapping[Path, int], trace: Path) -> None:
         self.program, self.sizes, self.trace = program, sizes, trace
@@ -101,11 +81,6 @@ def take_share(workers: int) -> Share:
     """Return the next share of a machine that has so many workers.
 
     PoCL asks once in a process how many threads it may have, so this must be the first to look at OpenCL.
-
-    Raises
-    ------
-    DeviceError
-        There is no OpenCL device, or it cannot run a kernel.
     """
     keep_memory()
     number, held = _take_number()

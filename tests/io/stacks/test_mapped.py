@@ -15,7 +15,7 @@ import pytest
 from fetching import GIVEN, compressible, ours, theirs, write
 
 from mirrorskin import io
-from mirrorskin.io.mapped_stack import SPARE, MappedStack
+from mirrorskin.io.mapped_stack import PADDING, MappedStack
 from mirrorskin.io.selection import Place, Region, Selection
 
 SHAPE = (9, 50, 70)
@@ -78,8 +78,8 @@ def test_a_region_or_a_range_is_cut_out(path):
         assert recording.read().lent
 
 
-@pytest.mark.parametrize("spare", [0, 1, SPARE - 1, SPARE, SPARE + 1, mmap.PAGESIZE - 1])
-@pytest.mark.parametrize("more", [0, 1, SPARE, 5000])
+@pytest.mark.parametrize("spare", [0, 1, PADDING - 1, PADDING, PADDING + 1, mmap.PAGESIZE - 1])
+@pytest.mark.parametrize("more", [0, 1, PADDING, 5000])
 def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
     """The last frame ends ``spare`` bytes before a page does, and the file ``more`` bytes behind it."""
     frames = compressible((4, 8, 256), "u1")
@@ -91,7 +91,7 @@ def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
         stack = MappedStack(file.fileno(), Place("raw", "x"), offset, frames.shape, frames.dtype, whole)
     out = np.zeros_like(frames)
     np.testing.assert_array_equal(stack.read(0, 4, out), frames)
-    assert np.array_equal(out, frames) == (more <= spare < SPARE)
+    assert np.array_equal(out, frames) == (more <= spare < PADDING)
     out[...] = 0
     assert stack.read(0, 3, out).base is not out  # those before it are lent in any case
 
