@@ -51,9 +51,8 @@ int excess_of_noise(const float quiet, const float gain)
 }
 
 __kernel void changepoint_scan(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int first,
-    const int level, const int least, const float quiet, MAP dark,
-    MAP gain, __global int *restrict start, __global int *restrict excess,
+    __global const FRAME *restrict frames, const int count, const int pixels, const int first, const int level,
+    const int least, const float quiet, MAP dark, MAP gain, __global int *restrict start, __global int *restrict excess,
     __global int *restrict below, __global FRAME *restrict ring)
 {
     const int base = get_global_id(0) * TILE;
@@ -107,8 +106,7 @@ __kernel void changepoint_scan(
 }
 
 __kernel void changepoint_sum(
-    __global const FRAME *restrict frames, const int count, const int pixels, OUT total,
-    OUT total_rest)
+    __global const FRAME *restrict frames, const int count, const int pixels, OUT total, OUT total_rest)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);
@@ -123,11 +121,9 @@ __kernel void changepoint_sum(
 }
 
 __kernel void changepoint_split(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int first,
-    MAP mean, MAP mean_rest,
-    MAP weight, OUT total,
-    OUT total_rest, __global int *restrict start, __global int *restrict since,
-    OUT score, __global FRAME *restrict ring)
+    __global const FRAME *restrict frames, const int count, const int pixels, const int first, MAP mean, MAP mean_rest,
+    MAP weight, OUT total, OUT total_rest, __global int *restrict start, __global int *restrict since, OUT score,
+    __global FRAME *restrict ring)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);
@@ -333,8 +329,7 @@ int is_flat(const samples_t *samples, const float noise)
 
 // Travel between frames, and beyond the ends as it was there, as the sum of two floats; the frame is told
 // from the start, which keeps its last bits.
-float2 travel_at(
-    __global const float2 *restrict travel, const int count, const int start, const float crossing)
+float2 travel_at(__global const float2 *restrict travel, const int count, const int start, const float crossing)
 {
     const int frame = clamp(start + (int)floor(crossing), 0, count - 2);
     const float2 step = travel[frame + 1] - travel[frame];
@@ -343,13 +338,10 @@ float2 travel_at(
 }
 
 __kernel void changepoint_heights(
-    const int pixels, const int count, __global const int *restrict start,
-    __global const int *restrict excess, __global const int *restrict below,
-    __global const int *restrict since, MAP dark,
-    MAP gain, __global const FRAME *restrict ring,
-    __global const float2 *restrict travel, const float noise, const float quiet, const float level,
-    const int own, OUT height, OUT sigma,
-    __global uchar *restrict status)
+    const int pixels, const int count, __global const int *restrict start, __global const int *restrict excess,
+    __global const int *restrict below, __global const int *restrict since, MAP dark, MAP gain,
+    __global const FRAME *restrict ring, __global const float2 *restrict travel, const float noise, const float quiet,
+    const float level, const int own, OUT height, OUT sigma, __global uchar *restrict status)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);

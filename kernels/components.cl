@@ -59,8 +59,8 @@ float chosen(const int which, const float one, const float other)
 // Each item sums over its rows, into its own row of the sums.
 __kernel void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    MAP relief, const float plane_x, const float plane_y, const float plane_z,
-    HEIGHT_MAPS const int strip, const int pieces, OUT sums, OUT totals)
+    MAP relief, const float plane_x, const float plane_y, const float plane_z, HEIGHT_MAPS const int strip,
+    const int pieces, OUT sums, OUT totals)
 {
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;
@@ -102,8 +102,7 @@ __kernel void components_sum(
 
 __kernel void components_settle(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    MAP relief, const float plane_x, const float plane_y, const float plane_z,
-    MAP offsets, OUT height)
+    MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP offsets, OUT height)
 {
     const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int row = item / pieces, begin = item % pieces * CHUNK, end = LESSER(columns, begin + CHUNK);
@@ -117,9 +116,7 @@ __kernel void components_settle(
 }
 
 // What brings the mean of each piece to 0.
-__kernel void components_level(
-    const int strips, const int count, MAP sums, MAP totals,
-    OUT offsets)
+__kernel void components_level(const int strips, const int count, MAP sums, MAP totals, OUT offsets)
 {
     const int piece = get_global_id(0);
     if (piece >= count) return;

@@ -27,9 +27,8 @@ typedef Narrow Sum;
 
 __kernel void correlation_slide(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
-    const int window, __global const int *restrict basis, __global FRAME *restrict ring,
-    __global Sum *restrict total, __global Sum *restrict cosine, __global Sum *restrict sine,
-    __global Sum *restrict square)
+    const int window, __global const int *restrict basis, __global FRAME *restrict ring, __global Sum *restrict total,
+    __global Sum *restrict cosine, __global Sum *restrict sine, __global Sum *restrict square)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int t = 0; t < count; ++t) {
@@ -157,8 +156,8 @@ void begin(Sums *restrict sums, const int width, __global const FRAME *restrict 
 }
 
 void add(
-    Sums *restrict sums, const int width, __global const FRAME *restrict frame, const float weight,
-    const float cosine, const float sine)
+    Sums *restrict sums, const int width, __global const FRAME *restrict frame, const float weight, const float cosine,
+    const float sine)
 {
     for (int p = 0; p < width; ++p) {
         const float sample = (float)frame[p] - sums->reference[p];
@@ -177,9 +176,7 @@ void add(
 #define FIT(i) ((Pair){fit[i], fit[9 + (i)]})
 #define ROW(i) settle(plus(plus(times(FIT(3 * i), a), times(FIT(3 * i + 1), b)), times(FIT(3 * i + 2), c)))
 
-void solve(
-    const Sums *restrict sums, const int width, MAP fit, OUT mean,
-    OUT cosine, OUT sine, OUT residual)
+void solve(const Sums *restrict sums, const int width, MAP fit, OUT mean, OUT cosine, OUT sine, OUT residual)
 {
     for (int p = 0; p < width; ++p) {
         const Pair a = GET(sums, TOTAL, p), b = GET(sums, COSINE, p), c = GET(sums, SINE, p);
@@ -199,8 +196,7 @@ void solve(
 __kernel void correlation_solve_counts(
     const int pixels, const int frames, const long cosines, const long sines, __global const Sum *restrict total,
     __global const Sum *restrict cosine, __global const Sum *restrict sine, __global const Sum *restrict square,
-    MAP fit, OUT mean, OUT cosine_part,
-    OUT sine_part, OUT residual)
+    MAP fit, OUT mean, OUT cosine_part, OUT sine_part, OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -215,9 +211,9 @@ __kernel void correlation_solve_counts(
 #define AS_LONG(sums, k, p, factor) as_long((float2)(factor * (sums).high[k][p], factor * (sums).rest[k][p]))
 
 __kernel void correlation_convert(
-    const int pixels, const int frames, const long cosines, const long sines, const float unit,
-    OUT reference, __global Sum *restrict total, __global Sum *restrict cosine,
-    __global Sum *restrict sine, __global Sum *restrict square)
+    const int pixels, const int frames, const long cosines, const long sines, const float unit, OUT reference,
+    __global Sum *restrict total, __global Sum *restrict cosine, __global Sum *restrict sine,
+    __global Sum *restrict square)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -242,9 +238,8 @@ __kernel void correlation_convert(
 #define FLOAT2(sums, k, p) (float2)((sums).high[k][p], (sums).rest[k][p])
 
 void load(
-    Sums *restrict sums, const int width, MAP reference,
-    __global const float2 *restrict total, __global const float2 *restrict cosine,
-    __global const float2 *restrict sine, __global const float2 *restrict square)
+    Sums *restrict sums, const int width, MAP reference, __global const float2 *restrict total,
+    __global const float2 *restrict cosine, __global const float2 *restrict sine, __global const float2 *restrict square)
 {
     for (int p = 0; p < width; ++p) {
         sums->reference[p] = reference[p];
@@ -257,9 +252,8 @@ void load(
 
 __kernel void correlation_sum(
     __global const FRAME *restrict frames, const int count, const int pixels, const int fresh,
-    __global const int *restrict place, MAP basis, OUT reference,
-    __global float2 *restrict total, __global float2 *restrict cosine, __global float2 *restrict sine,
-    __global float2 *restrict square)
+    __global const int *restrict place, MAP basis, OUT reference, __global float2 *restrict total,
+    __global float2 *restrict cosine, __global float2 *restrict sine, __global float2 *restrict square)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -283,10 +277,9 @@ __kernel void correlation_sum(
 }
 
 __kernel void correlation_solve_pairs(
-    const int pixels, MAP reference, __global const float2 *restrict total,
-    __global const float2 *restrict cosine, __global const float2 *restrict sine,
-    __global const float2 *restrict square, MAP fit, OUT mean,
-    OUT cosine_part, OUT sine_part, OUT residual)
+    const int pixels, MAP reference, __global const float2 *restrict total, __global const float2 *restrict cosine,
+    __global const float2 *restrict sine, __global const float2 *restrict square, MAP fit, OUT mean, OUT cosine_part,
+    OUT sine_part, OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -311,9 +304,7 @@ __kernel void correlation_keep(
 
 __kernel void correlation_window(
     __global const FRAME *restrict ring, const int count, const int pixels, const int stride,
-    __global const int *restrict place, MAP basis, MAP fit,
-    OUT mean, OUT cosine, OUT sine,
-    OUT residual)
+    __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine, OUT sine, OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {

@@ -47,8 +47,8 @@ __kernel void edges_clean(
 
 // One item a row, of the cells with their margin.
 __kernel void edges_cells(
-    const int rows, const int columns, MAP vectors, MAP sigma,
-    __global const uchar *restrict contact, __global const uchar *restrict clean, OUT cells)
+    const int rows, const int columns, MAP vectors, MAP sigma, __global const uchar *restrict contact,
+    __global const uchar *restrict clean, OUT cells)
 {
     const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     if (y >= rows + 2 * MARGIN) return;
@@ -73,9 +73,7 @@ __kernel void edges_cells(
 }
 
 // One item a row, of the cells with their margin.
-__kernel void edges_join(
-    const int rows, const int columns, MAP cells, __global const uchar *restrict edges,
-    OUT joined)
+__kernel void edges_join(const int rows, const int columns, MAP cells, __global const uchar *restrict edges, OUT joined)
 {
     const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     if (y >= rows + 2 * MARGIN) return;
@@ -99,10 +97,9 @@ __kernel void edges_join(
 #ifdef SPACING
 // Runs of CHUNK pixels of a row, one an item.
 __kernel void edges_jumps(
-    const int rows, const int columns, MAP cells, __global const int *restrict places,
-    MAP distances, const float jump, const float bend, const float sure, const float quiet,
-    const float floor_, const float lowest, __global uchar *restrict doubt, OUT strength,
-    __global uchar *restrict ways)
+    const int rows, const int columns, MAP cells, __global const int *restrict places, MAP distances, const float jump,
+    const float bend, const float sure, const float quiet, const float floor_, const float lowest,
+    __global uchar *restrict doubt, OUT strength, __global uchar *restrict ways)
 {
     const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
     const int first = (int)get_global_id(0) % runs * CHUNK;
@@ -213,8 +210,9 @@ float at(__global const float *strength, const int rows, const int columns, cons
 }
 
 // Whether a line of the passes before lies beside a pixel, or on it.
-int guarded(__global const uchar *edges, const int rows, const int columns, const int row, const int column,
-            const float cosine, const float sine)
+int guarded(
+    __global const uchar *edges, const int rows, const int columns, const int row, const int column, const float cosine,
+    const float sine)
 {
     for (int y = GREATER(row - GUARD, 0); y <= LESSER(row + GUARD, rows - 1); ++y) {
         for (int x = GREATER(column - GUARD, 0); x <= LESSER(column + GUARD, columns - 1); ++x) {

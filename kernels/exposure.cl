@@ -84,9 +84,8 @@ FRAME quantise(const float counts, const float top)
 }
 
 __kernel void expose(
-    MAP light, MAP offset,
-    MAP span, const int quarter, const ulong frame, const ulong seed,
-    const float read, const float grain, const float top, __global FRAME *restrict counts)
+    MAP light, MAP offset, MAP span, const int quarter, const ulong frame, const ulong seed, const float read,
+    const float grain, const float top, __global FRAME *restrict counts)
 {
     const int begin = get_global_id(0) * TILE, end = min(quarter, begin + TILE);
     for (int n = begin; n < end; ++n) {

@@ -50,8 +50,8 @@ __kernel void triad_all(__global WORD *words, const int count, const uint scale)
 }
 
 // WORDS is 8 here: as many sums that do not wait for each other.
-__kernel void multiply_all(__global NUMBERS *restrict numbers, const int count, const int steps, const float factor,
-                           const float summand)
+__kernel void multiply_all(
+    __global NUMBERS *restrict numbers, const int count, const int steps, const float factor, const float summand)
 {
     const long first = first_word();
     if (first + 7 * STRIDE >= count) return;

@@ -151,8 +151,8 @@ int kept(
 #define KEPT(p, row, column) kept(p, row, column, columns, dz_dx, dz_dy, edges, flags)
 
 __kernel void links_cut(
-    const int rows, const int columns, MAP dz_dx, MAP dz_dy,
-    __global const uchar *restrict edges, __global const uchar *restrict flags, __global uchar *restrict cut)
+    const int rows, const int columns, MAP dz_dx, MAP dz_dy, __global const uchar *restrict edges,
+    __global const uchar *restrict flags, __global uchar *restrict cut)
 {
     PIECE(1)
     if (top >= rows) return;
@@ -309,8 +309,7 @@ __kernel void links_misfit(GRAPH, MAP relief, OUT sums)
 }
 
 __kernel void links_smooth(
-    const int rows, const int columns, __global const uchar *restrict flags,
-    MAP values, OUT smoothed)
+    const int rows, const int columns, __global const uchar *restrict flags, MAP values, OUT smoothed)
 {
     PIECE(1)
     if (top >= rows) return;

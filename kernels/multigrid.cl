@@ -51,6 +51,10 @@ typedef float reals;
 #define WITH_ANCHOR(value)
 #endif
 
+#define LEVEL_ARGS const int base, const int rows, const int stride
+#define BETWEEN_ARGS const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride
+#define GRAPH_ARGS MAP right, MAP down, MAP anchor
+
 #define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
 
 // The links of nodes i: to the right and left, down and up.
@@ -71,9 +75,7 @@ typedef float reals;
 #define LEFT(i) AT(left + (i))
 
 // One over the diagonal.
-__kernel void multigrid_invert(
-    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor,
-    OUT inverse)
+__kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
 {
     ITEMS_NODES
     EACH_NODE {
@@ -86,8 +88,8 @@ __kernel void multigrid_invert(
 // Two steps of Jacobi's method from heights of zero.
 #define FIRST(i) (omega * AT(b + (i)) * AT(inverse + (i)))
 void begin_nodes(
-    const int begin, const int end, const int stride, const float omega, const float then, MAP right, MAP down,
-    MAP anchor, MAP inverse, MAP b, OUT x)
+    const int begin, const int end, const int stride, const float omega, const float then, GRAPH_ARGS, MAP inverse,
+    MAP b, OUT x)
 {
     EACH_NODE {
         LINKS
@@ -95,9 +97,7 @@ void begin_nodes(
     }
 }
 
-__kernel void multigrid_begin(
-    const int base, const int rows, const int stride, const float omega, const float then, MAP right, MAP down,
-    MAP anchor, MAP inverse, MAP b, OUT x)
+__kernel void multigrid_begin(LEVEL_ARGS, const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x)
 {
     ITEMS_NODES
     begin_nodes(begin, end, stride, omega, then, right, down, anchor, inverse, b, x);
@@ -105,8 +105,7 @@ __kernel void multigrid_begin(
 
 // One step of Jacobi's method.
 void smooth_nodes(
-    const int begin, const int end, const int stride, const float omega, MAP right, MAP down, MAP anchor, MAP b,
-    MAP x, OUT smoother)
+    const int begin, const int end, const int stride, const float omega, GRAPH_ARGS, MAP b, MAP x, OUT smoother)
 {
     EACH_NODE {
         LINKS
@@ -115,18 +114,14 @@ void smooth_nodes(
     }
 }
 
-__kernel void multigrid_smooth(
-    const int base, const int rows, const int stride, const float omega, MAP right, MAP down, MAP anchor, MAP b,
-    MAP x, OUT smoother)
+__kernel void multigrid_smooth(LEVEL_ARGS, const float omega, GRAPH_ARGS, MAP b, MAP x, OUT smoother)
 {
     ITEMS_NODES
     smooth_nodes(begin, end, stride, omega, right, down, anchor, b, x, smoother);
 }
 
 // What is left over.
-void residual_nodes(
-    const int begin, const int end, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
-    OUT left)
+void residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT left)
 {
     EACH_NODE {
         LINKS
@@ -134,17 +129,14 @@ void residual_nodes(
     }
 }
 
-__kernel void multigrid_residual(
-    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
-    OUT left)
+__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT left)
 {
     ITEMS_NODES
     residual_nodes(begin, end, stride, right, down, anchor, b, x, left);
 }
 
 // Ask for what is left over, and keep the heights so far.
-void keep_nodes(
-    const int begin, const int end, MAP left, MAP x, OUT b, OUT kept)
+void keep_nodes(const int begin, const int end, MAP left, MAP x, OUT b, OUT kept)
 {
     EACH_NODE {
         PUT(b + i) = AT(left + i);
@@ -152,18 +144,14 @@ void keep_nodes(
     }
 }
 
-__kernel void multigrid_keep(
-    const int base, const int rows, const int stride, MAP left, MAP x, OUT b,
-    OUT kept)
+__kernel void multigrid_keep(LEVEL_ARGS, MAP left, MAP x, OUT b, OUT kept)
 {
     ITEMS_NODES
     keep_nodes(begin, end, left, x, b, kept);
 }
 
 // What is left over, over the diagonal.
-void leave_nodes(
-    const int begin, const int end, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
-    OUT left)
+void leave_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT left)
 {
     EACH_NODE {
         LINKS
@@ -172,9 +160,7 @@ void leave_nodes(
     }
 }
 
-__kernel void multigrid_leave(
-    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP x,
-    OUT left)
+__kernel void multigrid_leave(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT left)
 {
     ITEMS_NODES
     leave_nodes(begin, end, stride, right, down, anchor, b, x, left);
@@ -188,15 +174,14 @@ void scale_nodes(const int begin, const int end, MAP inverse, MAP b, OUT left)
     }
 }
 
-__kernel void multigrid_scale(
-    const int base, const int rows, const int stride, MAP inverse, MAP b, OUT left)
+__kernel void multigrid_scale(LEVEL_ARGS, MAP inverse, MAP b, OUT left)
 {
     ITEMS_NODES
     scale_nodes(begin, end, inverse, b, left);
 }
 
 // Nothing, where no pass writes what others read.
-__kernel void multigrid_clear(const int base, const int rows, const int stride, OUT x)
+__kernel void multigrid_clear(LEVEL_ARGS, OUT x)
 {
     ITEMS_NODES
     EACH_NODE {
@@ -212,8 +197,7 @@ void add_nodes(const int begin, const int end, MAP other, OUT x)
     }
 }
 
-__kernel void multigrid_add(
-    const int base, const int rows, const int stride, MAP other, OUT x)
+__kernel void multigrid_add(LEVEL_ARGS, MAP other, OUT x)
 {
     ITEMS_NODES
     add_nodes(begin, end, other, x);
@@ -223,8 +207,8 @@ __kernel void multigrid_add(
 // Of each link that enters the block the far end counts, and of those inside both. What is left over lies, of the
 // row above the block, its own two and the one below, at `above` to `below`.
 void restrict_row(
-    const int I, const int K, const int J, const int count, const int stride, MAP right, MAP down, MAP above,
-    MAP upper, MAP lower, MAP below, OUT b)
+    const int I, const int K, const int J, const int count, const int stride, MAP right, MAP down, MAP above, MAP upper,
+    MAP lower, MAP below, OUT b)
 {
     for (int c = 0; c < count; c += WIDTH) {
         const int f = 2 * c, i = I + f, k = K + f;
@@ -246,9 +230,7 @@ void restrict_row(
     restrict_row(I, K, J, stride / 2, stride, right, down, left + I - stride, left + I, left + K,       \
                  left + K + stride, b);
 
-__kernel void multigrid_restrict(
-    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    MAP right, MAP down, MAP left, OUT b)
+__kernel void multigrid_restrict(BETWEEN_ARGS, MAP right, MAP down, MAP left, OUT b)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) {
@@ -258,17 +240,14 @@ __kernel void multigrid_restrict(
 
 // The coarse right side of full multigrid, where no block is odd: all that a block's nodes are asked for.
 void gather_row(
-    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, MAP fine,
-    OUT b)
+    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, MAP fine, OUT b)
 {
     EACH_BLOCK {
         PUT(b + J) = (EVEN(fine + I) + ODD(fine + I)) + (EVEN(fine + K) + ODD(fine + K));
     }
 }
 
-__kernel void multigrid_gather(
-    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride, MAP fine,
-    OUT b)
+__kernel void multigrid_gather(BETWEEN_ARGS, MAP fine, OUT b)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) gather_row(row, base, stride, coarse_base, coarse_stride, fine, b);
@@ -277,8 +256,7 @@ __kernel void multigrid_gather(
 // Heights and the coarse correction, spread by a step of Jacobi's method.
 void prolong_row(
     const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, const float keep,
-    MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT upper,
-    OUT lower)
+    MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT upper, OUT lower)
 {
     EACH_BLOCK {
         const reals here = AT(e + J), above = AT(e + J - coarse_stride), below = AT(e + J + coarse_stride);
@@ -303,8 +281,7 @@ void prolong_row(
     prolong_row(row, base, stride, coarse_base, coarse_stride, keep, right, down, inverse, e, x, upper, lower);
 
 __kernel void multigrid_prolong(
-    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    const float keep, MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT corrected)
+    BETWEEN_ARGS, const float keep, MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT corrected)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) {
@@ -320,10 +297,7 @@ __kernel void multigrid_prolong(
 #define COUNT(condition) ((condition) ? (reals)1 : (reals)0)
 #define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= STRENGTH * STRENGTH * (g) * (h)))
 __kernel void multigrid_coarsen(
-    const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride,
-    MAP right, MAP down, MAP anchor,
-    OUT coarse_right, OUT coarse_down, OUT coarse_anchor,
-    OUT split)
+    BETWEEN_ARGS, GRAPH_ARGS, OUT coarse_right, OUT coarse_down, OUT coarse_anchor, OUT split)
 {
     const int row = get_global_id(0);
     if (row >= coarse_rows) return;
@@ -359,8 +333,7 @@ __kernel void multigrid_coarsen(
         sum += term;                                                                                       \
     }
 
-__kernel void multigrid_invert_odd(
-    const int at, const int count, ODD_ROWS, MAP anchor, OUT inverse)
+__kernel void multigrid_invert_odd(const int at, const int count, ODD_ROWS, MAP anchor, OUT inverse)
 {
     ITEMS_ODD
     EACH_ODD {
@@ -372,8 +345,7 @@ __kernel void multigrid_invert_odd(
 
 #define SEED(i) (omega * b[i] * inverse[i])
 void begin_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b,
-    OUT x)
+    const int begin, const int end, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
 {
     EACH_ODD {
         const int i = node[k];
@@ -383,16 +355,14 @@ void begin_odd(
 }
 
 __kernel void multigrid_begin_odd(
-    const int at, const int count, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b,
-    OUT x)
+    const int at, const int count, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
 {
     ITEMS_ODD
     begin_odd(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
 }
 
 void smooth_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x,
-    OUT smoother)
+    const int begin, const int end, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
 {
     EACH_ODD {
         const int i = node[k];
@@ -402,8 +372,7 @@ void smooth_odd(
 }
 
 __kernel void multigrid_smooth_odd(
-    const int at, const int count, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x,
-    OUT smoother)
+    const int at, const int count, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
 {
     ITEMS_ODD
     smooth_odd(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
@@ -411,8 +380,7 @@ __kernel void multigrid_smooth_odd(
 
 // Over the diagonal, if there is one to divide by.
 void leave_odd(
-    const int begin, const int end, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x,
-    OUT left)
+    const int begin, const int end, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT left)
 {
     EACH_ODD {
         const int i = node[k];
@@ -422,8 +390,7 @@ void leave_odd(
 }
 
 __kernel void multigrid_leave_odd(
-    const int at, const int count, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x,
-    OUT left)
+    const int at, const int count, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT left)
 {
     ITEMS_ODD
     leave_odd(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, left);
@@ -437,16 +404,13 @@ void restrict_odd(const int begin, const int end, ODD_ROWS, MAP left, OUT b)
     }
 }
 
-__kernel void multigrid_restrict_odd(
-    const int at, const int count, ODD_ROWS, MAP left, OUT b)
+__kernel void multigrid_restrict_odd(const int at, const int count, ODD_ROWS, MAP left, OUT b)
 {
     ITEMS_ODD
     restrict_odd(begin, end, node, start, column, weight, left, b);
 }
 
-void prolong_odd(
-    const int begin, const int end, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x,
-    OUT corrected)
+void prolong_odd(const int begin, const int end, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
 {
     EACH_ODD {
         const int i = node[k];
@@ -456,16 +420,14 @@ void prolong_odd(
 }
 
 __kernel void multigrid_prolong_odd(
-    const int at, const int count, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x,
-    OUT corrected)
+    const int at, const int count, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
 {
     ITEMS_ODD
     prolong_odd(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
 }
 
 // The coarsest level: the pseudo-inverse of its matrix, times what is asked of its nodes.
-void solve_node(
-    const int k, const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
+void solve_node(const int k, const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
 {
     float sum = 0;
     for (int m = 0; m < count; ++m) {
@@ -474,8 +436,7 @@ void solve_node(
     x[bottom[k]] = sum;
 }
 
-__kernel void multigrid_solve(
-    const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
+__kernel void multigrid_solve(const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
 {
     const int k = get_global_id(0);
     if (k < count) solve_node(k, count, bottom, matrix, b, x);
@@ -504,10 +465,8 @@ void clear_line(__global float *line, const int stride)
 // Two steps of Jacobi's method from heights of zero, what is left over then, and the coarse right side. What is left
 // over is kept if `keep` is 1.
 __kernel void multigrid_descend(
-    const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
-    const int coarse_stride, const int band, const int keep, const float omega, const float then, MAP right, MAP down,
-    MAP anchor, MAP inverse, MAP b, OUT x, OUT left,
-    OUT lines, OUT coarse_b)
+    LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band, const int keep,
+    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x, OUT left, OUT lines, OUT coarse_b)
 {
     BAND
     if (first >= last) return;
@@ -541,9 +500,8 @@ __kernel void multigrid_descend(
 // The coarse correction and two steps of Jacobi's method, and parts of the product of heights and right side. The
 // rows of the table for odd prolongation that belong to a row of the picture begin at odd[row].
 __kernel void multigrid_ascend(
-    const int base, const int rows, const int stride, const int coarse_base, const int coarse_rows,
-    const int coarse_stride, const int band, const float omega, const float then, MAP right, MAP down, MAP anchor,
-    MAP inverse, MAP b, MAP e, MAP x, OUT lines, OUT smoother,
+    LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band,
+    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, MAP e, MAP x, OUT lines, OUT smoother,
     OUT parts, const int odds, __global const int *restrict odd, ODD_ROWS)
 {
     BAND
@@ -600,13 +558,11 @@ typedef struct {
 #define GRAPH right, down, anchor
 #define ALL_NODES(l) PICTURE_OF(l), LEVEL(l).stride
 #define TAIL                                                                                               \
-    const int first, const int last, __global const Level *restrict levels, MAP right, MAP down, MAP anchor, \
+    const int first, const int last, __global const Level *restrict levels, GRAPH_ARGS, \
     MAP inverse, ODD_ROWS, const int count, __global const int *restrict bottom, MAP matrix, const float omega, \
     const float then
 
-void tail_restrict(
-    const int l, __global const Level *restrict levels, MAP right, MAP down, ODD_ROWS, MAP left,
-    OUT b)
+void tail_restrict(const int l, __global const Level *restrict levels, MAP right, MAP down, ODD_ROWS, MAP left, OUT b)
 {
     const int base = LEVEL(l).base, stride = LEVEL(l).stride;
     const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
@@ -629,8 +585,8 @@ void tail_prolong(
 }
 
 void tail_smooth(
-    const int l, __global const Level *restrict levels, const float omega, MAP right, MAP down, MAP anchor,
-    MAP inverse, ODD_ROWS, MAP b, MAP x, OUT smoother)
+    const int l, __global const Level *restrict levels, const float omega, GRAPH_ARGS, MAP inverse, ODD_ROWS, MAP b,
+    MAP x, OUT smoother)
 {
     smooth_nodes(ALL_NODES(l), omega, GRAPH, b, x, smoother);
     smooth_odd(GRAPH_OF(l), ODDS, omega, anchor, inverse, b, x, smoother);
@@ -716,10 +672,7 @@ __kernel void multigrid_tail_full(TAIL, CYCLE, __global float *full_b, __global 
 // The next direction, the matrix times it, and the product of both.
 #define DIRECTION(i) (AT(z + (i)) + beta * AT(before + (i)))
 __kernel void multigrid_direct(
-    const int base, const int rows, const int stride, const float beta, MAP right,
-    MAP down, MAP anchor, MAP z,
-    MAP before, OUT direction, OUT image,
-    OUT parts)
+    LEVEL_ARGS, const float beta, GRAPH_ARGS, MAP z, MAP before, OUT direction, OUT image, OUT parts)
 {
     EACH_PART {
         LINKS
@@ -732,10 +685,7 @@ __kernel void multigrid_direct(
 }
 
 // A step along it, what is left over then, and the square of that.
-__kernel void multigrid_advance(
-    const int base, const int rows, const int stride, const float alpha, MAP direction,
-    MAP image, OUT b, OUT x,
-    OUT parts)
+__kernel void multigrid_advance(LEVEL_ARGS, const float alpha, MAP direction, MAP image, OUT b, OUT x, OUT parts)
 {
     EACH_PART {
         const reals r = AT(b + i) - alpha * AT(image + i);
@@ -750,9 +700,7 @@ __kernel void multigrid_advance(
 // z A p, p A p and b p.
 #define STEP(i) AT(p + (i))
 #define CORRECTION(i) AT(z + (i))
-__kernel void multigrid_curve(
-    const int base, const int rows, const int stride, MAP right, MAP down, MAP anchor, MAP b, MAP z, MAP p,
-    const int count, OUT parts)
+__kernel void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const int count, OUT parts)
 {
     const int begin = base + stride + (int)get_global_id(0) * PART;
     const int end = LESSER(begin + PART, base + stride * (rows + 1));
@@ -776,8 +724,7 @@ __kernel void multigrid_curve(
 // The best step in the plane of both, by the parts of these products and of that of b and z. No sum goes to the host.
 #define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
 __kernel void multigrid_follow(
-    const int base, const int rows, const int stride, const int products, MAP product, const int count, MAP parts,
-    MAP z, OUT p, OUT x)
+    LEVEL_ARGS, const int products, MAP product, const int count, MAP parts, MAP z, OUT p, OUT x)
 {
     ITEMS_NODES
     float bz = 0, zz = 0, zp = 0, pp = 0, bp = 0;
@@ -800,9 +747,7 @@ __kernel void multigrid_follow(
 }
 
 // The product of two.
-__kernel void multigrid_dot(
-    const int base, const int rows, const int stride, MAP one,
-    MAP other, OUT parts)
+__kernel void multigrid_dot(LEVEL_ARGS, MAP one, MAP other, OUT parts)
 {
     EACH_PART {
         sum += AT(one + i) * AT(other + i);
@@ -811,8 +756,7 @@ __kernel void multigrid_dot(
 }
 
 // What the anchors weigh of heights.
-__kernel void multigrid_weigh(
-    const int base, const int rows, const int stride, MAP anchor, MAP x, OUT parts)
+__kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, MAP x, OUT parts)
 {
     EACH_PART {
         sum += AT(anchor + i) * HEIGHT(i) * HEIGHT(i);
@@ -821,9 +765,7 @@ __kernel void multigrid_weigh(
 }
 
 // Maps of pixels without margins, to and from the finest level, row by row.
-__kernel void multigrid_admit(
-    const int rows, const int columns, const int stride, MAP map,
-    OUT level)
+__kernel void multigrid_admit(const int rows, const int columns, const int stride, MAP map, OUT level)
 {
     const int row = get_global_id(0);
     if (row >= rows) return;
@@ -832,9 +774,7 @@ __kernel void multigrid_admit(
     }
 }
 
-__kernel void multigrid_release(
-    const int rows, const int columns, const int stride, MAP level,
-    OUT map)
+__kernel void multigrid_release(const int rows, const int columns, const int stride, MAP level, OUT map)
 {
     const int row = get_global_id(0);
     if (row >= rows) return;

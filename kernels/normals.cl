@@ -294,8 +294,9 @@ F off_wave(const F zenith, const Wave wave, const float cosine, const float sine
 }
 
 // The normal equations at a direction, of samples that are all there and all within range.
-Sums look(const Direction at, const F *zeniths, const Wave wave, __global const float *turn,
-          const float cos_tilt, const float sin_tilt SCENE LAST)
+Sums look(
+    const Direction at, const F *zeniths, const Wave wave, __global const float *turn, const float cos_tilt,
+    const float sin_tilt SCENE LAST)
 {
     Sums sums = NOTHING;
     PREPARE
@@ -322,9 +323,10 @@ F mills(const F z)
 
 // The same of any samples. A clipped one tells only on which side of its bound it was (a Tobit model); one that is
 // expected out of range tells nothing of the direction, and a missing one nothing at all.
-Sums look_closely(const Direction at, const F *zeniths, __global const FRAME *frames, const int begins,
-                  const int each, const int p, __global const float *turn, const float cos_tilt, const float sin_tilt,
-                  const F offset, const F per_count, const F low, const F high, const F error_of_one SCENE)
+Sums look_closely(
+    const Direction at, const F *zeniths, __global const FRAME *frames, const int begins, const int each, const int p,
+    __global const float *turn, const float cos_tilt, const float sin_tilt, const F offset, const F per_count,
+    const F low, const F high, const F error_of_one SCENE)
 {
     Sums sums = NOTHING;
     PREPARE
@@ -426,8 +428,7 @@ Direction begin_at_wall(const F *lights, const F mean, __global const float *tur
 
 // Eq. 10 is linear in the normal once the cosine of the zenith is taken: its wave is the normal. A missing sample is
 // taken for the mean of the others.
-Direction begin_at(const F *zeniths, __global const float *turn, const float cos_tilt,
-                const float sin_tilt)
+Direction begin_at(const F *zeniths, __global const float *turn, const float cos_tilt, const float sin_tilt)
 {
     F known = 0.0f, sum = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f;
 #if !COUNTED
@@ -681,8 +682,8 @@ __kernel void normals_exact(ARGUMENTS)
 
 // Last come the variances of the wave's mean and cosine, the covariance of cosine and sine, and the sine's variance, in
 // those of a sample.
-__kernel void normals_paper(ARGUMENTS, const float of_mean, const float of_cosine,
-                            const float of_both, const float of_sine)
+__kernel void normals_paper(
+    ARGUMENTS, const float of_mean, const float of_cosine, const float of_both, const float of_sine)
 {
     EACH_VECTOR {
         READ_ZENITHS

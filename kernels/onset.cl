@@ -164,8 +164,7 @@ __kernel void onset_levels(
 }
 
 // Tells what is surely dark: samples that miss the level by `tolerance` counts.
-__kernel void onset_sure(
-    const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
+__kernel void onset_sure(const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);
     for (int i = 0; i < size; ++i) {
@@ -245,8 +244,9 @@ typedef struct {
 } Around;
 
 // Take the samples of pixels whose onset is at a time: one row before it, at it, and the two after it.
-void pick(const Bits time, __global const FRAME *restrict row, __global const FRAME *restrict before,
-          __global const FRAME *restrict first, __global const FRAME *restrict second, Around *restrict around)
+void pick(
+    const Bits time, __global const FRAME *restrict row, __global const FRAME *restrict before,
+    __global const FRAME *restrict first, __global const FRAME *restrict second, Around *restrict around)
 {
     for (int i = 0; i < PIXELS; ++i) {
         const FRAME one = SEE(first[i]), two = SEE(second[i]), lesser = LEAST(one, two);
@@ -260,8 +260,9 @@ void pick(const Bits time, __global const FRAME *restrict row, __global const FR
 }
 
 // Complete what follows the onsets at a time just before the span: the first sample after it, or the second.
-void complete(const Bits time, const int whole, __global const FRAME *restrict first,
-              __global const FRAME *restrict second, Around *restrict around)
+void complete(
+    const Bits time, const int whole, __global const FRAME *restrict first, __global const FRAME *restrict second,
+    Around *restrict around)
 {
     for (int i = 0; i < PIXELS; ++i) {
         const FRAME kept = around->after[i], one = whole ? SEE(first[i]) : kept, two = SEE(second[i]);
@@ -271,8 +272,9 @@ void complete(const Bits time, const int whole, __global const FRAME *restrict f
 }
 
 // Look up the samples around the onsets that lie in a span, set in `starts`, and after those just before it.
-void look_around(__global const FRAME *span, const int count, const int pixels, const uint starts, const int was_busy,
-                 __global const FRAME *last, Around *around)
+void look_around(
+    __global const FRAME *span, const int count, const int pixels, const uint starts, const int was_busy,
+    __global const FRAME *last, Around *around)
 {
     if (was_busy) {
         complete(0, 0, span, span, around);
@@ -286,8 +288,9 @@ void look_around(__global const FRAME *span, const int count, const int pixels, 
 }
 
 // The last surely dark frame from frame `from` of the span backwards; the first of all is taken for dark.
-int last_dark(__global const FRAME *series, const int from, const int pixels, const int now, const FRAME sure,
-              const FRAME last, const int known)
+int last_dark(
+    __global const FRAME *series, const int from, const int pixels, const int now, const FRAME sure, const FRAME last,
+    const int known)
 {
     int t = from;
     while (t >= (now == 0) && SEE(series[(size_t)t * pixels]) >= sure) --t;
@@ -295,8 +298,9 @@ int last_dark(__global const FRAME *series, const int from, const int pixels, co
 }
 
 // Height and variance of a pixel: onset.py explains them. All is computed, then chosen, so that it becomes vector code.
-float2 answer(const Around *around, const int i, const float from, const float step, const float level,
-              const float dark, const float noise, const float dark_tolerance, const float light_tolerance)
+float2 answer(
+    const Around *around, const int i, const float from, const float step, const float level, const float dark,
+    const float noise, const float dark_tolerance, const float light_tolerance)
 {
     const float low = around->before[i], high = around->at[i], rise = high - low, steepness = 1 / rise;
     const int from_dark = low <= dark + dark_tolerance, to_light = high >= around->after[i] - light_tolerance;
@@ -501,10 +505,9 @@ __kernel void onset_scan(
 // Answers for the pixels whose run is open or not complete, as if the press ended after `count` frames; `undo` takes
 // that back, so that more frames can follow.
 __kernel void onset_heights(
-    const int count, const int stride, __global const int *restrict times, MAP travel,
-    const int room, OUT answers, __global uchar *restrict status,
-    __global const uchar *restrict busy, __global const FRAME *restrict samples, MAP levels,
-    const float noise, const float dark_tolerance, const float light_tolerance, const int undo)
+    const int count, const int stride, __global const int *restrict times, MAP travel, const int room, OUT answers,
+    __global uchar *restrict status, __global const uchar *restrict busy, __global const FRAME *restrict samples,
+    MAP levels, const float noise, const float dark_tolerance, const float light_tolerance, const int undo)
 {
     const int base = get_global_id(0) * WORDS, width = min(WORDS, stride / PIXELS - base);
     for (int w = 0; w < width; ++w) {
@@ -532,8 +535,8 @@ __kernel void onset_heights(
 #else
 // Heights by the paper's equation 4, at the frame of the onset itself.
 __kernel void onset_heights(
-    const int stride, __global const int *restrict times, MAP travel, const int room,
-    OUT answers, __global uchar *restrict status)
+    const int stride, __global const int *restrict times, MAP travel, const int room, OUT answers,
+    __global uchar *restrict status)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);
     for (int i = 0; i < size; ++i) {

@@ -127,8 +127,8 @@ STEP(5)
 
 // Numbers n and radix - n go together: cosines meet their sums, sines their differences.
 void step_odd(
-    WORK, const int blocks, const int inner, const long next, const long far, MAP turns, const int way,
-    const int radix, MAP roots)
+    WORK, const int blocks, const int inner, const long next, const long far, MAP turns, const int way, const int radix,
+    MAP roots)
 {
     const int pairs = radix / 2;
     for (int block = 0; block < blocks; ++block, work += radix * far - inner * next) {
@@ -163,8 +163,7 @@ void step_odd(
     }
 }
 
-void step(
-    WORK, const int from, const int count, __global const int *restrict plan, MAP factors, const int way)
+void step(WORK, const int from, const int count, __global const int *restrict plan, MAP factors, const int way)
 {
     const int radix = plan[0], q = plan[1], some = radix > 5 ? 2 * radix : 0;
     MAP roots = factors + plan[2];
@@ -450,8 +449,9 @@ F mean_of(const int lines, __global const F *restrict mode)
 }
 
 // The slowest modes: from line to line they hardly change, and each line's rounding would add to that of all others.
-void march_slowly(const int lines, const F level, const int depth, __global const F *restrict rates,
-                  const F end, __global F *restrict mode)
+void march_slowly(
+    const int lines, const F level, const int depth, __global const F *restrict rates, const F end,
+    __global F *restrict mode)
 {
     const F off = level * mean_of(lines, mode);
     F sum = 0.0f, rest = 0.0f;
@@ -494,8 +494,8 @@ void march_slowly(const int lines, const F level, const int depth, __global cons
 #define BACK_EARLY(n, line) BACK_BY(n, line, rates[(line) * NEXT + n])
 
 __kernel void rectangle_columns(
-    const int lines, const int padded, const int slots, const int level, __global const int *restrict reach,
-    MAP fading, MAP ends, OUT spectrum)
+    const int lines, const int padded, const int slots, const int level, __global const int *restrict reach, MAP fading,
+    MAP ends, OUT spectrum)
 {
     const int slot = get_global_id(0) * (LANES == 8 ? SLOTS : 1), strip = slot / SLOTS;
     if (slot >= slots) return;

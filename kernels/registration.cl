@@ -41,8 +41,7 @@
 }
 
 __kernel void registration_admit(
-    const int rows, const int columns, __global const FRAME *restrict frame, MAP offset,
-    MAP gain, OUT padded)
+    const int rows, const int columns, __global const FRAME *restrict frame, MAP offset, MAP gain, OUT padded)
 {
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
     if (row >= rows) return;
@@ -71,9 +70,8 @@ __kernel void registration_mend(const int count, __global const int *restrict pl
 }
 
 __kernel void registration_resample(
-    const int rows, const int columns, MAP padded, MAP height,
-    MAP shift, MAP offset, MAP gain,
-    OUT registered, OUT noise)
+    const int rows, const int columns, MAP padded, MAP height, MAP shift, MAP offset, MAP gain, OUT registered,
+    OUT noise)
 {
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
     if (row >= rows) return;

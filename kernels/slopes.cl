@@ -51,9 +51,8 @@ typedef int I;
 // Slopes, and the squares of the normal's parts along x and y. Where nothing is known slopes are no numbers, and the
 // squares 0.
 __kernel void slopes_find(
-    const int pixels, const float least, MAP vectors, MAP sigma,
-    __global const uchar *restrict contact, OUT dz_dx, OUT dz_dy,
-    OUT squares_x, OUT squares_y)
+    const int pixels, const float least, MAP vectors, MAP sigma, __global const uchar *restrict contact, OUT dz_dx,
+    OUT dz_dy, OUT squares_x, OUT squares_y)
 {
     const int first = (int)get_global_id(0) * TILE;
     for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
@@ -93,10 +92,8 @@ __kernel void slopes_find(
 
 // Inverse variances of slopes along x and y, within bounds; 0 where nothing is known.
 __kernel void slopes_weigh(
-    const int rows, const int columns, const float least, const float lowest, const float highest,
-    MAP sigma, MAP dz_dx,
-    MAP squares_x, MAP squares_y,
-    OUT weight_x, OUT weight_y)
+    const int rows, const int columns, const float least, const float lowest, const float highest, MAP sigma, MAP dz_dx,
+    MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
 {
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);

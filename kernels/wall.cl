@@ -81,8 +81,9 @@ float cross_gap(const float out, const float ray_x, const float ray_y, const flo
 #endif
 
 // 1 below the rim, `below` above the height where the ray starts, and above the rest plane, `z` below; 0 beyond.
-float within_edges(const float z, const float below, const float ray_z, const float cosine, const float per_way,
-                   const float radius, const float sharpness)
+float within_edges(
+    const float z, const float below, const float ray_z, const float cosine, const float per_way, const float radius,
+    const float sharpness)
 {
     const float edge = below * per_way, bound = radius * edge;
     const float over = (edge - ray_z) * cosine * ROUGH_INVERSE_ROOT(cosine * cosine + bound * bound);
@@ -112,8 +113,7 @@ float look_up(MAP table, const int columns, const float row, const float x, cons
 #endif
 
 __kernel void wall_light(
-    const int pixels, const int samples, const int rows, const int columns, MAP sheet,
-    MAP places, MAP rays, MAP table,
+    const int pixels, const int samples, const int rows, const int columns, MAP sheet, MAP places, MAP rays, MAP table,
     const float radius, const float rim, const float gap, const float index, const float scatter, const float fade,
     const float asymmetry_x, const float asymmetry_y, OUT light)
 {
