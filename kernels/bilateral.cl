@@ -14,11 +14,7 @@
 #define SHARE 1e-6f
 #define LN2 0.69314718f
 
-#if TILE < 256
-#define CHUNK TILE
-#else
-#define CHUNK 256
-#endif
+#define CHUNK (TILE < 256 ? TILE : 256)
 
 #define SIZE const int rows, const int columns
 #define SLOPES __global const uchar *restrict flags, MAP slope_x, MAP slope_y

@@ -13,11 +13,7 @@
 #define KNOWN 8
 #define WIDE 8
 
-#if TILE < 256
-#define CHUNK TILE
-#else
-#define CHUNK 256
-#endif
+#define CHUNK (TILE < 256 ? TILE : 256)
 
 #define ANSWERED(p) (flags[p] & (SLOPE | KNOWN))
 #define RISEN(p, column) (relief[p] + (start + plane_x * (column)))

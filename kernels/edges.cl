@@ -18,11 +18,7 @@
 #define MARGIN 10
 #define LINES 3
 
-#if TILE < 64
-#define CHUNK TILE
-#else
-#define CHUNK 64
-#endif
+#define CHUNK (TILE < 64 ? TILE : 64)
 
 #define EACH_PIXEL                                                                               \
     const int begin = (int)get_global_id(0) * TILE, all = rows * columns;                        \

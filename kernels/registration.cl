@@ -14,11 +14,7 @@
 
 #define BORDER 2
 
-#if TILE < 64
-#define CHUNK TILE
-#else
-#define CHUNK 64  // pixels whose places are worked out side by side
-#endif
+#define CHUNK (TILE < 64 ? TILE : 64)  // pixels whose places are worked out side by side
 
 #ifdef TOP
 #define USABLE(counts) ((counts) > 0 & (counts) < TOP)

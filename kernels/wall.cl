@@ -8,11 +8,7 @@
 
 #include "common.clh"
 
-#if TILE < 64
-#define CHUNK TILE
-#else
-#define CHUNK 64  // pixels whose rays are traced side by side: what is known of them stays in the nearest cache
-#endif
+#define CHUNK (TILE < 64 ? TILE : 64)  // pixels whose rays are traced side by side: what is known of them stays in the nearest cache
 
 #define TINY 1e-20f
 #define LEAST 1e-6f  // one over a way that no ray goes, mm
