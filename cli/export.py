@@ -38,8 +38,8 @@ def command(
     from mirrorskin.cli.quantity import segment
 
     suffixes = {path.suffix.lower() for path in output}
-    for asked, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
-        if asked and suffix not in suffixes:
+    for given, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
+        if given and suffix not in suffixes:
             raise io.InputError(f"{option} is for a {suffix} file: name one with -o, or leave {option} out")
     ends = None if section is None else segment(section, "--section")
     for number, path in enumerate(output):

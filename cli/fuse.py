@@ -74,11 +74,11 @@ def command(
         _open(axial, "axial", dataset, known, limit) as turned,
     ):
         io.check_output(target, vertical, axial, phases, calibration)
-        told = None if calibration is None else io.open_calibration(calibration)
+        shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_sources(
-                calibrated(pressed, told),
-                calibrated(turned, told),
+                calibrated(pressed, shared),
+                calibrated(turned, shared),
                 rotation={name: value for name, value in rotation.items() if value is not None},
                 register=register,
                 robust=robust,
@@ -90,7 +90,7 @@ def command(
 
 
 def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:
-    """Open a recording; of another's file, its place on the command line tells the motion."""
+    """Open a recording; a file in another layout has the motion of its place on the command line."""
     from mirrorskin import io
     from mirrorskin.io.hdf5 import Hdf5File
     from mirrorskin.io.layout import MARK

@@ -1,4 +1,4 @@
-"""Groups of commands: what their help says, and commands that are made no sooner than they are named."""
+"""Groups of commands that are imported when they are named."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Group(TyperGroup):
     """A group whose help says in full what its commands are for."""
 
     def get_help_option(self, ctx: Any) -> Any:
-        """Return it with a value where it is not given: to tell what None is, typer imports pydantic."""
+        """Give it a default: for None, typer imports pydantic."""
         option = super().get_help_option(ctx)
         if option is not None:
             option.default = False

@@ -30,14 +30,14 @@ def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool)
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records()
-        told = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
-        print_json({"output": str(path), **told, "profile": profile})
+        facts = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
+        print_json({"output": str(path), **facts, "profile": profile})
     else:
         typer.echo(", ".join([f"{path}: {summary}", *_words(**pieces)]))
 
 
 def _pieces(result: Result) -> dict[str, int]:
-    """Count the pieces that heights are in, and those of which nobody knows how high they lie."""
+    """Count connected pieces, and those of unknown offset."""
     import numpy as np
 
     unknown = result.offset_unknown

@@ -23,7 +23,7 @@ class EventName(StrEnum):
 
 
 class MethodName(StrEnum):
-    """What tells a height, or a normal."""
+    """How heights, or normals, are estimated."""
 
     threshold = "threshold"
     change_point = "change-point"
@@ -69,7 +69,7 @@ def command(
     frames: options.Frames = None,
     live: Annotated[
         bool,
-        typer.Option("--live", help="Only the frames that a live run used, where it thought the body was."),
+        typer.Option("--live", help="Only the frames that a live run used, with the positions it had."),
     ] = False,
     method: Annotated[
         MethodName | None,
@@ -81,7 +81,9 @@ def command(
     ] = None,
     noise: Annotated[
         float | None,
-        typer.Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
+        typer.Option(
+            metavar="COUNTS", help="Standard deviation of a sample; by default estimated from the frames."
+        ),
     ] = None,
     dark: Annotated[
         float | None, typer.Option(metavar="COUNTS", help="Press: without light; else the file's.")
@@ -91,11 +93,12 @@ def command(
         EventName, typer.Option(help="Press: dark to light on the way down, or light to dark on the way up.")
     ] = EventName.onset,
     threshold: Annotated[
-        float, typer.Option(help="Press: share of the way from dark to bright that is light.")
+        float,
+        typer.Option(help="Press: fraction of the range from dark to bright at which a pixel is bright."),
     ] = 0.5,
-    hold: Annotated[int, typer.Option(help="Press: frames in a row that make the event.")] = 2,
+    hold: Annotated[int, typer.Option(help="Press: consecutive frames that confirm the event.")] = 2,
     subframe: Annotated[
-        bool, typer.Option(help="Press: look between frames; without it, eq. 4 as printed.")
+        bool, typer.Option(help="Press: interpolate between frames; without it, eq. 4 as printed.")
     ] = True,
     fill: Annotated[bool, typer.Option(help="Press: fill holes, such as flat tops, smoothly.")] = True,
     zenith_gain: options.ZenithGain = None,
@@ -108,7 +111,7 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Rotation: a result with heights, or a simulation, to keep pixels on the object.",
+            help="Rotation: heights (a result or a simulation) for registering the frames.",
         ),
     ] = None,
     calibration: options.Calibration = None,
@@ -141,20 +144,20 @@ def command(
         target = output or recording.with_name(f"{recording.stem}-result.h5")
         io.check_output(target, recording, phases, heights, calibration)
         calibrated = _calibrated(source, calibration, pixel_size)
-        asked: dict[str, Any] = {"method": method and method.value, "noise": noise}
+        arguments: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if source.motion == MotionName.axial:
-            asked |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
+            arguments |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
             # A tilt that is given is believed, whatever the calibration says.
             given_tilt = None if calibrated is source else known.get("tilt")
-            asked["tilt"] = _ESTIMATE if tilt == _ESTIMATE else given_tilt
-            asked["heights"] = None if heights is None else io.open_heights(heights, source)
+            arguments["tilt"] = _ESTIMATE if tilt == _ESTIMATE else given_tilt
+            arguments["heights"] = None if heights is None else io.open_heights(heights, source)
         else:
-            asked |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
-            asked |= {"dark": dark, "bright": bright, "fill": fill}
+            arguments |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
+            arguments |= {"dark": dark, "bright": bright, "fill": fill}
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 calibrated,
-                **{name: value for name, value in asked.items() if value is not None},
+                **{name: value for name, value in arguments.items() if value is not None},
                 memory_limit=limit,
                 device=device,
                 progress=show,
@@ -170,9 +173,7 @@ def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) ->
 
     found = calibrated(source, path)
     if isinstance(found, io.Calibrated) and found.whole.lens is not None and pixel_size is not None:
-        raise io.InputError(
-            f"{found.whole.name} tells the pixel size, and so does --pixel-size: leave that out"
-        )
+        raise io.InputError(f"{found.whole.name} gives the pixel size: leave --pixel-size out")
     return found
 
 

@@ -13,7 +13,7 @@ from mirrorskin.cli.output import print_fields, print_json
 
 def command(
     result: Annotated[Path, typer.Argument(metavar="RES.h5", help="Result to score.")],
-    truth: Annotated[Path, typer.Option(metavar="REC.h5", help="Simulated recording that knows the truth.")],
+    truth: Annotated[Path, typer.Option(metavar="REC.h5", help="Simulated recording, with the truth.")],
     as_json: options.Json = False,
 ) -> None:
     """Compare a result with a simulation's truth."""

@@ -138,7 +138,7 @@ def command(
     ] = 0.0,
     frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
     exposure: Annotated[
-        str, typer.Option(metavar="TIME", help="In which the body moves on steadily; 0: it stands still.")
+        str, typer.Option(metavar="TIME", help="Exposure during which the body moves; 0: it stands still.")
     ] = "0s",
     references: Annotated[
         ReferenceName, typer.Option(help="Dark and bright: taken with a ball, as in a lab, or exact.")

@@ -1,4 +1,4 @@
-"""What the command line says of a stack of frames: positions, pixel size, which part of it."""
+"""Options that describe a stack of frames: positions, pixel size, region, frames."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _phase(step: str | None, phases: Path | None, where: str) -> StackOptions:
     from mirrorskin.io import InputError, Steps
 
     if step is not None and phases is not None:
-        raise InputError("--phase-step and --phases both tell the phases: give one of them")
+        raise InputError("--phase-step and --phases both give the phases: leave one out")
     if step is not None:
         return {"phase": Steps(angle(step, f"{where}phase-step"))}
     return {} if phases is None else {"phase": read_phases(phases)}

@@ -1,4 +1,4 @@
-"""What all figures share: a canvas, where a map lies on it, and how it becomes a file or a window."""
+"""Canvas: Matplotlib figures, maps and their colour bars on them, and figures as files or windows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Extent = tuple[float, float, float, float]
 """Outer edges of a map's pixels: left, right, bottom and top."""
 
 BESIDE: Mapping[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False}
-"""Where a legend stands that hides nothing: at the right of a panel."""
+"""Place of a legend that hides nothing: to the right of a panel."""
 
 _ROUND = 1, 2, 5, 10
 _DPI = 110  # pixels an inch, of a file
@@ -40,7 +40,7 @@ def check_drawing() -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, of so many inches."""
+    """Return an empty figure, size in inches."""
     check_drawing()
     from matplotlib.figure import Figure
 
@@ -59,7 +59,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def encode_figure(figure: Figure, dpi: float) -> bytes:
-    """Return a figure as a PNG of so many pixels an inch."""
+    """Return a figure as a PNG."""
     target = BytesIO()
     figure.savefig(target, format="png", dpi=dpi)
     return target.getvalue()
@@ -153,7 +153,7 @@ def has_screen() -> bool:
 
     try:
         pyplot.switch_backend(matplotlib.get_backend())
-    except ImportError:  # the one that was asked for cannot be here
+    except ImportError:  # the requested backend is not installed
         return False
     opens = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
     return matplotlib.get_backend().lower() in opens

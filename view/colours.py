@@ -1,4 +1,4 @@
-"""Colours that all pictures share, and how heights and normals become colours; needs no Matplotlib."""
+"""Colour maps of heights and normals, and the colours of missing and filled pixels; needs no Matplotlib."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EDGE_RGB = (0, 0, 0)
 
 Colours = NDArray[np.uint8]
 
-_SHOWN = 0.2, 99.8  # per cent of the values that the colours tell apart
+_SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A surface in space, to be turned and looked at from all sides, in rerun."""
+"""A surface in 3D, in rerun's viewer."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _told(result: Result, name: str) -> Iterator[str]:
     if result.filled is not None and result.filled.any():
         yield "orange: not measured but filled"
     if result.offset_unknown is not None and result.offset_unknown.any():
-        yield "heights of a piece are about its mean: nobody knows how high it lies"
+        yield "heights of each piece are relative to its mean: the absolute offset is unknown"
 
 
 def _blueprint(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Figures of results beside the truth that a simulation knows: heights, normals, surfaces."""
+"""Figures of results beside the truth of a simulation: heights, normals, surfaces."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Relief:
     x, y : ndarray, (W,) and (H,), float64
         Millimetres.
     levelled : bool
-        Whether a component lies at the truth's mean height, as nobody knows its own.
+        Whether a component of unknown offset was moved to the truth's mean height.
     """
 
     height: NDArray[np.float32]
@@ -66,13 +66,13 @@ def relief_of(result: Result, truth: Truth) -> Relief:
 
 
 def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Take the mean error off each component that knows no height; one off the truth stays where it is."""
+    """Subtract its mean error from each component of unknown offset."""
     assert result.component is not None
     assert result.offset_unknown is not None
     error = height.astype(np.float64) - truth
-    told = np.isfinite(error) & (result.component >= 0)
-    count, label = result.offset_unknown.size, result.component[told]
-    mean = np.bincount(label, error[told], count) / np.maximum(np.bincount(label, minlength=count), 1)
+    valid = np.isfinite(error) & (result.component >= 0)
+    count, label = result.offset_unknown.size, result.component[valid]
+    mean = np.bincount(label, error[valid], count) / np.maximum(np.bincount(label, minlength=count), 1)
     # The last one is for pixels that are in no component.
     shift = np.append(np.where(result.offset_unknown, mean, 0.0), 0.0)[result.component]
     return np.asarray(height - shift, np.float32)
@@ -97,7 +97,7 @@ def draw_surface(axes: Axes3D, name: str, relief: Relief) -> None:
     height, filled = relief.height[::step, ::step], relief.filled[::step, ::step]
     shown = np.where((height >= lowest) & (height <= highest) | filled, height, np.nan)
     across, up = np.meshgrid(relief.x[::step], relief.y[::step])
-    # One surface with colours of its own, as Matplotlib would not know which of two lies in front.
+    # One surface in two colours: Matplotlib does not sort two surfaces by depth.
     colours = {"facecolors": _colours(shown, filled), "shade": False} if filled.any() else {"cmap": "viridis"}
     axes.plot_surface(across, up, shown, rstride=1, cstride=1, linewidth=0, antialiased=True, **colours)
     axes.set_box_aspect((np.ptp(relief.x), np.ptp(relief.y), 0.45 * np.ptp(relief.x)), zoom=1.15)
@@ -156,7 +156,8 @@ def height_figure(
     ----------
     results : mapping
         Names and results with ``height``, ``x`` and ``y``. The first and the last are drawn as a whole, all
-        are cut. What was ``filled`` is drawn apart, and what has no known offset lies as the truth does.
+        are cut. ``filled`` heights have their own colour; components of unknown
+        offset are moved to the truth's mean.
     truth : Truth
         Of the same size.
     title : str
@@ -189,7 +190,7 @@ def _draw_heights(results: Mapping[str, Result], truth: Truth, surface: bool) ->
 
 
 _NEEDLES = 36  # along the longer side
-_WORST = 98  # per cent of the errors that the colours tell apart
+_WORST = 98  # percentile of the errors at the end of the colour scale
 
 
 def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path: Path) -> None:
@@ -247,10 +248,10 @@ def _errors(result: Result, truth: Truth) -> Floats:
     """Return the angles to the true normals, degrees, where there was contact in every frame, else NaN."""
     normals, _, _ = _maps(result)
     angle = np.degrees(angle_between(normals, true_normals(truth)))
-    told = truth.contact.astype(bool)
+    valid = truth.contact.astype(bool)
     if result.contact is not None:
-        told = told & result.contact.astype(bool)
-    return np.where(told, angle, np.nan)
+        valid = valid & result.contact.astype(bool)
+    return np.where(valid, angle, np.nan)
 
 
 def _draw_normals(axes: Axes, name: str, result: Result) -> None:
@@ -270,17 +271,17 @@ def _draw_needles(axes: Axes, result: Result) -> None:
     normals, x, y = _maps(result)
     step = max(1, max(normals.shape[:2]) // _NEEDLES)
     shown = normals[step // 2 :: step, step // 2 :: step]
-    told = np.isfinite(shown).all(axis=-1)
+    valid = np.isfinite(shown).all(axis=-1)
     if result.contact is not None:
-        told &= result.contact[step // 2 :: step, step // 2 :: step].astype(bool)
+        valid &= result.contact[step // 2 :: step, step // 2 :: step].astype(bool)
     across, up = np.meshgrid(x[step // 2 :: step], y[step // 2 :: step])
     pixel = step * abs(x[1] - x[0])
-    axes.plot(across[told], up[told], ".", ms=2.5, color="tab:red")
+    axes.plot(across[valid], up[valid], ".", ms=2.5, color="tab:red")
     axes.quiver(
-        across[told],
-        up[told],
-        shown[told][:, 0],
-        shown[told][:, 1],
+        across[valid],
+        up[valid],
+        shown[valid][:, 0],
+        shown[valid][:, 1],
         angles="xy",
         scale_units="xy",
         scale=0.6 / pixel,
@@ -297,9 +298,9 @@ def _draw_needles(axes: Axes, result: Result) -> None:
 def _draw_angles(axes: Axes, result: Result, error: Floats, worst: float) -> None:
     _, x, y = _maps(result)
     known = error[np.isfinite(error)]
-    told = f"median {np.median(known):.2f} deg" if known.size else "no pixel in contact"
+    note = f"median {np.median(known):.2f} deg" if known.size else "no pixel in contact"
     draw_image(axes, error, extent(x, y), "angle to the truth (deg)", cmap="magma", vmin=0, vmax=worst)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{told}; blue: no lasting contact")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{note}; blue: no lasting contact")
 
 
 _MICROMETRES = 1e3  # in a millimetre
@@ -309,8 +310,8 @@ def surface_figure(results: Mapping[str, Result], truth: Truth, title: str, path
     """Draw a surface, and how it came about, into a PNG.
 
     The last result is drawn in space, as Fig. 10 (b) of the paper, by brightness, and as what is left when
-    the truth is taken away; all are cut across the middle, and below lies what is left of these cuts. What
-    was filled is orange or open; what nobody answered stays empty.
+    the truth is subtracted; all are cut across the middle, with the errors of these cuts below. What
+    was filled is orange or open; pixels without an answer stay empty.
 
     Parameters
     ----------
@@ -352,14 +353,14 @@ def _draw_height_errors(axes: Axes, relief: Relief, truth: Truth) -> None:
     error = _MICROMETRES * (relief.height - truth.height)
     known = error[np.isfinite(error)]
     worst = float(np.percentile(np.abs(known), _WORST)) if known.size else 1.0
-    told = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
+    note = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
     place, label = extent(relief.x, relief.y), "height - truth (\N{MICRO SIGN}m)"
     draw_image(axes, error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
     if relief.filled.any():
         marks = relief.filled.astype(float)
         axes.contour(relief.x, relief.y, marks, levels=[0.5], colors=FILLED, linewidths=1)
-        told += ", orange: round what was filled"
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"error: {told}\nblue: no answer")
+        note += ", orange: round what was filled"
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"error: {note}\nblue: no answer")
 
 
 def _draw_errors_on_row(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth) -> None:

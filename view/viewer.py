@@ -56,7 +56,7 @@ def check_place(where: str | Path, option: str) -> None:
 
 
 def close_stream(stream: Any, patience: float) -> None:
-    """Let the last pictures arrive within so many seconds, and let go of the viewer, which stays open."""
+    """Wait up to ``patience`` seconds for the last pictures to arrive; the viewer stays open."""
     with suppress(RuntimeError, ValueError):  # the viewer was closed
         stream.flush(timeout_sec=patience)
     with suppress(RuntimeError, ValueError):

@@ -35,10 +35,10 @@ def command(
     if as_json:
         print_json({**pressed, **turned, **shaped})
         return
-    presses.tell(pressed)
+    presses.print_outcomes(pressed)
     typer.echo()
-    rotation.tell(turned)
+    rotation.print_outcomes(turned)
     typer.echo()
-    shapes.tell(shaped)
+    shapes.print_outcomes(shaped)
     first = presses.EXPERIMENTS[0].name
     typer.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -92,7 +92,7 @@ Outcome = dict[str, float]
 Outcomes = dict[str, dict[str, Outcome]]
 
 
-def tell(outcomes: Mapping[str, Outcomes]) -> None:
+def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:
     """Print the errors of all presses, and what the columns are."""
     print_table(_HEAD, [row for name, by_sensor in outcomes.items() for row in _rows(name, by_sensor)])
     typer.echo(_LEGEND)
@@ -173,7 +173,7 @@ def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Out
 
 
 def _height(result: io.Result) -> NDArray[np.float32]:
-    """Return what was measured: what was filled is told with the surfaces."""
+    """Return the measured heights; filled ones are in the table of surfaces."""
     import numpy as np
 
     assert result.height is not None

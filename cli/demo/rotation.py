@@ -56,9 +56,9 @@ _HEAD = [
 ]
 _LEGEND = """\
 Angles between normals and truth in degrees. answered: share of the pixels in contact in every frame that
-are answered and told to be in contact. chi2: mean of (error / predicted error)^2. The linear pattern's dark
-end hides zeniths below 13 degrees, its bright end those above 43. registered: frames follow the object, by
-its true heights."""
+have an answer and are marked as in contact. chi2: mean of (error / predicted error)^2. The linear pattern's
+dark end hides zeniths below 13 degrees, its bright end those above 43. registered: frames follow the
+object, by its true heights."""
 
 Outcomes = Mapping[str, "Score"]
 
@@ -101,7 +101,7 @@ def _record(experiment: Experiment, path: Path, device: str | None) -> io.Truth:
     return record(twin, path, f"turning on the {experiment.thing}")
 
 
-def tell(outcomes: Mapping[str, Outcomes]) -> None:
+def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:
     """Print the errors of all rotations, and what the columns are."""
     rows = [
         [name, method, *_cells(score)]

@@ -20,8 +20,8 @@ _PRESS, _ROTATION = "fig5-conform-ideal", "fig10a"
 _HEAD = ["experiment", "heights from", "answered", "median", "RMS", "99 %", "filled", "RMS there", "apex"]
 _LEGEND = """\
 Errors in micrometres. answered: pixels that were measured. filled: pixels that were not, but lie inside;
-they count in 'RMS there' and 'apex' alone. apex: error at the top of the sphere. A rotation does not tell
-how high all of it lies: its mean error is taken off. registered: frames follow the object, by its true
+they count in 'RMS there' and 'apex' alone. apex: error at the top of the sphere. A rotation does not
+give absolute heights: its mean error is subtracted. registered: frames follow the object, by its true
 heights; those of the fused surface follow the heights that it found."""
 _MICROMETRES = 1e3  # in a millimetre
 
@@ -48,7 +48,7 @@ Outcomes = Mapping[str, Mapping[str, Shape]]
 
 
 def run(folder: Path, device: str | None) -> Outcomes:
-    """Draw what the rotation in the folder tells of heights, and fuse it with the press in there."""
+    """Draw the heights of the folder's rotation, and fuse it with the folder's press."""
     from mirrorskin import io, view
 
     with io.open_recording(folder / f"{_ROTATION}.h5") as recording:
@@ -63,13 +63,13 @@ def run(folder: Path, device: str | None) -> Outcomes:
         "rotation": turned["rotation"],
         "press and rotation": _fuse(folder, device),
     }
-    # The last is drawn as a whole: what anybody gets of a rotation, who does not know the true heights.
+    # The last is drawn as a whole: the one that needs no true heights.
     turned_back = dict(reversed(turned.items()))
     title = "Fig. 10 (b): sphere, 10 mm, integrated from its normals"
     view.surface_figure(turned_back, truth, title, folder / "fig10b.png")
     title = "Fig. 5 and Fig. 10 fused: sphere, 10 mm, from a press and a rotation"
     view.surface_figure(fused, truth, title, folder / "fused.png")
-    del fused["rotation"]  # told already
+    del fused["rotation"]  # in the table already
     return {
         name: {way: _judge(result, truth) for way, result in by_way.items()}
         for name, by_way in (("fig10b", turned), ("fused", fused))
@@ -104,7 +104,7 @@ def _judge(result: io.Result, truth: io.Truth) -> Shape:
     return Shape(score.height, score.filled, float(np.mean(result.height[middle] - truth.height[middle])))
 
 
-def tell(outcomes: Outcomes) -> None:
+def print_outcomes(outcomes: Outcomes) -> None:
     """Print the errors of all surfaces, and what the columns are."""
     print_table(
         _HEAD,

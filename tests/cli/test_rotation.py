@@ -263,7 +263,7 @@ CASES = {
     "one phase": ({}, ["--phase-step", "360deg"], "1 different phases"),
     "phases side by side": ({}, ["--phase-step", "0.001deg"], "too close together"),
     "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
-    "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "give one of them"),
+    "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "leave one out"),
     "heights from nowhere": ({}, ["--heights", "gone.h5"], "gone.h5: no such file"),
     "no heights": ({}, ["--heights", "flat.h5"], "flat.h5 holds no heights"),
     "heights of another size": ({}, ["--heights", "small.h5"], "small.h5 holds the heights of"),

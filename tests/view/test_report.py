@@ -20,7 +20,7 @@ from mirrorskin.view import report
 from mirrorskin.view.report import contents
 from mirrorskin.view.report.contents import align
 from mirrorskin.view.report.surface import sample, surface_data
-from mirrorskin.view.report.words import MAPS, PICTURES, told_process
+from mirrorskin.view.report.words import MAPS, PICTURES, split_process
 
 SHAPE = (23, 31)
 HOSTILE = '"><script>alert(1)</script>&$x'
@@ -258,7 +258,7 @@ def test_without_a_pixel_size_places_are_pixels(tmp_path, quick):
         == -page.surface["y"][-1]
         == 11 - np.flatnonzero(np.isfinite(cap().height).any(1))[0]
     )
-    assert "does not know the size of its pixels" in page.words
+    assert "pixel size of this result is unknown" in page.words
     assert "--pixel-size" in page.words  # what measuring would take
 
 
@@ -298,7 +298,7 @@ def test_a_fused_process_is_told_by_movement():
         "axial_source": "b.h5",
         "axial_tilt": 0.0436332313,
     }
-    parameters, provenance = told_process(process)
+    parameters, provenance = split_process(process)
     assert parameters == {
         "": [("method", "fusion")],
         "Press": [("threshold", "0.5")],

@@ -84,7 +84,7 @@ def test_what_is_seen_is_told(stream):
     told = stream.logged["about"].text.as_arrow_array().to_pylist()[0]
     assert "heights from -1." in told
     assert "orange: not measured but filled" in told
-    assert "about its mean" in told
+    assert "relative to its mean" in told
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.report.surface import surface_data
-from mirrorskin.view.report.words import MAPS, PICTURES, PIXELS, UNITS, Rows, told_process
+from mirrorskin.view.report.words import MAPS, PICTURES, PIXELS, UNITS, Rows, split_process
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,9 +44,9 @@ class Group:
 
 
 def contents_of(result: Result, name: str, section: Ends | None, turn: int | None) -> dict[str, Any]:
-    """Return what the template of the page is told, by the names that it has there."""
+    """Return the variables of the page's template."""
     surface = surface_data(result)
-    parameters, provenance = told_process(result.process)
+    parameters, provenance = split_process(result.process)
     contents = {
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
@@ -77,16 +77,16 @@ def _said_of(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any
 
 
 def _relative(result: Result) -> list[str]:
-    """Say of how many pieces nobody knows how high they lie."""
+    """Say how many pieces have an unknown offset."""
     unknown = result.offset_unknown
     if unknown is None or not unknown.any():
         return []
     if unknown.size == 1:
-        return ["The height is relative: nobody knows how high it lies, and its mean is put at 0."]
+        return ["The height is relative: its absolute offset is unknown, and its mean is set to 0."]
     count = "all" if unknown.all() else f"{np.count_nonzero(unknown)} of"
     return [
-        f"The heights of {count} {unknown.size} pieces are relative: nobody knows how high each of them "
-        "lies, and its mean is put at 0."
+        f"The heights of {count} {unknown.size} pieces are relative: the offset of each "
+        "is unknown, and its mean is set to 0."
     ]
 
 
@@ -105,10 +105,10 @@ def _calibration_of(result: Result) -> list[tuple[str, ...]]:
 
 
 def _made(process: Mapping[str, object]) -> str:
-    """Say when the result was made, by what and of what, as far as it is told."""
+    """Say when the result was made, by what and from what, as far as known."""
     words = {"of": process.get("source"), "by": _program(process), "on": _day(process)}
-    told = [f"{word} {value}" for word, value in words.items() if value]
-    return f"Made {' '.join(told)}" if told else ""
+    parts = [f"{word} {value}" for word, value in words.items() if value]
+    return f"Made {' '.join(parts)}" if parts else ""
 
 
 def _citation(name: str, process: Mapping[str, object]) -> str:
@@ -154,14 +154,14 @@ def numbers_of(result: Result, section: Ends | None) -> Numbers:
         measures = measure(result, section=section)
     except InputError as error:
         return Numbers([], [sentence(str(error))])
-    told = [_told(quantity) for quantity in measures.quantities.values()]
-    values, sigmas = (align([one[part] for one in told]) for part in (0, 1))
+    written = [_written(quantity) for quantity in measures.quantities.values()]
+    values, sigmas = (align([one[part] for one in written]) for part in (0, 1))
     units = [_UNITS.get(quantity.unit, quantity.unit) for quantity in measures.quantities.values()]
     rows = [Row(*row) for row in zip(measures.quantities, values, sigmas, units, strict=True)]
     return Numbers(rows, [sentence(note) for note in measures.notes])
 
 
-def _told(quantity: Quantity) -> tuple[str, str]:
+def _written(quantity: Quantity) -> tuple[str, str]:
     """Return a value and its uncertainty as they are written, the latter empty where it is not known."""
     number = str(quantity).removesuffix(quantity.unit).strip()
     value, _, sigma = number.replace("-", "\N{MINUS SIGN}").partition(" ± ")
@@ -169,7 +169,7 @@ def _told(quantity: Quantity) -> tuple[str, str]:
 
 
 def align(numbers: list[str]) -> list[str]:
-    """Put spaces as wide as digits behind numbers, so that their points stand below each other."""
+    """Pad numbers with figure spaces so that their decimal points align."""
     behind = [number.partition(".")[2] for number in numbers]
     longest = max(map(len, behind), default=0)
     return [

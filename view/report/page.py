@@ -1,4 +1,4 @@
-"""The page: what it is told, and how it becomes one file."""
+"""A report: one HTML file that needs no network."""
 
 from __future__ import annotations
 

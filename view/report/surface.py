@@ -18,7 +18,7 @@ MOST_EXAGGERATED = 20
 
 _RELIEF = 0.25  # of the picture's width, that heights should span on the screen
 _MAP = "viridis"
-_STOPS = 16  # colours of the map that the script is told
+_STOPS = 16  # samples of the colour map for the script
 _CODES = 65535
 _PIECES = 0x7FFF  # numbers of pieces that a mark has room for
 _FILLED_BIT = 0x8000
@@ -170,7 +170,7 @@ def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int
 
 
 def _blocks(values: NDArray[Number], block: tuple[int, int], beyond: float) -> NDArray[Number]:
-    """Put the pixels of each block into a row, (m, n, pixels); beyond the picture lies what is given."""
+    """Return the pixels of each block, (m, n, pixels); pixels beyond the picture are ``beyond``."""
     beside = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
     whole = np.pad(values, beside, constant_values=beyond)
     rows, columns = whole.shape[0] // block[0], whole.shape[1] // block[1]

@@ -1,4 +1,4 @@
-"""What a page says in plain words: of pictures, of maps, and of how a result came about."""
+"""Texts of a report: captions of pictures, meanings of maps, and a result's parameters and provenance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PICTURES: Mapping[str, tuple[str, str]] = {
     ),
     "histogram": ("How often each height occurs.", "Histogram of the heights"),
 }
-"""Of each picture its caption, and what stands for it where it cannot be seen."""
+"""Caption and alternative text of each picture."""
 
 MAPS: Mapping[str, tuple[str, str]] = {
     "height": ("mm", "height of the surface; 0 is the sheet at rest, and z runs towards the camera"),
@@ -43,9 +43,9 @@ MAPS: Mapping[str, tuple[str, str]] = {
         "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
         "2 dark at start, 3 light to the end",
     ),
-    "normals": ("", "unit vectors along x, y and z that stand upright on the surface"),
+    "normals": ("", "unit normals of the surface: x, y and z"),
     "zenith": ("rad", "angle between the normal and the direction to the camera"),
-    "azimuth": ("rad", "which way the normal leans, counter-clockwise from x"),
+    "azimuth": ("rad", "direction in which the normal leans, counter-clockwise from x"),
     "normal_sigma": ("rad", "the angle by which the normal is expected to be wrong (RMS)"),
     "mean": ("counts", "mean brightness over the turn"),
     "cosine": ("counts", "part of the brightness that goes with the cosine of the phase"),
@@ -72,7 +72,7 @@ UNITS = (
 )
 """What holds for all numbers of a result."""
 
-PIXELS = "This result does not know the size of its pixels, so places are told in pixels from the centre."
+PIXELS = "The pixel size of this result is unknown, so positions are in pixels from the centre."
 
 _FIRST = (
     "program",
@@ -89,7 +89,7 @@ _FIRST = (
     "calibration",
     "calibration_parts",
 )
-"""What a process says of where a result comes from; all else are parameters."""
+"""Entries of a process that are provenance; the others are parameters."""
 
 _UNITS = {
     "tilt": "rad",
@@ -103,14 +103,14 @@ _FUSED = "fusion"
 Rows = list[tuple[str, str]]
 
 
-def told_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[str, Rows]]:
-    """Put what a result's process says into words."""
+def split_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[str, Rows]]:
+    """Split a result's process into parameters and provenance, as text."""
     parameters: dict[str, Rows] = {}
     provenance: dict[str, Rows] = {}
     for name, value in process.items():
         motion, own = _motion_of(name) if process.get("method") == _FUSED else ("", name)
         place = provenance if own in _FIRST else parameters
-        place.setdefault(motion, []).append((own.replace("_", " "), _told(own, value)))
+        place.setdefault(motion, []).append((own.replace("_", " "), _text(own, value)))
     for rows in provenance.values():
         rows.sort(key=lambda row: _FIRST.index(row[0].replace(" ", "_")))
     return parameters, provenance
@@ -121,7 +121,7 @@ def _motion_of(name: str) -> tuple[str, str]:
     return (_MOTIONS[motion], own) if motion in _MOTIONS else ("", name)
 
 
-def _told(name: str, value: object) -> str:
+def _text(name: str, value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

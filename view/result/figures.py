@@ -40,7 +40,7 @@ MAPS = ("height", "section", "normals", "edges", "status", "sigma", "histogram",
 """What can be drawn, where a result has it."""
 
 _GRAPHS = "section", "histogram"  # which are no maps
-_IN_A_ROW = 3  # panels; more stand in two
+_IN_A_ROW = 3  # panels; more are put in two rows
 # Inches: of a map, at its sides, below and above it, and above all.
 _WIDTH, _HIGHEST = 3.5, 5.2
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 1.45, 0.55, 0.5
@@ -81,8 +81,8 @@ def figures_of(
     Raises
     ------
     mirrorskin.io.InputError
-        Matplotlib is not installed, the result has several turns or nothing of what is asked, or a section
-        cannot be where it is asked.
+        Matplotlib is not installed, the result has several turns or none of the requested maps, or a section
+        cannot be placed.
     """
     sheet = sheet_of(result)
     panels: dict[str, list[_Panel]] = {}
@@ -100,12 +100,12 @@ def overview(
 
 
 def png_of(figure: Figure, width_px: int) -> bytes:
-    """Return a figure as a PNG of so many pixels across."""
+    """Return a figure as a PNG, width in pixels."""
     return encode_figure(figure, width_px / figure.get_figwidth())
 
 
 def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] | None) -> list[_Panel]:
-    """Return the panels that are asked for, or raise InputError."""
+    """Return the requested panels, or raise InputError."""
     panels = list(_panels_of(sheet, section))
     has = list(dict.fromkeys(panel.name for panel in panels))
     lacking = [one for one in maps or () if one not in has]
@@ -136,7 +136,7 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
     ):
         if values is not None:
             yield _Panel(name, partial(draw, sheet=sheet))
-    if result.normals is None:  # which tell more
+    if result.normals is None:  # normals show more
         if result.azimuth is not None:
             yield _Panel("azimuth", partial(draw_azimuth, sheet=sheet))
         if result.modulation is not None:
@@ -184,6 +184,6 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
 
 
 def _wrapped(text: str, width: float, size: float) -> tuple[str, float]:
-    """Break a text of so many points into lines that fit a width, and tell how high they are, inches."""
+    """Break a text (size in points) into lines that fit a width; return them and their height in inches."""
     lines = wrap(text, int((width - 2 * _MARGIN) / (_LETTER * size)))
     return "\n".join(lines), _LINE * size * len(lines)

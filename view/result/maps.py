@@ -45,7 +45,7 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
 
 
 def quantity(sheet: Sheet) -> str:
-    """Name what heights are: relative where nobody knows how high they lie."""
+    """Return the quantity's name: relative height if the absolute offset is unknown."""
     unknown = sheet.result.offset_unknown
     return "relative height" if unknown is not None and unknown.size and unknown.all() else "height"
 
@@ -128,8 +128,8 @@ def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
 
 _LAMP = 315.0, 45.0  # degrees: azimuth clockwise from above, which is the upper left, and elevation
 _SMOOTH = 1.0  # pixels, of the slopes that light falls on: steps of a press are no terraces
-_SHOWN_SLOPES = 98.0  # per cent of the slopes that the light tells apart
-_STEEPEST = 20.0  # light tells gentle slopes apart as if they were so many times as steep
+_SHOWN_SLOPES = 98.0  # percentile of the slopes at full contrast
+_STEEPEST = 20.0  # greatest factor by which gentle slopes are steepened
 
 
 def shaded(
@@ -207,7 +207,7 @@ def _draw_key(axes: Axes) -> None:
 
 
 _MICROMETRES = 1e3  # in a millimetre
-_SHOWN = 1, 99  # per cent of the values that the colours tell apart
+_SHOWN = 1, 99  # percentiles at the ends of the colour scale
 _DECADES = 30.0  # times between these, from which on colours are of the logarithm
 
 
@@ -277,7 +277,7 @@ _EDGE_COLOURS = "0.85", "black", MISSING
 
 
 def draw_edges(axes: Axes, sheet: Sheet) -> None:
-    """Draw edges, and where the sheet was in contact in every frame, if that is told."""
+    """Draw edges, and where the sheet was in contact in every frame, if known."""
     edges, contact = sheet.result.edges, sheet.result.contact
     assert edges is not None
     classes = np.zeros(edges.shape, np.uint8)
@@ -303,7 +303,7 @@ def draw_status(axes: Axes, sheet: Sheet) -> None:
 def _draw_shares(
     axes: Axes, sheet: Sheet, classes: NDArray[np.uint8], colours: tuple[str, ...], names: tuple[str, ...]
 ) -> None:
-    """Draw classes, and tell of each how many per cent of the pixels it has."""
+    """Draw classes with the share of pixels that each has."""
     counts = np.bincount(classes.ravel(), minlength=len(names))
     labels = {
         number: f"{name}\n{percent(int(counts[number]), classes.size)}"

@@ -36,7 +36,7 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     if np.isfinite(cut.sigma).any():
         band = measured - cut.sigma, measured + cut.sigma
         axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label="± 1 sigma")
-    told = _scale(axes, sheet, cut)
+    scale = _scale(axes, sheet, cut)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
             name,
@@ -55,7 +55,7 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     axes.grid(alpha=0.3)
     if np.isfinite(cut.height).any():
         axes.legend(fontsize=SMALL, **BESIDE)
-    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{told}")
+    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{scale}")
 
 
 def _joined(cut: Section) -> Floats:
@@ -134,7 +134,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     if known.size:
         axes.legend(fontsize=SMALL, **BESIDE)
     sigma = sheet.result.height_sigma
-    told = [f"median {np.median(known):.3f} mm"] if known.size else ["no answer"]
+    notes = [f"median {np.median(known):.3f} mm"] if known.size else ["no answer"]
     if sigma is not None and np.isfinite(sigma).any():
-        told.append(f"median expected error {1e3 * np.nanmedian(sigma):.3g} \N{MICRO SIGN}m")
-    entitle(axes, "Distribution of heights", "; ".join(told))
+        notes.append(f"median expected error {1e3 * np.nanmedian(sigma):.3g} \N{MICRO SIGN}m")
+    entitle(axes, "Distribution of heights", "; ".join(notes))

@@ -1,4 +1,4 @@
-"""A result as it lies on paper: its maps, and where they are, in millimetres or in pixels."""
+"""Page coordinates of a result's maps, in millimetres or in pixels, and titles and axes of panels."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def sheet_of(result: Result) -> Sheet:
 
 
 def draw_map(axes: Axes, sheet: Sheet, values: NDArray[Any], label: str = "", **colours: Any) -> AxesImage:
-    """Draw a map where it lies; see ``draw_image``."""
+    """Draw a map at its place; see ``draw_image``."""
     picture = draw_image(axes, values, sheet.place, label, **colours)
     lay_out(axes, sheet)
     return picture

@@ -236,7 +236,7 @@ def test_a_pixel_size_beside_that_of_a_lens_is_refused():
     words = ("--calibration", "cal.h5", "--pixel-size", "0.1mm")
     ended = run("reconstruct", "press.h5", "-o", "out.h5", *words)
     assert ended.code == 2
-    assert "cal.h5 tells the pixel size, and so does --pixel-size: leave that out" in ended.said
+    assert "cal.h5 gives the pixel size: leave --pixel-size out" in ended.said
 
 
 def test_the_calibration_is_not_overwritten():
