@@ -20,6 +20,7 @@ from mirrorskin.bench.same import check_correlation
 from mirrorskin.bench.turns import STEPS, fill, phases
 from mirrorskin.engine import Correlator
 from mirrorskin.engine.rotation.design_matrix import basis
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
@@ -165,7 +166,7 @@ def _push_all(
 
     def work() -> None:
         for block in blocks:
-            correlator.push(block)
+            push_block(correlator, block)
         correlator.device.finish()
 
     return work

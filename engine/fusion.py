@@ -279,7 +279,12 @@ def _check_rotation(axial: Source, rotation: Mapping[str, Any]) -> None:
 def _slopes_of(rotation: Rotation) -> Slopes:
     normals = rotation.normals
     return find_slopes(
-        normals.vectors, normals.sigma, normals.contact, normals.tilt, normals.turns, rotation.white
+        normals.vectors,
+        normals.sigma,
+        normals.contact,
+        normals.tilt,
+        normals.turns,
+        rotation.independent_sigma,
     )
 
 

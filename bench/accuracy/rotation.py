@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mirrorskin.bench.accuracy.aims import at_most, tell, within
 from mirrorskin.bench.results import Case, Target
 from mirrorskin.engine import Correlation, Correlator, correlate, estimate_normals, find_edges
-from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 
 TILT = float(np.radians(2.5))
@@ -87,8 +86,8 @@ def run_normals(device: Device, quick: bool) -> Case:
 
 def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float) -> list[Target]:
     frames = expose(truth, sensor, 6)
-    scale = sensor.gain, sensor.offset
-    found = estimate_normals(frames, phases(), TILT, *scale, noise=sensor.spread, device=device)
+    known = {"tilt": TILT, "gain": sensor.gain, "offset": sensor.offset, "noise": sensor.spread}
+    found = estimate_normals(frames, phases(), **known, device=device)
     across = np.linalg.norm(np.cross(found.vectors.astype(np.float64), truth), axis=-1)
     square = np.arcsin(np.minimum(across, 1)) ** 2
     targets = []
@@ -136,7 +135,7 @@ def run_correlation(device: Device, quick: bool) -> Case:
         targets += _score_waves(f"{kind}, a stack", correlate(frames, phase, device=device), frames)
         window = Correlator(shape, kind, window=STEPS, device=device)
         for number, frame in enumerate(frames):
-            window.push(Block(frame[np.newaxis], number, phase=phase[number : number + 1]))
+            window.push(frame[np.newaxis], phase=phase[number : number + 1])
         moved, last = window.result(), frames[-STEPS:]
         targets += _score_waves(f"{kind}, a window", moved, last)
         anew = correlate(last, phases(), device=device)

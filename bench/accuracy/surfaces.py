@@ -123,8 +123,9 @@ def run_fusion(device: Device, quick: bool) -> Case:
     )
     sensor = SENSORS[1]
     normals = toward(np.where(there, zenith, 0.0), np.arctan2(y, x))
-    frames, scale = expose(normals, sensor, 10), (sensor.gain, sensor.offset)
-    told = estimate_normals(frames, phases(), TILT, *scale, noise=sensor.spread, device=device)
+    frames = expose(normals, sensor, 10)
+    known = {"tilt": TILT, "gain": sensor.gain, "offset": sensor.offset, "noise": sensor.spread}
+    told = estimate_normals(frames, phases(), **known, device=device)
     turn = _Turn(told.vectors, told.sigma, (told.contact * there).astype(np.uint8))
     found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
     inner = zenith <= _LIT[1]

@@ -41,9 +41,10 @@ def main() -> None:
     dz_dx, dz_dy = generator.normal(0, 0.1, (2, rows, columns)).astype(np.float32)
     mask = place > 2.5
 
+    sensor = {"tilt": 0.0436, "gain": 180.0, "offset": 16.0}
     works = {
         "press": lambda: engine.find_onset(press, travel, dark=20, bright=220, device=device).height,
-        "turn": lambda: engine.estimate_normals(turn, phase, 0.0436, 180.0, 16.0, device=device).vectors,
+        "turn": lambda: engine.estimate_normals(turn, phase, **sensor, device=device).vectors,
         "surface": lambda: engine.integrate(dz_dx, dz_dy, 0.03, mask=mask, sigma=False, device=device).height,
     }
     compiling, answers = {}, hashlib.sha256()

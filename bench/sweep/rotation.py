@@ -16,6 +16,7 @@ from mirrorskin.engine import Correlator, NormalEstimator, find_edges
 from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.engine.rotation.edges import LIMITS
 from mirrorskin.engine.rotation.normals_to_height import SlopeKernels
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block
 from mirrorskin.kernels import correlation, edges, registration, slopes
 from mirrorskin.kernels.array import Array
@@ -46,13 +47,13 @@ def _make_correlation(device: Device, shape: Shape, kind: str, count: int) -> di
 
     def add() -> None:
         whole.reset()
-        whole.push(blocks[0])
+        push_block(whole, blocks[0])
 
     def check() -> None:
         add()
         expected = _refer_correlation(frames, phases(count))
         _compare_waves("correlation_add", whole.result(), expected)
-        window.push(blocks[1])
+        push_block(window, blocks[1])
         last = _refer_correlation(frames[-STEPS:], phases(count)[-STEPS:])
         _compare_waves("correlation_slide", window.result(), last)
 
@@ -62,7 +63,7 @@ def _make_correlation(device: Device, shape: Shape, kind: str, count: int) -> di
     name = "correlation_add" if dtype.kind == "u" else "correlation_sum"
     slide = "correlation_slide" if dtype.kind == "u" else "correlation_keep"
     one_turn = Block(window.room[:STEPS], 0, phase=phases(STEPS))
-    move = run_kernel(device, lambda: window.push(one_turn))
+    move = run_kernel(device, lambda: push_block(window, one_turn))
     operations = 2 * _WAVE * STEPS * pixels if dtype.kind == "u" else 0  # floats are only kept here
     return {
         name: Job(run_kernel(device, add), size, check, count, _WAVE * frames.size),
@@ -112,11 +113,11 @@ def _make_normals(device: Device, shape: Shape, kind: str, _: int) -> dict[str, 
 
     def push() -> None:
         estimator.reset()
-        estimator.push(block)
+        push_block(estimator, block)
 
     def check() -> None:
         estimator.reset()
-        estimator.push(Block(frames, 0, phase=turn.phase))
+        push_block(estimator, Block(frames, 0, phase=turn.phase))
         found = estimator.result()
         expected = answer(frames, turn, np.arange(shape[0] * shape[1]))
         sigma, spared = expected.sigma.reshape(shape), shape[0] * shape[1] // 1000

@@ -28,8 +28,7 @@ from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, integrate
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.response import initial_response, wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
-from mirrorskin.engine.streaming import push_block
-from mirrorskin.io import Block, InputError, LiveSource, ProcessValue, Result
+from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _FEWEST = 3  # frames that determine a wave
@@ -161,7 +160,7 @@ class LiveRotation:
     def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`."""
         with naming(self._source):
-            push_block(self._frames_to, Block(frames, 0, phase=np.asarray(phase), lent=lent))
+            self._frames_to.push(frames, phase=phase, lent=lent)
 
     def maps(self) -> Maps:
         """Return the maps of the last window; none until one is full."""
@@ -172,8 +171,8 @@ class LiveRotation:
             normals.estimate()
         self._follow(normals)
         self._has_estimate = True
-        vectors, contact = normals.glance("vectors"), normals.glance("contact")  # while heights are found
-        height = None if self._heights is None else self._heights.result()
+        vectors, contact = (normals.fetch_early(name) for name in ("vectors", "contact"))
+        height = None if self._heights is None else self._heights.result()  # found meanwhile
         self._updates += 1
         if height is not None and self._updates % _PLACED == 1:
             self._place(height)
@@ -192,11 +191,11 @@ class LiveRotation:
             self._edges.work(self._normals, seconds)
 
     def normals(self) -> Normals:
-        """Return the normals of the last window; see ``NormalWindow.normals``."""
+        """Return the normals of the last window; see ``NormalWindow.result``."""
         if self._normals is None:
             raise InputError(f"{self._source.name} has no zenith gain, so no normals")
         with naming(self._source):
-            return self._normals.normals()
+            return self._normals.result()
 
     def correlation(self) -> Correlation:
         """Return the fit of the frames in the last window; see ``Correlator.result``."""
@@ -232,7 +231,7 @@ class LiveRotation:
             return self._signed(replace(result, **maps), process)
         with naming(self._source):
             relief = integrate_normals(normals, normals.sigma, self._header.pixel_size, device=self.device)
-        maps |= {"height": relief.height, "height_sigma": relief.sigma, "component": relief.component}
+        maps |= {"height": relief.height, "height_sigma": relief.height_sigma, "component": relief.component}
         maps["offset_unknown"] = relief.offset_unknown
         return self._signed(replace(result, **maps), process | relief.process)
 
@@ -263,7 +262,7 @@ class LiveRotation:
         if response is None or header.pixel_size is None or header.press is None:
             return normals
         assert self._normals is not None
-        maps = normals.vectors, normals.contact, response.level(normals.mean)
+        maps = normals.vectors, normals.contact, response.too_level(normals.mean)
         self._normals.place(coarse_heights(*maps, header.pixel_size, header.press, self.device))
         return self.normals()
 
@@ -271,7 +270,7 @@ class LiveRotation:
         """Begin a step towards the heights of the normals that are being estimated."""
         if self._slopes is None or self._heights is None:
             return
-        maps = {name: normals.whole(name) for name in ("vectors", "sigma", "contact")}
+        maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
         self._slopes.find(normals.tilt, maps, self._heights.maps)
         self._heights.push(self._slopes.typical)
 

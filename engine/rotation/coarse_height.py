@@ -1,4 +1,4 @@
-"""How high the object stands in the sensor's body: roughly, from the normals of a rotation and the press."""
+"""How high the object stands in the sensor's body: coarsely, from the normals of a rotation and the press."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.nearest import with_nearest
@@ -24,7 +23,7 @@ _TOLERANCE = 1e-3
 def coarse_heights(
     vectors: NDArray[np.float32],
     contact: NDArray[np.uint8],
-    level: Mask,
+    too_level: Mask,
     pixel_size: tuple[float, float],
     press: float,
     device: Device,
@@ -32,9 +31,9 @@ def coarse_heights(
     """Return the height of the sheet above its rest plane in the mean pose.
 
     Slopes are integrated; the highest point of each piece is taken to be as high as the body was pressed.
-    Where no normal is known, the nearest slope goes on, as over a crease; where that is because the surface
+    Where no normal is known, the nearest slope is taken, as over a crease; where that is because the surface
     is too level to be seen, it becomes less towards the middle, as on a ball. Beyond the pieces, the nearest
-    height is told.
+    height is taken.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ def coarse_heights(
         Unit normals.
     contact : ndarray, (H, W), uint8
         0 where they mean nothing.
-    level : ndarray, (H, W), bool
+    too_level : ndarray, (H, W), bool
         Where the surface is too level to be seen.
     pixel_size : (float, float)
         Millimetres along x and y.
@@ -54,15 +53,12 @@ def coarse_heights(
     -------
     ndarray, (H, W), float64
         Millimetres, finite, from 0 to the press; the press where there is no contact at all.
-
-    Raises
-    ------
-    mirrorskin.engine.NotConverged
-        The heights were not found.
     """
+    from scipy import ndimage
+
     shape = contact.shape
     step = -(-max(shape) // _CELLS)
-    east, north, share, too_level = _cells(vectors, contact, level, step)
+    east, north, share, level = _cells(vectors, contact, too_level, step)
     known = share > 0
     if not known.any():
         return np.full(shape, float(press))
@@ -72,10 +68,10 @@ def coarse_heights(
     region = ndimage.binary_fill_holes(ndimage.binary_dilation(known, around, reach))
     inside = known | ndimage.binary_erosion(region, around, reach, border_value=1)
     far, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
-    lasting = _lasting(far, region & ~known & (too_level > 0.5))
+    remaining = _remaining(far, region & ~known & (level > 0.5))
     surface = integrate(
-        lasting * east[tuple(nearest)],
-        lasting * north[tuple(nearest)],
+        remaining * east[tuple(nearest)],
+        remaining * north[tuple(nearest)],
         size,
         mask=region,
         slope_weights=np.where(known, 1.0, _FILLED),
@@ -91,15 +87,15 @@ def coarse_heights(
     return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))
 
 
-def _cells(vectors: NDArray[np.float32], contact: NDArray[np.uint8], level: Mask, step: int) -> Doubles:
-    """Return means over cells of so many pixels a side, (4, h, w).
+def _cells(vectors: NDArray[np.float32], contact: NDArray[np.uint8], too_level: Mask, step: int) -> Doubles:
+    """Return means over cells of ``step`` pixels a side, (4, h, w).
 
-    Slopes along x and y, of which share of the pixels they are known, and of which the surface is level.
+    Slopes along x and y, the share of pixels of which they are known, and of those that are too level.
     """
     x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
     known = (contact != 0) & (z > 0)
     flat = np.where(known, z, 1.0)
-    maps = np.stack([np.where(known, -x / flat, 0), np.where(known, -y / flat, 0), known, level])
+    maps = np.stack([np.where(known, -x / flat, 0), np.where(known, -y / flat, 0), known, too_level])
     rows, columns = (-(-length // step) * step for length in contact.shape)
     padded = np.pad(maps, ((0, 0), (0, rows - contact.shape[0]), (0, columns - contact.shape[1])))
     means: Doubles = padded.reshape(4, rows // step, step, columns // step, step).mean(axis=(2, 4))
@@ -107,8 +103,10 @@ def _cells(vectors: NDArray[np.float32], contact: NDArray[np.uint8], level: Mask
     return means
 
 
-def _lasting(far: Doubles, level: Mask) -> Doubles:
-    """Return which share of the nearest slope is left in each cell, so far from it."""
+def _remaining(far: Doubles, level: Mask) -> Doubles:
+    """Return which share of the nearest slope is left in each cell, at its distance."""
+    from scipy import ndimage
+
     hole, count = ndimage.label(level, np.ones((3, 3)))
     deepest = np.concatenate([[np.inf], ndimage.maximum(far, hole, np.arange(1, count + 1))])[hole]
     return np.asarray(1 - np.minimum(far / (deepest + 0.5), 1))

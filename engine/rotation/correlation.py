@@ -1,8 +1,14 @@
-"""Mean, cosine and sine of the brightness over an axial rotation (paper, section 4: equations 17 to 22)."""
+"""Mean, cosine and sine of the brightness over an axial rotation (paper, section 4: equations 17 to 22).
+
+A device holds four sums a pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them. Whole
+counts of frames of weight 0 or 1 are summed as integers, with cosines rounded to multiples of 2^-17 or 2^-23:
+nothing drifts, and it does not matter how frames are cut into blocks. Anything else is summed as pairs of
+floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +17,18 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands
-from mirrorskin.io import Block, InputError, check_phase
-from mirrorskin.kernels.array import Array, Operand
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows
+from mirrorskin.io import InputError, check_phase
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
+
+_STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
+_PIECE = 256  # frames whose tables a kernel gets at once
+_MAX_FRAMES = 2**23  # that integer sums can take
+_SUMS = {"total": "sum", "cosine": "cosine sum", "sine": "sine sum", "square": "square sum"}
+_ANSWERS = {"mean": "wave mean", "cosine": "wave cosine", "sine": "wave sine", "residual": "wave residual"}
+"""Maps of a band, by the arguments of kernels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +67,8 @@ class Correlation:
 def correlate(
     frames: NDArray[Any],
     phase: ArrayLike,
-    weights: ArrayLike | None = None,
+    *,
+    frame_weights: ArrayLike | None = None,
     device: str | Device | None = None,
 ) -> Correlation:
     """Fit mean, cosine and sine to a stack that fits in memory.
@@ -62,7 +76,7 @@ def correlate(
     It minimises SS = sum_k w_k (E_k - mean - cosine cos alpha_k - sine sin alpha_k)^2. For N evenly spaced
     phases, sine and cosine are 2/N times the sums that stand for the paper's integrals S and C (equations 17
     and 20), and so gain times tilt times sine and cosine of the azimuth, as in equations 19 and 22. Uneven
-    or measured phases mix the three, and least squares tells them apart.
+    or measured phases mix the three, and least squares separates them.
 
     Parameters
     ----------
@@ -70,25 +84,38 @@ def correlate(
         Raw counts.
     phase : array_like, (T,)
         Radians, one a frame.
-    weights : array_like, (T,), optional
+    frame_weights : array_like, (T,), optional
         How much each frame counts; 0 for a missing one. By default, all count the same.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
+    Returns
+    -------
+    Correlation
+
     Raises
     ------
     mirrorskin.io.InputError
-        Frames, phases or weights that cannot be used; see ``check_phases``.
+        Frames, phases or weights that cannot be used, or phases that do not determine the fit.
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> phase = np.arange(8) * np.pi / 4
+    >>> frames = (100 + 10 * np.cos(phase - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
+    >>> float(engine.correlate(frames, phase).azimuth[0, 0].round(4))
+    1.0
     """
     if frames.ndim != 3 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
     alpha = check_phase(phase, len(frames), "phase")
-    check_phases(alpha, check_weights(weights, len(frames)))
+    check_phases(alpha, check_weights(frame_weights, len(frames)))
     limit = min(MEMORY_LIMIT, 2 * frames.nbytes)
     correlator = Correlator(frames.shape[1:], frames.dtype, device=device, memory_limit=limit)
-    correlator.push(Block(frames, index=0, phase=alpha), weights)
+    correlator.push(frames, phase=alpha, frame_weights=frame_weights)
     return correlator.result()
 
 
@@ -112,7 +139,19 @@ class Correlator:
     ------
     mirrorskin.io.InputError
         Parameters that cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> correlator = engine.Correlator((2, 3), "uint8")
+    >>> for phase in np.arange(8) * np.pi / 4:
+    ...     correlator.push(np.full((1, 2, 3), 100 + 20 * np.sin(phase), np.uint8), phase=[phase])
+    >>> float(correlator.result().sine[0, 0].round())
+    20.0
     """
+
+    position = "phase"
 
     def __init__(
         self,
@@ -125,32 +164,39 @@ class Correlator:
     ) -> None:
         dtype = np.dtype(dtype)
         check_dtype(dtype)
-        if window is not None and not 3 <= window <= WINDOW:
-            raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
-        opened = open_device(device)
+        self.device = open_device(device)
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self.device = opened
         self._shape, self._dtype = shape, dtype
-        self._sums = (
-            TurnSums(opened, shape, dtype, length)
-            if window is None
-            else WindowSums(opened, shape, dtype, length, window, {})
-        )
+        self._sums: TurnSums | WindowSums
+        if window is None:
+            self._sums = TurnSums(self.device, shape, dtype, length)
+        else:
+            self._sums = WindowSums(self.device, shape, dtype, length, window)
 
     @property
     def room(self) -> NDArray[Any]:
         """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
         return self._sums.room
 
-    def push(self, block: Block, weights: ArrayLike | None = None) -> None:
+    def push(
+        self,
+        frames: NDArray[Any],
+        *,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        lent: bool = False,
+    ) -> None:
         """Take in the next frames.
 
         Parameters
         ----------
-        block : Block
-            Frames and their phases.
-        weights : array_like, (n,), optional
-            How much each of them counts; 0 for a missing one. By default, each has weight 1.
+        frames : ndarray, (n, H, W)
+        phase : array_like, (n,)
+            Radians.
+        frame_weights : array_like, (n,), optional
+            How much each frame counts; 0 for a missing one. By default, each has weight 1.
+        lent : bool
+            Whether nobody writes to the frames' memory as long as it is referred to.
 
         Raises
         ------
@@ -158,49 +204,30 @@ class Correlator:
             Frames of another shape or type, phases or weights that cannot be used, or more frames than
             the sums hold.
         """
-        frames = block.frames
         check_frames(frames, self._dtype, self._shape)
-        phase = check_phase(block.phase, len(frames), "phase")
-        self._sums.push(frames, phase, check_weights(weights, len(frames)), block.lent)
+        alpha = check_phase(phase, len(frames), "phase")
+        self._sums.push(frames, alpha, check_weights(frame_weights, len(frames)), lent)
 
     def result(self) -> Correlation:
-        """Return the fit of the frames so far, or of those in the window; more may follow.
+        """Return the fit of the frames so far, or of those in the window.
 
         Raises
         ------
         mirrorskin.io.InputError
             Their phases do not determine a fit yet.
         """
-        return tell_wave(self._sums)
+        return self._sums.correlation()
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._sums.reset()
 
 
-def tell_wave(sums: TurnSums | WindowSums) -> Correlation:
-    """Return the fit that sums tell; see ``Correlator.result``."""
-    phase, weight = sums.seen()
-    used = weight > 0
-    check_phases(phase[used], weight[used])
-    mean, cosine, sine, residual = sums.solve()
-    return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
+class _Sums:
+    """Sums over frames on a device, and the fit that follows from them."""
 
-
-_STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
-_PIECE = 256  # frames that a kernel is told of at once
-_MOST = 2**23  # frames that an accumulator of counts can take
-_SUMS = ("total", "cosine_sum", "sine_sum", "square")
-_PAIRS = ("reference", *_SUMS)
-_ANSWERS = ("wave mean", "wave cosine", "wave sine", "wave residual")
-
-
-class Sums:
-    """Sums over frames on a device, and the fit that they tell.
-
-    Whole counts of frames of weight 0 or 1 are summed as integers, anything else as pairs of floats; see
-    ``mirrorskin.kernels.correlation``.
-    """
+    _phase: Doubles
+    _weight: Doubles
 
     def __init__(
         self,
@@ -211,132 +238,140 @@ class Sums:
         length: int,
         wide: bool,
     ) -> None:
-        self._device = device
-        self._size = dtype.itemsize
-        self._integer = dtype.kind == "u"
-        self._steps = np.array([1, *2 * [_STEPS.get(dtype.itemsize, 1)]])
+        self._device, self._size, self._integer = device, dtype.itemsize, dtype.kind == "u"
+        self._step = _STEPS.get(dtype.itemsize, 1)
         self._macros: dict[str, str | int] = {
             "FRAME": C_TYPES[dtype.name],
             "BITS": 8 * dtype.itemsize,
             "WIDE": int(wide and self._integer),
         }
-        answers = dict.fromkeys(_ANSWERS, np.float32)
-        self._bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length)
-        alone = len(self._bands) == 1
-        self.room = self._bands[0].frames.host if alone else np.empty((length, *shape), dtype)
+        answers = dict.fromkeys(_ANSWERS.values(), np.float32)
+        self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length)
+        alone = len(self.bands) == 1
+        self.room = self.bands[0].frames.host if alone else np.empty((length, *shape), dtype)
         self._place = device.array("place", (_PIECE,), np.int32)
-        self._whole = device.array("basis", (max(6 * WINDOW, 3 * _PIECE),), np.int32)
-        self._real = device.array("basis", (3 * _PIECE,), np.float32)
+        self._steps = device.array("basis", (max(6 * WINDOW, 3 * _PIECE),), np.int32)
+        self._floats = device.array("basis", (3 * _PIECE,), np.float32)
         self._fit = device.array("fit", (28,), np.float32)
 
-    def _whole_rows(self, phase: Doubles, weight: Doubles) -> Doubles:
+    @property
+    def frames(self) -> tuple[Doubles, Doubles]:
+        """Phases and weights of the frames that count; 0 for missing ones."""
+        return self._phase, self._weight
+
+    def correlation(self) -> Correlation:
+        """Return the fit that the sums determine; see `Correlator.result`."""
+        used = self._weight > 0
+        check_phases(self._phase[used], self._weight[used])
+        return Correlation(*self._solve(), int(np.count_nonzero(used)))
+
+    def _solve(self) -> list[NDArray[np.float32]]:
+        """Return mean, cosine, sine and residual, (H, W) each."""
+        raise NotImplementedError
+
+    def _rows_in_steps(self, phase: Doubles, weight: Doubles) -> Doubles:
         """Return 1, cos alpha and sin alpha, (N, 3), in whole steps; zeros for other weights than 1."""
-        return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * self._steps), 0)
+        steps = np.array([1, self._step, self._step])
+        return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * steps), 0)
 
     def _stage(self, frames: NDArray[Any], lent: bool) -> Iterator[tuple[Band, Staged]]:
         """Have each band at work on its rows of the frames; yield which of these are on the device."""
-        for band in self._bands:
+        for band in self.bands:
             with band.resident():
                 for staged in band.stage(frames, lent):
                     yield band, staged
 
-    def _run(self, band: Band, name: str, *arguments: str | int | Operand | np.generic, moved: int) -> None:
-        """Run a kernel over a band, whose maps are told by their names; ``moved`` is bytes a pixel."""
-        values: list[Operand | np.generic] = []
-        for argument in arguments:
-            if isinstance(argument, str):
-                values.append(band.maps[argument])
-            else:
-                values.append(np.int32(argument) if isinstance(argument, int) else argument)
+    def _run(self, band: Band, name: str, moved: int, **arguments: Any) -> None:
+        """Run a kernel over a band; ``moved`` is bytes a pixel."""
         kernel = self._device.kernel("correlation", name, **self._macros)
-        kernel(-(-band.pixels // self._device.layout.tile), *values, moved=moved * band.pixels)
+        items = -(-band.pixels // self._device.layout.tile)
+        kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
 
-    def _answer(
-        self, name: str, known: Callable[[Band], Sequence[str | int | Array | np.generic]], moved: int
-    ) -> list[NDArray[np.float32]]:
-        """Have a kernel turn what is known of each band into mean, cosine, sine and residual, (H, W)."""
+    def _answer(self, name: str, moved: int, **arguments: Any) -> list[NDArray[np.float32]]:
+        """Have a kernel turn the sums of each band, or its ring, into the answers."""
         parts = []
-        for band in self._bands:
+        for band in self.bands:
+            answers = {key: band.maps[answer] for key, answer in _ANSWERS.items()}
+            if name == "correlation_window":
+                known = {"ring": band.maps["ring"], "stride": band.stride, **answers}
+            else:
+                known = _sums_of(band, reference="pairs" in name)
+                known |= {"cosine_part": answers.pop("cosine"), "sine_part": answers.pop("sine"), **answers}
             with band.resident():
-                self._run(band, name, *known(band), self._fit, *_ANSWERS, moved=moved)
-                parts.append([band.maps[answer].download() for answer in _ANSWERS])
-        return [np.concatenate(part) for part in zip(*parts, strict=True)]
+                self._run(band, name, moved, **arguments, fit=self._fit, **known)
+                parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
+        return [join_rows(part) for part in zip(*parts, strict=True)]
 
-    def _answer_counts(self, phase: Doubles, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
-        """Return the answers that integer sums of ``size`` bytes tell."""
-        _fill(self._fit, _fit_table(phase, rows))
-        counted = _counted(rows)
-        moved = 4 * (size + 4)
-        return self._answer("correlation_solve_counts", lambda band: (band.pixels, *counted, *_SUMS), moved)
+    def _answer_counts(self, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
+        """Return the answers of integer sums of ``size`` bytes."""
+        _fill(self._fit, _fit_table(self._phase, rows))
+        return self._answer("correlation_solve_counts", 4 * (size + 4), **_counted(rows))
 
 
-class TurnSums(Sums):
-    """Sums over all frames so far."""
+class TurnSums(_Sums):
+    """Sums over all frames so far: integers until the first weight that is neither 0 nor 1, then pairs."""
 
     def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
         # Eight bytes, for a whole number or for two floats.
-        maps = {"reference": np.float32, **dict.fromkeys(_SUMS, np.int64)}
+        maps = {"reference": np.float32, **dict.fromkeys(_SUMS.values(), np.int64)}
         super().__init__(device, shape, dtype, maps, length, wide=True)
         self.reset()
 
     def reset(self) -> None:
         """Forget the frames so far."""
-        self._phase: list[float] = []
-        self._weight: list[float] = []
+        self._phase, self._weight = np.empty((2, 0))
         self._counts: int | None = None if self._integer else 0  # frames in integer sums; None for all
-        for band in self._bands:
-            for name in _SUMS:
+        for band in self.bands:
+            for name in _SUMS.values():
                 band.write(name, 0)
 
-    def seen(self) -> tuple[Doubles, Doubles]:
-        """Return phases and weights of the frames so far."""
-        return np.array(self._phase, np.float64), np.array(self._weight, np.float64)
-
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
-        """Add some frames: whole counts as integers, until the first weight that is neither 0 nor 1."""
-        if len(self._phase) + len(frames) > _MOST:
-            raise InputError(f"sums hold {_MOST} frames: take the result of those so far, and reset")
+        """Add some frames."""
+        if len(self._phase) + len(frames) > _MAX_FRAMES:
+            raise InputError(f"sums hold {_MAX_FRAMES} frames: take the result of those so far, and reset")
         if self._counts is None:
             fractions = np.flatnonzero((weight != 0) & (weight != 1))
             whole = slice(fractions[0] if len(fractions) else len(frames))
-            self._add(frames[whole], phase[whole], weight[whole], lent)
+            self._add_counts(frames[whole], phase[whole], weight[whole], lent)
             frames, phase, weight = (part[whole.stop :] for part in (frames, phase, weight))
         if len(frames) > 0:
-            self._convert()
-            self._sum(frames, phase, weight, lent)
+            self._convert_to_pairs()
+            self._add_floats(frames, phase, weight, lent)
 
-    def solve(self) -> list[NDArray[np.float32]]:
-        """Return mean, cosine, sine and residual of all frames, (H, W) each."""
-        phase, weight = self.seen()
-        rows = self._whole_rows(phase, weight)
+    def _solve(self) -> list[NDArray[np.float32]]:
+        rows = self._rows_in_steps(self._phase, self._weight)
         if self._counts is None:
-            return self._answer_counts(phase, rows, size=8)
-        rows /= self._steps
-        rows[self._counts :] = _real_rows(phase, weight)[self._counts :]
-        _fill(self._fit, _fit_table(phase, rows))
-        return self._answer("correlation_solve_pairs", lambda band: (band.pixels, *_PAIRS), moved=52)
+            return self._answer_counts(rows, size=8)
+        rows /= [1, self._step, self._step]
+        rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
+        _fill(self._fit, _fit_table(self._phase, rows))
+        return self._answer("correlation_solve_pairs", 52)
 
-    def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
+    def _add_counts(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames of weight 0 or 1 to integer sums."""
-        rows = self._whole_rows(phase, weight)
+        rows = self._rows_in_steps(phase, weight)
         for band, staged, places in self._pieces(frames, weight, lent):
-            _fill(self._whole, rows[staged.frames.start + places])
-            known = len(places), band.pixels, self._place, self._whole
-            moved = self._size * len(places) + 64
-            self._run(band, "correlation_add", staged.array, *known, *_SUMS, moved=moved)
+            _fill(self._steps, rows[staged.frames.start + places])
+            self._add(band, "correlation_add", 64, staged, places, basis=self._steps, **_sums_of(band))
         self._note(phase, weight)
 
-    def _sum(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
+    def _add_floats(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames of any weight to sums that are pairs of floats."""
-        rows, fresh = _real_rows(phase, weight), not any(self._weight)
+        rows, fresh = _float_rows(phase, weight), not np.any(self._weight)
         for band, staged, places in self._pieces(frames, weight, lent):
             start = staged.frames.start
             first = fresh and not np.any(weight[: start + places[0]])
-            _fill(self._real, rows[start + places])
-            known = len(places), band.pixels, int(first), self._place, self._real
-            moved = self._size * len(places) + 72
-            self._run(band, "correlation_sum", staged.array, *known, *_PAIRS, moved=moved)
+            _fill(self._floats, rows[start + places])
+            known = {"fresh": int(first), "basis": self._floats, **_sums_of(band, reference=True)}
+            self._add(band, "correlation_sum", 72, staged, places, **known)
         self._note(phase, weight)
+
+    def _add(
+        self, band: Band, name: str, moved: int, staged: Staged, places: NDArray[np.intp], **arguments: Any
+    ) -> None:
+        count = len(places)
+        known = {"frames": staged.array, "count": count, "place": self._place}
+        self._run(band, name, self._size * count + moved, **known, **arguments)
 
     def _pieces(
         self, frames: NDArray[Any], weight: Doubles, lent: bool
@@ -350,25 +385,35 @@ class TurnSums(Sums):
                 yield band, staged, places
 
     def _note(self, phase: Doubles, weight: Doubles) -> None:
-        self._phase += phase.tolist()
-        self._weight += weight.tolist()
+        self._phase = np.concatenate([self._phase, phase])
+        self._weight = np.concatenate([self._weight, weight])
 
-    def _convert(self) -> None:
+    def _convert_to_pairs(self) -> None:
         """Turn integer sums, if there still are any, into pairs of floats."""
         if self._counts is not None:
             return
-        phase, weight = self.seen()
-        self._counts = len(phase)
-        if np.any(weight):
-            counted = _counted(self._whole_rows(phase, weight))
-            step = np.float32(1 / self._steps[1])
-            for band in self._bands:
+        self._counts = len(self._phase)
+        if np.any(self._weight):
+            known = _counted(self._rows_in_steps(self._phase, self._weight))
+            for band in self.bands:
                 with band.resident():
-                    self._run(band, "correlation_convert", band.pixels, *counted, step, *_PAIRS, moved=68)
+                    sums = _sums_of(band, reference=True)
+                    self._run(band, "correlation_convert", 68, unit=1 / self._step, **known, **sums)
 
 
-class WindowSums(Sums):
-    """The last frames of an endless rotation: integer sums move on with it, anything else is summed anew."""
+class WindowSums(_Sums):
+    """The last frames of an endless rotation, in a ring.
+
+    Integer sums move on with it: a frame that leaves takes with it exactly what it brought. Anything else is
+    summed anew.
+
+    Attributes
+    ----------
+    bands : list of Band
+        Map ``ring`` of each holds its rows of the frames.
+    oldest : int
+        Plane of the ring that the oldest frame of a full window is in; the next frame goes there.
+    """
 
     def __init__(
         self,
@@ -377,92 +422,83 @@ class WindowSums(Sums):
         dtype: np.dtype[Any],
         length: int,
         window: int,
-        beside: Mapping[str, DTypeLike | Planes],
+        other_maps: Mapping[str, DTypeLike | Planes] | None = None,
     ) -> None:
+        if not 3 <= window <= WINDOW:
+            raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
         self._window = window
         self._width = {1: 4, 2: 8}.get(dtype.itemsize, 0)  # bytes of an integer sum
-        sums = dict.fromkeys(_SUMS if self._width else (), f"i{self._width}")
-        maps = {"ring": Planes(window, dtype), **sums, **beside}
+        sums = dict.fromkeys(_SUMS.values() if self._width else (), f"i{self._width}")
+        maps = {"ring": Planes(window, dtype), **sums, **(other_maps or {})}
         super().__init__(device, shape, dtype, maps, length, wide=False)
         self.reset()
-
-    @property
-    def bands(self) -> list[Band]:
-        """Where the frames are: map ``ring`` of each band holds its rows of them."""
-        return self._bands
-
-    @property
-    def oldest(self) -> int:
-        """Plane of the ring that the oldest frame of a full window is in; the next frame goes there."""
-        return self._next
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._phase, self._weight = np.zeros((2, self._window))  # the oldest frame first; weight 0 for none
-        self._next = 0  # plane of the ring that the next frame goes to
-        for band in self._bands:
-            for name in _SUMS if self._integer else ():
+        self.oldest = 0
+        for band in self.bands:
+            for name in _SUMS.values() if self._integer else ():
                 band.write(name, 0)
-
-    def seen(self) -> tuple[Doubles, Doubles]:
-        """Return phases and weights of the frames in the window."""
-        return self._phase, self._weight
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Move the window on; of a block that is longer than it, only the end is ever in it."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
         phase, weight = np.concatenate([self._phase, phase]), np.concatenate([self._weight, weight])
-        rows = self._whole_rows(phase, weight)
+        rows = self._rows_in_steps(phase, weight)
         moves = np.hstack([rows[self._window :], rows[: len(frames)]])
         for band, staged in self._stage(frames, lent):
-            count, there = staged.count, staged.frames
-            place = count, band.pixels, band.stride, self._next + there.start, self._window
+            known = {
+                "frames": staged.array,
+                "count": staged.count,
+                "stride": band.stride,
+                "first": self.oldest + staged.frames.start,
+                "window": self._window,
+                "ring": band.maps["ring"],
+            }
+            moved = 2 * self._size * staged.count
             if not self._integer:
-                moved = 2 * self._size * count
-                self._run(band, "correlation_keep", staged.array, *place, "ring", moved=moved)
+                self._run(band, "correlation_keep", moved, **known)
                 continue
-            _fill(self._whole, moves[there])
-            moved = 3 * self._size * count + 8 * self._width
-            known = *place, self._whole, "ring", *_SUMS
-            self._run(band, "correlation_slide", staged.array, *known, moved=moved)
-        self._next = (self._next + len(frames)) % self._window
+            _fill(self._steps, moves[staged.frames])
+            moved += self._size * staged.count + 8 * self._width
+            self._run(band, "correlation_slide", moved, basis=self._steps, **known, **_sums_of(band))
+        self.oldest = (self.oldest + len(frames)) % self._window
         self._phase, self._weight = phase[-self._window :], weight[-self._window :]
 
-    def solve(self) -> list[NDArray[np.float32]]:
-        """Return mean, cosine, sine and residual of the window's frames, (H, W) each."""
-        phase, weight = self.seen()
+    def _solve(self) -> list[NDArray[np.float32]]:
+        phase, weight = self._phase, self._weight
         if self._integer and np.all((weight == 0) | (weight == 1)):
-            return self._answer_counts(phase, self._whole_rows(phase, weight), self._width)
-        rows, used = _real_rows(phase, weight), np.flatnonzero(weight)
+            return self._answer_counts(self._rows_in_steps(phase, weight), self._width)
+        rows, used = _float_rows(phase, weight), np.flatnonzero(weight)
         _fill(self._fit, _fit_table(phase, rows))
-        _fill(self._place, (self._next + used) % self._window)
-        _fill(self._real, rows[used])
-        return self._answer(
-            "correlation_window",
-            lambda band: ("ring", len(used), band.pixels, band.stride, self._place, self._real),
-            self._size * len(used) + 16,
-        )
+        _fill(self._place, (self.oldest + used) % self._window)
+        _fill(self._floats, rows[used])
+        known = {"count": len(used), "place": self._place, "basis": self._floats}
+        return self._answer("correlation_window", self._size * len(used) + 16, **known)
 
 
-def _real_rows(phase: Doubles, weight: Doubles) -> Doubles:
+def _sums_of(band: Band, reference: bool = False) -> dict[str, Array]:
+    """Return the maps that sums are kept in, by the arguments of kernels."""
+    sums = {key: band.maps[name] for key, name in _SUMS.items()}
+    return {"reference": band.maps["reference"], **sums} if reference else sums
+
+
+def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:
     """Return w, w cos alpha and w sin alpha, (N, 3), as float32 has them."""
     return (basis(phase) * weight[:, np.newaxis]).astype(np.float32).astype(np.float64)
 
 
-def _counted(rows: Doubles) -> tuple[int, np.int64, np.int64]:
+def _counted(rows: Doubles) -> dict[str, int]:
     """Return how many frames are in integer sums, and the sums of their cosines and sines, in steps."""
     frames, cosines, sines = np.sum(rows.astype(np.int64), axis=0)
-    return int(frames), cosines, sines
+    return {"frames": int(frames), "cosines": int(cosines), "sines": int(sines)}
 
 
 def _fit_table(phase: Doubles, rows: Doubles) -> NDArray[np.float32]:
-    """Return what ``mirrorskin.kernels.correlation`` calls the fit, (28,) float32.
+    """Return what `mirrorskin.kernels.correlation` calls the fit, (28,) float32.
 
-    Parameters
-    ----------
-    phase : ndarray, (N,), float64
-    rows : ndarray, (N, 3), float64
-        Z: what the samples were multiplied by before they were summed. The first column is the weights.
+    ``rows``, (N, 3), is Z: what the samples were multiplied by before they were summed, the weights first.
     """
     weight, exact = rows[:, :1], basis(phase)
     root = np.asarray(np.linalg.qr(np.sqrt(weight) * exact, mode="r"))

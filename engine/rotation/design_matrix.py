@@ -1,4 +1,4 @@
-"""The phases of a rotation: its turns, whether they determine mean, cosine and sine, and how these follow."""
+"""The fit E = mean + cosine cos alpha + sine sin alpha of a rotation's samples: its turns, and its matrix."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ from mirrorskin.io import InputError, check_phase
 
 Doubles = NDArray[np.float64]
 
-_WORST = 1e8  # condition of the Gram matrix up to which a fit is told
+LONGEST = 64
+"""Frames of one turn at most."""
+
+_MAX_CONDITION = 1e8  # of the Gram matrix
 _SAME = 1e-9  # radians within which two phases are one
+_DIGITS = 9  # of a phase modulo a turn, by which turns of the same phases are known
+_FULL_TURN = 2 * np.pi - 1e-6  # but for the rounding of phases
 
 
 def basis(phase: ArrayLike) -> Doubles:
@@ -22,27 +27,14 @@ def basis(phase: ArrayLike) -> Doubles:
     return np.stack([np.ones_like(alpha), np.cos(alpha), np.sin(alpha)], axis=1)
 
 
-def check_weights(weights: ArrayLike | None, count: int) -> Doubles:
-    """Return the weights of some frames, (count,) float64, if they can be used; 1 each by default.
-
-    Parameters
-    ----------
-    weights : array_like, (count,), or None
-        How much a frame counts; 0 for a missing one.
-    count : int
-        Frames.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        They are of another length, or not all of them are finite and at least 0.
-    """
-    if weights is None:
+def check_weights(frame_weights: ArrayLike | None, count: int) -> Doubles:
+    """Return the weights of ``count`` frames, float64; 1 each by default."""
+    if frame_weights is None:
         return np.ones(count)
-    values = np.asarray(weights)
+    values = np.asarray(frame_weights)
     if values.dtype.kind not in "biuf" or values.shape != (count,):
-        told = f"weights of type {values.dtype} and shape {values.shape} for {count} frames"
-        raise InputError(f"{told}: one number a frame is needed")
+        given = f"frame weights of type {values.dtype} and shape {values.shape} for {count} frames"
+        raise InputError(f"{given}: one number a frame is needed")
     wrong = ~(np.isfinite(values) & (values >= 0))
     if np.any(wrong):
         frame = int(np.argmax(wrong))
@@ -50,15 +42,15 @@ def check_weights(weights: ArrayLike | None, count: int) -> Doubles:
     return values.astype(np.float64)
 
 
-def check_phases(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
+def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
     """Return phases as float64, (N,), if they determine mean, cosine and sine of what they sample.
 
     Parameters
     ----------
     phase : array_like, (N,)
         Radians.
-    weights : array_like, (N,), optional
-        How much each frame counts; one of weight 0 does not.
+    frame_weights : array_like, (N,), optional
+        How much each frame counts; 0 for a missing one.
 
     Raises
     ------
@@ -67,7 +59,7 @@ def check_phases(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
         phases so close together that the condition of the Gram matrix exceeds 1e8.
     """
     alpha = check_phase(phase, int(np.size(phase)), "phase")
-    weight = check_weights(weights, len(alpha))
+    weight = check_weights(frame_weights, len(alpha))
     known = alpha[weight > 0]
     if len(alpha) > 0 and len(known) == 0:
         raise InputError(f"all {len(alpha)} frames have weight 0: nothing is left to be fitted")
@@ -77,14 +69,14 @@ def check_phases(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
         raise InputError(f"{problem} of mean, cosine and sine: at least 3 are needed")
     weighted = basis(known) * np.sqrt(weight[weight > 0] / weight.max())[:, np.newaxis]
     condition = float(np.linalg.cond(weighted)) ** 2
-    if not condition <= _WORST:
-        limit = f"condition {condition:.0e}, at most {_WORST:.0e}"
-        problem = f"the phases are too close together to tell mean, cosine and sine apart ({limit})"
+    if not condition <= _MAX_CONDITION:
+        limit = f"condition {condition:.0e}, at most {_MAX_CONDITION:.0e}"
+        problem = f"the phases are too close together to separate mean, cosine and sine ({limit})"
         raise InputError(f"{problem}: spread them over more of the turn")
     return alpha
 
 
-def fit_matrix(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
+def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
     """Return the matrix that makes mean, cosine and sine of samples: the weighted pseudo-inverse.
 
     It minimises sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With N evenly spaced phases and equal
@@ -93,54 +85,86 @@ def fit_matrix(phase: ArrayLike, weights: ArrayLike | None = None) -> Doubles:
 
     Parameters
     ----------
-    phase, weights
-        As for ``check_phases``.
+    phase, frame_weights
+        As for `check_phases`.
 
     Returns
     -------
     ndarray, (3, N), float64
         Its product with the samples, (N,), is a, b and c.
 
-    Raises
-    ------
-    mirrorskin.io.InputError
-        As ``check_phases``.
+    Examples
+    --------
+    >>> import numpy as np
+    >>> phase = np.arange(4) * np.pi / 2
+    >>> (fit_matrix(phase) @ (10 + 3 * np.cos(phase))).round(6).tolist()
+    [10.0, 3.0, 0.0]
     """
-    alpha = check_phases(phase, weights)
-    root = np.sqrt(check_weights(weights, len(alpha)))
+    alpha = check_phases(phase, frame_weights)
+    root = np.sqrt(check_weights(frame_weights, len(alpha)))
     return np.asarray(np.linalg.pinv(basis(alpha) * root[:, np.newaxis]) * root)
 
 
-def _count_different(phase: Doubles) -> int:
-    """Return how many different points of the circle phases are, but for rounding."""
-    if len(phase) == 0:
-        return 0
-    turn = np.sort(np.mod(phase, 2 * np.pi))
-    gaps = np.diff(turn, append=turn[0] + 2 * np.pi)
-    return max(1, int(np.count_nonzero(gaps > _SAME)))
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnFit:
+    """How a turn of N frames is fitted; two are the same if they are one object.
+
+    Attributes
+    ----------
+    phase, weights : ndarray, (N,), float64
+        Radians from 0 to a turn, and weights above 0.
+    matrix : ndarray, (3, N), float64
+        See `fit_matrix`.
+    table : ndarray, (6, N), float32
+        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
+    covariance : ndarray, (3, 3), float64
+        Of mean, cosine and sine, where samples of weight 1 have variance 1.
+    weighted : bool
+        Whether a frame has another weight than 1.
+    goes_round : bool
+        See `goes_round`.
+    """
+
+    phase: Doubles
+    weights: Doubles
+    matrix: Doubles
+    table: NDArray[np.float32]
+    covariance: Doubles
+    weighted: bool
+    goes_round: bool
 
 
-LONGEST = 64
-"""Frames of one turn that are taken at most."""
+def turn_fit(phase: Doubles, weights: Doubles) -> TurnFit | None:
+    """Return how a turn is fitted, weights being above 0, or None if its phases do not determine that.
 
-_WHOLE = 2 * np.pi - 1e-6  # a turn, but for the rounding of phases
+    Turns of the same phases, modulo a whole turn, share one fit.
+    """
+    return _turn_fit(np.round(np.mod(phase, 2 * np.pi), _DIGITS).tobytes(), weights.tobytes())
+
+
+@lru_cache(256)
+def _turn_fit(phases: bytes, weighing: bytes) -> TurnFit | None:
+    phase, weights = np.frombuffer(phases), np.frombuffer(weighing)
+    try:
+        matrix = fit_matrix(phase, weights)
+    except InputError:
+        return None
+    return TurnFit(
+        phase,
+        weights,
+        matrix,
+        np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *matrix]).astype(np.float32),
+        matrix @ (matrix / weights).T,
+        bool(np.any(weights != 1)),
+        goes_round(phase),
+    )
 
 
 def cut_into_turns(phase: Doubles) -> list[slice]:
-    """Return the turns that are over, and the one that may go on.
+    """Return the frames of each turn, in order; the last turn may go on with later frames.
 
     A turn is over with the first frame that is a whole turn away from its own first. Phases that fall back
-    by more than half a turn are taken for going on, as those that are told modulo a turn.
-
-    Parameters
-    ----------
-    phase : ndarray, (N,), float64
-        Radians.
-
-    Returns
-    -------
-    list of slice
-        They meet, and the last one holds the last frame; none without frames.
+    by more than half a turn are taken to be given modulo a turn.
     """
     if len(phase) == 0:
         return []
@@ -150,15 +174,9 @@ def cut_into_turns(phase: Doubles) -> list[slice]:
     way = np.concatenate([[0.0], np.cumsum(steps)])
     starts = [0]
     for frame, angle in enumerate(way):
-        if abs(angle - way[starts[-1]]) >= _WHOLE:
+        if abs(angle - way[starts[-1]]) >= _FULL_TURN:
             starts.append(frame)
     return [slice(start, stop) for start, stop in zip(starts, [*starts[1:], len(way)], strict=True)]
-
-
-def goes_round(phase: Doubles) -> bool:
-    """Tell whether no gap between phases is above half a turn."""
-    points = np.sort(np.mod(phase, 2 * np.pi))
-    return bool(np.max(np.diff(points, append=points[0] + 2 * np.pi)) <= np.pi + 1e-6)
 
 
 def longest_turn(phase: Doubles) -> int:
@@ -166,59 +184,17 @@ def longest_turn(phase: Doubles) -> int:
     return max((turn.stop - turn.start for turn in cut_into_turns(phase)), default=0)
 
 
-_DIGITS = 9  # of a phase in radians: what differs by less is the same phase, told after another turn
-_KEPT = 256
+def goes_round(phase: Doubles) -> bool:
+    """Return whether no gap between phases is above half a turn."""
+    return bool(np.max(_gaps(phase)) <= np.pi + 1e-6)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnFit:
-    """How a turn of N frames is fitted; two are the same if they are one object.
-
-    Attributes
-    ----------
-    matrix : ndarray, (3, N), float64
-        See `mirrorskin.engine.rotation.design_matrix.fit_matrix`.
-    table : ndarray, (6, N), float32
-        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
-    covariance : ndarray, (3, 3), float64
-        Of mean, cosine and sine, where samples of weight 1 have variance 1.
-    weighted : bool
-        Whether a frame has another weight than 1.
-    goes_round : bool
-        Whether no gap between phases is above half a turn.
-    """
-
-    matrix: Doubles
-    table: NDArray[np.float32]
-    covariance: Doubles
-    weighted: bool
-    goes_round: bool
+def _count_different(phase: Doubles) -> int:
+    """Return how many different points of the circle phases are, but for rounding."""
+    return max(1, int(np.count_nonzero(_gaps(phase) > _SAME))) if len(phase) else 0
 
 
-def turn_fit(phase: Doubles, weights: Doubles) -> TurnFit | None:
-    """Return how a turn is fitted, or None if its phases do not determine that.
-
-    Parameters
-    ----------
-    phase : ndarray, (N,), float64
-        Radians; they count modulo a turn, to 1e-9.
-    weights : ndarray, (N,), float64
-        Above 0.
-    """
-    return _fit_of(np.round(np.mod(phase, 2 * np.pi), _DIGITS).tobytes(), weights.tobytes())
-
-
-@lru_cache(_KEPT)
-def _fit_of(phases: bytes, weighing: bytes) -> TurnFit | None:
-    phase, weights = np.frombuffer(phases), np.frombuffer(weighing)
-    try:
-        matrix = fit_matrix(phase, weights)
-    except InputError:
-        return None
-    return TurnFit(
-        matrix,
-        np.stack([np.cos(phase), np.sin(phase), np.sqrt(weights), *matrix]).astype(np.float32),
-        matrix @ (matrix / weights).T,
-        bool(np.any(weights != 1)),
-        goes_round(phase),
-    )
+def _gaps(phase: Doubles) -> Doubles:
+    """Return the angles between phases that are next to each other on the circle."""
+    points = np.sort(np.mod(phase, 2 * np.pi))
+    return np.diff(points, append=points[0] + 2 * np.pi)

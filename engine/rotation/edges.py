@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,9 @@ LIMITS = Limits(
     floor=math.radians(0.05),
     lowest=math.radians(5.0),
 )
-"""What the device and its reference are told."""
+"""When a jump is an edge, for the device and its reference."""
 
 _SHORTER = 4  # by how much other kernels are shorter than the longest one
-_FLAGS = ("clean", "lines", "more", "ways")
 
 
 def find_edges(
@@ -62,11 +62,23 @@ def find_edges(
         The maps are not of one size.
     mirrorskin.kernels.errors.DeviceError
         No device, or one without room for the maps.
+
+    Examples
+    --------
+    Two planes that lean 20 degrees to either side of a ridge:
+
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> lean = np.radians(20) * np.sign(np.arange(20) - 9.5) * np.ones((20, 1))
+    >>> vectors = np.stack([np.sin(lean), 0 * lean, np.cos(lean)], axis=-1).astype(np.float32)
+    >>> sigma, contact = np.full((20, 20), 0.01, np.float32), np.ones((20, 20), np.uint8)
+    >>> np.flatnonzero(engine.find_edges(vectors, sigma, contact)[10]).tolist()
+    [9]
     """
     shape = contact.shape
     if contact.ndim != 2 or vectors.shape != (*shape, 3) or sigma.shape != shape or 0 in shape:
-        told = f"vectors {vectors.shape}, sigma {sigma.shape} and contact {shape}"
-        raise InputError(f"{told} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
+        given = f"vectors {vectors.shape}, sigma {sigma.shape} and contact {shape}"
+        raise InputError(f"{given} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
     drawing = EdgeDrawing(open_device(device), shape)
     drawing.take(vectors, sigma, contact)
     for _ in drawing.steps():
@@ -85,24 +97,25 @@ class EdgeDrawing:
     """
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        rows, columns = shape
-        self._device, self._shape = device, (rows, columns)
+        self._device, (rows, columns) = device, shape
+        self._shape = rows, columns
         cells = (6, rows + 2 * MARGIN, columns + 2 * MARGIN)
-        self._maps = {
-            "vectors": self._room("vectors", (rows, columns, 3), np.float32),
-            "sigma": self._room("sigma", shape, np.float32),
-            "contact": self._room("contact", shape, np.uint8),
-            "doubt": self._device.given("doubt", np.ones(shape), np.uint8),
-            **{name: self._room(name, shape, np.uint8) for name in _FLAGS},
-            "strength": self._room("strength", shape, np.float32),
-            **{name: self._room(name, cells, np.float32) for name in ("cells", "joined")},
+        kinds: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
+            "vectors": ((rows, columns, 3), np.float32),
+            **dict.fromkeys(("sigma", "strength"), (shape, np.float32)),
+            **dict.fromkeys(("contact", "clean", "lines", "more", "ways"), (shape, np.uint8)),
+            **dict.fromkeys(("cells", "joined"), (cells, np.float32)),
         }
-        self._tables = {chosen: self._place(chosen) for chosen in (NEAR, FINE, COARSE)}
+        self._maps = {name: device.array(name, *kind) for name, kind in kinds.items()}
+        for array in self._maps.values():
+            array.upload()
+        self._maps["doubt"] = device.given("doubt", np.ones(shape), np.uint8)
+        self._pairs = {chosen: self._place(chosen) for chosen in (NEAR, FINE, COARSE)}
 
     def take(
         self, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
     ) -> None:
-        """Take the maps of a picture; see ``find_edges``."""
+        """Take the maps of a picture; see `find_edges`."""
         for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact != 0)):
             array = self._maps[name]
             array.claim()
@@ -111,28 +124,33 @@ class EdgeDrawing:
 
     def steps(self, parts: int = 1) -> Iterator[None]:
         """Put the kernels on the queue, the longest in so many parts, and yield after each."""
-        rows, fewer = self._shape[0] + 2 * MARGIN, -(-parts // _SHORTER)
-        yield from self._run("edges_clean", fewer, self._tiles, "contact", "clean")
-        yield from self._run("edges_cells", fewer, rows, "vectors", "sigma", "contact", "clean", "cells")
-        yield from self._look(NEAR, parts, "cells", "lines", "more")
-        yield from self._look(FINE, parts, "cells", "more", "lines")
-        yield from self._run("edges_join", fewer, rows, "cells", "lines", "joined")
-        yield from self._look(COARSE, parts, "joined", "lines", "more")
-        yield from self._run("edges_bound", fewer, self._tiles, "clean", "more", "lines")
+        maps, fewer = self._maps, -(-parts // _SHORTER)
+        rows = self._shape[0] + 2 * MARGIN
+        contact = {name: maps[name] for name in ("contact", "clean")}
+        normals = {name: maps[name] for name in ("vectors", "sigma", "cells")}
+        yield from self._run("edges_clean", fewer, self._tiles, **contact)
+        yield from self._run("edges_cells", fewer, rows, **contact, **normals)
+        yield from self._draw(NEAR, parts, "cells", "lines", "more")
+        yield from self._draw(FINE, parts, "cells", "more", "lines")
+        joined = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
+        yield from self._run("edges_join", fewer, rows, **joined)
+        yield from self._draw(COARSE, parts, "joined", "lines", "more")
+        drawn = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
+        yield from self._run("edges_bound", fewer, self._tiles, **drawn)
 
     def lines(self) -> NDArray[np.uint8]:
         """Return the edges, once all steps are done."""
         return self._maps["lines"].download().copy()
 
-    def _place(self, chosen: Pass) -> tuple[Array, Array]:
+    def _place(self, chosen: Pass) -> dict[str, Array]:
         """Return the pairs of cells that a pass compares."""
         places, distances = pairs(chosen)
-        return (
-            self._device.given("places", places, np.int32),
-            self._device.given("distances", distances, np.float32),
-        )
+        return {
+            "places": self._device.given("places", places, np.int32),
+            "distances": self._device.given("distances", distances, np.float32),
+        }
 
-    def _look(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
+    def _draw(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
         """Add the lines of one pass."""
         macros: dict[str, str | int] = {
             "SPACING": chosen.spacing,
@@ -143,36 +161,46 @@ class EdgeDrawing:
             "PART": f"{chosen.part}f",
             "LAST": int(chosen is COARSE),
         }
-        limits = LIMITS.jump, LIMITS.bend, LIMITS.sure, LIMITS.quiet, LIMITS.floor, LIMITS.lowest
-        rows, columns = self._shape
-        run = min(self._device.layout.tile, 64)
-        found = "doubt", "strength", "ways"
-        items, fewer = rows * -(-columns // run), -(-parts // _SHORTER)
-        jumps = cells, *self._tables[chosen], *limits, *found
-        yield from self._run("edges_jumps", parts, items, *jumps, **macros)
-        thin = "strength", "ways", before, after
-        yield from self._run("edges_thin", fewer, self._tiles, *thin, **macros)
+        maps, (rows, columns) = self._maps, self._shape
+        found = {name: maps[name] for name in ("strength", "ways")}
+        yield from self._run(
+            "edges_jumps",
+            parts,
+            rows * -(-columns // min(self._device.layout.tile, 64)),
+            macros,
+            cells=maps[cells],
+            **self._pairs[chosen],
+            jump=LIMITS.jump,
+            bend=LIMITS.bend,
+            sure=LIMITS.sure,
+            quiet=LIMITS.quiet,
+            floor_=LIMITS.floor,
+            lowest=LIMITS.lowest,
+            doubt=maps["doubt"],
+            **found,
+        )
+        lines = {"edges": maps[before], "added": maps[after]}
+        yield from self._run("edges_thin", -(-parts // _SHORTER), self._tiles, macros, **found, **lines)
 
     @property
     def _tiles(self) -> int:
         rows, columns = self._shape
         return int(-(-rows * columns // self._device.layout.tile))
 
-    def _room(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
-        array = self._device.array(name, shape, dtype)
-        array.upload()
-        return array
-
     def _run(
-        self, name: str, parts: int, items: int, *arguments: str | float | Array, **macros: str | int
+        self,
+        name: str,
+        parts: int,
+        items: int,
+        macros: dict[str, str | int] | None = None,
+        **arguments: Any,
     ) -> Iterator[None]:
-        values: list[Array | np.generic] = [np.int32(size) for size in self._shape]
-        for one in arguments:
-            kept = self._maps[one] if isinstance(one, str) else one
-            values.append(kept if isinstance(kept, Array) else np.float32(kept))
-        moved = sum(one.host.nbytes for one in values if isinstance(one, Array))
-        kernel, part = self._device.kernel("edges", name, **macros), -(-items // parts)
+        """Run a kernel over its items in so many parts."""
+        rows, columns = self._shape
+        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
+        kernel, part = self._device.kernel("edges", name, **(macros or {})), -(-items // parts)
         for first in range(0, items, part):
             count = min(part, items - first)
-            kernel(count, *values, moved=moved * count // items, first_item=first)
+            share = moved * count // items
+            kernel(count, rows=rows, columns=columns, **arguments, moved=share, first_item=first)
             yield

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Unpack
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,16 +21,15 @@ from mirrorskin.engine.rotation.design_matrix import (
 )
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
+    NormalKernel,
     NormalMethod,
     NormalOptions,
     Samples,
-    set_up,
-    settle,
+    TurnModel,
 )
-from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.engine.rotation.response import Response
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands
-from mirrorskin.io import Block, InputError, check_phase
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows
+from mirrorskin.io import InputError, check_phase
 from mirrorskin.kernels.device import Device
 
 
@@ -50,11 +49,11 @@ class Normals:
         Counts, of the samples' fit with one wave a turn; see `mirrorskin.engine.Correlation`. Of several
         turns the mean, of the residual the root mean square. NaN where a sample is missing in each turn.
     noise : float
-        Standard deviation of a sample that was reckoned with, counts, at the middle of the brightness.
+        Standard deviation of a sample, given or estimated, counts, at the middle of the brightness.
     shot : float
-        By how much its square was reckoned to grow with each count.
+        By how much its square grows with each count.
     tilt : float
-        Half-angle of the precession that was reckoned with, radians.
+        Half-angle of the precession, given or estimated, radians.
     turns, frames : int
         How many entered.
     """
@@ -71,6 +70,16 @@ class Normals:
     tilt: float
     turns: int
     frames: int
+
+    @classmethod
+    def of(cls, maps: list[NDArray[Any]], model: TurnModel, turns: int, frames: int) -> Normals:
+        """Put together what the kernel left, as `MAPS` lists it."""
+        vectors, sigma, contact, mean, cosine, sine, residual = maps
+        some = thin_out(mean)
+        known = some[np.isfinite(some)]
+        level = np.median(known) if known.size else 0.0
+        numbers = float(model.noise.at(level)), model.noise.slope, model.tilt, turns, frames
+        return cls(vectors, sigma, contact, mean, cosine, sine, residual, *numbers)
 
     @cached_property
     def zenith(self) -> NDArray[np.float32]:
@@ -95,19 +104,22 @@ class Normals:
 def estimate_normals(
     frames: NDArray[Any],
     phase: ArrayLike,
-    tilt: float | None,
+    *,
+    tilt: float | Literal["estimate"],
     gain: ArrayLike | None = None,
     offset: ArrayLike = 0.0,
-    *,
     method: NormalMethod = "exact",
     noise: float | None = None,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
+    dark: ArrayLike | None = None,
+    bright: ArrayLike | None = None,
     response: Response | None = None,
-    weights: ArrayLike | None = None,
+    frame_weights: ArrayLike | None = None,
     device: str | Device | None = None,
 ) -> Normals:
     """Estimate the normals from a stack that fits in memory.
+
+    At each phase a pixel shows the angle between its normal n and the body's axis a, cos theta' = n . a
+    (eq. 10); the normal is the most likely one by all samples. See docs/method/rotation.md.
 
     Parameters
     ----------
@@ -115,21 +127,22 @@ def estimate_normals(
         Raw counts. Whole counts at the ends of their type are taken for clipped, a NaN for missing.
     phase : array_like, (T,)
         Radians, one a frame, at least three different ones a turn.
-    tilt : float or None
-        Half-angle of the precession, radians; None estimates it from the first turn.
+    tilt : float or "estimate"
+        Half-angle of the precession, radians, or to estimate it from the first turn.
     gain, offset : array_like, scalar or (H, W)
         E = offset + gain zenith: counts per radian, and counts.
     method : {"exact", "paper"}
         The most likely normals, or the paper's equations 14 to 22.
     noise : float, optional
-        Standard deviation of any sample, counts; by default told from the first turn's residuals, as read and
-        shot noise.
-    low, high : array_like, scalar or (H, W), optional
-        Counts between which brightness is linear in the zenith; what is expected beyond tells nothing.
+        Standard deviation of any sample, counts; by default estimated from the first turn's residuals, as
+        read and shot noise.
+    dark, bright : array_like, scalar or (H, W), optional
+        Counts between which brightness is linear in the zenith; samples that are expected beyond are left
+        out.
     response : Response, optional
-        What is known of a sensor that is not linear, instead of gain, offset, low and high; see
+        Of a calibrated sensor that is not linear, instead of gain, offset, dark and bright; see
         ``mirrorskin.engine.rotation.response``.
-    weights : array_like, (T,), optional
+    frame_weights : array_like, (T,), optional
         Inverse variances of the frames, in those of ``noise``; 0 for a missing one.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
@@ -144,6 +157,19 @@ def estimate_normals(
         Frames, phases, tilt, scale or parameters that cannot be used.
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
+
+    Examples
+    --------
+    A plane that is inclined by 0.3 rad towards x, seen by a body that leans by 0.05 rad:
+
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> phase = np.arange(8) * np.pi / 4
+    >>> cosine = np.cos(0.3) * np.cos(0.05) - np.sin(0.3) * np.sin(0.05) * np.cos(phase)
+    >>> frames = (500 * np.arccos(cosine)[:, None, None] * np.ones((2, 3))).astype(np.float32)
+    >>> normals = engine.estimate_normals(frames, phase, tilt=0.05, gain=500, noise=1.0)
+    >>> float(normals.zenith[0, 0].round(4))
+    0.3
     """
     if frames.ndim != 3 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
@@ -156,18 +182,21 @@ def estimate_normals(
         offset=offset,
         method=method,
         noise=noise,
-        low=low,
-        high=high,
+        dark=dark,
+        bright=bright,
         response=response,
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
-    estimator.push(Block(frames, index=0, phase=alpha), weights)
+    estimator.push(frames, phase=alpha, frame_weights=frame_weights)
     return estimator.result()
 
 
 class NormalEstimator:
     """Estimate normals from frames that come block by block, turn after turn.
+
+    Frames are kept until their turn is over, at most 64 of them; of turns that are over, the device keeps the
+    mean of the normals, weighted by inverse variance.
 
     Parameters
     ----------
@@ -175,12 +204,12 @@ class NormalEstimator:
         Rows and columns of a frame.
     dtype : dtype
         uint8, uint16 or float32.
-    tilt, gain, offset, method, noise, low, high, response, device
-        As for ``estimate_normals``.
+    tilt, gain, offset, method, noise, dark, bright, response, device
+        As for `estimate_normals`.
     longest : int
         Frames of a turn at most.
     per_turn : bool
-        Whether to tell each turn alone, in maps with a leading axis, instead of the mean over turns.
+        Whether to return each turn alone, in maps with a leading axis, instead of the mean over turns.
     memory_limit : int
         Bytes of host memory for frames on the move, where more than one turn is to be held.
 
@@ -188,7 +217,19 @@ class NormalEstimator:
     ------
     mirrorskin.io.InputError
         Parameters that cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> estimator = engine.NormalEstimator((2, 3), "uint8", tilt=0.05, gain=300, noise=1.0)
+    >>> for phase in np.arange(8) * np.pi / 4:
+    ...     estimator.push(np.full((1, 2, 3), 100 + 15 * np.cos(phase), np.uint8), phase=[phase])
+    >>> estimator.result().turns
+    1
     """
+
+    position = "phase"
 
     def __init__(
         self,
@@ -202,25 +243,25 @@ class NormalEstimator:
     ) -> None:
         self._shape, self._dtype = shape, np.dtype(dtype)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn
-        self._setup = set_up(shape, self._dtype, **options)
-        self.device, self._launch = self._setup.device, self._setup.launch
+        self._kernel = NormalKernel(shape, self._dtype, **options)
+        self.device = self._kernel.device
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
-        self._bands = cut_into_bands(
-            self.device, shape, self._dtype, self._launch.planes, length, self._longest + 1
-        )
-        self._buffer = self._bands[0].frames.host
-        if len(self._bands) > 1:
-            fits = min(len(band.frames.host) for band in self._bands)
-            self._buffer = np.empty((fits, *shape), self._dtype)
+        planes = self._kernel.planes
+        self._bands = cut_into_bands(self.device, shape, self._dtype, planes, length, self._longest + 1)
+        self._alone = len(self._bands) == 1
+        if self._alone:
+            self._buffer = self._bands[0].frames.host
+        else:
+            self._buffer = np.empty((min(len(band.frames.host) for band in self._bands), *shape), self._dtype)
         for band in self._bands:
-            self._launch.write_scale(band)
+            self._kernel.write_scale(band)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames so far, and be ready for another rotation of the same sensor."""
-        self._tilt, self._noise = self._setup.tilt, self._setup.noise
-        self._phase, self._weights = np.empty(0), np.empty(0)
-        self._turns = self._frames = 0
+        """Forget the frames so far, and what was estimated from them."""
+        self._model = self._kernel.model
+        self._phase, self._weights = np.empty((2, 0))  # of the frames in the buffer
+        self._turns = self._frames = 0  # that are in the maps
         self._each: list[list[NDArray[Any]]] = []
 
     @property
@@ -228,15 +269,25 @@ class NormalEstimator:
         """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
         return self._buffer[len(self._phase) :]
 
-    def push(self, block: Block, weights: ArrayLike | None = None) -> None:
+    def push(
+        self,
+        frames: NDArray[Any],
+        *,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        lent: bool = False,
+    ) -> None:
         """Take in the next frames.
 
         Parameters
         ----------
-        block : Block
-            With the phase of each frame.
-        weights : array_like, (n,), optional
-            Of the frames, as for ``estimate_normals``.
+        frames : ndarray, (n, H, W)
+        phase : array_like, (n,)
+            Radians.
+        frame_weights : array_like, (n,), optional
+            As for `estimate_normals`.
+        lent : bool
+            Of no use here: frames are copied unless they lie in ``room``.
 
         Raises
         ------
@@ -244,73 +295,78 @@ class NormalEstimator:
             Frames of another type or size, phases or weights that cannot be used, or a turn of too many
             frames.
         """
-        frames = block.frames
         check_frames(frames, self._dtype, self._shape)
-        phase = check_phase(block.phase, len(frames), "phase")
-        weight = check_weights(weights, len(frames))
+        alpha = check_phase(phase, len(frames), "phase")
+        weights = check_weights(frame_weights, len(frames))
         start = 0
         while start < len(frames):
             part = slice(start, start + len(self.room))
-            self._take(frames[part], phase[part], weight[part])
+            self._take(frames[part], alpha[part], weights[part])
             start = part.stop
 
     def result(self) -> Normals:
-        """Return the maps of all turns, and be ready for another rotation: the last turn ends here.
+        """Return the maps of all turns, the last of which is taken to end here.
 
         Raises
         ------
         mirrorskin.io.InputError
             The phases of the first turn do not determine a normal.
         """
-        phase, weights = self._phase.copy(), self._weights.copy()
-        self._work(cut_into_turns(phase))
-        if self._turns == 0:
-            check_phases(phase, weights)  # says what is wrong
-        if self._per_turn:
-            maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
-        else:
-            maps = self._maps()
-        assert self._noise is not None
-        assert self._tilt is not None
-        normals = tell_normals(maps, self._noise, self._tilt, self._turns, self._frames)
-        self.reset()
-        return normals
+        state = self._model, self._turns, self._frames, self._phase.copy(), self._weights.copy()
+        frames = self._buffer[: len(self._phase)].copy() if np.any(self._weights == 0) else None
+        closed = [self._copy_maps(band) for band in self._bands] if self._turns and not self._per_turn else []
+        try:
+            self._estimate(cut_into_turns(self._phase))
+            if self._turns == 0:
+                check_phases(*state[-2:])  # says what is wrong
+            assert self._model is not None
+            if self._per_turn:
+                maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
+            else:
+                maps = self._take_maps()
+            return Normals.of(maps, self._model, self._turns, self._frames)
+        finally:  # more frames may follow: the last turn is as open as before
+            self._model, self._turns, self._frames, self._phase, self._weights = state
+            del self._each[self._turns :]
+            for band, kept in zip(self._bands, closed, strict=False):
+                for name, values in kept.items():
+                    band.write(name, values)
+            if frames is not None:
+                self._buffer[: len(frames)] = frames
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
-        """Take in frames that fit, and work on the turns that are then over."""
+        """Take in frames that fit into the buffer, and estimate the turns that are then over."""
         turns = cut_into_turns(np.concatenate([self._phase, phase]))
         longest = max(turn.stop - turn.start for turn in turns)
         if longest > self._longest:
-            told = f"a turn of {longest} frames or more: normals are told from {self._longest} at most"
-            raise InputError(f"{told}; leave some out, or use 'mirrorskin correlate'")
+            given = f"a turn of {longest} frames or more: normals take {self._longest} at most"
+            raise InputError(f"{given}; leave some out, or use 'mirrorskin correlate'")
         here = self.room[: len(frames)]
         if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
             here[:] = frames
         self._phase = np.concatenate([self._phase, phase])
         self._weights = np.concatenate([self._weights, weights])
         if len(turns) > 1:
-            self._work(turns[:-1])
+            self._estimate(turns[:-1])
+            end, frame_count = turns[-1].start, len(self._phase)
+            self._buffer[: frame_count - end] = self._buffer[end:frame_count].copy()
+            self._phase, self._weights = self._phase[end:], self._weights[end:]
 
-    def _work(self, turns: list[slice]) -> None:
-        """Estimate the normals of turns in the buffer, and keep the frames that come after them."""
-        told = self._told([self._close_up(turn) for turn in turns])
-        alone = len(self._bands) == 1
-        if alone and turns:
+    def _estimate(self, turns: list[slice]) -> None:
+        """Estimate the normals of turns in the buffer."""
+        fitted = self._fitted([self._close_up(turn) for turn in turns])
+        if self._alone:
             self._bands[0].frames.upload(len(self._phase))
-        for start in range(0, len(told), self._launch.together):
-            group = told[start : start + self._launch.together]
-            self._launch.write_tables([fit for _, fit in group])
+        for start in range(0, len(fitted), self._kernel.tables_at_once):
+            group = fitted[start : start + self._kernel.tables_at_once]
+            self._kernel.write_tables([fit for _, fit in group])
             for turn, fit in group:
-                self._estimate(turn, fit)
-        if alone:
+                self._estimate_turn(turn, fit)
+        if self._alone:
             self._bands[0].frames.claim()
-        end = turns[-1].stop if turns else 0
-        rest = len(self._phase) - end
-        self._buffer[:rest] = self._buffer[end : end + rest].copy()
-        self._phase, self._weights = self._phase[end:], self._weights[end:]
 
     def _close_up(self, turn: slice) -> slice:
-        """Move the frames of a turn that are not missing to its begin."""
+        """Move the frames of a turn that are not missing to its begin, and return where they are."""
         there = turn.start + np.flatnonzero(self._weights[turn] > 0)
         known = slice(turn.start, turn.start + len(there))
         if known != turn:
@@ -318,65 +374,48 @@ class NormalEstimator:
                 values[known] = values[there]
         return known
 
-    def _told(self, turns: list[slice]) -> list[tuple[slice, TurnFit]]:
+    def _fitted(self, turns: list[slice]) -> list[tuple[slice, TurnFit]]:
         """Return the turns whose phases determine a normal, and, after the first that does, go all round."""
-        told: list[tuple[slice, TurnFit]] = []
+        fitted: list[tuple[slice, TurnFit]] = []
         for turn in turns:
             fit = turn_fit(self._phase[turn], self._weights[turn])
-            if fit is not None and (fit.goes_round or not (self._turns or told)):
-                told.append((turn, fit))
-        return told
+            if fit is not None and (fit.goes_round or not (self._turns or fitted)):
+                fitted.append((turn, fit))
+        return fitted
 
-    def _estimate(self, turn: slice, fit: TurnFit) -> None:
+    def _estimate_turn(self, turn: slice, fit: TurnFit) -> None:
+        """Take a turn into the maps."""
         count = turn.stop - turn.start
-        if self._noise is None or self._tilt is None:
-            self._settle(turn, fit.matrix)
-        assert self._noise is not None
-        assert self._tilt is not None
+        if self._model is None:
+            samples = self._buffer[turn].reshape(count, -1)[:, :: thinning(self._shape)]
+            self._model = self._kernel.estimate_model(samples, fit)
         self._turns += 1
         self._frames += count
+        turns = 1 if self._per_turn else self._turns
         for band in self._bands:
             start = turn.start
-            if len(self._bands) > 1:
+            if not self._alone:
                 band.frames.claim()
                 band.frames.host[:count] = self._buffer[turn, band.rows]
                 band.frames.upload(count)
                 start = 0
-            turns = 1 if self._per_turn else self._turns
-            samples = Samples(band.frames, start, count)
             with band.resident():
-                self._launch.run(band, samples, fit, self._noise, self._tilt, turns)
+                self._kernel.run(band, Samples(band.frames, start, count), fit, self._model, turns)
         if self._per_turn:
-            self._each.append(self._maps())
+            self._each.append(self._take_maps())
 
-    def _settle(self, turn: slice, matrix: Doubles) -> None:
-        """Tell from a turn what was not given: the noise, and the tilt."""
-        samples = self._buffer[turn].reshape(turn.stop - turn.start, -1)[:, :: thinning(self._shape)]
-        known = self._phase[turn], self._weights[turn], matrix, self._setup.scale, self._noise, self._tilt
-        self._noise, self._tilt = settle(samples, self._shape, *known)
-
-    def _maps(self) -> list[NDArray[Any]]:
-        """Return the maps of all rows, as they are listed."""
-        if len(self._bands) == 1:
-            return self._download(self._bands[0])
-        return [np.concatenate(parts) for parts in zip(*map(self._download, self._bands), strict=True)]
-
-    def _download(self, band: Band) -> list[NDArray[Any]]:
-        """Return the maps of a band, as they are listed; it has new ones then."""
-        rows = (-1, self._shape[1])
+    def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
+        """Return copies of a band's maps, with their padding."""
         with band.resident():
-            vectors, *others = (band.hand_over(name).reshape(-1) for name in MAPS)
-        flat = [one[: band.pixels].reshape(rows) for one in others]
-        return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
+            return {name: band.maps[name].download().copy() for name in MAPS}
 
-
-def tell_normals(
-    maps: list[NDArray[Any]], noise: CountNoise, tilt: float, turns: int, frames: int
-) -> Normals:
-    """Put together what a kernel left, as ``mirrorskin.engine.rotation.normals_kernel.MAPS`` lists it."""
-    vectors, sigma, contact, mean, cosine, sine, residual = maps
-    some = thin_out(mean)
-    known = some[np.isfinite(some)]
-    level = np.median(known) if known.size else 0.0
-    told = float(noise.at(level)), noise.slope, tilt, turns, frames
-    return Normals(vectors, sigma, contact, mean, cosine, sine, residual, *told)
+    def _take_maps(self) -> list[NDArray[Any]]:
+        """Return the maps of all rows, as they are listed; the bands have new ones then."""
+        parts = []
+        for band in self._bands:
+            with band.resident():
+                vectors, *others = (band.hand_over(name).reshape(-1) for name in MAPS)
+            rows = (-1, self._shape[1])
+            flat = [one[: band.pixels].reshape(rows) for one in others]
+            parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])
+        return [join_rows(part) for part in zip(*parts, strict=True)]

@@ -1,31 +1,37 @@
-"""The heights that fit the normals of a rotation."""
+"""The heights that fit the normals of a rotation: slopes, how sure those are, and their integration."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.frames import SAMPLES
 from mirrorskin.engine.integration.integration import explain, integrate
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.integration.validation import LEAST, MOST
-from mirrorskin.engine.rotation.normals import Normals
-from mirrorskin.io import ProcessValue
+from mirrorskin.io import ProcessValue, Result
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.rotation.normals import Normals
 
 Floats = NDArray[np.float32]
 
 _STEEPEST = math.radians(80.0)  # zenith beyond which a slope would grow without bounds
 _AROUND = 5  # pixels across, from which the meridian's direction is taken
-_WIDEST = 0.5  # radians: standard deviation of an azimuth beyond which its mean cosine is no longer made good
+_WIDEST = 0.5  # radians: standard deviation of an azimuth up to which its mean cosine is corrected for
+_TOLERANCE = (
+    1e-4  # residual to accept of many small facets, where integrate's is not met: normals err far more
+)
+_NO_LIMIT = 1e9  # seconds: with a budget, integrate returns what was reached
+_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see slopes.cl
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,24 +57,24 @@ class Slopes:
 
 
 def find_slopes(
-    vectors: NDArray[np.float32],
-    sigma: NDArray[np.float32],
+    vectors: Floats,
+    sigma: Floats,
     contact: NDArray[np.uint8],
     tilt: float | None,
     turns: int = 1,
-    white: NDArray[np.float32] | None = None,
+    independent_sigma: Floats | None = None,
 ) -> Slopes:
     """Turn the normals of a rotation into slopes, -n_x / n_z and -n_y / n_z.
 
-    *How sure they are.* Samples are distances from the axis, which goes round on a circle of radius d: they
-    tell a zenith far better than an azimuth. Of the information of samples evenly round the circle the share
+    *Variances.* Samples are distances from the axis, which goes round on a circle of radius d: they determine
+    a zenith far better than an azimuth. Of the information of samples evenly round the circle the share
     that is across the meridian is ::
 
         q = 1/2 within the circle,  sin(d)^2 / (2 sin(zenith)^2) without
 
     so the variance sigma^2 of an angular error is sigma^2 q along the meridian, sigma^2 (1 - q) across. An
     error along it changes the slope by 1/cos(zenith)^2, one across it by 1/cos(zenith). Along x and y these
-    two are mixed; that their errors go together is not told.
+    two are mixed; their covariance is left out.
 
     *Bias.* An azimuth that is uncertain by s makes the mean of its vectors shorter by exp(-s^2 / 2), and
     a surface of them flatter. Slopes are made longer by as much.
@@ -85,9 +91,9 @@ def find_slopes(
         Half-angle d of the precession, radians. None: errors are the same in all directions.
     turns : int
         Of how many turns the normals are the mean.
-    white : ndarray, (H, W), float32, optional
-        What to weigh slopes by instead of ``sigma``, where errors of neighbours are alike: those independent
-        errors of which as much is left in a mean over many pixels.
+    independent_sigma : ndarray, (H, W), float32, optional
+        What to weigh slopes by instead of ``sigma``, where errors of neighbours are correlated: independent
+        errors that leave as much in a mean over many pixels.
 
     Returns
     -------
@@ -95,11 +101,11 @@ def find_slopes(
         Finite: a surface steeper than 80 degrees is taken to be as steep as that.
     """
     nx, ny, nz = np.moveaxis(vectors, -1, 0)
-    white = sigma if white is None else white
+    white = sigma if independent_sigma is None else independent_sigma
     known = (contact != 0) & (nz > 0) & (sigma > 0) & (sigma < np.inf) & (white > 0) & (white < np.inf)
     nx, ny, nz, sigma, white = (np.where(known, one, np.float32(1)) for one in (nx, ny, nz, sigma, white))
     nz = np.maximum(nz, np.float32(math.cos(_STEEPEST)))
-    longer = np.exp(0.5 * _turned(nx, ny, sigma, tilt, turns))
+    longer = np.exp(0.5 * _azimuth_variance(nx, ny, sigma, tilt, turns))
     nothing = np.float32(np.nan)
     variances = _variances(nx, ny, nz, white, tilt, known)
     return Slopes(
@@ -117,7 +123,7 @@ def _share_along(nx: Floats, ny: Floats, tilt: float | None) -> Floats:
     return np.asarray(0.5 * least / np.maximum(nx * nx + ny * ny, least), np.float32)
 
 
-def _turned(nx: Floats, ny: Floats, sigma: Floats, tilt: float | None, turns: int = 1) -> Floats:
+def _azimuth_variance(nx: Floats, ny: Floats, sigma: Floats, tilt: float | None, turns: int = 1) -> Floats:
     """Return the variance of the azimuth in one turn, radians^2, within bounds; 0 without a tilt."""
     if tilt is None:
         return np.zeros(nx.shape, np.float32)
@@ -126,106 +132,94 @@ def _turned(nx: Floats, ny: Floats, sigma: Floats, tilt: float | None, turns: in
     return np.asarray(np.minimum(variance, _WIDEST**2), np.float32)
 
 
-def _east(nx: Floats, ny: Floats, known: NDArray[np.bool_], turned: Floats) -> Floats:
+def _cosine_squared(nx: Floats, ny: Floats, known: NDArray[np.bool_], azimuth_variance: Floats) -> Floats:
     """Return the square of the azimuth's cosine, from the normals around.
 
     By its own azimuth, a slope that noise has made shorter would be given another weight than one that it has
-    made longer, and the weighted mean would be wrong. Squares do not mind which way a ridge faces. Noise of
-    the azimuth, of the variance ``turned``, makes their means more alike, by exp(-2 turned).
+    made longer, and the weighted mean would be wrong. Squares are the same on both sides of a ridge. Noise of
+    the azimuth makes their means more alike, by exp(-2 variance).
     """
+    from scipy import ndimage
+
     x, y = (ndimage.uniform_filter(np.where(known, n * n, 0), _AROUND, mode="constant") for n in (nx, ny))
     least = np.finfo(np.float32).tiny
-    east = (x + least) / (x + y + 2 * least)
-    return np.asarray(np.clip(0.5 + (east - 0.5) * np.exp(2 * turned), 0, 1), np.float32)
+    square = (x + least) / (x + y + 2 * least)
+    return np.asarray(np.clip(0.5 + (square - 0.5) * np.exp(2 * azimuth_variance), 0, 1), np.float32)
 
 
 def _variances(
     nx: Floats, ny: Floats, nz: Floats, sigma: Floats, tilt: float | None, known: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
     """Return the variances of the slopes along x and y."""
-    share, turned = _share_along(nx, ny, tilt), _turned(nx, ny, sigma, tilt)
+    share, turned = _share_along(nx, ny, tilt), _azimuth_variance(nx, ny, sigma, tilt)
     # An azimuth that is off by e makes a slope shorter by e^2 / 2 of it, besides what it does across.
     along = share * (sigma / nz**2) ** 2 + (nx * nx + ny * ny) / nz**2 * turned**2 / 2
     across = (1 - share) * (sigma / nz) ** 2
-    east = _east(nx, ny, known, turned)
-    along_x, along_y = east * along + (1 - east) * across, (1 - east) * along + east * across
+    square = _cosine_squared(nx, ny, known, turned)
+    along_x, along_y = square * along + (1 - square) * across, (1 - square) * along + square * across
     return along_x.astype(np.float32), along_y.astype(np.float32)
-
-
-_ENOUGH = 1e-4  # residual that will do where that is not met, of many small facets: normals err far more
-_FOREVER = 1e9  # seconds: with a budget, what was reached is returned
-
-
-@dataclass(frozen=True, slots=True)
-class RelativeHeights:
-    """Heights that are relative, of one picture or of one for each turn, and which of them hang together.
-
-    Attributes
-    ----------
-    height, sigma : ndarray, (H, W) or (turns, H, W), float32
-        Millimetres; see ``mirrorskin.engine.Surface``. ``sigma`` may be None.
-    component : ndarray, the same, int32
-        Numbered through all turns.
-    offset_unknown : ndarray, (components,), uint8
-        Ones.
-    edges : ndarray, (H, W) or (turns, H, W), uint8, or None
-        Where the surface breaks, if that was asked.
-    process : dict
-        How they were found.
-    """
-
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32] | None
-    component: NDArray[np.int32]
-    offset_unknown: NDArray[np.uint8]
-    edges: NDArray[np.uint8] | None
-    process: dict[str, ProcessValue]
 
 
 def integrate_normals(
     normals: Normals,
-    white: NDArray[np.float32],
+    independent_sigma: Floats,
     pixel_size: tuple[float, float],
     *,
     robust: bool = False,
     device: Device,
-) -> RelativeHeights:
+) -> Result:
     """Integrate the normals of pixels in contact.
 
     Parameters
     ----------
     normals : Normals
         Of one picture, or of one for each turn.
-    white : ndarray, (H, W) or (turns, H, W), float32
-        Independent errors that amount to theirs, radians; see ``find_slopes``.
+    independent_sigma : ndarray, (H, W) or (turns, H, W), float32
+        See `find_slopes`.
     pixel_size : (float, float)
         Millimetres along x and y.
     robust, device
-        As for ``mirrorskin.engine.integrate``.
+        As for `mirrorskin.engine.integrate`.
 
     Returns
     -------
-    RelativeHeights
+    Result
+        Heights, with a mean of 0 of each connected component, and what came with them; components are
+        numbered through all turns. Edges are those where the surface breaks, if that was asked for.
 
     Raises
     ------
     mirrorskin.engine.NotConverged
         No heights were found that fit.
     """
-    each = normals.contact.ndim == 3
-    maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact, white]
-    turns = [np.index_exp[turn] for turn in range(len(white))] if each else [np.index_exp[:]]
+    maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact, independent_sigma]
+    per_turn = normals.contact.ndim == 3
+    each = list(zip(*maps, strict=True)) if per_turn else [maps]
+    turns = 1 if per_turn else normals.turns
     surfaces = []
-    for turn in turns:
-        vectors, sigma, contact, weighed = (one[turn] for one in maps)
-        slopes = find_slopes(vectors, sigma, contact, normals.tilt, 1 if each else normals.turns, weighed)
+    for vectors, sigma, contact, white in each:
+        slopes = find_slopes(vectors, sigma, contact, normals.tilt, turns, white)
         surfaces.append(_integrate(slopes, pixel_size, robust, device))
-    relief = _stack(surfaces)
-    return relief if each else _only(relief)
+    before = np.cumsum([0, *(len(one.offset_unknown) for one in surfaces)])
+    components = [
+        np.where(one.component >= 0, one.component + np.int32(shift), np.int32(-1))
+        for one, shift in zip(surfaces, before, strict=False)
+    ]
+    stacked = [
+        _stack([getattr(one, name) for one in surfaces], per_turn) for name in ("height", "sigma", "edges")
+    ]
+    return Result(
+        height=stacked[0],
+        height_sigma=stacked[1],
+        component=_stack(components, per_turn),
+        offset_unknown=np.ones(before[-1], np.uint8),
+        edges=stacked[2],
+        process=describe_integration(surfaces),
+    )
 
 
 def describe_integration(surfaces: Sequence[Surface]) -> dict[str, ProcessValue]:
-    """Say how surfaces were found, for a result's process."""
+    """Return how surfaces were found, for a result's process."""
     if not surfaces:
         return {}
     return {
@@ -238,7 +232,7 @@ def describe_integration(surfaces: Sequence[Surface]) -> dict[str, ProcessValue]
 def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, device: Device) -> Surface:
     """Return the surface of one picture; one of no pixels, where there is no normal to begin with."""
     if not slopes.known.any():
-        return _nothing(slopes.known.shape)
+        return _empty_surface(slopes.known.shape)
     surface = integrate(
         slopes.dz_dx,
         slopes.dz_dy,
@@ -246,16 +240,15 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         mask=slopes.known,
         slope_weights=slopes.weights,
         robust=robust,
-        budget=_FOREVER,
+        budget=_NO_LIMIT,
         device=device,
     )
-    if not (surface.converged or surface.residual <= _ENOUGH):
-        raise NotConverged(explain(surface.iterations, surface.residual, _ENOUGH))
+    if not (surface.converged or surface.residual <= _TOLERANCE):
+        raise NotConverged(explain(surface.iterations, surface.residual, _TOLERANCE))
     return surface
 
 
-def _nothing(shape: tuple[int, ...]) -> Surface:
-    """Return a surface without an answer."""
+def _empty_surface(shape: tuple[int, ...]) -> Surface:
     unknown = np.full(shape, np.nan, np.float32)
     return Surface(
         height=unknown,
@@ -272,65 +265,38 @@ def _nothing(shape: tuple[int, ...]) -> Surface:
     )
 
 
-def _stack(surfaces: list[Surface]) -> RelativeHeights:
-    """Put the surfaces of turns together."""
-    before = np.cumsum([0, *(len(surface.offset_unknown) for surface in surfaces)])
-    components = [
-        np.where(surface.component >= 0, surface.component + np.int32(shift), np.int32(-1))
-        for surface, shift in zip(surfaces, before, strict=False)
-    ]
-    return RelativeHeights(
-        height=np.stack([surface.height for surface in surfaces]),
-        sigma=_stack_known([surface.sigma for surface in surfaces]),
-        component=np.stack(components),
-        offset_unknown=np.ones(before[-1], np.uint8),
-        edges=_stack_known([surface.edges for surface in surfaces]),
-        process=describe_integration(surfaces),
-    )
-
-
-def _stack_known(maps: list[NDArray[Any] | None]) -> NDArray[Any] | None:
-    """Stack maps, if there are all of them."""
+def _stack(maps: list[NDArray[Any] | None], per_turn: bool) -> NDArray[Any] | None:
+    """Return a map of each turn as one, if there are all of them, or that of the only picture."""
     known = [one for one in maps if one is not None]
-    return np.stack(known) if len(known) == len(maps) else None
-
-
-def _only(relief: RelativeHeights) -> RelativeHeights:
-    """Return what is told of the only picture without a leading axis."""
-    return replace(
-        relief,
-        height=relief.height[0],
-        sigma=None if relief.sigma is None else relief.sigma[0],
-        component=relief.component[0],
-        edges=None if relief.edges is None else relief.edges[0],
-    )
-
-
-_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see slopes.cl
-_PARTS = "squares_x", "squares_y"
+    if len(known) < len(maps):
+        return None
+    return np.stack(known) if per_turn else known[0]
 
 
 class SlopeKernels:
-    """Turns normals into slopes and weights, as ``find_slopes`` does of one turn, on the device.
+    """Turns normals into slopes and weights on the device, as `find_slopes` does of one turn.
 
     Parameters
     ----------
     device : Device
     shape : (int, int)
         Rows and columns.
+
+    Attributes
+    ----------
+    typical : float
+        A weight of middle size, which bounds weights; it is found the first time. NaN to find it anew.
     """
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device, self._shape = device, shape
-        self._parts = [device.array(name, shape, np.float32) for name in _PARTS]
-        for array in self._parts:
+        self._squares = {name: device.array(name, shape, np.float32) for name in ("squares_x", "squares_y")}
+        for array in self._squares.values():
             array.upload()
         self.typical = math.nan
 
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
-        """Put the work on the device's queue.
-
-        The first time, a weight as there are many is waited for, ``typical``: it bounds weights.
+        """Put the work on the device's queue; the first time, wait for `typical`.
 
         Parameters
         ----------
@@ -341,29 +307,52 @@ class SlopeKernels:
         to : mapping of str to Array
             ``dz_dx``, ``dz_dy``, ``weight_x`` and ``weight_y``, (H, W), float32.
         """
-        device, (rows, columns) = self._device, self._shape
-        pixels = rows * columns
-        given = normals["vectors"], normals["sigma"], normals["contact"]
-        slopes, weights = (to["dz_dx"], to["dz_dy"]), (to["weight_x"], to["weight_y"])
-        width = 8 if device.layout.tile > 1 else 1
-        find, weigh = (device.kernel("slopes", f"slopes_{name}", WIDTH=width) for name in ("find", "weigh"))
-        least = np.float32(math.sin(tilt) ** 2)
-        items = -(-pixels // device.layout.tile)
-        find(items, np.int32(pixels), least, *given, *slopes, *self._parts, moved=33 * pixels)
-        tile = device.layout.tile
+        rows, columns = self._shape
+        pixels, tile = rows * columns, self._device.layout.tile
+        width, least = 8 if tile > 1 else 1, math.sin(tilt) ** 2
+        find = self._device.kernel("slopes", "slopes_find", WIDTH=width)
+        find(
+            -(-pixels // tile),
+            pixels=pixels,
+            least=least,
+            vectors=normals["vectors"],
+            sigma=normals["sigma"],
+            contact=normals["contact"],
+            dz_dx=to["dz_dx"],
+            dz_dy=to["dz_dy"],
+            **self._squares,
+            moved=33 * pixels,
+        )
+        if math.isnan(self.typical):
+            self._weigh(least, width, (0.0, math.inf), normals["sigma"], to)
+            self.typical = _typical(to["weight_x"], to["weight_y"])
+        typical = 1.0 if math.isnan(self.typical) else self.typical
+        self._weigh(least, width, (LEAST * typical, MOST * typical), normals["sigma"], to)
+
+    def _weigh(
+        self, least: float, width: int, bounds: tuple[float, float], sigma: Array, to: Mapping[str, Array]
+    ) -> None:
+        rows, columns = self._shape
+        tile = self._device.layout.tile
         strip = _STRIP if tile >= _CHUNK else 1
-        items = -(-rows // strip) * -(-columns // min(tile, _CHUNK))
-        for _ in range(2 if math.isnan(self.typical) else 1):
-            typical = 1.0 if math.isnan(self.typical) else self.typical
-            free = math.isnan(self.typical)
-            bounds = (0.0, math.inf) if free else (LEAST * typical, MOST * typical)
-            sizes = np.int32(rows), np.int32(columns), least, *map(np.float32, bounds)
-            weigh(items, *sizes, given[1], slopes[0], *self._parts, *weights, moved=24 * pixels)
-            if free:
-                self.typical = _typical(weights)
+        weigh = self._device.kernel("slopes", "slopes_weigh", WIDTH=width)
+        weigh(
+            -(-rows // strip) * -(-columns // min(tile, _CHUNK)),
+            rows=rows,
+            columns=columns,
+            least=least,
+            lowest=bounds[0],
+            highest=bounds[1],
+            sigma=sigma,
+            dz_dx=to["dz_dx"],
+            weight_x=to["weight_x"],
+            weight_y=to["weight_y"],
+            **self._squares,
+            moved=24 * rows * columns,
+        )
 
 
-def _typical(weights: tuple[Array, Array]) -> float:
+def _typical(*weights: Array) -> float:
     """Return the median of weights above 0, of evenly spread pixels, or NaN where there is none."""
     some = []
     for array in weights:

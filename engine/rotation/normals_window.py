@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_frames, thinning
-from mirrorskin.engine.rotation.correlation import Correlation, WindowSums, tell_wave
+from mirrorskin.engine.rotation.correlation import Correlation, WindowSums
 from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn_fit
-from mirrorskin.engine.rotation.normals import Normals, tell_normals
-from mirrorskin.engine.rotation.normals_kernel import MAPS, NormalOptions, Samples, set_up, settle
-from mirrorskin.engine.rotation.residual_noise import CountNoise
-from mirrorskin.engine.tiling import Band
-from mirrorskin.io import Block, InputError, check_phase
+from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.normals_kernel import MAPS, NormalKernel, NormalOptions, Samples, TurnModel
+from mirrorskin.engine.tiling import Band, join_rows
+from mirrorskin.io import InputError, check_phase
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.correlation import WINDOW
 
 _ROOM = 16  # frames that may be pushed at once without a copy
 
@@ -37,7 +34,7 @@ class NormalWindow:
         uint8, uint16 or float32.
     window : int
         Frames, 3 to 64.
-    tilt, gain, offset, method, noise, low, high, response, device
+    tilt, gain, offset, method, noise, dark, bright, response, device
         As for ``estimate_normals``.
 
     Attributes
@@ -52,26 +49,19 @@ class NormalWindow:
         Parameters that cannot be used.
     """
 
+    position = "phase"
+
     def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        window: int,
-        **options: Unpack[NormalOptions],
+        self, shape: tuple[int, int], dtype: DTypeLike, *, window: int, **options: Unpack[NormalOptions]
     ) -> None:
-        self._shape, self._dtype = shape, np.dtype(dtype)
-        if not 3 <= window <= WINDOW:
-            raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
-        self._window = window
-        self._setup = set_up(shape, self._dtype, **options)
-        self._tilt, self._noise = self._setup.tilt, self._setup.noise
-        self.device, self._launch = self._setup.device, self._setup.launch
-        beside = self._launch.planes
-        self._sums = WindowSums(self.device, shape, self._dtype, _ROOM, window, beside)
-        for band in self._sums.bands:
-            self._launch.write_scale(band)
-        self.count = 0
+        self._shape, self._dtype, self._window = shape, np.dtype(dtype), window
+        self._kernel = NormalKernel(shape, self._dtype, **options)
+        self.device = self._kernel.device
+        planes = self._kernel.planes
+        self._sums = WindowSums(self.device, shape, self._dtype, _ROOM, window, planes)
+        for band in self.bands:
+            self._kernel.write_scale(band)
+        self._model, self.count = self._kernel.model, 0
 
     @property
     def room(self) -> NDArray[Any]:
@@ -85,40 +75,37 @@ class NormalWindow:
 
     @property
     def tilt(self) -> float:
-        """Half-angle of the precession that is reckoned with, radians; once it is known."""
-        assert self._tilt is not None
-        return self._tilt
+        """Half-angle of the precession, given or estimated, radians; once the window is full."""
+        return self._known_model.tilt
 
     @property
     def bands(self) -> list[Band]:
-        """Where the maps are that ``estimate`` leaves; see ``MAPS``."""
+        """Where the maps are that `estimate` leaves, by the names of `MAPS`."""
         return self._sums.bands
 
     def reset(self) -> None:
-        """Forget the frames so far, and what was told from them."""
+        """Forget the frames so far, and what was estimated from them."""
         self._sums.reset()
-        self._tilt, self._noise, self.count = self._setup.tilt, self._setup.noise, 0
+        self._model, self.count = self._kernel.model, 0
 
-    def push(self, block: Block) -> None:
-        """Take in the next frames.
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`.
 
         Raises
         ------
         mirrorskin.io.InputError
-            Frames of another type or size, phases that cannot be used; or the first full window does not
-            tell what noise or tilt there is.
+            Frames of another type or size, phases that cannot be used; or noise or tilt cannot be estimated
+            from the first full window.
         """
-        frames = block.frames
         check_frames(frames, self._dtype, self._shape)
-        phase = check_phase(block.phase, len(frames), "phase")
-        start = 0
-        if not self.is_full:
-            start = min(len(frames), self._window - self.count)
-            self._push(replace(block, frames=frames[:start], phase=phase[:start]))
-            if self.is_full:
-                self._settle()
-        if start < len(frames):
-            self._push(replace(block, frames=frames[start:], phase=phase[start:]))
+        alpha, weights = check_phase(phase, len(frames), "phase"), np.ones(len(frames))
+        filling = max(0, min(len(frames), self._window - self.count))
+        for part in (slice(filling), slice(filling, None)):
+            if len(frames[part]) > 0:
+                self._sums.push(frames[part], alpha[part], weights[part], lent)
+                self.count += len(frames[part])
+            if self.is_full and self._model is None:
+                self._model = self._kernel.estimate_model(self._samples(), self._fit())
 
     def estimate(self, bare: bool = True) -> None:
         """Put the estimate of the window's normals on the device's queue; their maps lie in the bands.
@@ -134,91 +121,76 @@ class NormalWindow:
             The window is not full, or its phases do not determine a normal.
         """
         fit = self._fit()
-        assert self._noise is not None
-        samples = self._sums.oldest, self._window, True
-        self._launch.write_tables([fit])
+        self._kernel.write_tables([fit])
         for band in self.bands:
             with band.resident():
                 ring = band.maps["ring"]
-                known = fit, self._noise, self.tilt
-                self._launch.run(band, Samples(ring, *samples), *known, turns=1, bare=bare)
+                samples = Samples(ring, self._sums.oldest, self._window, ring=True)
+                self._kernel.run(band, samples, fit, self._known_model, turns=1, bare=bare)
                 self._estimated = ring.used
 
     def place(self, heights: NDArray[np.floating]) -> None:
-        """Say where the object is from now on, (H, W), mm above the rest plane; under a calibrated wall."""
+        """Set how high the object stands from now on, (H, W), mm above the rest plane; with a response."""
         for band in self.bands:
             band.write("scale", heights[band.rows], plane=4)
 
-    def normals(self) -> Normals:
-        """Estimate the window's normals, and bring them to the host; more frames may follow.
+    def result(self) -> Normals:
+        """Estimate the window's normals.
 
         Raises
         ------
         mirrorskin.io.InputError
-            As ``estimate``.
+            As `estimate`.
         """
         self.estimate(bare=False)
-        assert self._noise is not None
-        maps = [self.fetch(name) for name in MAPS]
-        return tell_normals(maps, self._noise, self.tilt, 1, self._window)
+        return Normals.of([self.fetch(name) for name in MAPS], self._known_model, 1, self._window)
 
     def correlation(self) -> Correlation:
         """Return the fit of the frames in the window; see ``Correlator.result``."""
-        return tell_wave(self._sums)
+        return self._sums.correlation()
 
     def fetch(self, name: str) -> NDArray[Any]:
         """Wait for a map of the last estimate, and return a copy, (H, W), or (H, W, 3)."""
         parts = []
         for band in self.bands:
             with band.resident():
-                parts.append(self._part(band, band.maps[name].download()).copy())
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+                parts.append(self._without_padding(band, band.maps[name].download()).copy())
+        return join_rows(parts)
 
-    def glance(self, name: str) -> NDArray[Any]:
-        """Return what ``fetch`` does, but wait for the last estimate alone, not for what came after it."""
+    def fetch_early(self, name: str) -> NDArray[Any]:
+        """Return what `fetch` does, but wait for the last estimate alone, not for what came after it."""
         if len(self.bands) > 1:
             return self.fetch(name)
         band = self.bands[0]
-        return self._part(band, band.maps[name].see(self._estimated))
+        return self._without_padding(band, band.maps[name].see(self._estimated))
 
-    def whole(self, name: str) -> Array:
-        """Return a map of the last estimate on the device, where it is one piece, up to the padding."""
+    def on_device(self, name: str) -> Array:
+        """Return a map of the last estimate as one array of the device; it may have padding."""
         if len(self.bands) == 1:
             return self.bands[0].maps[name]
         return self.device.given(name, self.fetch(name), self.bands[0].maps[name].host.dtype)
 
-    def _part(self, band: Band, map_: NDArray[Any]) -> NDArray[Any]:
-        """Return a map of a band without its padding."""
+    @property
+    def _known_model(self) -> TurnModel:
+        assert self._model is not None  # of a full window
+        return self._model
+
+    def _without_padding(self, band: Band, map_: NDArray[Any]) -> NDArray[Any]:
         depth = len(map_)
         flat = map_.reshape(-1)[: depth * band.pixels]
         return flat.reshape(-1, self._shape[1], *([depth] if depth > 1 else []))
 
-    def _push(self, block: Block) -> None:
-        assert block.phase is not None
-        self._sums.push(block.frames, block.phase, np.ones(len(block.frames)), block.lent)
-        self.count += len(block.frames)
-
     def _fit(self) -> TurnFit:
         """Return how the window's frames are fitted."""
-        phase, weight = self._sums.seen()
+        phase, weight = self._sums.frames
         fit = turn_fit(phase, weight) if self.is_full else None
         if fit is None:
             check_phases(phase[weight > 0])  # says what is wrong
             raise InputError(f"{self.count} frames: a window of {self._window} is not full yet")
         return fit
 
-    def _settle(self) -> None:
-        """Tell from the first full window what was not given: the noise, and the tilt."""
-        if self._noise is not None and self._tilt is not None:
-            return
-        fit = self._fit()
-        phase, weight = self._sums.seen()
-        known: tuple[CountNoise | None, float | None] = self._noise, self._tilt
-        told = self._samples(), self._shape, phase, weight, fit.matrix, self._setup.scale
-        self._noise, self._tilt = settle(*told, *known)
-
     def _samples(self) -> NDArray[Any]:
-        """Return each so-manieth pixel of the frames in the window, (N, n), the oldest frame first."""
+        """Return every n-th pixel of the frames in the window, (N, n), the oldest frame first."""
         order = np.roll(np.arange(self._window), -self._sums.oldest)
         step, before, parts = thinning(self._shape), 0, []
         for band in self.bands:

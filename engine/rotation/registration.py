@@ -65,9 +65,8 @@ class Registered:
     ``zenith_offset``, counts are brought to the scale of the pixel that they come to; one that has none, as
     a defect, counts as the mean of those on opposite sides of it.
 
-    Whether the sheet touches a point in every pose is not asked: frames show what is seen there. Nor is it
-    whether a point is hidden by others: a mirror skin takes the object's shape, and a camera that looks along
-    the body's axis sees all of it that does not overhang.
+    It is not checked whether the sheet touches a point in every pose, nor whether a point is hidden: a mirror
+    skin takes the object's shape, and a camera along the body's axis sees all of it that does not overhang.
 
     Parameters
     ----------
@@ -76,13 +75,12 @@ class Registered:
         enters it.
     heights : array_like, (H, W)
         Millimetres of the object's surface; z = 0 is the sheet's rest plane at travel 0. NaN where unknown.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``. It holds five maps and a frame.
-
     header : Header, optional
-        What to believe instead of the source's own.
+        Instead of the source's own.
     sight : Sight, optional
         Of a camera that does not look along the body's axis everywhere.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``. It holds five maps and a frame.
 
     Attributes
     ----------
@@ -107,9 +105,10 @@ class Registered:
         self,
         source: Source,
         heights: ArrayLike,
-        device: str | Device | None = None,
+        *,
         header: Header | None = None,
         sight: Sight | None = None,
+        device: str | Device | None = None,
     ) -> None:
         check_dtype(source.dtype)
         header = source.header if header is None else header
@@ -272,15 +271,15 @@ class _Maps:
         dtype: np.dtype[Any],
         curved: bool,
     ) -> None:
-        rows, columns = height.shape
-        self._device, self._macros = device, _macros(dtype, levels=offset.size > 1)
+        self._rows, self._columns = rows, columns = height.shape
+        self._device = device
+        self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "LEVELS": int(offset.size > 1)}
+        self._macros |= {"TOP": int(np.iinfo(dtype).max)} if dtype.kind == "u" else {}
         self._macros |= {"CURVED": 1} if curved else {}
-        self._sizes = np.int32(rows), np.int32(columns)
-        self._items = rows * -(-columns // device.layout.tile)
         padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
         self._padded = device.given("padded", padding)
-        self._height, self._offset = device.given("height", height), device.given("offset", offset)
-        self._gain = device.given("gain", gain)
+        self._height = device.given("height", height)
+        self._levels = {"offset": device.given("offset", offset), "gain": device.given("gain", gain)}
         places = _mendable(offset, gain)
         self._places = device.given("places", places, np.int32) if len(places) else None
         self._noise = device.given("noise", np.zeros((2, rows, columns), np.float32))
@@ -290,25 +289,28 @@ class _Maps:
 
     def resample(self, frame: NDArray[Any], shift: NDArray[np.float32], out: NDArray[np.float32]) -> None:
         """Write a frame, (H, W), as it looks from the mean pose."""
-        self._fill(self._frame, frame)
-        self._fill(self._shift, shift)
-        levels = self._offset, self._gain
-        counts, samples = self._frame.host.nbytes, self._registered.host.nbytes
-        self._run("registration_admit", self._frame, *levels, self._padded, moved=counts + samples)
+        _fill(self._frame, frame)
+        _fill(self._shift, shift)
+        tile, size = self._device.layout.tile, self._registered.host.nbytes
+        items = self._rows * -(-self._columns // tile)
+        known = {"rows": self._rows, "columns": self._columns, "padded": self._padded, **self._levels}
+        admit, mend, resample = (
+            self._device.kernel("registration", f"registration_{name}", **self._macros)
+            for name in ("admit", "mend", "resample")
+        )
+        admit(items, **known, frame=self._frame, moved=self._frame.host.nbytes + size)
         if self._places is not None:
-            kernel = self._device.kernel("registration", "registration_mend", **self._macros)
             count = len(self._places.host)
-            kernel(
-                -(-count // self._device.layout.tile),
-                np.int32(count),
-                self._places,
-                self._padded,
-                moved=9 * 4 * count,
-            )
-        self._run(
-            "registration_resample",
-            *(self._padded, self._height, self._shift, *levels, self._registered, self._noise),
-            moved=7 * samples,
+            places = {"places": self._places, "padded": self._padded}
+            mend(-(-count // tile), count=count, **places, moved=9 * 4 * count)
+        resample(
+            items,
+            **known,
+            height=self._height,
+            shift=self._shift,
+            registered=self._registered,
+            noise=self._noise,
+            moved=7 * size,
         )
         out[:] = self._registered.download()
 
@@ -320,16 +322,13 @@ class _Maps:
 
     def forget(self) -> None:
         """Begin the noise anew."""
-        self._fill(self._noise, np.zeros_like(self._noise.host))
+        _fill(self._noise, np.zeros_like(self._noise.host))
 
-    def _fill(self, array: Array, values: NDArray[Any]) -> None:
-        array.claim()
-        array.host[:] = values
-        array.upload()
 
-    def _run(self, name: str, *arrays: Array, moved: int) -> None:
-        kernel = self._device.kernel("registration", name, **self._macros)
-        kernel(self._items, *self._sizes, *arrays, moved=moved)
+def _fill(array: Array, values: NDArray[Any]) -> None:
+    array.claim()
+    array.host[:] = values
+    array.upload()
 
 
 def _mendable(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -349,11 +348,6 @@ def _mendable(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray
     known = chosen[0] > 0
     lost, (one, other) = lost[known], chosen[:, known]
     return np.stack([lost, lost - one, lost + one, lost - other, lost + other], axis=1).astype(np.int32)
-
-
-def _macros(dtype: np.dtype[Any], levels: bool) -> dict[str, str | int]:
-    top = {"TOP": int(np.iinfo(dtype).max)} if dtype.kind == "u" else {}
-    return {"FRAME": C_TYPES[dtype.name], "LEVELS": int(levels), **top}
 
 
 def _known(source: Source, header: Header, name: str) -> Any:

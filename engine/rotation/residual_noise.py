@@ -1,4 +1,4 @@
-"""The noise of a rotation's samples, from the residuals of a fit of waves."""
+"""The noise of a rotation's samples, from the residuals of a fit of waves to one turn."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from mirrorskin.engine.frames import QUANTUM
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError
 
-_FLOAT = 1e-6  # of the greatest count: the least noise that float frames are taken to have
-_FRAMES_OF_TWO, _APART = 7, 100.0  # frames, and condition, with which a second wave is told from the first
-_PARTS, _ENOUGH = 16, 200  # parts by brightness, and pixels of one
-_ROUNDS, _USUAL = 10, 0.2  # of the fit of a line, and by which share a part's variance may miss it
-_BEYOND = 1e-3  # share of the pixels that noise alone puts out
+_FLOAT_NOISE = 1e-6  # of the greatest count: the least noise that float frames are taken to have
+_FRAMES_OF_TWO, _MAX_CONDITION = (
+    7,
+    100.0,
+)  # least frames, and condition, to fit a second wave beside the first
+_BINS, _BIN_PIXELS = 16, 200  # bins of brightness at most, and pixels of one at least
+_ROUNDS, _OUTLYING = 10, 0.2  # of the line's robust fit, and share by which a variance may miss it
+_BEYOND = 1e-3  # share of the pixels whose sum of squares is that large by noise alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +29,7 @@ class CountNoise:
     Attributes
     ----------
     base : float
-        Variance at 0 counts, were it to go on like that down to there.
+        Variance at 0 counts, extrapolated.
     slope : float
         Variance per count.
     least : float
@@ -44,60 +46,61 @@ class CountNoise:
 
 
 def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> CountNoise:
-    """Estimate the noise of samples from what waves of one and two a turn leave.
+    """Estimate the noise of samples of weight 1 from what waves of one and two a turn leave.
 
     Level surfaces show the second one; of fewer than 7 frames a turn it is taken for noise. Pixels are sorted
-    by their brightness. Of each part, the median of the sums of squares tells the variance at first. Then
-    those beyond chi-square's quantile of 99.9 % are left out, until that settles: pixels that lose contact.
-    Through the parts' variances goes a line that does not fall.
+    by their brightness into bins. The median of a bin's sums of squares is a first guess of its variance;
+    then those beyond chi-square's quantile of 99.9 %, of pixels that lose contact, are left out until that
+    changes nothing. Through the bins' variances goes a line that does not fall.
 
     Parameters
     ----------
     samples : ndarray, (N, n), uint8, uint16 or float32
-        Of n pixels. Frames that have less than half as many whole samples as others are left out, and then
+        Of n pixels. Frames that have less than half as many valid samples as others are left out, and then
         pixels of which a sample is clipped by its type or no number.
     phase, weights : ndarray, (N,), float64
         Radians, and weights above 0.
-
-    Returns
-    -------
-    CountNoise
-        Of a sample of weight 1.
-
-    Raises
-    ------
-    InputError
-        Three frames, of which a fit leaves nothing, or no pixel that is whole.
     """
     if len(samples) == 3:
-        raise InputError("3 frames a turn tell no noise: give the standard deviation of a sample in counts")
-    good = whole(samples)
-    quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT
+        raise InputError(
+            "3 frames a turn leave no residual to estimate the noise from: give its standard deviation"
+        )
+    good = valid(samples)
+    quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT_NOISE
     if not (good.sum(axis=0) >= 3).any():  # no pixel will have an answer
         return CountNoise(quantum**2, 0.0, quantum**2)
     share = good.mean(axis=1)
-    frames = share > share.max() / 2  # one that is missing or clipped tells nothing
+    frames = share > share.max() / 2
     pixels = good[frames].all(axis=0)
     if np.count_nonzero(frames) <= 3 or not pixels.any():
         raise InputError(
-            "too few samples are whole to tell the noise: give the standard deviation of a sample in counts"
+            "too few samples are valid to estimate the noise: give a sample's standard deviation, in counts"
         )
     counts, phase, weights = samples[frames][:, pixels].astype(np.float64), phase[frames], weights[frames]
     floor = quantum * (1.0 if samples.dtype.kind == "u" else float(np.max(np.abs(counts))))
     root = np.sqrt(weights)[:, np.newaxis]
     waves = root * _waves(phase)
-    left = root * counts - waves @ (np.linalg.pinv(waves) @ (root * counts))
-    squares, level = np.sum(left**2, axis=0), counts.mean(axis=0)
+    residual = root * counts - waves @ (np.linalg.pinv(waves) @ (root * counts))
+    squares, level = np.sum(residual**2, axis=0), counts.mean(axis=0)
     freedom = len(counts) - waves.shape[1]
     order = np.argsort(level, kind="stable")
-    parts = np.array_split(order, max(1, min(_PARTS, len(order) // _ENOUGH)))
-    variances = np.array([_variance(squares[part], freedom) for part in parts])
-    levels = np.array([level[part].mean() for part in parts])
+    bins = np.array_split(order, max(1, min(_BINS, len(order) // _BIN_PIXELS)))
+    variances = np.array([_variance(squares[one], freedom) for one in bins])
+    levels = np.array([level[one].mean() for one in bins])
     return _line(levels, np.maximum(variances, floor**2), floor**2)
 
 
+def valid(samples: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which samples, of any shape, are neither clipped by their type nor NaN or infinite."""
+    if samples.dtype.kind == "f":
+        return np.asarray(np.isfinite(samples))
+    return np.asarray((samples > 0) & (samples < np.iinfo(samples.dtype).max))
+
+
 def _variance(squares: Doubles, freedom: int) -> float:
-    """Return the variance of normal samples from sums of so many squares, some of which are of others."""
+    """Return the variance of normal samples from sums of squares, some of which are of other pixels."""
+    from scipy import special
+
     furthest = float(special.chdtri(freedom, _BEYOND))
     kept_share = float(special.chdtr(freedom + 2, furthest) / special.chdtr(freedom, furthest))
     variance = float(np.median(squares)) / float(special.chdtri(freedom, 0.5))
@@ -109,32 +112,24 @@ def _variance(squares: Doubles, freedom: int) -> float:
 
 
 def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
-    """Lay a line that does not fall through variances, which parts that are quite wrong do not bend."""
+    """Fit a line that does not fall to variances, robustly: iteratively reweighted least squares."""
     weights = 1 / variances
     base, slope = float(np.median(variances)), 0.0
     for _ in range(_ROUNDS if np.ptp(levels) > 0 else 0):
         centre = np.average(levels, weights=weights**2)
         mean = np.average(variances, weights=weights**2)
-        apart = levels - centre
-        slope = max(
-            0.0, float(np.sum(weights**2 * apart * (variances - mean)) / np.sum(weights**2 * apart**2))
-        )
+        off_centre = levels - centre
+        rise = np.sum(weights**2 * off_centre * (variances - mean)) / np.sum(weights**2 * off_centre**2)
+        slope = max(0.0, float(rise))
         base = float(mean - slope * centre)
         fitted = np.maximum(base + slope * levels, least)
         off = np.abs(variances - fitted) / fitted
-        weights = np.sqrt(np.minimum(1.0, _USUAL / np.maximum(off, _USUAL))) / fitted
+        weights = np.sqrt(np.minimum(1.0, _OUTLYING / np.maximum(off, _OUTLYING))) / fitted
     return CountNoise(base, slope, least)
 
 
 def _waves(phase: Doubles) -> Doubles:
-    """Return what to fit, (N, 3 or 5): one wave a turn, and two where the phases tell them apart."""
+    """Return what to fit, (N, 3 or 5): one wave a turn, and two where the phases separate them."""
     one = basis(phase)
     both = np.concatenate([one, basis(2 * phase)[:, 1:]], axis=1)
-    return both if len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _APART else one
-
-
-def whole(samples: NDArray[Any]) -> NDArray[np.bool_]:
-    """Tell which samples, of any shape, are neither clipped by their type nor no number."""
-    if samples.dtype.kind == "f":
-        return np.asarray(np.isfinite(samples))
-    return np.asarray((samples > 0) & (samples < np.iinfo(samples.dtype).max))
+    return both if len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _MAX_CONDITION else one

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.provenance import naming
@@ -14,9 +15,9 @@ from mirrorskin.engine.rotation.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Precession, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.normals_wall import Wall
 
-_SAMPLES = 400  # of the curve, to tell its ends and its inverse from
-_INVERSE = 8  # numbers of the inverse, which is where to begin only
-_MOST = 12  # numbers of a curve
+_SAMPLES = 400  # of the curve, to find its ends and its inverse
+_INVERSE = 8  # coefficients of the inverse, which is a starting point only
+_MAX_CURVE = 12  # coefficients of a curve
 _DARK = 0.05  # share of full light that is next to none
 
 HALF_WAY = 0.5
@@ -25,13 +26,13 @@ HALF_WAY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """How light each pixel gets from which normal; it takes the place of a ``Scale``.
+    """How bright each pixel gets from which normal; it takes the place of a ``Scale``.
 
     Attributes
     ----------
     planes : ndarray, (5, H, W), float32
         Counts without light; light per count; x and y from the wall's axis, and height z of the object in the
-        mean pose above the rest plane, mm. NaN where a pixel tells nothing.
+        mean pose above the rest plane, mm. NaN where a pixel has no response.
     wall : Wall
     sigma : ndarray, (H, W), float32
         Standard error of the normals that the calibration makes, radians; NaN where it is unknown.
@@ -43,16 +44,8 @@ class Response:
     wall: Wall
     sigma: NDArray[np.float32]
     axis: tuple[float, float]
-
-    @property
-    def per_pixel(self) -> bool:
-        """Whether each pixel has planes of its own: it has."""
-        return True
-
-    @property
-    def ends(self) -> bool:
-        """Whether there is a range out of which light tells nothing: there is."""
-        return True
+    per_pixel = True  # each pixel has planes of its own
+    ends = True  # there is a range of light out of which a sample is left out
 
     @property
     def sight(self) -> Sight:
@@ -63,31 +56,23 @@ class Response:
 
     @property
     def table(self) -> NDArray[np.float32]:
-        """What ``normals.cl`` is told of the wall: see the names there."""
+        """The wall's numbers in the order of the names in ``normals.cl``."""
         wall = self.wall
         radius, rim, scatter = wall.geometry
         low, high = wall.reach
-        curve = np.polynomial.Polynomial(wall.curve).convert(
-            domain=[low, high], window=[-1, 1], kind=np.polynomial.Polynomial
-        )
+        curve = Polynomial(wall.curve).convert(domain=[low, high], window=[-1, 1], kind=Polynomial)
         known = [radius, rim, np.sin(scatter) ** 2, *wall.sight, *(lamp / radius for lamp in wall.lamps)]
         known += [low, high, *wall.ends, wall.sense, *wall.pivot, (low + high) / 2, 2 / (high - low)]
-        numbers = np.zeros(len(wall.curve))
-        numbers[: len(curve.coef)] = curve.coef
-        return np.array([*known, *wall.inverse, *numbers], np.float32)
+        return np.array([*known, *wall.inverse, *_padded(curve, len(wall.curve))], np.float32)
 
     def thinned(self, step: int) -> Doubles:
-        """Return the planes of each so-manieth pixel, (5, n)."""
+        """Return the planes of every ``step``-th pixel, (5, n)."""
         return self.planes.reshape(5, -1)[:, ::step].astype(np.float64)
 
-    def telling(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
-        """Tell which pixels, of each so-manieth, stay within the range of the light over a turn.
+    def clear_pixels(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
+        """Return which of every ``step``-th pixel stay within the range of the light over a turn.
 
-        Parameters
-        ----------
-        wave : ndarray, (3, n), float64
-            Mean, cosine and sine of the samples, counts.
-        step : int
+        ``wave``, (3, n), is mean, cosine and sine of the samples, counts.
         """
         offset, per_count = self.thinned(step)[:2]
         mean, swing = (wave[0] - offset) * per_count, np.hypot(*wave[1:]) * np.abs(per_count)
@@ -95,14 +80,8 @@ class Response:
         with np.errstate(invalid="ignore"):
             return np.asarray((mean - swing > low) & (mean + swing < high))
 
-    def level(self, mean: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Tell where a surface is too level to be seen: it shows what lies over the rim of the wall.
-
-        Parameters
-        ----------
-        mean : ndarray, (H, W), float32
-            Of the samples, counts.
-        """
+    def too_level(self, mean: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return where the surface is too level to be seen: it shows what lies over the wall's rim."""
         wall = self.wall
         rim = float(np.polynomial.polynomial.polyval(wall.reach[1], wall.curve))
         with np.errstate(invalid="ignore"):
@@ -124,43 +103,32 @@ class Response:
 
 
 def wall_response_of(source: Source) -> WallResponse | None:
-    """Return the response of a source's calibration, if it has one that tells zeniths."""
+    """Return the response of a source's calibration, if it has one that gives zeniths."""
     known = source.calibration if isinstance(source, Calibrated) else None
     if known is None or known.zenith is None or known.zenith.pattern != "graded":
         return None
-    return known.zenith if known.precession is None else _with_oval(known.zenith, known.precession)
+    return known.zenith if known.precession is None else _with_ellipse(known.zenith, known.precession)
 
 
-def _with_oval(wall: WallResponse, precession: Precession) -> WallResponse:
+def _with_ellipse(wall: WallResponse, precession: Precession) -> WallResponse:
     """Add to the azimuth's errors what comes of taking one half-angle d where the lean goes round an ellipse.
 
     Of ellipticity e the half-angle is d (1 + e cos 2(a - m)) at azimuth a, m that of the greatest. A surface
     inclined towards p so seems to change, beside the third harmonic, by d e/2 cos(a - 2m + p): as if p were
     e/2 sin 2(p - m) off, root mean square e / (2 sqrt 2). As for the rest, the zenith is in mid range.
     """
-    oval = abs(precession.ellipticity) / math.sqrt(8)
-    if not oval > 0:
+    error = abs(precession.ellipticity) / math.sqrt(8)
+    if not error > 0:
         return wall
     zenith = math.pi / 4 - math.atan(sum(wall.reach) / 2)
-    sigma = np.hypot(wall.azimuth_sigma, np.float32(oval * math.sin(zenith)))
+    sigma = np.hypot(wall.azimuth_sigma, np.float32(error * math.sin(zenith)))
     return replace(wall, azimuth_sigma=sigma)
 
 
 def initial_response(wall: WallResponse, source: Source, header: Header) -> Response:
     """Return the response for a source's pixels, the object taken to stand as high as half the press.
 
-    Parameters
-    ----------
-    wall : WallResponse
-        With maps of the source's pictures.
-    source : Source
-    header : Header
-        What to believe of it.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The header says too little, or what `make_response` raises.
+    ``header`` counts instead of the source's own.
     """
     if header.pixel_size is None or header.press is None:
         missing = "pixel size" if header.pixel_size is None else "press"
@@ -196,19 +164,13 @@ def make_response(
         As for `Response.at`.
     pivot : (float, float, float), optional
         What the body turns about, mm; by default the centre of the rest sheet.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        A response that tells no zenith, or no references to tell the light by.
     """
     if wall.pattern != "graded":
+        raise InputError("the calibration is of a uniform pattern, but normals need a graded one")
+    if not 1 < len(wall.curve) <= _MAX_CURVE:
         raise InputError(
-            "the calibration is of a uniform pattern, which tells no zenith: normals need a graded one"
-        )
-    if not 1 < len(wall.curve) <= _MOST:
-        raise InputError(
-            f"the calibration's curve has {len(wall.curve)} numbers, 2 to {_MOST} are needed: calibrate again"
+            f"the calibration's curve has {len(wall.curve)} coefficients, 2 to {_MAX_CURVE} are needed:"
+            " calibrate again"
         )
     if dark is None or bright is None:
         raise InputError("the calibration's response needs dark and bright references: calibrate them, too")
@@ -239,15 +201,12 @@ def shade(wall: WallResponse, x: Doubles, y: Doubles) -> Doubles:
 
 
 def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: bool) -> Wall:
-    """Work out what the kernel is told besides: the ends of the light, and where to begin."""
+    """Return the wall as kernels take it: with the ends of the light, and the curve's inverse."""
     q = np.linspace(*wall.reach, _SAMPLES)
     curve = np.asarray(wall.curve, np.float64)
     light = np.polynomial.polynomial.polyval(q, curve)
     uneven = float(np.hypot(*wall.lamps))
-    inverse = np.polynomial.Polynomial.fit(light, q, _INVERSE - 1, domain=[light.min(), light.max()])
-    numbers = np.zeros(_INVERSE)
-    coefficients = inverse.convert().coef
-    numbers[: len(coefficients)] = coefficients
+    inverse = Polynomial.fit(light, q, _INVERSE - 1, domain=[light.min(), light.max()]).convert()
     return Wall(
         geometry=(wall.radius, wall.rim, wall.scatter),
         sight=wall.sight,
@@ -255,8 +214,15 @@ def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: boo
         curve=curve,
         reach=wall.reach,
         ends=(float(light.min()) * (1 - uneven), float(light.max()) * (1 + uneven)),
-        inverse=numbers,
+        inverse=_padded(inverse, _INVERSE),
         sense=1.0 if light[0] > light[-1] else -1.0,
         pivot=(pivot[0] - wall.axis[0], pivot[1] - wall.axis[1], pivot[2]),
         follows=follows,
     )
+
+
+def _padded(polynomial: Polynomial, count: int) -> Doubles:
+    """Return the coefficients of a polynomial, of which high ones may be missing."""
+    numbers = np.zeros(count)
+    numbers[: len(polynomial.coef)] = polynomial.coef
+    return numbers

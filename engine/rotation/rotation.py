@@ -1,14 +1,17 @@
-"""Normals, contact, edges and heights from an axial rotation; or its wave alone."""
+"""Normals, contact, edges and heights from an axial rotation; or its wave alone.
+
+Frames are read once where brightness is linear in the zenith. Under a calibrated wall, what a pixel shows
+depends on the height of what it sees as well: that is found in the first turn, unless it is given.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.nearest import with_nearest
 from mirrorskin.engine.provenance import naming, sign, told, told_level
@@ -24,22 +27,25 @@ from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_resp
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Block, Header, InputError, ProcessValue, Result, Source, WallResponse, check_phase
+from mirrorskin.io.types import Closing
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
+_REACH = 5  # pixels across, of which a registered sample may be made
+_ROUNDS = 2  # in which it is found how high the object stands
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """What a rotation tells of each pixel.
+    """What was found of each pixel.
 
     Attributes
     ----------
     normals : Normals
-    white : ndarray, (H, W), float32
+    independent_sigma : ndarray, (H, W), float32
         The predicted errors, radians, that normals would have without registration. That makes errors smaller
-        but neighbours' alike, and means over many pixels no better.
+        but correlates those of neighbours, and means over many pixels are no better.
     edges : ndarray, (H, W), uint8
     device : Device
     process : dict
@@ -49,10 +55,10 @@ class Rotation:
     """
 
     normals: Normals
-    white: NDArray[np.float32]
+    independent_sigma: NDArray[np.float32]
     edges: NDArray[np.uint8]
     device: Device
-    process: dict[str, ProcessValue]
+    process: dict[str, ProcessValue] = field(default_factory=dict)
     systematic: NDArray[np.float32] | None = None
 
 
@@ -83,17 +89,17 @@ def reconstruct_rotation(
     source : Source
         Of axial motion. It is rewound first, if it can be.
     method : {"exact", "paper"}
-        See ``estimate_normals``.
+        See `mirrorskin.engine.estimate_normals`.
     tilt : float or "estimate", optional
         Half-angle of the precession, radians; by default the source's own. It is estimated from the first
         turn on request only: where the pivot is far from the object's surface, that is wrong.
     gain, offset : array_like, scalar or (H, W), optional
         Counts per radian of zenith, and counts at zenith 0, instead of the source's own and of a calibrated
-        response; an offset that nobody knows is 0.
+        response; an unknown offset is 0.
     noise : float, optional
-        Standard deviation of a sample, counts; by default told from the first turn.
+        Standard deviation of a sample, counts; by default estimated from the first turn.
     per_turn : bool
-        Whether to tell each turn alone, in maps with a leading axis, instead of the mean over turns.
+        Whether to return each turn alone, in maps with a leading axis, instead of the mean over turns.
     heights : array_like, (H, W), optional
         Millimetres of the surface: frames are registered for the pivot's shift with them first; see
         ``Registered``. A calibrated response needs them in any case: where they are not given, they are found
@@ -106,7 +112,7 @@ def reconstruct_rotation(
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
     progress : callable, optional
-        Told the number of frames so far.
+        Called with the number of frames so far.
 
     Returns
     -------
@@ -120,8 +126,12 @@ def reconstruct_rotation(
         The heights that fit the normals were not found.
     """
     if gain is None and source.header.zenith_gain is None and wall_response_of(source) is None:
-        check_method(source, method)
-        _need_no_gain(source, per_turn, heights)
+        _check_method(source, method)
+        if per_turn or heights is not None:
+            option = "turns of their own" if per_turn else "use for heights"
+            raise InputError(
+                f"{source.name} has no zenith gain, so no normals, and no {option}: give the gain"
+            )
         return correlate_source(source, memory_limit=memory_limit, device=device, progress=progress)
     found = estimate_rotation(
         source,
@@ -136,22 +146,22 @@ def reconstruct_rotation(
         device=device,
         progress=progress,
     )
-    result = rotation_maps(found)
-    if source.header.pixel_size is None:
+    result, pixel_size = rotation_maps(found), source.header.pixel_size
+    if pixel_size is None:
         return sign(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
     with naming(source):
-        relief = integrate_normals(
-            found.normals, found.white, source.header.pixel_size, robust=robust, device=found.device
+        surface = integrate_normals(
+            found.normals, found.independent_sigma, pixel_size, robust=robust, device=found.device
         )
     result = replace(
         result,
-        height=relief.height,
-        height_sigma=relief.sigma,
-        component=relief.component,
-        offset_unknown=relief.offset_unknown,
-        edges=found.edges if relief.edges is None else found.edges | relief.edges,
+        height=surface.height,
+        height_sigma=surface.height_sigma,
+        component=surface.component,
+        offset_unknown=surface.offset_unknown,
+        edges=found.edges if surface.edges is None else found.edges | surface.edges,
     )
-    return sign(result, source, found.device, found.process | relief.process)
+    return sign(result, source, found.device, {**found.process, **surface.process})
 
 
 def estimate_rotation(
@@ -168,26 +178,27 @@ def estimate_rotation(
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> Rotation:
-    """Find the normals of a rotation whose zenith gain is known; see ``reconstruct_rotation``."""
-    check_method(source, method)
-    header = _believe(source, tilt, gain, offset)
+    """Find the normals of a rotation whose zenith gain is known; see `reconstruct_rotation`."""
+    _check_method(source, method)
+    header = _header(source, tilt, gain, offset)
     wall = wall_response_of(source) if gain is None else None
-    run = Run(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
+    passes = _Passes(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
     if heights is not None and tilt == "estimate":
         raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
     if wall is None:
-        found = run.linear(heights)
-        process: dict[str, ProcessValue] = {
+        found = passes.linear(heights)
+        scale: dict[str, ProcessValue] = {
             "zenith_gain": told(gain, source.header.zenith_gain, "none"),
             "zenith_offset": told(offset, source.header.zenith_offset, "0"),
             "low": told_level(source, "dark"),
             "high": told_level(source, "bright"),
             "heights": "none" if heights is None else "given",
         }
+        found = replace(found, process=scale)
     else:
-        found, process = run.calibrated(wall, heights)
+        found = passes.calibrated(wall, heights)
     normals = found.normals
-    process = {
+    process: dict[str, ProcessValue] = {
         "method": method,
         "tilt": normals.tilt,
         "tilt_from": "estimate" if tilt == "estimate" else "given" if tilt is not None else "recording",
@@ -196,9 +207,8 @@ def estimate_rotation(
         "turns": normals.turns,
         "frames": normals.frames,
         "per_turn": per_turn,
-        **process,
     }
-    return Rotation(normals, found.white, found.edges, run.device, process, found.systematic)
+    return replace(found, process=process | found.process)
 
 
 def correlate_source(
@@ -228,11 +238,9 @@ def correlate_source(
         The phases do not determine the fit.
     """
     opened = open_device(device)
-    size = math.prod(source.shape) * source.dtype.itemsize
+    limit = min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize)
     with naming(source):
-        correlator = Correlator(
-            source.shape[1:], source.dtype, device=opened, memory_limit=min(memory_limit, 2 * size)
-        )
+        correlator = Correlator(source.shape[1:], source.dtype, device=opened, memory_limit=limit)
         feed(source, correlator, range(source.shape[0]), progress)
         wave = correlator.result()
     result = Result(
@@ -247,13 +255,13 @@ def correlate_source(
 
 
 def rotation_maps(rotation: Rotation) -> Result:
-    """Put together what a rotation tells, but heights."""
-    normals = rotation.normals
+    """Return the maps of a rotation, but heights."""
+    normals, systematic = rotation.normals, rotation.systematic
     return Result(
         normals=normals.vectors,
         zenith=normals.zenith,
         azimuth=normals.azimuth,
-        normal_sigma=_with_systematic(normals.sigma, rotation.systematic),
+        normal_sigma=normals.sigma if systematic is None else np.hypot(normals.sigma, systematic),
         mean=normals.mean,
         modulation=normals.modulation,
         residual=normals.residual,
@@ -262,20 +270,13 @@ def rotation_maps(rotation: Rotation) -> Result:
     )
 
 
-def check_method(source: Source, method: str) -> None:
-    """Refuse a method that is none of a rotation."""
+def _check_method(source: Source, method: str) -> None:
     if method not in NORMAL_METHODS:
         known = ", ".join(NORMAL_METHODS)
         raise InputError(f"{source.name} is a rotation, which method {method!r} cannot do: take {known}")
 
 
-def _with_systematic(
-    sigma: NDArray[np.float32], systematic: NDArray[np.float32] | None
-) -> NDArray[np.float32]:
-    return sigma if systematic is None else np.hypot(sigma, systematic)
-
-
-def _believe(
+def _header(
     source: Source,
     tilt: float | Literal["estimate"] | None,
     gain: ArrayLike | None,
@@ -295,40 +296,9 @@ def _believe(
     return replace(header, tilt=used, zenith_gain=known_gain, zenith_offset=known_offset)
 
 
-def _need_no_gain(source: Source, per_turn: bool, heights: ArrayLike | None) -> None:
-    """Refuse what only normals have, of a source without a zenith gain."""
-    if per_turn or heights is not None:
-        asked = "turns of their own" if per_turn else "use for heights"
-        raise InputError(f"{source.name} has no zenith gain, so no normals, and no {asked}: give the gain")
-
-
-_REACH = 5  # pixels across, of which a registered sample may be made
-_ROUNDS = 2  # in which it is found how high the object stands
-
-
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What a run tells; see ``mirrorskin.engine.rotation.rotation.Rotation``."""
-
-    normals: Normals
-    white: NDArray[np.float32]
-    edges: NDArray[np.uint8]
-    systematic: NDArray[np.float32] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """How a rotation is to be told.
-
-    Attributes
-    ----------
-    source : Source
-    header : Header
-        What to believe of it; a tilt of None is one to estimate.
-    device : Device
-    method, noise, per_turn, memory_limit, progress
-        As for ``reconstruct_rotation``.
-    """
+class _Passes:
+    """The passes over a source's frames; ``header`` counts instead of the source's own."""
 
     source: Source
     header: Header
@@ -339,143 +309,122 @@ class Run:
     memory_limit: int
     progress: Progress | None
 
-    def linear(self, heights: ArrayLike | None) -> Found:
-        """Tell the normals of pixels that are linear in the zenith; registered, if there are heights."""
+    def linear(self, heights: ArrayLike | None) -> Rotation:
+        """Find the normals of pixels that are linear in the zenith; registered, if there are heights."""
         frames: Source = self.source
         if heights is not None:
-            frames = Registered(self.source, heights, self.device, self.header)
-        return self._told(frames, self._normals(frames, None, self.per_turn, self.progress))
+            frames = Registered(self.source, heights, device=self.device, header=self.header)
+        return self._rotation(frames, None)
 
-    def calibrated(
-        self, wall: WallResponse, heights: ArrayLike | None
-    ) -> tuple[Found, dict[str, ProcessValue]]:
-        """Tell the normals under a wall, and how.
-
-        Where a pixel looks depends on the height of what it sees. Heights that are not given are found in the
-        first turn; see `coarse_heights`. Frames are registered with them where the pivot is known.
-        """
+    def calibrated(self, wall: WallResponse, heights: ArrayLike | None) -> Rotation:
+        """Find the normals under a wall, with frames registered where the pivot is known."""
         response = initial_response(wall, self.source, self.header)
         if heights is not None:
             known = check_heights(heights, self.source.shape[1:])
-            how, stand = "given", with_nearest(known).astype(np.float64)
+            origin, stand = "given", with_nearest(known).astype(np.float64)
         elif self.source.rewindable:
-            how, stand = "found in the first turn", self._stand(response)
+            origin, stand = "found in the first turn", self._stand(response)
         else:
-            how, stand = "half the press: the source cannot be read twice", self._half_way()
+            origin, stand = "half the press: the source cannot be read twice", self._half_way()
         frames, response = self._placed_at(self.source, response, stand)
-        found = self._told(frames, self._normals(frames, response, self.per_turn, self.progress))
         process: dict[str, ProcessValue] = {
             "zenith": "calibrated",
             "zenith_error": wall.error,
-            "heights": how,
+            "heights": origin,
             "registered": isinstance(frames, Registered),
         }
-        return replace(found, systematic=response.sigma), process
+        return replace(self._rotation(frames, response), process=process, systematic=response.sigma)
 
     def _stand(self, response: Response) -> Doubles:
         """Find from the first turn how high the object is, less the press, (H, W), mm."""
-        pixel_size, press = self.header.pixel_size, self.header.press
+        pixel_size, press = self.header.pixel_size, self._press
         assert pixel_size is not None
-        assert press is not None
+        once = replace(self, per_turn=False, progress=None)
         turn, heights = FirstTurn(self.source), self._half_way()
         for _ in range(_ROUNDS):
             frames, response = self._placed_at(turn, response, heights)
-            normals = self._normals(frames, response, False, None)
-            maps = normals.vectors, normals.contact, response.level(normals.mean)
-            heights = coarse_heights(*maps, pixel_size, press, self.device) - press
+            normals = once._normals(frames, response)
+            too_level = response.too_level(normals.mean)
+            stand = coarse_heights(
+                normals.vectors, normals.contact, too_level, pixel_size, press, self.device
+            )
+            heights = stand - press
         return heights
 
     def _half_way(self) -> Doubles:
         """Return the height of an object of which nothing is known yet, less the press, (H, W), mm."""
-        assert self.header.press is not None
-        return np.full(self.source.shape[1:], -HALF_WAY * self.header.press)
+        return np.full(self.source.shape[1:], -HALF_WAY * self._press)
+
+    @property
+    def _press(self) -> float:
+        assert self.header.press is not None  # or there is no response
+        return self.header.press
 
     def _placed_at(self, source: Source, response: Response, heights: Doubles) -> tuple[Source, Response]:
         """Return frames that follow an object of known heights, mm, if they can, and the response to them."""
         follows = self.header.pivot is not None and self.header.tilt is not None
-        assert self.header.press is not None
-        response = response.at(self.header.press + heights, follows)
-        if follows:
-            levels = self._levels(response)
-            return Registered(source, heights, self.device, levels, response.sight), response
-        return source, response
+        response = response.at(self._press + heights, follows)
+        if not follows:
+            return source, response
+        offset, per_count = response.planes[:2]  # counts without light, and for full light, as a scale
+        header = replace(self.header, zenith_offset=offset, zenith_gain=1 / per_count)
+        sight = response.sight
+        return Registered(source, heights, device=self.device, header=header, sight=sight), response
 
-    def _levels(self, response: Response) -> Header:
-        """Return the header with each pixel's counts without light, and for full light, as a scale."""
-        offset, per_count = response.planes[:2]
-        return replace(self.header, zenith_offset=offset, zenith_gain=1 / per_count)
-
-    def _normals(
-        self, frames: Source, response: Response | None, per_turn: bool, progress: Progress | None
-    ) -> Normals:
+    def _normals(self, frames: Source, response: Response | None) -> Normals:
         """Feed the frames through an estimator."""
+        phase: NDArray[np.float64] | None = getattr(frames, "phase", None)
         size = math.prod(frames.shape) * frames.dtype.itemsize
         with naming(self.source):
             estimator = NormalEstimator(
                 frames.shape[1:],
                 frames.dtype,
-                longest=_longest_turn(frames),
-                per_turn=per_turn,
+                longest=LONGEST if phase is None else longest_turn(phase),
+                per_turn=self.per_turn,
                 memory_limit=min(self.memory_limit, 2 * size),
                 **options_from(self.header, self.method, self.noise, response, self.device),
             )
-            feed(frames, estimator, range(frames.shape[0]), progress)
+            feed(frames, estimator, range(frames.shape[0]), self.progress)
             return estimator.result()
 
-    def _told(self, frames: Source, normals: Normals) -> Found:
-        """Find the edges, and account for a registration."""
-        edges = _edges(normals, self.device)  # where contact ends, before that is moved inwards
-        white = normals.sigma
+    def _rotation(self, frames: Source, response: Response | None) -> Rotation:
+        """Find normals and edges, and account for a registration."""
+        normals = self._normals(frames, response)
+        maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact]
+        if normals.contact.ndim == 3:
+            edges = np.stack([find_edges(*turn, device=self.device) for turn in zip(*maps, strict=True)])
+        else:
+            edges = find_edges(*maps, device=self.device)
+        independent = normals.sigma
         if isinstance(frames, Registered):
-            white = white if self.noise is not None else white / frames.noise_gain
-            normals = _mend(normals, frames.noise_gain, given=self.noise is not None)
-        return Found(normals, white, edges)
+            given, gain = self.noise is not None, frames.noise_gain
+            independent = independent if given else independent / gain
+            normals = _account_for_registration(normals, gain if given else None)
+        return Rotation(normals, independent, edges, self.device)
 
 
-def _edges(normals: Normals, device: Device) -> NDArray[np.uint8]:
-    """Find the edges of each turn, or of their mean."""
-    maps = normals.vectors, normals.sigma, normals.contact
-    if normals.contact.ndim == 2:
-        return find_edges(*maps, device=device)
-    return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
-
-
-def _longest_turn(source: Source) -> int:
-    """Return how many frames a turn may have: as many as they have, where that is known beforehand."""
-    phase: NDArray[np.float64] | None = getattr(source, "phase", None)
-    return LONGEST if phase is None else longest_turn(phase)
-
-
-def _mend(normals: Normals, noise_gain: NDArray[np.float32], given: bool) -> Normals:
+def _account_for_registration(normals: Normals, noise_gain: NDArray[np.float32] | None) -> Normals:
     """Account for what interpolation did to a pixel's noise, and where it reached beyond the contact.
 
-    Noise that was told from the frames themselves knows of the former. Samples are made of 4 x 4, of which
-    two on either side may have lost contact.
+    Noise that was estimated from the frames themselves has the former in it: no ``noise_gain``. Samples are
+    made of 4 x 4, of which two on either side may have lost contact.
     """
+    from scipy import ndimage
+
     reach = np.ones((1,) * (normals.contact.ndim - 2) + (_REACH, _REACH), bool)
     lost = np.isfinite(normals.sigma) & (normals.contact == 0)
     inside = normals.contact * ~ndimage.binary_dilation(lost, reach)
-    sigma = normals.sigma * noise_gain if given else normals.sigma
+    sigma = normals.sigma if noise_gain is None else normals.sigma * noise_gain
     return replace(normals, sigma=sigma, contact=inside)
 
 
-class FirstTurn:
-    """The frames of a source's first turn, as a source.
+class FirstTurn(Closing):
+    """The frames of a source's first turn, 64 at most, kept in memory, as a source.
 
     Parameters
     ----------
     source : Source
-        Of axial motion, which can be rewound. It is read up to the first frame of the second turn, and to 64
-        frames at most.
-
-    Attributes
-    ----------
-    name, header, motion, dtype
-        Those of the source.
-    shape : (int, int, int)
-    phase : ndarray, (T,), float64
-    rewindable : bool
-        True.
+        Of axial motion, which can be rewound. It is read up to the first frame of the second turn.
 
     Raises
     ------
@@ -486,19 +435,14 @@ class FirstTurn:
     rewindable = True
 
     def __init__(self, source: Source) -> None:
-        self.name, self.header, self.motion, self.dtype = (
-            source.name,
-            source.header,
-            source.motion,
-            source.dtype,
-        )
+        self.name, self.header, self.motion = source.name, source.header, source.motion
+        self.dtype = source.dtype
         frames: list[NDArray[Any]] = []
         phase = np.empty(0)
         source.rewind()
         while len(frames) < LONGEST and (block := source.read()) is not None:
-            phase = np.concatenate(
-                [phase, check_phase(block.phase, len(block.frames), f"{self.name}: phase")]
-            )
+            more = check_phase(block.phase, len(block.frames), f"{self.name}: phase")
+            phase = np.concatenate([phase, more])
             if len(cut_into_turns(phase)) > 1:
                 break
             frames.extend(block.frames.copy())
@@ -518,14 +462,8 @@ class FirstTurn:
             return None
         part = slice(self._next, self._next + count)
         self._next = part.stop
-        block = Block(self._frames[part], part.start, phase=self.phase[part])
-        if out is None:
-            return block
-        out[:count] = block.frames
-        return replace(block, frames=out[:count])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
+        frames = self._frames[part]
+        if out is not None:
+            out[:count] = frames
+            frames = out[:count]
+        return Block(frames, part.start, phase=self.phase[part])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +11,8 @@ from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.tilt import one_wave
 from mirrorskin.io import InputError
 
-_OPEN = {"low": -np.inf, "high": np.inf}
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Scale:
     """How brightness goes with the zenith: E = offset + gain zenith, between two zeniths.
 
@@ -33,25 +30,25 @@ class Scale:
         """Whether each pixel has a scale of its own."""
         return self.planes.ndim == 3
 
-    @cached_property
+    @property
     def ends(self) -> bool:
         """Whether brightness is linear between some zeniths only."""
         return bool(np.isfinite(self.planes[2:]).any())
 
     def thinned(self, step: int) -> Doubles:
-        """Return the scale of each so-manieth pixel, (4,) or (4, n)."""
+        """Return the scale of every ``step``-th pixel, (4,) or (4, n)."""
         return self.planes.reshape(4, -1)[:, ::step] if self.per_pixel else self.planes
 
-    def telling(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
-        """Tell which of so many pixels show little but one wave a turn; see ``one_wave``."""
+    def clear_pixels(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
+        """Return which of every ``step``-th pixel show little but one wave a turn; see `one_wave`."""
         return one_wave(wave, self.thinned(step))
 
 
 def make_scale(
     gain: ArrayLike | None,
     offset: ArrayLike,
-    low: ArrayLike | None,
-    high: ArrayLike | None,
+    dark: ArrayLike | None,
+    bright: ArrayLike | None,
     shape: tuple[int, int],
 ) -> Scale:
     """Check a scale and bring it into the kernels' form.
@@ -62,38 +59,37 @@ def make_scale(
         Counts per radian of zenith; below 0 where steeper is darker. A pixel with 0 or NaN has no answer.
     offset : array_like, scalar or (H, W)
         Counts at zenith 0.
-    low, high : array_like, scalar or (H, W), or None
+    dark, bright : array_like, scalar or (H, W), or None
         Counts between which brightness is linear, where the pattern or the light ends.
     shape : (int, int)
         Rows and columns of a frame.
-
-    Raises
-    ------
-    InputError
-        A shape that does not fit, no gain but 0 or NaN, no offset that is a number, or a low above its high.
     """
     if gain is None:
         raise InputError("a zenith gain is needed: counts per radian, such as 206, or a calibration")
-    given = {"zenith gain": gain, "zenith offset": offset, "low": low, "high": high}
+    given = {"zenith gain": gain, "zenith offset": offset, "dark": dark, "bright": bright}
     known = {name: _as_map(name, value, shape) for name, value in given.items() if value is not None}
     rate, zero = known["zenith gain"], known["zenith offset"]
-    if not np.any(np.isfinite(rate) & (rate != 0)):
-        told = f"zenith gain {rate}" if rate.ndim == 0 else "the zenith gain of every pixel is 0 or no number"
-        raise InputError(f"{told}: counts per radian other than 0 are needed; calibrate, or leave it out")
+    sound = np.isfinite(rate) & (rate != 0)
+    if not sound.any():
+        what = f"zenith gain {rate}" if rate.ndim == 0 else "the zenith gain of every pixel is 0 or no number"
+        raise InputError(f"{what}: counts per radian other than 0 are needed; calibrate, or leave it out")
     if not np.isfinite(zero).any():
         raise InputError("the zenith offset is no number: give the counts at zenith 0, such as 10")
-    for name in ("low", "high"):
+    for name in ("dark", "bright"):
         if name in known and not np.isfinite(known[name]).any():
             raise InputError(
                 f"{name} is no number: give the counts at which brightness ends, or leave it out"
             )
+    if "dark" in known and "bright" in known and not np.any(known["dark"] < known["bright"]):
+        raise InputError("dark is not below bright at any pixel: are they swapped?")
     with np.errstate(divide="ignore", invalid="ignore"):
-        per_count = np.where(np.isfinite(rate) & np.isfinite(zero) & (rate != 0), 1 / rate, np.nan)
-        ends = [(known.get(name, np.asarray(end)) - zero) * per_count for name, end in _OPEN.items()]
-    if "low" in known and "high" in known and not np.any(known["low"] < known["high"]):
-        raise InputError("low is not below high at any pixel: are they swapped?")
-    lowest, highest = np.fmin(*ends), np.fmax(*ends)
-    return Scale(np.stack(np.broadcast_arrays(zero, per_count, lowest, highest)).astype(np.float64))
+        per_count = np.where(sound & np.isfinite(zero), 1 / rate, np.nan)
+        ends = [
+            (known.get(name, np.asarray(end)) - zero) * per_count
+            for name, end in (("dark", -np.inf), ("bright", np.inf))
+        ]
+    planes = zero, per_count, np.fmin(*ends), np.fmax(*ends)
+    return Scale(np.stack(np.broadcast_arrays(*planes)).astype(np.float64))
 
 
 def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> Doubles:

@@ -1,4 +1,4 @@
-"""The half-angle of the precession: whether it can be one, and what it is if nobody knows."""
+"""The half-angle of the precession: whether it can be one, and its estimate from a turn."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
-from mirrorskin.engine.rotation.design_matrix import Doubles, basis
-from mirrorskin.engine.rotation.residual_noise import CountNoise, whole
+from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, basis
+from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
 from mirrorskin.io import InputError
 
 _STEEPEST = math.radians(30.0)  # no sheet follows a body that leans further
-_CLEAR = 4.0  # tilts that a zenith must have for one wave a turn to be nearly all of it
-_FEWEST = 30  # pixels that tell a tilt
+_STEEP = 4.0  # tilts that a zenith must have for one wave a turn to be nearly all of it
+_FEWEST = 30  # pixels that an estimate takes
 _ROUNDS = 5
 
 
@@ -29,7 +28,7 @@ def check_tilt(tilt: float) -> float:
 
 
 def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
-    """Tell which pixels are steep, or level, enough to show one wave a turn and little else.
+    """Return which pixels are steep enough to show one wave a turn and little else.
 
     Parameters
     ----------
@@ -39,70 +38,52 @@ def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
         See `mirrorskin.engine.rotation.scale.Scale`.
     """
     offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
-    told = (wave[0] - offset) * per_count > _CLEAR * np.hypot(*wave[1:]) * np.abs(per_count)
-    return np.asarray(told)
+    return np.asarray((wave[0] - offset) * per_count > _STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
 
 
-def estimate_tilt(
-    samples: NDArray[Any],
-    phase: Doubles,
-    weights: Doubles,
-    matrix: Doubles,
-    scale: Doubles,
-    noise: CountNoise,
-) -> float:
+def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: CountNoise) -> float:
     """Estimate the tilt from the amplitude of the zenith's wave, which it is but for its third power.
 
     Amplitudes are averaged as squares, from which the noise's share is taken: the mean of amplitudes would be
     too large by the noise's variance over twice the tilt. Pixels count that have a zenith of four tilts or
     more and show nothing but one wave and noise.
 
-    The pivot's shift changes amplitudes too. Where the heights differ much from the pivot's, what comes out
-    is no tilt.
+    The pivot's shift changes amplitudes too: where the heights differ much from the pivot's, the estimate is
+    wrong.
 
     Parameters
     ----------
     samples : ndarray, (N, n), uint8, uint16 or float32
         Of n pixels in one turn.
-    phase, weights : ndarray, (N,), float64
-        Radians, and weights above 0.
-    matrix : ndarray, (3, N), float64
-        See `mirrorskin.engine.rotation.design_matrix.fit_matrix`.
+    fit : TurnFit
     scale : ndarray, (4,) or (4, n), float64
         See `mirrorskin.engine.rotation.scale.Scale`.
     noise : CountNoise
-
-    Returns
-    -------
-    float
-        Radians.
-
-    Raises
-    ------
-    InputError
-        Too few pixels tell it.
     """
+    from scipy import special
+
     offset, per_count, low, high = np.broadcast_to(scale.reshape(4, -1), (4, samples.shape[1]))
     zeniths = (samples - offset) * per_count
     error = noise.at(samples.mean(axis=0)) * np.abs(per_count)
     with np.errstate(invalid="ignore"):
         inside = ((zeniths > low + 3 * error) & (zeniths < high - 3 * error)).all(axis=0)
-    usable = whole(samples).all(axis=0) & inside
+    usable = valid(samples).all(axis=0) & inside
     zeniths, error = zeniths[:, usable], error[usable]
-    mean, cosine, sine = wave = matrix @ zeniths
-    left = np.sum(weights[:, np.newaxis] * (zeniths - basis(phase) @ wave) ** 2, axis=0)
-    clean = left <= special.chdtri(max(1, len(phase) - 3), 1e-3) * error**2 * 1.5
-    covariance = matrix @ (matrix / weights).T
-    square = cosine**2 + sine**2 - (covariance[1, 1] + covariance[2, 2]) * error**2
+    mean, cosine, sine = wave = fit.matrix @ zeniths
+    residual = np.sum(fit.weights[:, np.newaxis] * (zeniths - basis(fit.phase) @ wave) ** 2, axis=0)
+    clean = residual <= special.chdtri(max(1, len(fit.phase) - 3), 1e-3) * error**2 * 1.5
+    square = cosine**2 + sine**2 - (fit.covariance[1, 1] + fit.covariance[2, 2]) * error**2
 
     tilt = math.sqrt(max(0.0, float(np.median(square[clean])))) if clean.any() else 0.0
     for _ in range(_ROUNDS):
-        told = clean & (mean > max(_CLEAR * tilt, 1e-3))
-        if np.count_nonzero(told) < _FEWEST or not tilt > 0:
-            raise InputError("too few pixels tell the tilt: give it, such as 2.5deg")
-        azimuth = np.arctan2(sine[told], cosine[told])
-        expected = matrix @ zenith_seen(mean[told], azimuth, phase, tilt)
-        growth = np.sum(square[told]) / np.sum(expected[1] ** 2 + expected[2] ** 2)
+        chosen = clean & (mean > max(_STEEP * tilt, 1e-3))
+        if np.count_nonzero(chosen) < _FEWEST or not tilt > 0:
+            raise InputError(
+                "too few pixels are steep and clear enough to estimate the tilt: give it, such as 2.5deg"
+            )
+        azimuth = np.arctan2(sine[chosen], cosine[chosen])
+        expected = fit.matrix @ zenith_seen(mean[chosen], azimuth, fit.phase, tilt)
+        growth = np.sum(square[chosen]) / np.sum(expected[1] ** 2 + expected[2] ** 2)
         tilt *= math.sqrt(max(0.0, float(growth)))
     return check_tilt(tilt)
 

@@ -45,8 +45,8 @@ def test_contact_may_differ_where_it_is_in_doubt(device):
     pixels = np.arange(CASE.pixels)
     wide, narrow = (answer(frames, turn, pixels, slack).contact for slack in (1.01, 0.99))
     doubtful, sure = (np.flatnonzero(chosen)[0] for chosen in (wide != narrow, wide & narrow))
-    known = turn.phase, turn.tilt, turn.gain, turn.offset
-    ours = estimate_normals(frames, *known, noise=turn.noise, device=device)
+    known = {"tilt": turn.tilt, "gain": turn.gain, "offset": turn.offset}
+    ours = estimate_normals(frames, turn.phase, **known, noise=turn.noise, device=device)
     theirs = numpy_.normals(frames, turn)
     check_normals("peer", ours, theirs, frames, turn)
     theirs.contact.flat[doubtful] = 1 - ours.contact.flat[doubtful]

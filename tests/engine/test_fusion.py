@@ -63,8 +63,8 @@ def by_equation_10(size, pixel, seed=1, setup=Setup(), steepest=55.0):  # noqa: 
     x, y, _, zenith = ball(size, pixel)
     seen = zenith <= steepest
     true = rotations.direction(np.radians(np.where(seen, zenith, 0)), np.arctan2(y, x))
-    known = setup.phase, setup.tilt, setup.slope, setup.offset
-    normals = engine.estimate_normals(rotations.expose(true, setup, seed), *known)
+    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
+    normals = engine.estimate_normals(rotations.expose(true, setup, seed), **known)
     return replace(normals, contact=(seen & (normals.contact > 0)).astype(np.uint8))
 
 

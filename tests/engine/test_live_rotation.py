@@ -10,8 +10,7 @@ from mirrorskin.bench.turns import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
 from mirrorskin.engine.live import LiveRotation, choose_window, run
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
-from mirrorskin.engine.streaming import push_block
-from mirrorskin.io import Block, InputError, open_result, save_result
+from mirrorskin.io import InputError, open_result, save_result
 
 SHAPE, WINDOW = (24, 40, 52), 8
 PHASE = phases(SHAPE[0])
@@ -47,7 +46,8 @@ def test_an_update_tells_the_last_turn(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     assert not any(updates[: WINDOW - 1])
     last = updates[-1]
-    exact = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
+    known = {"tilt": TILT, "gain": GAIN, "offset": OFFSET, "noise": NOISE}
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **known, device=device)
     np.testing.assert_array_equal(last["normals"], exact.vectors)
     np.testing.assert_array_equal(last["contact"], exact.contact)
     assert last["contact_area"] == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
@@ -59,7 +59,9 @@ def test_heights_follow_those_that_fit_best(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     for update, stop in [(updates[WINDOW - 1], WINDOW), (updates[-1], SHAPE[0])]:
         turn = slice(stop - WINDOW, stop)
-        normals = estimate_normals(frames[turn], PHASE[turn], TILT, GAIN, OFFSET, noise=NOISE)
+        normals = estimate_normals(
+            frames[turn], PHASE[turn], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE
+        )
         best = best_heights(normals)
         np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
         off = (update["height"] - best)[np.isfinite(best)]
@@ -88,9 +90,9 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
     save_result(live.result(), tmp_path / "live.h5")
     result = open_result(tmp_path / "live.h5")
     correlator = Correlator(SHAPE[1:], "uint8", window=WINDOW)
-    push_block(correlator, Block(frames, 0, phase=PHASE))
+    correlator.push(frames, phase=PHASE)
     np.testing.assert_array_equal(result.cosine, correlator.result().cosine)
-    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
     np.testing.assert_array_equal(result.normals, normals.vectors)
     np.testing.assert_array_equal(result.edges, find_edges(normals.vectors, normals.sigma, normals.contact))
     np.testing.assert_allclose(result.height, best_heights(normals), atol=1e-6)
@@ -106,7 +108,9 @@ def test_edges_are_drawn_in_the_time_that_is_left(device):
         live.spare(0.05)
         if live.maps()["edges"] is not None:
             break
-    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE, device=device)
+    normals = estimate_normals(
+        frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE, device=device
+    )
     exact = find_edges(normals.vectors, normals.sigma, normals.contact, device=device)
     np.testing.assert_array_equal(live.maps()["edges"], exact)
     assert exact.any()
@@ -117,7 +121,7 @@ def test_a_sudden_change_is_followed_within_some_frames():
     frames[: SHAPE[0] // 2] = frames[: SHAPE[0] // 2, :, ::-1]
     _, live = make(frames=frames)
     update = feed(live, frames, [1] * SHAPE[0])[-1]
-    normals = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
     best = best_heights(normals)
     off = (update["height"] - best)[np.isfinite(best)]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
@@ -168,7 +172,7 @@ def test_a_whole_run_uses_each_frame():
     live = LiveRotation(source, window=WINDOW, noise=NOISE)
     status = run(source, live)
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
-    exact = estimate_normals(frames[LAST], PHASE[LAST], TILT, GAIN, OFFSET, noise=NOISE)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
     np.testing.assert_array_equal(live.normals().vectors, exact.vectors)
 
 

@@ -7,6 +7,7 @@ from live_frames import blocks, phases, turn_frames
 from mirrorskin.bench.turns import SCALES, TILT
 from mirrorskin.engine import Correlator, correlate, estimate_normals
 from mirrorskin.engine.rotation.normals_window import NormalWindow
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import InputError
 
 SHAPE, WINDOW = (21, 13, 29), 8
@@ -23,7 +24,7 @@ def make(dtype="uint8", device=None, **other):
 
 def push(window, frames, cuts, phase=PHASE):
     for block in blocks(frames, cuts, phase=phase):
-        window.push(block)
+        push_block(window, block)
 
 
 def same(one, other, maps=MAPS):
@@ -37,18 +38,20 @@ def test_normals_are_bit_by_bit_those_of_the_windows_frames(device, dtype):
     window = make(dtype, device, noise=noise)
     push(window, frames, [5, 1, 1, 9, 5])
     last = slice(-WINDOW, None)
-    exact = estimate_normals(frames[last], PHASE[last], TILT, gain, offset, noise=noise, device=device)
+    exact = estimate_normals(
+        frames[last], PHASE[last], tilt=TILT, gain=gain, offset=offset, noise=noise, device=device
+    )
     assert np.mean(exact.contact) > 0.3
-    same(window.normals(), exact)
+    same(window.result(), exact)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_cuts_do_not_matter_when_noise_and_tilt_are_told_from_the_frames(dtype):
     frames, found = turn_frames(SHAPE, dtype), []
     for cuts in CUTS:
-        window = make(dtype, tilt=None)
+        window = make(dtype, tilt="estimate")
         push(window, frames, cuts)
-        found.append((window.normals(), window.correlation()))
+        found.append((window.result(), window.correlation()))
     for normals, wave in found[1:]:
         same(normals, found[0][0])
         assert (normals.noise, normals.tilt) == (found[0][0].noise, found[0][0].tilt)
@@ -58,11 +61,11 @@ def test_cuts_do_not_matter_when_noise_and_tilt_are_told_from_the_frames(dtype):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_noise_and_tilt_are_those_of_the_first_full_window(dtype):
     frames, (offset, gain, _) = turn_frames(SHAPE, dtype), SCALES[dtype]
-    window = make(dtype, tilt=None)
+    window = make(dtype, tilt="estimate")
     push(window, frames, [21])
     first = slice(WINDOW)
-    exact = estimate_normals(frames[first], PHASE[first], None, gain, offset)
-    normals = window.normals()
+    exact = estimate_normals(frames[first], PHASE[first], tilt="estimate", gain=gain, offset=offset)
+    normals = window.result()
     assert window.tilt == exact.tilt
     assert normals.shot == exact.shot
     assert normals.noise == pytest.approx(exact.noise, rel=0.1)  # it is told at the brightness of each
@@ -74,9 +77,9 @@ def test_the_correlation_is_that_of_a_correlator(device, dtype):
     window = make(dtype, device, noise=1.0)
     correlator = Correlator(SHAPE[1:], dtype, window=WINDOW, device=device)
     for block in blocks(frames, [4, 12, 5], phase=PHASE):
-        window.push(block)
-        correlator.push(block)
-    window.normals()  # which has maps of its own
+        push_block(window, block)
+        push_block(correlator, block)
+    window.result()  # which has maps of its own
     same(window.correlation(), correlator.result(), MAPS[3:])
     if dtype != "float32":
         exact = correlate(frames[-WINDOW:], PHASE[-WINDOW:], device=device)
@@ -91,19 +94,22 @@ def test_a_device_without_room_works_in_bands(small_device):
     window = make(device=small_device, noise=1.3)
     assert len(window.bands) > 1
     push(window, frames, [2, 19])
-    found = window.normals()
-    assert np.mean(np.isclose(found.vectors, exact.normals().vectors, atol=1e-5, equal_nan=True)) > 0.99
+    found = window.result()
+    assert np.mean(np.isclose(found.vectors, exact.result().vectors, atol=1e-5, equal_nan=True)) > 0.99
     assert found.vectors.shape == (*SHAPE[1:], 3)
 
 
 def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
     frames, (offset, gain, noise) = turn_frames(SHAPE), SCALES["uint8"]
     gains = gain * np.linspace(0.9, 1.1, SHAPE[2]) * np.ones(SHAPE[1:])
-    known = {"noise": noise, "low": offset + 4, "high": offset + 150}
+    known = {"noise": noise, "dark": offset + 4, "bright": offset + 150}
     window = make(gain=gains, **known)
     push(window, frames, [11, 10])
     last = slice(-WINDOW, None)
-    same(window.normals(), estimate_normals(frames[last], PHASE[last], TILT, gains, offset, **known))
+    same(
+        window.result(),
+        estimate_normals(frames[last], PHASE[last], tilt=TILT, gain=gains, offset=offset, **known),
+    )
 
 
 def test_a_reset_forgets_all():
@@ -113,7 +119,7 @@ def test_a_reset_forgets_all():
     window.reset()
     for one in (window, fresh):
         push(one, frames, [21])
-    same(window.normals(), fresh.normals())
+    same(window.result(), fresh.result())
 
 
 def test_a_window_that_is_not_full_has_no_normals():
@@ -121,14 +127,14 @@ def test_a_window_that_is_not_full_has_no_normals():
     push(window, turn_frames(SHAPE)[:5], [5])
     assert not window.is_full
     with pytest.raises(InputError, match="not full"):
-        window.normals()
+        window.result()
 
 
 def test_phases_that_tell_nothing_are_refused():
     window = make(noise=1.0)
     push(window, turn_frames(SHAPE), [21], np.zeros(21))
     with pytest.raises(InputError, match="phases"):
-        window.normals()
+        window.result()
 
 
 @pytest.mark.parametrize("wrong", [2, 65])

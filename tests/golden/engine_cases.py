@@ -329,7 +329,7 @@ def correlate_uneven_phases() -> Answer:
 def correlate_weights_and_missing_samples() -> Answer:
     frames = turn("float32", phase=UNEVEN)[0]
     frames[pick(frames.shape, 0.002, 3)] = np.nan
-    return wave_maps(engine.correlate(frames, UNEVEN, weights=[1, 1, 0, 2, 1, 0.5, 1, 1]))
+    return wave_maps(engine.correlate(frames, UNEVEN, frame_weights=[1, 1, 0, 2, 1, 0.5, 1, 1]))
 
 
 def long_turn(dtype: str) -> tuple[Any, Any]:
@@ -367,7 +367,7 @@ def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> A
     made = {name: options.pop(name) for name in ("noise_of", "lost", "shape") if name in options}
     made = {"noise": made.pop("noise_of", 1.0), **made}
     frames, gain, offset = turn(dtype, phase=phase, **made)
-    return normal_maps(engine.estimate_normals(frames, phase, TILT, gain, offset, **options))
+    return normal_maps(engine.estimate_normals(frames, phase, tilt=TILT, gain=gain, offset=offset, **options))
 
 
 ROTATION = {"vectors": NORMAL, "sigma": (1e-4, 1e-7), "zenith": NORMAL}
@@ -395,8 +395,8 @@ def estimate_normals_of_noise_and_clipped_samples() -> Answer:
     return named(
         noisy=normals_of("uint8", noise_of=4.0),
         told=normals_of("uint8", noise=1.5),
-        clipped=normals_of("uint16", low=400.0, high=1400.0),
-        weighed=normals_of("uint16", weights=[1, 1, 0.5, 1, 1, 0, 1, 1]),
+        clipped=normals_of("uint16", dark=400.0, bright=1400.0),
+        weighed=normals_of("uint16", frame_weights=[1, 1, 0.5, 1, 1, 0, 1, 1]),
     )
 
 
@@ -408,7 +408,7 @@ def estimate_normals_where_contact_is_lost() -> Answer:
 @case(FITTED, **ROTATION, numbers=(1e-4, 1e-7))
 def estimate_normals_and_the_tilt() -> Answer:
     frames, gain, offset = turn("uint16")
-    return normal_maps(engine.estimate_normals(frames, EIGHTHS, None, gain, offset))
+    return normal_maps(engine.estimate_normals(frames, EIGHTHS, tilt="estimate", gain=gain, offset=offset))
 
 
 @case(FITTED, **ROTATION)
@@ -622,7 +622,7 @@ def integrate_live() -> Answer:
 def fuse() -> Answer:
     shape = (40, 52)
     frames, gain, offset = turn("uint16", shape)
-    normals = engine.estimate_normals(frames, EIGHTHS, TILT, gain, offset)
+    normals = engine.estimate_normals(frames, EIGHTHS, tilt=TILT, gain=gain, offset=offset)
     travel = np.arange(0.0, 1.0, 0.05)
     x, y = places(shape)
     starts = np.where(np.hypot(x, y) < 0.3, 9.0, -dome(shape)[0])

@@ -163,8 +163,8 @@ def test_kernel_and_reference_agree(device, case):
         frames[scene.rng.random(frames.shape) < 0.02] = np.nan
     expected = scene.answer(frames, noise, weights)
     stack = frames.reshape(-1, *shape)
-    known = {"response": scene.response, "noise": noise, "weights": weights, "device": device}
-    found = estimate_normals(stack, scene.phase, TILT, **known)
+    known = {"response": scene.response, "noise": noise, "frame_weights": weights, "device": device}
+    found = estimate_normals(stack, scene.phase, tilt=TILT, **known)
     told = np.isfinite(found.sigma.ravel())
     # A sample at the very end of the wall may fall on either side.
     assert np.mean(told != np.isfinite(expected.sigma)) <= 0.01

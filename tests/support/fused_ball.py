@@ -66,8 +66,8 @@ def turned(name: str, shape: tuple[int, int], pixel: float, device: object = Non
     there = within(DEEP, shape, pixel)
     normals = rotations.direction(np.where(there, surface.zenith, 0), np.nan_to_num(surface.azimuth))
     frames = rotations.expose(normals, setup, seed)
-    known = setup.phase, setup.tilt, setup.slope, setup.offset
-    found = estimate_normals(frames, *known, noise=setup.spread, device=device)
+    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
+    found = estimate_normals(frames, **known, noise=setup.spread, device=device)
     return Turn(found.vectors, found.sigma, (found.contact * there).astype(np.uint8))
 
 

@@ -20,10 +20,10 @@ def table_of_equation_10(name, draws=20_000):
 
     setup = SETUPS[name]
     stack = rotations.draw(setup, draws, seed=1)
-    known = setup.phase, setup.tilt, setup.slope, setup.offset
-    found = estimate_normals(stack.frames, *known, noise=setup.spread)
+    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
+    found = estimate_normals(stack.frames, **known, noise=setup.spread)
     told = rotations.scores(found.vectors, found.sigma, stack)
-    paper = estimate_normals(stack.frames, *known, noise=setup.spread, method="paper")
+    paper = estimate_normals(stack.frames, **known, noise=setup.spread, method="paper")
     errors = rotations.between(paper.vectors.astype(float), stack.normals)
     rms = np.degrees(np.sqrt(np.nanmean(errors**2, axis=1)))
     sigma = setup.spread / setup.gain
@@ -65,8 +65,8 @@ def errors_on_the_twin(dtype, noise, method, registered):
     with Registered(twin, truth.height) if registered else twin as source:
         frames = read_all(source, len(EIGHTHS)).frames
     spread = float(np.hypot(noise, 0 if dtype == "float32" else 1 / np.sqrt(12)))
-    known = EIGHTHS, TILT, header.zenith_gain, header.zenith_offset
-    found = estimate_normals(frames, *known, noise=max(spread, 0.1), method=method)
+    known = {"phase": EIGHTHS, "tilt": TILT, "gain": header.zenith_gain, "offset": header.zenith_offset}
+    found = estimate_normals(frames, **known, noise=max(spread, 0.1), method=method)
     normals = rotations.direction(truth.zenith, np.nan_to_num(truth.azimuth))
     errors = np.degrees(rotations.between(found.vectors.astype(float), normals))
     zenith = np.where(truth.contact != 0, np.degrees(truth.zenith), np.nan)

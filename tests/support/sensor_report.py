@@ -310,7 +310,7 @@ def mistakes() -> Table:
     rows = []
     for name, numbers in wrong.items():
         phase, tilt, gain, offset = numbers
-        found = engine.estimate_normals(frames, phase, tilt, gain, offset, noise=0.1)
+        found = engine.estimate_normals(frames, phase, tilt=tilt, gain=gain, offset=offset, noise=0.1)
         zenith, azimuth = rotations.angles(normals)
         other_zenith, other_azimuth = rotations.angles(found.vectors.astype(float))
         turned = np.angle(np.exp(1j * (other_azimuth - azimuth)))

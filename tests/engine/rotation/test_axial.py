@@ -95,7 +95,7 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them():
 def test_it_is_the_normals_of_the_frames():
     result = reconstruct(method="paper", noise=20.0)
     found = engine.estimate_normals(
-        frames(), PHASE, TILT, SETUP.slope, SETUP.offset, method="paper", noise=20.0
+        frames(), PHASE, tilt=TILT, gain=SETUP.slope, offset=SETUP.offset, method="paper", noise=20.0
     )
     np.testing.assert_array_equal(result.normals, found.vectors)
     np.testing.assert_array_equal(result.normal_sigma, found.sigma)

@@ -81,9 +81,9 @@ def told(request, device):
     normals = engine.estimate_normals(
         scene.frames,
         scene.phase,
-        TILT,
-        header.zenith_gain,
-        header.zenith_offset,
+        tilt=TILT,
+        gain=header.zenith_gain,
+        offset=header.zenith_offset,
         noise=spread,
         device=device,
     )

@@ -75,7 +75,7 @@ def push(
     phase = np.asarray(phase, np.float64)
     for start, stop in pairwise([0, *cuts, len(frames)]):
         part = None if weights is None else weights[start:stop]
-        correlator.push(Block(frames[start:stop], start, phase=phase[start:stop]), part)
+        correlator.push(frames[start:stop], phase=phase[start:stop], frame_weights=part)
 
 
 def same(one: Correlation, other: Correlation) -> None:
@@ -105,7 +105,7 @@ def test_it_is_least_squares(device: Device, dtype: str, phases: str) -> None:
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_frames_count_by_their_weights(device: Device, dtype: str, weights: str) -> None:
     frames, weight = swing(dtype, MEASURED), WEIGHTS[weights]
-    whole = correlate(frames, MEASURED, weight, device=device)
+    whole = correlate(frames, MEASURED, frame_weights=weight, device=device)
     expected = least_squares(frames, MEASURED, weight)
     for found in (whole, in_window(frames, weight, device)):
         atol = 1e-5 * expected[3].max()
@@ -214,7 +214,7 @@ def test_a_sample_that_is_no_number_spoils_its_pixel_while_it_is_in_the_window(
     clean, correlator = np.isfinite(frames[2]), Correlator(SHAPE, "float32", window=8, device=device)
     for start in range(12):
         part = slice(start, start + 1)
-        correlator.push(Block(frames[part], start, phase=PHASES["turns"][part]))
+        correlator.push(frames[part], phase=PHASES["turns"][part])
         if start < 4:
             continue
         spoilt = start <= 9
@@ -231,7 +231,7 @@ def test_what_a_missing_frame_holds_does_not_matter(device: Device, missing: int
     weights[missing], others = 0, np.arange(8) != missing
     expected = correlate(frames[others], MEASURED[others], device=device)
     frames[missing] = np.nan
-    same(correlate(frames, MEASURED, weights, device=device), expected)
+    same(correlate(frames, MEASURED, frame_weights=weights, device=device), expected)
     same(in_window(frames, weights, device), expected)
 
 
@@ -247,7 +247,7 @@ def test_a_window_answers_as_soon_as_its_phases_determine_a_fit(device: Device) 
     for count in range(3):
         with pytest.raises(InputError, match=f"{count} frames at {count} different phases"):
             correlator.result()
-        correlator.push(Block(frames[count : count + 1], count, phase=MEASURED[count : count + 1]))
+        correlator.push(frames[count : count + 1], phase=MEASURED[count : count + 1])
     three = correlator.result()
     assert three.frames == 3
     assert np.isnan(three.residual).all()
@@ -284,8 +284,8 @@ def test_lent_frames_make_no_difference(device: Device, dtype: str, window: int 
     lent = memory[: frames.nbytes].view(dtype).reshape(frames.shape)
     lent[:] = frames
     one, other = (Correlator(SHAPE, dtype, window=window, device=device) for _ in range(2))
-    one.push(Block(frames, 0, phase=MEASURED), WEIGHTS[weights])
-    other.push(Block(lent, 0, phase=MEASURED, lent=True), WEIGHTS[weights])
+    one.push(frames, phase=MEASURED, frame_weights=WEIGHTS[weights])
+    other.push(lent, phase=MEASURED, lent=True, frame_weights=WEIGHTS[weights])
     same(one.result(), other.result())
 
 
@@ -326,7 +326,7 @@ def test_less_room_gives_the_same_answer(
         correlator.result()
         push(correlator, frames[4:], phase[4:], None if weight is None else weight[4:])
         found.append(correlator.result())
-    assert len(correlator._sums._bands) > 1
+    assert len(correlator._sums.bands) > 1
     same(*found)
 
 
@@ -368,7 +368,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     frames: NDArray[Any], phase: ArrayLike, weights: Any, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:
-        correlate(frames, phase, weights)
+        correlate(frames, phase, frame_weights=weights)
     assert "\n" not in str(caught.value)
 
 
@@ -395,12 +395,12 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing() -> None:
         ]
         for block, weights, message in wrong:
             with pytest.raises(InputError, match=message):
-                correlator.push(block, weights)
+                correlator.push(block.frames, phase=block.phase, frame_weights=weights)
         same(correlator.result(), before)
 
 
 def test_more_frames_than_sums_hold_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MOST", 12)
+    monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MAX_FRAMES", 12)
     correlator = Correlator(SHAPE, "uint8")
     push(correlator, swing("uint8", MEASURED), MEASURED)
     with pytest.raises(InputError, match="sums hold 12 frames"):

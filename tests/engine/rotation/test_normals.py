@@ -43,7 +43,7 @@ def push(estimator, frames, phase, cuts=(), weights=None):
     """Push frames in blocks that are cut as told."""
     for start, stop in pairwise([0, *cuts, len(frames)]):
         part = None if weights is None else weights[start:stop]
-        estimator.push(Block(frames[start:stop], start, phase=phase[start:stop]), part)
+        estimator.push(frames[start:stop], phase=phase[start:stop], frame_weights=part)
     return estimator
 
 
@@ -102,7 +102,7 @@ def test_frames_may_be_written_into_the_room(device, weights):
         stop = start + len(room)
         room[:] = frames[start:stop]
         part = None if weights is None else weights[start:stop]
-        estimator.push(Block(room, start, phase=phase[start:stop]), part)
+        estimator.push(room, phase=phase[start:stop], frame_weights=part)
         start = stop
     same(estimator.result(), elsewhere)
 
@@ -168,22 +168,26 @@ def test_the_body_may_turn_clockwise(device):
     close(found, estimate_normals(frames, phase, **known(), device=device), 1e-3)
 
 
-def test_a_result_ends_the_rotation(device):
-    frames, phase = frames_of(turns=2), phases(SETUP, 2)
-    for given in ({"noise": None}, {"per_turn": True}):
-        estimator = push(estimator_of(device, **given), frames[:, ::-1], phase + 1)
-        estimator.result()
-        with pytest.raises(InputError, match="0 frames at 0 different phases"):
-            estimator.result()
-        again = push(estimator, frames, phase).result()
-        same(again, push(estimator_of(device, **given), frames, phase).result())
+@pytest.mark.parametrize("given", [{"noise": None}, {"per_turn": True}, {"memory_limit": 1, "longest": 8}])
+def test_a_result_changes_nothing_and_a_reset_forgets(device, given):
+    frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.ones(24)
+    weights[[2, 17]] = 0
+    whole = push(estimator_of(device, **given), frames, phase, weights=weights).result()
+    estimator = push(estimator_of(device, **given), frames[:, ::-1], phase + 1)
+    estimator.reset()
+    for start in range(0, 24, 3):
+        part = slice(start, start + 3)
+        push(estimator, frames[part], phase[part], weights=weights[part])
+        if start >= 3:
+            same(estimator.result(), estimator.result())
+    same(estimator.result(), whole)
 
 
 def test_without_frames_there_is_no_result(device):
     with pytest.raises(InputError, match="0 frames at 0 different phases"):
         estimator_of(device).result()
     with pytest.raises(InputError, match=r"all 8 frames have weight 0|0 frames"):
-        estimate_normals(frames_of(), EIGHTHS, **known(), weights=np.zeros(8), device=device)
+        estimate_normals(frames_of(), EIGHTHS, **known(), frame_weights=np.zeros(8), device=device)
 
 
 def test_an_incomplete_last_turn_counts_as_far_as_it_goes(device):
@@ -212,7 +216,7 @@ def test_a_frame_of_weight_0_is_a_missing_one(device):
     counts, phase = weights > 0, np.array(EIGHTHS)
     left = estimate_normals(frames[counts], phase[counts], **known(), device=device)
     frames[2], frames[6] = 65_535, 0
-    found = estimate_normals(frames, phase, **known(), weights=weights, device=device)
+    found = estimate_normals(frames, phase, **known(), frame_weights=weights, device=device)
     same(found, left)
     assert found.frames == 5
 
@@ -238,7 +242,7 @@ def test_less_room_gives_the_same_answer(small_device, per_pixel):
     shape, setup = (5, 65), replace(SETUP, phase=tuple(2 * np.pi * np.arange(count) / count))
     frames, phase, found = frames_of(setup, 3, shape), phases(setup, 3), []
     gain = np.full(shape, setup.slope)
-    given = {"gain": gain, "low": gain * 0 + 120, "high": 64_000.0} if per_pixel else {}
+    given = {"gain": gain, "dark": gain * 0 + 120, "bright": 64_000.0} if per_pixel else {}
     for limit in (10**9, 3000, 1536):
         small_device.max_allocation = limit
         estimator = estimator_of(small_device, setup, shape, noise=None, longest=9, **given)
@@ -258,23 +262,23 @@ def test_a_turn_may_have_64_frames_and_no_more(device):
     setup = replace(SETUP, dtype="uint8", gain=3.6, offset=12.0, noise=1.0)
     setup = replace(setup, phase=tuple(2 * np.pi * np.arange(64) / 64), low=3)
     frames = frames_of(setup, turns=2)
-    found = estimate_normals(frames, phases(setup, 2), **known(setup), low=3, device=device)
+    found = estimate_normals(frames, phases(setup, 2), **known(setup), dark=3, device=device)
     assert (found.turns, found.frames) == (2, 128)
     error = rotations.between(found.vectors.astype(float), facing())
     assert np.mean((error / found.sigma) ** 2) < 2
     for count in (65, 128):
         with pytest.raises(
-            InputError, match=r"a turn of \d+ frames or more: .* from 64 at most; leave some out"
+            InputError, match=r"a turn of \d+ frames or more: .* take 64 at most; leave some out"
         ):
-            estimate_normals(frames[:count], 0.01 * np.arange(count), **known(setup), low=3, device=device)
+            estimate_normals(frames[:count], 0.01 * np.arange(count), **known(setup), dark=3, device=device)
     with pytest.raises(InputError, match="a turn of 9 frames"):
-        push(estimator_of(device, setup, longest=8, low=3), frames[:9], 0.01 * np.arange(9), range(1, 9))
+        push(estimator_of(device, setup, longest=8, dark=3), frames[:9], 0.01 * np.arange(9), range(1, 9))
 
 
 def test_three_frames_are_enough_where_the_noise_is_known(device):
     phase = np.array(EIGHTHS)[[0, 3, 5]]
     frames = frames_of()[[0, 3, 5]]
-    with pytest.raises(InputError, match="3 frames a turn tell no noise"):
+    with pytest.raises(InputError, match="3 frames a turn leave no residual"):
         estimate_normals(frames, phase, **known(noise=None), device=device)
     found = estimate_normals(frames, phase, **known(), device=device)
     told = np.isfinite(found.sigma)
@@ -290,7 +294,7 @@ def test_a_pixel_without_a_gain_has_no_answer(device):
     setup = replace(SETUP, phase=tuple(2 * np.pi * np.arange(9) / 9))
     frames, gain = frames_of(setup), np.full(SHAPE, setup.slope)
     gain[1, 2], gain[4, 6], gain[0, 0] = 0, np.nan, np.inf
-    lost, ends = ~(np.isfinite(gain) & (gain != 0)), {"low": -1.0, "high": 70_000.0}
+    lost, ends = ~(np.isfinite(gain) & (gain != 0)), {"dark": -1.0, "bright": 70_000.0}
     found = estimate_normals(frames, setup.phase, **known(setup, gain=gain), **ends, device=device)
     all_known = known(setup, gain=np.full(SHAPE, setup.slope))
     others = estimate_normals(frames, setup.phase, **all_known, **ends, device=device)
@@ -372,7 +376,7 @@ def test_frames_without_light_or_full_of_it_have_no_answer(device, value):
 def test_frames_of_no_numbers_have_no_answer(device, bad):
     frames = np.full((8, 1, 2), bad, np.float32)
     for noise in (None, 1.0):
-        found = estimate_normals(frames, EIGHTHS, TILT, 200.0, noise=noise, device=device)
+        found = estimate_normals(frames, EIGHTHS, tilt=TILT, gain=200.0, noise=noise, device=device)
         assert np.isnan(found.vectors).all()
         assert not found.contact.any()
         assert found.noise > 0
@@ -382,8 +386,10 @@ def test_the_noise_and_the_tilt_are_told_from_the_first_turn(device):
     setup = replace(SETUP, tilt=np.radians(3))
     frames = frames_of(setup, 2, (20, 20))
     phase = phases(setup, 2)
-    found = estimate_normals(frames, phase, **known(setup, tilt=None, noise=None), device=device)
-    first = estimate_normals(frames[:8], phase[:8], **known(setup, tilt=None, noise=None), device=device)
+    found = estimate_normals(frames, phase, **known(setup, tilt="estimate", noise=None), device=device)
+    first = estimate_normals(
+        frames[:8], phase[:8], **known(setup, tilt="estimate", noise=None), device=device
+    )
     assert (found.tilt, found.shot) == (first.tilt, first.shot)
     assert found.tilt == pytest.approx(setup.tilt, rel=0.02)
     assert first.noise == pytest.approx(setup.spread, rel=0.1)
@@ -398,7 +404,7 @@ def test_weights_are_inverse_variances(device):
     noise = np.random.default_rng(5).normal(0, 20, clean.shape) / np.sqrt(weights)[:, None, None]
     frames = (clean + noise).astype(np.float32)
     told = known(replace(SETUP, dtype="float32"), gain=np.full(shape, SETUP.slope))
-    found = estimate_normals(frames, EIGHTHS, **told, weights=weights, device=device)
+    found = estimate_normals(frames, EIGHTHS, **told, frame_weights=weights, device=device)
     best = rotations.bound(facing(shape), SETUP, weights[:, None, None])
     error = rotations.between(found.vectors.astype(float), facing(shape))
     assert np.mean(error**2 / best) == pytest.approx(1, abs=0.3)
@@ -424,8 +430,13 @@ REFUSED = {
     "two frames": (stack(2), EIGHTHS[:2], {}, "2 frames at 2 different phases do not determine a fit"),
     "two phases": (stack(), [0, 3] * 4, {}, "8 frames at 2 different phases do not determine a fit"),
     "phases close together": (stack(), 1e-4 * np.arange(8), {}, "the phases are too close together"),
-    "weights of others": (stack(), EIGHTHS, {"weights": [1, 1]}, r"weights of type int64 and shape \(2,\)"),
-    "a weight below 0": (stack(), EIGHTHS, {"weights": [-1] + [1] * 7}, "weight -1 at frame 0"),
+    "weights of others": (
+        stack(),
+        EIGHTHS,
+        {"frame_weights": [1, 1]},
+        r"weights of type int64 and shape \(2,\)",
+    ),
+    "a weight below 0": (stack(), EIGHTHS, {"frame_weights": [-1] + [1] * 7}, "weight -1 at frame 0"),
     "an unknown method": (
         stack(),
         EIGHTHS,
@@ -435,14 +446,14 @@ REFUSED = {
     "no tilt": (stack(), EIGHTHS, {"tilt": 0.0}, "tilt 0 deg: above 0 and up to 30 deg is needed"),
     "a tilt below 0": (stack(), EIGHTHS, {"tilt": -0.1}, "tilt -5.7.* deg: above 0"),
     "a tilt of 40 degrees": (stack(), EIGHTHS, {"tilt": np.radians(40)}, "tilt 40 deg: above 0"),
-    "a tilt that nothing tells": (stack(), EIGHTHS, {"tilt": None}, "too few pixels tell the tilt"),
+    "a tilt that nothing tells": (stack(), EIGHTHS, {"tilt": "estimate"}, "to estimate the tilt"),
     "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0.0: a standard deviation in counts is needed"),
     "noise of no number": (stack(), EIGHTHS, {"noise": np.nan}, "noise nan: a standard deviation"),
     "endless noise": (stack(), EIGHTHS, {"noise": np.inf}, "noise inf: a standard deviation"),
     "no gain": (stack(), EIGHTHS, {"gain": 0}, "zenith gain 0.0: counts per radian other than 0"),
     "a gain of no number": (stack(), EIGHTHS, {"gain": np.nan}, "zenith gain nan: counts per radian"),
     "a gain of others": (stack(), EIGHTHS, {"gain": np.ones((7, 5))}, r"zenith gain has shape \(7, 5\)"),
-    "swapped ends": (stack(), EIGHTHS, {"low": 900, "high": 10}, "low is not below high"),
+    "swapped ends": (stack(), EIGHTHS, {"dark": 900, "bright": 10}, "dark is not below bright"),
 }
 
 
@@ -468,7 +479,7 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     ]
     for block, weights, message in wrong:
         with pytest.raises(InputError, match=message):
-            estimator.push(block, weights)
+            estimator.push(block.frames, phase=block.phase, frame_weights=weights)
     with pytest.raises(InputError, match="a turn of 72 frames or more"):
         push(estimator, np.repeat(frames, 5, axis=0)[:70], phase[9] + 1e-3 * np.arange(70))
     push(estimator, frames[10:], phase[10:])
@@ -478,7 +489,9 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
 @pytest.mark.parametrize("level", [12, 50, 77, 200])
 def test_the_paper_tells_no_azimuth_where_nothing_swings(device, level):
     frames = np.full((8, 1, 2), level, np.uint8)
-    found = estimate_normals(frames, EIGHTHS, TILT, 206.0, 12.0, noise=1.0, method="paper", device=device)
+    found = estimate_normals(
+        frames, EIGHTHS, tilt=TILT, gain=206.0, offset=12.0, noise=1.0, method="paper", device=device
+    )
     assert np.isnan(found.sigma).all()
     assert np.isnan(found.azimuth).all()
     assert not found.contact.any()

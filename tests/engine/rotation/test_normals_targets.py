@@ -25,7 +25,9 @@ def drawn(name):
 def estimate(frames, setup, device, **given):
     """Estimate with what a lab knows: phases, tilt, gain, offset, and the noise of a sample."""
     known = {"noise": setup.spread, "device": device, **given}
-    return engine.estimate_normals(frames, setup.phase, setup.tilt, setup.slope, setup.offset, **known)
+    return engine.estimate_normals(
+        frames, setup.phase, tilt=setup.tilt, gain=setup.slope, offset=setup.offset, **known
+    )
 
 
 @pytest.fixture(scope="module", params=SETUPS)
@@ -114,7 +116,7 @@ def without_one(stack, how, device):
     left = np.ones(frames.shape)
     if how == "weight":
         frames[3], left[3] = 0, 0
-        given = {"weights": left[:, 0, 0]}
+        given = {"frame_weights": left[:, 0, 0]}
     elif how == "nan":
         lost = np.random.default_rng(0).integers(0, 8, (1, *stack.bound.shape))
         np.put_along_axis(frames, lost, np.nan, axis=0)
@@ -152,7 +154,8 @@ def test_a_clipped_frame_is_no_bias(device, side):
     stack = clipped(side)
     lost = np.mean(stack.frames == getattr(stack.setup, side), axis=(0, 2)) * 8
     assert np.all((lost > 0.9) & (lost < 1.6)), lost
-    normals = estimate(stack.frames, stack.setup, device, **{side: getattr(stack.setup, side)})
+    end = "dark" if side == "low" else "bright"
+    normals = estimate(stack.frames, stack.setup, device, **{end: getattr(stack.setup, side)})
     assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)) < 4)
     told = rotations.scores(normals.vectors, normals.sigma, stack)
     np.testing.assert_allclose(told.ratio, 1, atol=0.08)
@@ -184,7 +187,13 @@ def test_an_unknown_tilt_is_told_within_its_own_error(device, name, tilt):
     setup = stack.setup
     assert error < 1e-3 * setup.tilt
     found = engine.estimate_normals(
-        stack.frames, setup.phase, None, setup.slope, setup.offset, noise=setup.spread, device=device
+        stack.frames,
+        setup.phase,
+        tilt="estimate",
+        gain=setup.slope,
+        offset=setup.offset,
+        noise=setup.spread,
+        device=device,
     )
     assert found.tilt == pytest.approx(setup.tilt, abs=4 * error)
     told = rotations.scores(found.vectors.reshape(1, -1, 3), None, flat(stack))

@@ -60,7 +60,7 @@ def usable(column, row, fine):
 
 
 def register(source, heights, device=None):
-    return read_all(Registered(source, heights, device), 4).frames
+    return read_all(Registered(source, heights, device=device), 4).frames
 
 
 def ramp(shape=SHAPE):
@@ -178,12 +178,12 @@ def test_blocks_make_no_difference(device, dtype, monkeypatch):
     frames = np.random.default_rng(5).uniform(1, 250, (6, *SHAPE)).astype(dtype)
     answers = []
     for length in (1, 2, 4, 5, 6, 9):
-        source = Registered(made_up(frames), some_heights(), device)
+        source = Registered(made_up(frames), some_heights(), device=device)
         read = read_all(source, length)
         np.testing.assert_array_equal(read.phase, PHASES)
         answers.append((read.frames, source.noise_gain))
     monkeypatch.setattr("mirrorskin.engine.rotation.registration._BLOCK", 2 * frames[0].nbytes)
-    small = Registered(made_up(frames), some_heights(), device)
+    small = Registered(made_up(frames), some_heights(), device=device)
     assert len(small.read(np.empty((6, *SHAPE), np.float32)).frames) == 2
     for found, gain in answers:
         assert found.tobytes() == answers[0][0].tobytes()
@@ -260,7 +260,7 @@ def test_a_picture_without_16_samples_has_no_answer(device, shape):
 
 def test_equal_frames_stay_equal(device):
     frames = np.full((6, *SHAPE), 137, np.uint8)
-    found = register(made_up(frames), some_heights(), device)
+    found = register(made_up(frames), some_heights(), device=device)
     assert np.isfinite(found).sum() > 0.5 * found.size
     np.testing.assert_allclose(found[np.isfinite(found)], 137, rtol=1e-6)
 
@@ -306,7 +306,7 @@ def test_a_buffer_that_does_not_fit_is_a_defect_of_the_caller(out):
 def test_a_device_without_room_says_so(small_device):
     small_device.max_allocation = 4 * 27 * 35 - 1  # a padded frame takes one byte more
     with pytest.raises(DeviceMemoryError, match="no room for padded"):
-        Registered(made_up(ramp()), some_heights(), small_device)
+        Registered(made_up(ramp()), some_heights(), device=small_device)
 
 
 def test_registered_frames_are_not_lent(tmp_path):

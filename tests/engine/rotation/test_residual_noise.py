@@ -111,7 +111,7 @@ def test_where_nothing_will_be_answered_any_noise_will_do(samples):
 def test_without_a_whole_pixel_noise_is_not_made_up():
     samples, *known = samples_of(1.0, 0.0, dtype="uint8")
     samples[np.arange(PIXELS) % 8, np.arange(PIXELS)] = 255
-    with pytest.raises(InputError, match="too few samples are whole to tell the noise"):
+    with pytest.raises(InputError, match="too few samples are valid to estimate the noise"):
         residual_noise(samples, *known)
 
 
@@ -133,7 +133,10 @@ def test_few_pixels_tell_roughly(pixels):
 
 def test_three_frames_tell_no_noise():
     samples, phase, weights = samples_of(1.0, 0.0)
-    with pytest.raises(InputError, match="3 frames a turn tell no noise: give the standard deviation"):
+    with pytest.raises(
+        InputError,
+        match=r"3 frames a turn leave no residual .*: give its standard deviation",
+    ):
         residual_noise(samples[:3], phase[:3], weights[:3])
 
 

@@ -76,7 +76,7 @@ def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
     np.testing.assert_array_equal(np.isfinite(per_count), expected)
     with np.errstate(invalid="ignore"):
         frames = np.random.default_rng(0).integers(90, 110, (8, *SHAPE)).astype(np.uint8)
-    normals = estimate_normals(frames, PHASE, TILT, response=found, noise=1.0)
+    normals = estimate_normals(frames, PHASE, tilt=TILT, response=found, noise=1.0)
     assert np.isnan(normals.sigma[~expected]).all()
     assert np.isfinite(normals.sigma[expected]).any()
 
@@ -84,7 +84,7 @@ def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
 def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(device):
     response = made(pivot=walls.PIVOT)
     frames, normal = frames_of(response, 0.5, 2.0)
-    found = estimate_normals(frames, PHASE, TILT, response=response, noise=1.0, device=device)
+    found = estimate_normals(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
     error = np.linalg.norm(found.vectors - normal, axis=-1) / found.sigma
     assert np.mean(error**2) == pytest.approx(1, abs=0.25)
     assert found.contact.mean() > 0.98
@@ -94,7 +94,7 @@ def test_the_noise_is_told_from_the_frames():
     response = made(pivot=walls.PIVOT)
     frames, _ = frames_of(response, 0.55, -1.0, noise=2.0)
     frames[:, 0] = 10.0  # dark and still
-    found = estimate_normals(frames, PHASE, TILT, response=response)
+    found = estimate_normals(frames, PHASE, tilt=TILT, response=response)
     assert found.noise == pytest.approx(2.0, rel=0.12)
 
 
@@ -104,15 +104,15 @@ def test_dark_pixels_are_told_to_be_too_level():
     light[2, 3:9] = 0.01
     mean = (response.planes[0] + light / response.planes[1]).astype(np.float32)
     mean[0, 0] = np.nan
-    np.testing.assert_array_equal(response.level(mean), light < 0.1)
+    np.testing.assert_array_equal(response.too_level(mean), light < 0.1)
 
 
 @pytest.mark.parametrize(
     ("change", "told"),
     [
         ({"wall": walls.response(SHAPE, pattern="uniform")}, "uniform pattern"),
-        ({"wall": walls.response(SHAPE, curve=np.ones(13))}, "13 numbers"),
-        ({"wall": walls.response(SHAPE, curve=np.ones(1))}, "1 numbers"),
+        ({"wall": walls.response(SHAPE, curve=np.ones(13))}, "13 coefficients"),
+        ({"wall": walls.response(SHAPE, curve=np.ones(1))}, "1 coefficients"),
         ({"dark": None}, "references"),
         ({"dark": 240.0, "bright": 10.0}, "swapped"),
     ],
@@ -124,7 +124,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(change, told):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [({"method": "paper"}, "exact"), ({"tilt": None}, "does not tell the tilt")]
+    ("change", "told"), [({"method": "paper"}, "exact"), ({"tilt": "estimate"}, "tilt cannot be estimated")]
 )
 def test_what_a_response_cannot_do_is_refused(change, told):
     frames = np.full((8, *SHAPE), 100, np.uint8)
@@ -135,7 +135,7 @@ def test_what_a_response_cannot_do_is_refused(change, told):
 
 def test_neither_a_gain_nor_a_response_is_too_little():
     with pytest.raises(InputError, match="zenith gain"):
-        estimate_normals(np.full((8, *SHAPE), 100, np.uint8), PHASE, TILT)
+        estimate_normals(np.full((8, *SHAPE), 100, np.uint8), PHASE, tilt=TILT)
 
 
 def test_a_source_without_a_calibration_has_no_response():

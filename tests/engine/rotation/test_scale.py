@@ -9,8 +9,8 @@ from mirrorskin.io import InputError
 SHAPE = (3, 4)
 
 
-def planes(gain=200.0, offset=10.0, low=None, high=None):
-    return make_scale(gain, offset, low, high, SHAPE)
+def planes(gain=200.0, offset=10.0, dark=None, bright=None):
+    return make_scale(gain, offset, dark, bright, SHAPE)
 
 
 def test_numbers_make_one_scale_for_all():
@@ -21,9 +21,9 @@ def test_numbers_make_one_scale_for_all():
     np.testing.assert_array_equal(scale.thinned(5), scale.planes)
 
 
-@pytest.mark.parametrize("name", ["gain", "offset", "low", "high"])
+@pytest.mark.parametrize("name", ["gain", "offset", "dark", "bright"])
 def test_one_map_makes_a_scale_of_each_pixel(name):
-    numbers = {"gain": 200.0, "offset": 10.0, "low": 20.0, "high": 210.0}
+    numbers = {"gain": 200.0, "offset": 10.0, "dark": 20.0, "bright": 210.0}
     single = planes(**numbers).planes
     numbers[name] = np.full(SHAPE, numbers[name])
     scale = planes(**numbers)
@@ -34,18 +34,18 @@ def test_one_map_makes_a_scale_of_each_pixel(name):
 
 
 def test_ends_are_zeniths():
-    scale = planes(low=30.0, high=210.0)
+    scale = planes(dark=30.0, bright=210.0)
     assert scale.ends
     np.testing.assert_allclose(scale.planes[2:], [0.1, 1.0])
-    np.testing.assert_allclose(planes(low=30.0).planes[2:], [0.1, np.inf])
-    np.testing.assert_allclose(planes(high=30.0).planes[2:], [-np.inf, 0.1])
-    assert planes(high=30.0).ends
+    np.testing.assert_allclose(planes(dark=30.0).planes[2:], [0.1, np.inf])
+    np.testing.assert_allclose(planes(bright=30.0).planes[2:], [-np.inf, 0.1])
+    assert planes(bright=30.0).ends
 
 
 def test_a_gain_below_0_turns_the_ends_round():
     np.testing.assert_allclose(planes(-200.0, 230.0, 30.0, 210.0).planes, [230, -1 / 200, 0.1, 1.0])
-    np.testing.assert_allclose(planes(-200.0, 230.0, low=30.0).planes[2:], [-np.inf, 1.0])
-    np.testing.assert_allclose(planes(-200.0, 230.0, high=210.0).planes[2:], [0.1, np.inf])
+    np.testing.assert_allclose(planes(-200.0, 230.0, dark=30.0).planes[2:], [-np.inf, 1.0])
+    np.testing.assert_allclose(planes(-200.0, 230.0, bright=210.0).planes[2:], [0.1, np.inf])
 
 
 def test_a_pixel_without_a_gain_or_an_offset_has_no_scale():
@@ -68,13 +68,13 @@ def test_a_pixel_without_a_gain_or_an_offset_has_no_scale():
         ({"offset": np.full(SHAPE, np.nan)}, "zenith offset is no number"),
         ({"gain": np.ones((4, 3))}, r"zenith gain has shape \(4, 3\), the frames are 3 x 4"),
         ({"offset": np.ones(3)}, r"zenith offset has shape \(3,\)"),
-        ({"low": np.ones((1, 4))}, r"low has shape \(1, 4\)"),
-        ({"high": np.ones((2, 3, 4))}, r"high has shape \(2, 3, 4\)"),
-        ({"low": np.nan}, "low is no number: give the counts at which brightness ends"),
-        ({"low": np.inf}, "low is no number"),
-        ({"high": np.full(SHAPE, np.nan)}, "high is no number"),
-        ({"low": 210.0, "high": 30.0}, "low is not below high at any pixel: are they swapped"),
-        ({"low": 30.0, "high": np.full(SHAPE, 30.0)}, "low is not below high"),
+        ({"dark": np.ones((1, 4))}, r"dark has shape \(1, 4\)"),
+        ({"bright": np.ones((2, 3, 4))}, r"bright has shape \(2, 3, 4\)"),
+        ({"dark": np.nan}, "dark is no number: give the counts at which brightness ends"),
+        ({"dark": np.inf}, "dark is no number"),
+        ({"bright": np.full(SHAPE, np.nan)}, "bright is no number"),
+        ({"dark": 210.0, "bright": 30.0}, "dark is not below bright at any pixel: are they swapped"),
+        ({"dark": 30.0, "bright": np.full(SHAPE, 30.0)}, "dark is not below bright"),
     ],
 )
 def test_what_is_no_scale_is_refused_in_one_line(given, message):

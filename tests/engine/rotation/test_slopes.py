@@ -82,14 +82,14 @@ STEEP = (10, 30, 50)
 @pytest.mark.parametrize("phase", [EIGHTHS, UNEVEN])
 def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
     setup = replace(SETUP, phase=phase)
-    known = setup.phase, setup.tilt, setup.slope, setup.offset
+    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
     # Uneven phases tell azimuths of one direction better than those of another.
     spare = 0.15 if phase is EIGHTHS else 0.4
     toward = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
     for zenith in (0, 1, 4, *STEEP):
         true = np.tile(rotations.direction(np.radians(zenith), np.radians(azimuth)), (100, 100, 1))
         frames = rotations.expose(true, setup, seed=zenith)
-        normals = estimate_normals(frames, *known, noise=setup.spread)
+        normals = estimate_normals(frames, **known, noise=setup.spread)
         found = find_slopes(normals.vectors, normals.sigma, np.ones_like(normals.contact), TILT)
         steepness = np.tan(np.radians(zenith))
         slopes = found.dz_dx, found.dz_dy
@@ -125,7 +125,7 @@ def test_means_over_turns_are_as_flat_as_single_turns():
 
 def test_weights_may_go_by_other_errors():
     plain = slopes_at(40, 0, sigma=0.02, tilt=TILT)
-    white = slopes_at(40, 0, sigma=0.02, tilt=TILT, white=np.float32(0.04) * ONE)
+    white = slopes_at(40, 0, sigma=0.02, tilt=TILT, independent_sigma=np.float32(0.04) * ONE)
     assert white[:2] == plain[:2]
     assert white[2:4] == slopes_at(40, 0, sigma=0.04, tilt=TILT)[2:4]
     assert white[2:4] != plain[2:4]

@@ -7,7 +7,7 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.rotation.design_matrix import fit_matrix
+from mirrorskin.engine.rotation.design_matrix import turn_fit
 from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt, one_wave, zenith_seen
 from mirrorskin.io import InputError
@@ -22,7 +22,7 @@ def told(samples, setup, weights=None, ends=OPEN):
     weight = np.ones(len(phase)) if weights is None else np.array(weights)
     scale = np.array([setup.offset, 1 / setup.slope, *ends])
     noise = CountNoise(setup.spread**2, 0.0, setup.spread**2)
-    return estimate_tilt(samples, phase, weight, fit_matrix(phase, weight), scale, noise)
+    return estimate_tilt(samples, turn_fit(phase, weight), scale, noise)
 
 
 def samples_of(setup, zenith=(0, 55), count=400, seed=1):
@@ -108,7 +108,10 @@ def still():
     ids=["too level", "too few", "still", "dark", "bright"],
 )
 def test_too_little_that_tells_is_said_so(samples):
-    with pytest.raises(InputError, match=r"too few pixels tell the tilt: give it, such as 2\.5deg"):
+    with pytest.raises(
+        InputError,
+        match=r"too few pixels are steep and clear .*: give it, such as 2\.5deg",
+    ):
         told(samples, SETUP)
 
 
