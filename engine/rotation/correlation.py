@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands
 from mirrorskin.io import InputError, check_phase
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.correlation import WINDOW
@@ -300,7 +300,7 @@ class _Sums:
             with band.resident():
                 self._run(band, name, moved, **arguments, fit=self._fit, **known)
                 parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
-        return [join_rows(part) for part in zip(*parts, strict=True)]
+        return [np.concatenate(part) for part in zip(*parts, strict=True)]  # copies
 
     def _answer_counts(self, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
         """Return the answers of integer sums of ``size`` bytes."""
