@@ -1,10 +1,8 @@
-"""Files that exist whole or not at all, and room on the disk that is taken before it is needed."""
+"""Files that exist whole or not at all."""
 
 from __future__ import annotations
 
-import errno
 import fcntl
-import math
 import os
 import secrets
 import tempfile
@@ -75,7 +73,6 @@ class NewHdf5:
     """An HDF5 file in the making."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
-        self.descriptor = descriptor
         self._path = path
         self._disk = _Disk(descriptor, "w+b", closefd=False)
         self.root = h5py.File(self._disk, "w", **_ALIGNED)
@@ -195,42 +192,3 @@ def write_new(path: Path, parts: Sequence[bytes]) -> None:
         os.fdopen(descriptor, "wb", closefd=False) as file,
     ):
         file.writelines(parts)
-
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_UNABLE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
-
-
-class Reserve:
-    """The bytes of a file that the disk has promised."""
-
-    def __init__(self, path: Path, descriptor: int, step: int) -> None:
-        self._path, self._descriptor, self._step = path, descriptor, step
-        self._end: float = 0
-
-    def hold(self, end: int) -> None:
-        """See that the file can be written up to some byte.
-
-        A disk that cannot promise anything is believed to have room.
-        """
-        if self._end < math.inf:
-            self._end = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
-        if end > self._end and not self._grow(end + self._step):
-            self._grow(end, last=True)
-
-    def _grow(self, end: int, last: bool = False) -> bool:
-        start = int(self._end)
-        try:
-            os.posix_fallocate(self._descriptor, start, end - start)
-        except OSError as error:
-            if error.errno in _UNABLE:
-                self._end = math.inf
-                return True
-            if error.errno not in _FULL:
-                raise
-            if last:
-                why = os.strerror(error.errno)
-                raise InputError(f"{self._path}: the disk is full ({why}); {MAKE_ROOM}") from error
-            return False
-        self._end = end
-        return True

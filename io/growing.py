@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import itertools
 import math
 import os
 from collections.abc import Mapping
@@ -14,91 +16,70 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import Reserve
+from mirrorskin.io.atomic import MAKE_ROOM
 from mirrorskin.io.calibration.file import CARRIED, size_of, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import DROPPED, LIVE, SERIES, STATE, UNDER_WAY, USED
 from mirrorskin.io.recorder import POSITIONS, Compression, new_stack, packing, write_header, write_plot
-from mirrorskin.io.types import Block, Closing, Floats, Header
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
-_AT_ONCE = 1 << 14  # rows for which there is room at once
+# Files for HDF5 1.10 and later, the first that could read what is being written.
+_VERSIONS = ("v110", "v110")
+_STATE_LENGTH = 240  # bytes; their place is made before the first frame
+_ROWS = 1 << 14  # of each column, for which there is room at once
+_PAGE, _STEP, _SPARE, _MOST_META = 4 << 10, 64 << 20, 2 << 20, 4 << 20  # bytes
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_UNABLE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 
 
 class Column:
-    """A dataset with one row a frame, to which rows are appended."""
+    """A dataset with one row a frame; rows are set at any time, and written by ``flush``."""
 
     def __init__(
         self,
         file: h5py.File,
         name: str,
         unit: str | None,
-        dtype: Any,
+        default: Any,
         expected: int,
         width: tuple[int, ...] = (),
     ) -> None:
-        chunk = (min(max(expected, 64), _AT_ONCE), *width)
+        chunk = (min(max(expected, 64), _ROWS), *width)
+        self._default = default
+        self._rows: NDArray[Any] = np.full((chunk[0], *width), default)
         # With a first row, its place in the file is found before the first frame.
-        blank = np.zeros((1, *width), dtype)
+        blank = np.zeros_like(self._rows[:1])
         self._dataset = file.create_dataset(name, data=blank, chunks=chunk, maxshape=(None, *width))
         if unit is not None:
             self._dataset.attrs["units"] = unit
-        self._width, self._count, self._waiting = width, 0, list[NDArray[Any]]()
+        self._written = 0  # rows in the file that are up to date
 
-    def append(self, rows: NDArray[Any] | None, count: int) -> None:
-        """Take the rows of so many frames more, NaN if they are unknown; ``flush`` writes them."""
-        self._waiting.append(np.full((count, *self._width), np.nan) if rows is None else np.array(rows))
-
-    def flush(self) -> None:
-        """Give HDF5 the rows that wait."""
-        if self._waiting:
-            self.write(self._count, np.concatenate(self._waiting))
-            self._waiting.clear()
-
-    def write(self, start: int, rows: NDArray[Any]) -> None:
-        """Write rows, also over others."""
-        stop = start + len(rows)
-        if stop > self._count:
-            self._dataset.resize(stop, axis=0)
-            self._count = stop
-        self._dataset[start:stop] = rows
+    def set(self, start: int, rows: NDArray[Any]) -> None:
+        """Set the rows from some frame on; those of other frames are the default."""
+        self._grow(start + len(rows))
+        self._rows[start : start + len(rows)] = rows
+        self._written = min(self._written, start)
 
     def correct(self, rows: NDArray[Any]) -> None:
         """Replace the first rows by better ones, where these are finite."""
-        rows = rows[: self._count]
-        kept = self._dataset[: len(rows)]
-        self.write(0, np.where(np.isfinite(rows), rows, kept))
-
-
-class Marks:
-    """Whether each frame was used; it may be marked before or after the frame is written."""
-
-    def __init__(self, column: Column) -> None:
-        self._column = column
-        self._used = bytearray()
-        self._first = 0  # of those that changed
-
-    def mark(self, index: int, used: NDArray[np.bool_]) -> None:
-        """Say whether frames, from number ``index`` on, were used."""
-        self._extend(index + len(used))
-        self._used[index : index + len(used)] = used.tobytes()
-        self._first = min(self._first, index)
+        self._grow(len(rows))
+        self.set(0, np.where(np.isfinite(rows), rows, self._rows[: len(rows)]))
 
     def flush(self, count: int) -> None:
-        """Give HDF5 what is new of so many frames; those that nobody marked were used."""
-        self._extend(count)
-        if self._first < count:
-            rows = np.frombuffer(bytes(self._used[self._first : count]), np.uint8)
-            self._column.write(self._first, rows)
-        self._first = max(self._first, count)
+        """Give HDF5 what is new of the first rows."""
+        self._grow(count)
+        if self._written < count:
+            if count > len(self._dataset):
+                self._dataset.resize(count, axis=0)
+            self._dataset[self._written : count] = self._rows[self._written : count]
+        self._written = max(self._written, count)
 
-    def _extend(self, count: int) -> None:
-        self._used.extend(b"\1" * (count - len(self._used)))
-
-
-# Files for HDF5 1.10 and later, the first that could read what is being written.
-_VERSIONS = ("v110", "v110")
-_STATE_LENGTH = 240  # bytes; their place is made before the first frame
-_PAGE, _STEP, _SPARE, _MOST_META = 4 << 10, 64 << 20, 2 << 20, 4 << 20
+    def _grow(self, count: int) -> None:
+        if count > len(self._rows):
+            more = np.full(
+                (max(count - len(self._rows), len(self._rows)), *self._rows.shape[1:]), self._default
+            )
+            self._rows = np.concatenate([self._rows, more.astype(self._rows.dtype)])
 
 
 class GrowingRecording(Closing):
@@ -151,14 +132,15 @@ class GrowingRecording(Closing):
             else:
                 self._frames[number] = frame
         for name, columns in self._series.items():
-            for column in columns:
-                column.append(getattr(block, name), n)
-        self._dropped.append(np.array([block.dropped, *[0] * (n - 1)], np.int32), n)
+            rows = getattr(block, name)
+            for column in columns if rows is not None else ():
+                column.set(self.count, rows)
+        self._dropped.set(self.count, np.array([block.dropped]))
         self.count += n
 
     def mark(self, index: int, used: NDArray[np.bool_]) -> None:
         """Say whether frames, from number ``index`` on, were used; unless marked, they were."""
-        self._marks.mark(index, used)
+        self._used.set(index, used)
 
     def flush(self) -> None:
         """Hand everything to the system, so that it can be read and outlives this process."""
@@ -176,11 +158,11 @@ class GrowingRecording(Closing):
         """Write what is known only now."""
         if self._frames.shape[0] > self.count:  # it failed to write some
             self._frames.resize(self.count, axis=0)
-        self._flush()
         for name, values in positions.items():
             if name in self._series:
-                self._series[name][0].correct(np.asarray(values, np.float64))
-        self._tell(state)
+                self._series[name][0].correct(np.asarray(values, np.float64)[: self.count])
+        self._flush()
+        self._write_state(state)
         self._file.flush()
 
     def close(self) -> None:
@@ -199,32 +181,25 @@ class GrowingRecording(Closing):
         # Without a cache, a chunk is packed when it is written.
         self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
         self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
-        self._tell(UNDER_WAY)
+        self._write_state(UNDER_WAY)
         width = (2,) if position == "displacement" else ()
-        series = {"time": [SERIES["time"]], position: [SERIES[position]]}
-        if position in LIVE:
-            series[position].append(LIVE[position])
         self._series = {
-            name: [
-                Column(file, place, unit, np.float64, expected, () if name == "time" else width)
-                for place, unit in places
-            ]
-            for name, places in series.items()
+            "time": [Column(file, *SERIES["time"], np.nan, expected)],
+            position: [Column(file, *SERIES[position], np.nan, expected, width)],
         }
-        self._dropped = Column(file, DROPPED, None, np.int32, expected)
-        self._marks = Marks(Column(file, USED, None, np.uint8, expected))
+        if position in LIVE:
+            self._series[position].append(Column(file, *LIVE[position], np.nan, expected))
+        self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
+        self._used = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
         """Do so; the room that was reserved last is enough for it."""
         self._frames.flush()  # the frames are there before anything says so
-        for columns in self._series.values():
-            for column in columns:
-                column.flush()
-        self._dropped.flush()
-        self._marks.flush(self.count)
+        for column in (*itertools.chain(*self._series.values()), self._dropped, self._used):
+            column.flush(self.count)
         self._file.flush()
 
-    def _tell(self, state: str) -> None:
+    def _write_state(self, state: str) -> None:
         self._state[()] = state.encode()[:_STATE_LENGTH].decode(errors="ignore")
 
     def _hold(self, size: int) -> None:
@@ -243,3 +218,38 @@ def _new_hdf5(descriptor: int, meta: int, frame: int) -> h5py.File:
         alignment_threshold=frame,
         alignment_interval=math.gcd(frame, _PAGE),
     )
+
+
+class Reserve:
+    """The bytes of a file that the disk has promised."""
+
+    def __init__(self, path: Path, descriptor: int, step: int) -> None:
+        self._path, self._descriptor, self._step = path, descriptor, step
+        self._end: float = 0
+
+    def hold(self, end: int) -> None:
+        """See that the file can be written up to some byte.
+
+        A disk that cannot promise anything is believed to have room.
+        """
+        if self._end < math.inf:
+            self._end = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
+        if end > self._end and not self._grow(end + self._step):
+            self._grow(end, last=True)
+
+    def _grow(self, end: int, last: bool = False) -> bool:
+        start = int(self._end)
+        try:
+            os.posix_fallocate(self._descriptor, start, end - start)
+        except OSError as error:
+            if error.errno in _UNABLE:
+                self._end = math.inf
+                return True
+            if error.errno not in _FULL:
+                raise
+            if last:
+                why = os.strerror(error.errno)
+                raise InputError(f"{self._path}: the disk is full ({why}); {MAKE_ROOM}") from error
+            return False
+        self._end = end
+        return True

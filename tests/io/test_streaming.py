@@ -21,7 +21,7 @@ from stacks import plot_of, read_all
 
 from mirrorskin import io
 from mirrorskin.io import growing, streaming
-from mirrorskin.io.atomic import Reserve
+from mirrorskin.io.growing import Reserve
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 SUPPORT = Path(__file__).parents[1] / "support"
