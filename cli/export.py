@@ -59,7 +59,7 @@ def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDAr
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.engine.metrology.sections import section
+    from mirrorskin.engine.metrology import section
 
     cut = section(result, *(ends or ()))
     if not np.isfinite(cut.height).any():

@@ -8,7 +8,7 @@ goes a cross-section.
 import numpy as np
 
 from mirrorskin import engine, hw
-from mirrorskin.engine.metrology.sections import section
+from mirrorskin.engine.metrology import section
 from mirrorskin.engine.summary import summarise
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.view.result import figures_of

@@ -1,1 +1,24 @@
-"""Numbers of a height map as metrology defines them, each with its standard uncertainty."""
+"""Numbers with uncertainties from height maps: forms, areas and volumes, sections, steps, roughness."""
+
+from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
+from mirrorskin.engine.metrology.measures import FormName, Measures, measure
+from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology.sections import Section, Step, section, step_height
+from mirrorskin.engine.metrology.texture import Roughness, roughness
+
+__all__ = [
+    "FormName",
+    "Measures",
+    "Plane",
+    "Quantity",
+    "Roughness",
+    "Section",
+    "Sphere",
+    "Step",
+    "fit_plane",
+    "fit_sphere",
+    "measure",
+    "roughness",
+    "section",
+    "step_height",
+]

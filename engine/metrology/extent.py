@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.metrology.fitting import far_less_sure
 from mirrorskin.engine.metrology.patch import Patch
@@ -20,11 +18,10 @@ Mask = NDArray[np.bool_]
 _REACH = 3  # pixels to either side of the highest one, over which its top is fitted
 _ENOUGH = 20  # of these 49 pixels that must be known
 _NEAR = 3.0  # standard deviations above the lowest pixel, within which others might have been it
-_UP_TO_TOP = ("highest point", "height range", "height above rim")
-_AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+_UNIFORM = 1 / math.sqrt(3)  # standard deviation of what lies anywhere within 1 of its middle
 
 
-def levels(patch: Patch) -> dict[str, Quantity]:
+def heights(patch: Patch) -> dict[str, Quantity]:
     """Return the heights of the highest and the lowest point, of the middle and of the rim, mm.
 
     The *highest* is that of a paraboloid fitted to 7 x 7 pixels around the highest one after a median: the
@@ -32,52 +29,42 @@ def levels(patch: Patch) -> dict[str, Quantity]:
     the mean of the nine pixels around. The *lowest* is the lowest level that two neighbouring pixels
     reach, as it often lies at the rim where nothing can be fitted; a few far less sure than others (see
     `far_less_sure`) do not count. Its uncertainty grows with the number of pixels of which it is the
-    lowest by chance.
+    lowest by chance. Where a filled point is above the highest, values that reach up to it are also given
+    "with filled".
     """
-    highest, lowest = _highest(patch), _lowest(patch)
-    sigma = patch.sigmas()
-    middle = Quantity(float(np.median(patch.height[patch.measured])), float(np.median(sigma)), "mm")
-    base = rim(patch)
-    told = {
-        "highest point": highest,
-        "lowest point": lowest,
-        "height range": _difference(highest, lowest),
-        "median height": middle,
-    }
+    highest, lowest, base = _highest(patch), _lowest(patch), rim(patch)
+    median = Quantity(float(np.median(patch.height[patch.measured])), float(np.median(patch.sigmas())), "mm")
+    found = {"highest point": highest, "lowest point": lowest, "height range": _difference(highest, lowest)}
+    up_to_top = {"highest point", "height range", "height above rim"}
+    found["median height"] = median
     if base is not None:
-        told |= {"rim height": base, "height above rim": _difference(highest, base)}
-    return _with_filled(told, _highest_filled(patch))
-
-
-def _with_filled(told: dict[str, Quantity], top: float | None) -> dict[str, Quantity]:
-    """Add to what goes up to the highest point what it is with a higher filled one."""
-    every: dict[str, Quantity] = {}
-    for name, quantity in told.items():
-        every[name] = quantity
-        if top is not None and name in _UP_TO_TOP:
-            value = quantity.value + top - told["highest point"].value
-            every[f"{name} with filled"] = Quantity(value, np.nan, "mm")
-    return every
+        found |= {"rim height": base, "height above rim": _difference(highest, base)}
+    filled = patch.filled[np.isfinite(patch.filled)]
+    if not filled.size or not filled.max() > np.max(patch.height[patch.measured]):
+        return found
+    quantities: dict[str, Quantity] = {}
+    for name, quantity in found.items():
+        quantities[name] = quantity
+        if name in up_to_top:
+            value = quantity.value + float(filled.max()) - highest.value
+            quantities[f"{name} with filled"] = Quantity(value, np.nan, "mm")
+    return quantities
 
 
 def _difference(upper: Quantity, lower: Quantity) -> Quantity:
-    """Return how far two points are apart; their errors are taken to be independent."""
+    """Return the distance of two points; their errors are taken to be independent."""
     return Quantity(upper.value - lower.value, math.hypot(upper.sigma, lower.sigma), upper.unit)
 
 
 def rim(patch: Patch) -> Quantity | None:
     """Return the median height of the outermost measured pixels of the largest connected area, mm.
 
-    Holes have no rim of their own, and the picture's border is none.
-
-    Returns
-    -------
-    Quantity or None
-        None where more than half of the area's outline is the picture's border.
+    Holes have no rim of their own, and the picture's border is none. None where more than half of the area's
+    outline is the picture's border.
     """
-    whole = _largest(patch.measured | np.isfinite(patch.filled))
-    outermost = border(whole)
-    if 2 * np.count_nonzero(outermost) < np.count_nonzero(border(whole, ends=True)):
+    area = _largest(patch.measured | np.isfinite(patch.filled))
+    outermost = border(area)
+    if 2 * np.count_nonzero(outermost) < np.count_nonzero(border(area, ends=True)):
         return None
     outermost &= patch.measured
     if not outermost.any():
@@ -88,23 +75,19 @@ def rim(patch: Patch) -> Quantity | None:
 
 def border(mask: Mask, *, ends: bool = False) -> Mask:
     """Return the pixels of a mask beside one outside of it, or with ``ends`` beside the picture's end."""
+    from scipy import ndimage
+
     return np.asarray(mask & ~ndimage.binary_erosion(mask, border_value=not ends))
 
 
 def _largest(mask: Mask) -> Mask:
     """Return the largest connected area of a mask, with its holes."""
+    from scipy import ndimage
+
     label, count = ndimage.label(mask, np.ones((3, 3)))
     if count > 1:
         mask = label == 1 + np.argmax(np.bincount(label.ravel())[1:])
     return np.asarray(ndimage.binary_fill_holes(mask))
-
-
-def _highest_filled(patch: Patch) -> float | None:
-    """Return the height of the highest filled point, mm, if it is above all that was measured."""
-    filled = patch.filled[np.isfinite(patch.filled)]
-    if not filled.size or not filled.max() > np.max(patch.height[patch.measured]):
-        return None
-    return float(filled.max())
 
 
 def _highest(patch: Patch) -> Quantity:
@@ -123,7 +106,7 @@ def _highest(patch: Patch) -> Quantity:
 
 
 def _top(x: NDArray[np.intp], y: NDArray[np.intp], z: Doubles) -> tuple[float, float] | None:
-    """Return the top of a paraboloid through pixels, and the RMS of what it leaves; None if it has none."""
+    """Return the top of a paraboloid through pixels, and the RMS of its residual; None if it has none."""
     if z.size < _ENOUGH:
         return None
     rows = np.stack([np.ones(z.size), x, y, x * x, x * y, y * y]).astype(np.float64)
@@ -139,12 +122,15 @@ def _top(x: NDArray[np.intp], y: NDArray[np.intp], z: Doubles) -> tuple[float, f
 
 
 def _lowest(patch: Patch) -> Quantity:
+    import cv2
+
     counts = patch.measured
     if patch.sigma is not None:
         counts = counts & ~far_less_sure(patch.sigma, counts)
     height = np.where(counts, patch.height, np.inf)
     # Only pixels with one beside them that is as low: a single low pixel does not count.
-    beside = cv2.erode(height, _AROUND, borderType=cv2.BORDER_CONSTANT, borderValue=math.inf)
+    around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+    beside = cv2.erode(height, around, borderType=cv2.BORDER_CONSTANT, borderValue=math.inf)
     pair = np.where(height >= beside, height, np.inf)
     place = np.unravel_index(int(np.argmin(pair if np.isfinite(pair).any() else height)), height.shape)
     value = float(height[place])
@@ -156,54 +142,42 @@ def _lowest(patch: Patch) -> Quantity:
     return Quantity(value, sigma, "mm")
 
 
-_UNIFORM = 1 / math.sqrt(3)  # standard deviation of what lies anywhere within 1 of its middle
-
-
 def areas(patch: Patch) -> dict[str, Quantity]:
     """Return the areas with a height and in contact, as the camera sees them, and of the surface there, mm2.
 
     Where contact ends is known within half a pixel, everywhere to the same side: so the whole border of
-    half a pixel's width is uncertain. Where the result does not tell the contact, the area with a height is
-    taken for it, and says so if part of that was filled. The surface is told by normals: a pixel's
+    half a pixel's width is uncertain. Where the result has no map of contact, the area with a height is
+    taken for it, and named so if part of that was filled. The surface is that of the normals: a pixel's
     area over the normal's z.
     """
     filled = np.isfinite(patch.filled)
-    told = {"measured area": _area(patch, patch.measured)}
+    found = {"measured area": _area(patch, patch.measured)}
     if filled.any():
-        told["measured area with filled"] = _area(patch, patch.measured | filled)
-    guessed = filled.any() and not patch.contact_told
-    told["contact area with filled" if guessed else "contact area"] = _area(patch, patch.contact)
+        found["measured area with filled"] = _area(patch, patch.measured | filled)
+    guessed = filled.any() and not patch.contact_given
+    found["contact area with filled" if guessed else "contact area"] = _area(patch, patch.contact)
     if patch.secant is not None:
         known = patch.contact & np.isfinite(patch.secant)
         if known.any():
-            told["contact surface area"] = _surface(patch, known, patch.secant)
-    return told
+            found["contact surface area"] = _surface(patch, known, patch.secant)
+    return found
 
 
 def volume(patch: Patch, level: float, level_sigma: float, name: str) -> dict[str, Quantity]:
-    """Return the volume between the surface and a plane of some height, mm3; negative where it lies below.
+    """Return the volume between the surface and a plane at a level, mm, in mm3; negative where it lies below.
 
-    Errors of heights are taken to go together wholly, so their standard deviations add up: no correlation
+    Errors of heights are taken to be fully correlated, so their standard deviations add up: no correlation
     makes the volume less sure than that.
-
-    Parameters
-    ----------
-    patch : Patch
-    level, level_sigma : float
-        Of the plane, mm.
-    name : str
-        What to call it.
     """
     above = patch.height - level
     value = patch.pixel_area * float(np.nansum(above))
     errors = float(np.sum(patch.sigmas())) + level_sigma * np.count_nonzero(patch.measured)
-    ends = border(patch.measured)
-    edge = 0.5 * _UNIFORM * float(np.sum(abs(above[ends])))
-    told = {name: Quantity(value, patch.pixel_area * math.hypot(errors, edge), "mm3")}
+    edge = 0.5 * _UNIFORM * float(np.sum(abs(above[border(patch.measured)])))
+    found = {name: Quantity(value, patch.pixel_area * math.hypot(errors, edge), "mm3")}
     if np.isfinite(patch.filled).any():
         filled = patch.pixel_area * float(np.nansum(patch.filled - level))
-        told[f"{name} with filled"] = Quantity(value + filled, np.nan, "mm3")
-    return told
+        found[f"{name} with filled"] = Quantity(value + filled, np.nan, "mm3")
+    return found
 
 
 def _area(patch: Patch, mask: Mask) -> Quantity:
@@ -212,7 +186,7 @@ def _area(patch: Patch, mask: Mask) -> Quantity:
 
 
 def _surface(patch: Patch, known: Mask, secant: Doubles) -> Quantity:
-    """Add up secants; errors of the zenith change them by the tangent, and are taken to go together."""
+    """Add up secants; errors of the zenith change them by the tangent, and are taken as fully correlated."""
     value = float(np.sum(secant[known]))
     edge = 0.5 * _UNIFORM * float(np.sum(secant[border(known)]))
     errors = np.nan

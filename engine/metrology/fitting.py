@@ -1,39 +1,50 @@
-"""Least squares of distances: a form is moved until it fits the points best."""
+"""Forms fitted to points by least squares of their distances, and how sure their parameters are.
+
+Errors of heights that were integrated from slopes are alike over many pixels, and a fit is then far less sure
+than so many independent pixels would make it. So residuals are projected on a few smooth shapes that the fit
+leaves free. Errors with the form's own shape cannot be seen, but they are as large as those of the other
+smooth shapes, if errors have no reason to look like the form: the mean square of the projections is the
+variance of what the fit took in. This is the long-run variance by orthonormal series of Y. Sun, "A
+heteroskedasticity and autocorrelation robust F test using an orthonormal series variance estimator", The
+Econometrics Journal 16 (2013). It covers white errors, correlated ones and a form that does not fit. Where
+errors are so smooth that the form takes most of them in, residuals are smaller than the heights' standard
+deviations claim; the variance that is missing is counted as taken in.
+"""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Frame = tuple[Doubles, Doubles]
+_Frame = tuple[Doubles, Doubles]
 
 _STEPS, _HALVINGS = 50, 10
-_SETTLED = 1e-6  # of the residuals, by which a step may still change them
-_SINGULAR = 1e-14  # least eigenvalue of the normal equations, of columns of length 1
+_CONVERGED = 1e-6  # of the residuals, by which a step may still change them
+_SINGULAR = 1e-14  # least eigenvalue of normal equations, of columns of length 1
 _MEDIAN = 0.6745  # of the magnitude of a normal variate
-_FAR = 5.0  # standard deviations, as the median of the distances tells them, beyond which points are outliers
-_FEW = 0.15  # of the points: if more are that far, they belong to the surface
+_FAR = 5.0  # standard deviations, estimated by the median of the distances, beyond which points are outliers
+_FEW = 0.15  # of the points: if more are that far, or that unsure, they belong to the surface
 _PASSES = 5  # over the outliers
 _ENOUGH = 65536  # points to begin with
-_ROOM = 16384  # points at a time: what is worked out of them stays in the processor's cache
+_CHUNK = 16384  # points at a time: their derivatives stay in the processor's cache
 _NOTHING = 1e-300
-_ROUNDING = 1e-9  # of the points' extent: distances below it are none
+_ROUNDING = 1e-9  # of the points' extent: distances below it are none; of a shape's squared length likewise
+_UNSURE = 5.0  # times the median standard deviation, beyond which a height shows its error alone
+_OVERSTATED = 0.1  # of the claimed variance, that may be missing because claims are not exact
 
 
 class Form(Protocol):
-    """What a surface must tell of itself to be fitted."""
+    """A surface with k parameters that can be fitted."""
 
-    @property
-    def lift(self) -> int:
-        """Number of the parameter that moves it along z: distances go with that as with heights."""
+    lift: int
+    """Number of the parameter that moves it along z: distances go with that as with heights."""
 
     def start(self) -> Doubles:
         """Return parameters, (k,), to begin with."""
@@ -45,19 +56,19 @@ class Form(Protocol):
         """Return their derivatives by the parameters, (k, n)."""
 
 
-class Association(NamedTuple):
+class Fit(NamedTuple):
     """A form that fits, and how well.
 
     Attributes
     ----------
     parameters : ndarray, (k,), float64
     covariance : ndarray, (k, k), float64
-        NaN where points are too few to tell.
+        NaN where points are too few.
     kept : ndarray, (n,), bool
         False of outliers.
     birge : float
-        Birge's ratio: root mean square of the weighted distances that are left, over what standard deviations
-        make it; much more than 1 if the surface is not of this form. NaN where these are unknown.
+        Birge's ratio: root mean square of the weighted residuals over that by the standard deviations; much
+        more than 1 if the surface is not of this form. NaN where these are unknown.
     """
 
     parameters: Doubles
@@ -65,165 +76,15 @@ class Association(NamedTuple):
     kept: Mask
     birge: float
 
-
-def associate(form: Form, points: Doubles, sigma: Doubles) -> Association | None:
-    """Fit a form to points.
-
-    Distances are weighted by their inverse variances; no point counts as surer than the median. Outliers are
-    left out: points beyond five standard deviations, as the median of the weighted distances tells them, if
-    they are at most 15 %. If more are that far, they are part of the surface and all count.
-
-    Parameters
-    ----------
-    form : Form
-    points : ndarray, (3, n), float64
-        Millimetres.
-    sigma : ndarray, (n,), float64
-        Their standard deviations, mm; all NaN where they are unknown and so alike.
-
-    Returns
-    -------
-    Association or None
-        None where no form of this kind fits.
-    """
-    weight = _weights(sigma)
-    rounding = _ROUNDING * float(np.ptp(points, axis=1).max())
-    # Nearly all steps are taken with few points, and the last ones with all.
-    every = max(1, weight.size // _ENOUGH)
-    near = _hold_back(form, points[:, ::every], weight[::every], form.start(), rounding)
-    found = None if near is None else _leave_out(form, points, weight, near, rounding)
-    if found is None:
-        return None
-    parameters, kept = found
-    if not kept.all():
-        points, weight, sigma = points[:, kept], weight[kept], sigma[kept]
-    gram = _gram(form, points, weight, parameters, _frame(points))
-    claimed = 0.0
-    if np.isfinite(sigma[0]):
-        steepness = form.jacobian(points, parameters)[form.lift]
-        claimed = float(np.sum(weight * (sigma * steepness) ** 2))
-    birge = float(np.sqrt(gram[-1, -1] / claimed)) if claimed > 0 else np.nan
-    return Association(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
-
-
-def _hold_back(
-    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
-) -> Doubles | None:
-    """Fit so that far points pull no more than near ones (Huber 1964): some to one side do not spoil it."""
-    held: Doubles | None = parameters
-    share = np.ones_like(weight)
-    for _ in range(_PASSES):
-        held = _settle(form, points, weight * share, parameters, rounding)
-        if held is None:
-            return None
-        parameters = held
-        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
-        share = 1 / np.maximum(misfit / (_typical(misfit) + rounding), 1)
-    return parameters
-
-
-def _leave_out(
-    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
-) -> tuple[Doubles, Mask] | None:
-    """Leave out what is far, and fit, until the same points are left out."""
-    kept = np.zeros(weight.size, bool)
-    for _ in range(_PASSES):
-        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
-        near = misfit <= _FAR * max(_typical(misfit), rounding)
-        if np.count_nonzero(~near) > _FEW * near.size:
-            near[:] = True
-        if np.array_equal(kept, near):
-            break
-        kept = near
-        part = (points, weight) if kept.all() else (points[:, kept], weight[kept])
-        settled = _settle(form, *part, parameters, rounding)
-        if settled is None:
-            return None
-        parameters = settled
-    return parameters, kept
-
-
-def _typical(misfit: Doubles) -> float:
-    """Return the standard deviation that a median of magnitudes tells."""
-    return float(np.median(misfit)) / _MEDIAN
-
-
-def _weights(sigma: Doubles) -> Doubles:
-    """Return inverse variances, (n,), as shares of a typical one; ones where there are none."""
-    typical = float(np.median(sigma))
-    if not typical > 0:
-        return np.ones_like(sigma)
-    return np.asarray(np.maximum(sigma / typical, 1.0) ** -2)
-
-
-def _settle(
-    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
-) -> Doubles | None:
-    """Go down from parameters to the least sum of squares, by Gauss and Newton's steps."""
-    gram = _gram(form, points, weight, parameters)
-    least = rounding**2 * weight.size
-    for _ in range(_STEPS):
-        found = _step(gram)
-        if found is None:
-            return None
-        step, gain = found
-        before = gram[-1, -1]
-        for _ in range(_HALVINGS):
-            gram = _gram(form, points, weight, parameters + step)
-            if gram[-1, -1] <= before + least:
-                break
-            step = step / 2
-        parameters = parameters + step
-        if gain <= _SETTLED**2 * before + least:
-            return parameters
-    return None
-
-
-def _step(gram: Doubles) -> tuple[Doubles, float] | None:
-    """Return the step that is best where distances are linear, and the sum of squares that it takes away."""
-    scale = np.sqrt(np.diag(gram)[:-1])
-    if not np.all(scale > 0):
-        return None
-    normal, right = gram[:-1, :-1] / np.multiply.outer(scale, scale), -gram[:-1, -1] / scale
-    if np.linalg.eigvalsh(normal)[0] < _SINGULAR:
-        return None
-    step = np.linalg.solve(normal, right)
-    return step / scale, float(step @ normal @ step)
-
-
-def _gram(
-    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, frame: Frame | None = None
-) -> Doubles:
-    """Return the weighted sums that steps and `covariance` need, the latter with smooth shapes in a frame."""
-    total: Doubles | float = 0.0
-    for start in range(0, weight.size, _ROOM):
-        part = points[:, start : start + _ROOM]
-        shapes = [] if frame is None else _shapes(part, frame)
-        rows = np.stack([*form.jacobian(part, parameters), *shapes, form.distance(part, parameters)])
-        rows *= np.sqrt(weight[start : start + _ROOM])
-        total = total + rows @ rows.T
-    return np.asarray(total)
-
-
-def _frame(points: Doubles) -> Frame:
-    """Return the middle of the points along x and y, and how far they reach from it."""
-    low, high = points[:2].min(axis=1), points[:2].max(axis=1)
-    return (low + high) / 2, np.maximum((high - low) / 2, _NOTHING)
-
-
-def _shapes(points: Doubles, frame: Frame) -> list[Doubles]:
-    """Return the products of two and of three of x and y, (n,) each, within -1 and 1."""
-    (x_middle, y_middle), (x_reach, y_reach) = frame
-    x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
-    xx, xy, yy = x * x, x * y, y * y
-    return [xx, xy, yy, xx * x, xx * y, yy * x, yy * y]
-
-
-_UNSURE = 5.0  # times the median standard deviation, beyond which a height tells of its error alone
+    def sigma(self, *direction: float) -> float:
+        """Return the standard deviation of a linear combination of parameters."""
+        along = np.asarray(direction)
+        # Of parameters that nearly cancel, rounding may leave less than nothing.
+        return float(np.sqrt(np.maximum(along @ self.covariance @ along, 0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
+class PointCloud:
     """The known points of a height map.
 
     Attributes
@@ -241,7 +102,7 @@ class Cloud:
     where: Mask
 
     @classmethod
-    def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> Cloud:
+    def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> PointCloud:
         """Take a height map, with NaN where there is none, and where its pixels are; see `fit_plane`."""
         z = np.asarray(height, np.float64)
         where = np.isfinite(z)
@@ -253,7 +114,7 @@ class Cloud:
         return cls(points, known, where)
 
     @property
-    def common(self) -> float:
+    def common_sigma(self) -> float:
         """Mean standard deviation, mm: by so much heights may be wrong together; 0 where it is not known."""
         return float(np.nan_to_num(np.mean(self.sigma)))
 
@@ -264,34 +125,153 @@ class Cloud:
         noise = np.sqrt(np.mean(self.sigma**2))
         return residual, micrometres(float(np.sqrt(np.mean(distance**2))), float(noise))
 
+    def fit(self, form: Form) -> Fit | None:
+        """Fit a form; None where none of its kind fits.
+
+        Distances are weighted by their inverse variances; no point counts as surer than the median. Outliers
+        are left out: points beyond five standard deviations, estimated by the median of the weighted
+        distances, if they are at most 15 %. If more are that far, they are part of the surface and all count.
+        """
+        points, sigma = self.points, self.sigma
+        weight = _weights(sigma)
+        rounding = _ROUNDING * float(np.ptp(points, axis=1).max())
+        # Nearly all steps are taken with few points, and the last ones with all.
+        every = max(1, weight.size // _ENOUGH)
+        near = _fit_robustly(form, points[:, ::every], weight[::every], form.start(), rounding)
+        found = None if near is None else _leave_outliers_out(form, points, weight, near, rounding)
+        if found is None:
+            return None
+        parameters, kept = found
+        if not kept.all():
+            points, weight, sigma = points[:, kept], weight[kept], sigma[kept]
+        gram = _gram(form, points, weight, parameters, _frame(points))
+        claimed = 0.0
+        if np.isfinite(sigma[0]):
+            steepness = form.jacobian(points, parameters)[form.lift]
+            claimed = float(np.sum(weight * (sigma * steepness) ** 2))
+        birge = float(np.sqrt(gram[-1, -1] / claimed)) if claimed > 0 else np.nan
+        return Fit(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
+
 
 def far_less_sure(sigma: Doubles, known: Mask) -> Mask:
     """Return the known pixels, (H, W), of more than five times the median sigma, if at most 15 % are.
 
-    What is highest and lowest of all would be their errors. If more are that unsure, all count.
+    The highest and the lowest of all would be their errors. If more are that unsure, all count.
     """
     unsure = known & (sigma > _UNSURE * np.median(sigma[known]))
     return np.asarray(unsure & (np.count_nonzero(unsure) <= _FEW * np.count_nonzero(known)))
 
 
-def micrometres(value: float, sigma: float) -> Quantity:
-    """Return a quantity in micrometres of numbers in millimetres."""
-    return Quantity(1e3 * value, 1e3 * sigma, "µm")
+def _fit_robustly(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> Doubles | None:
+    """Fit so that far points pull no more than near ones (Huber 1964): some to one side do not spoil it."""
+    share = np.ones_like(weight)
+    for _ in range(_PASSES):
+        found = _minimise(form, points, weight * share, parameters, rounding)
+        if found is None:
+            return None
+        parameters = found
+        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
+        share = 1 / np.maximum(misfit / (_typical(misfit) + rounding), 1)
+    return parameters
 
 
-def degrees(value: float, sigma: float) -> Quantity:
-    """Return a quantity in degrees of numbers in radians."""
-    return Quantity(math.degrees(value), math.degrees(sigma), "deg")
+def _leave_outliers_out(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> tuple[Doubles, Mask] | None:
+    """Leave out what is far, and fit, until the same points are left out."""
+    kept = np.zeros(weight.size, bool)
+    for _ in range(_PASSES):
+        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
+        near = misfit <= _FAR * max(_typical(misfit), rounding)
+        if np.count_nonzero(~near) > _FEW * near.size:
+            near[:] = True
+        if np.array_equal(kept, near):
+            break
+        kept = near
+        part = (points, weight) if kept.all() else (points[:, kept], weight[kept])
+        found = _minimise(form, *part, parameters, rounding)
+        if found is None:
+            return None
+        parameters = found
+    return parameters, kept
 
 
-def spread(covariance: Doubles, *direction: float) -> float:
-    """Return the standard deviation of a linear combination of parameters."""
-    along = np.asarray(direction)
-    # Of parameters that nearly cancel, rounding may leave less than nothing.
-    return float(np.sqrt(np.maximum(along @ covariance @ along, 0)))
+def _typical(misfit: Doubles) -> float:
+    """Return the standard deviation of normal variates with that median of magnitudes."""
+    return float(np.median(misfit)) / _MEDIAN
 
 
-_OVERSTATED = 0.1  # of the claimed variance, that may be missing because claims are not exact
+def _weights(sigma: Doubles) -> Doubles:
+    """Return inverse variances, (n,), as shares of a typical one; ones where there are none."""
+    typical = float(np.median(sigma))
+    if not typical > 0:
+        return np.ones_like(sigma)
+    return np.asarray(np.maximum(sigma / typical, 1.0) ** -2)
+
+
+def _minimise(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
+) -> Doubles | None:
+    """Find the parameters of the least sum of squares by Gauss-Newton steps."""
+    gram = _gram(form, points, weight, parameters)
+    least = rounding**2 * weight.size
+    for _ in range(_STEPS):
+        found = _step(gram)
+        if found is None:
+            return None
+        step, gain = found
+        before = gram[-1, -1]
+        for _ in range(_HALVINGS):
+            gram = _gram(form, points, weight, parameters + step)
+            if gram[-1, -1] <= before + least:
+                break
+            step = step / 2
+        parameters = parameters + step
+        if gain <= _CONVERGED**2 * before + least:
+            return parameters
+    return None
+
+
+def _step(gram: Doubles) -> tuple[Doubles, float] | None:
+    """Return the step that is best where distances are linear, and the sum of squares that it takes away."""
+    scale = np.sqrt(np.diag(gram)[:-1])
+    if not np.all(scale > 0):
+        return None
+    normal, right = gram[:-1, :-1] / np.multiply.outer(scale, scale), -gram[:-1, -1] / scale
+    if np.linalg.eigvalsh(normal)[0] < _SINGULAR:
+        return None
+    step = np.linalg.solve(normal, right)
+    return step / scale, float(step @ normal @ step)
+
+
+def _gram(
+    form: Form, points: Doubles, weight: Doubles, parameters: Doubles, frame: _Frame | None = None
+) -> Doubles:
+    """Return the weighted sums that steps and `covariance` need, the latter with smooth shapes in a frame."""
+    total: Doubles | float = 0.0
+    for start in range(0, weight.size, _CHUNK):
+        part = points[:, start : start + _CHUNK]
+        shapes = [] if frame is None else _shapes(part, frame)
+        rows = np.stack([*form.jacobian(part, parameters), *shapes, form.distance(part, parameters)])
+        rows *= np.sqrt(weight[start : start + _CHUNK])
+        total = total + rows @ rows.T
+    return np.asarray(total)
+
+
+def _frame(points: Doubles) -> _Frame:
+    """Return the middle of the points along x and y, and how far they reach from it."""
+    low, high = points[:2].min(axis=1), points[:2].max(axis=1)
+    return (low + high) / 2, np.maximum((high - low) / 2, _NOTHING)
+
+
+def _shapes(points: Doubles, frame: _Frame) -> list[Doubles]:
+    """Return the products of two and of three of x and y, (n,) each, within -1 and 1."""
+    (x_middle, y_middle), (x_reach, y_reach) = frame
+    x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
+    xx, xy, yy = x * x, x * y, y * y
+    return [xx, xy, yy, xx * x, xx * y, yy * x, yy * y]
 
 
 def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0) -> Doubles:
@@ -306,21 +286,20 @@ def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0)
     parameters, count : int
         How many parameters and residuals.
     claimed : float
-        What the weighted sum of squares is expected to be, from standard deviations; 0 without these.
+        Expectation of the weighted sum of squares, from standard deviations; 0 without these.
 
     Returns
     -------
     ndarray, (k, k), float64
-        NaN where there are too few residuals to tell.
+        NaN where there are too few residuals.
     """
     scale = np.sqrt(np.diag(gram))
     lengths = np.where(scale > 0, scale, np.inf)
     gram = gram / np.multiply.outer(lengths, lengths)
     inverse = _inverse(gram[:parameters, :parameters])
     across = gram[:parameters, parameters:]
-    # Of shapes and residuals, what the form leaves.
-    left = gram[parameters:, parameters:] - across.T @ inverse @ across
-    variance = scale[-1] ** 2 * _variance(left, count - parameters)
+    rest = gram[parameters:, parameters:] - across.T @ inverse @ across  # of shapes and residuals
+    variance = scale[-1] ** 2 * _variance(rest, count - parameters)
     # Not by all: errors that are so smooth go more into one parameter than into another.
     taken_in = max((1 - _OVERSTATED) * claimed - scale[-1] ** 2, 0.0) / max(parameters - 1, 1)
     own = lengths[:parameters]
@@ -328,21 +307,21 @@ def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0)
 
 
 def _inverse(normal: Doubles) -> Doubles:
-    """Invert normal equations, of columns of length 1; directions that nothing tells of are left out."""
+    """Invert normal equations, of columns of length 1; undetermined directions are left out."""
     lengths, directions = np.linalg.eigh(normal)
     real = directions[:, lengths > _SINGULAR] / np.sqrt(lengths[lengths > _SINGULAR])
     return np.asarray(real @ real.T)
 
 
-def _variance(left: Doubles, freedom: int) -> float:
+def _variance(rest: Doubles, freedom: int) -> float:
     """Return the variance of a smooth shape's amplitude, or of a pixel's error if that is larger."""
-    lengths, directions = np.linalg.eigh(left[:-1, :-1])
+    lengths, directions = np.linalg.eigh(rest[:-1, :-1])
     real = lengths > _ROUNDING
-    white = max(float(left[-1, -1]), 0.0)
+    white = max(float(rest[-1, -1]), 0.0)
     free = min(int(np.count_nonzero(real)), freedom)
     if free < 3:
         return np.nan if freedom < 1 else white / freedom
-    power = (directions[:, real].T @ left[:-1, -1]) ** 2 / lengths[real]
+    power = (directions[:, real].T @ rest[:-1, -1]) ** 2 / lengths[real]
     # Of so few amplitudes the mean square is uncertain itself: the variance of Student's t.
     smooth = float(np.sum(power)) / (free - 2)
     return max(smooth, white / freedom)

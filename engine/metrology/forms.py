@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.metrology.fitting import Cloud, associate, degrees, spread
-from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology.fitting import PointCloud
+from mirrorskin.engine.metrology.quantity import Quantity, degrees
 from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
 
-_PLANE_POINTS = 3
 _LEVEL = 1e-12  # slope
-_ANYWHERE = math.pi / math.sqrt(3)  # standard deviation of any angle, radians
+_ANY_ANGLE = math.pi / math.sqrt(3)  # standard deviation of an angle that may be any, radians
+_FLATTEST = 1e-9  # sagitta over extent, below which a surface has no radius
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,13 +32,13 @@ class Plane:
     offset : Quantity
         Its height at x = y = 0, mm.
     rms : Quantity
-        Root mean square of the distances that are left, of outliers too, µm.
+        Root mean square of the residual, outliers included, µm.
     residual : ndarray, (H, W), float64
         Distances from it, mm, positive on the camera's side; NaN where there is no height.
     outliers : int
         Pixels that did not count.
     birge : float
-        Residual over what standard deviations make it; see `Association`.
+        Residual over that by the standard deviations; see `Fit`.
     """
 
     tilt: Quantity
@@ -50,7 +50,7 @@ class Plane:
     birge: float
 
     def quantities(self) -> dict[str, Quantity]:
-        """Return what it tells, by name."""
+        """Return its quantities by name."""
         return {
             "plane tilt": self.tilt,
             "plane azimuth": self.azimuth,
@@ -69,7 +69,7 @@ def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | 
     x, y : array_like, (W,) and (H,)
         Millimetres of the pixel centres.
     sigma : array_like, (H, W), optional
-        Standard deviations of the heights, mm; see `associate` for how they weigh.
+        Standard deviations of the heights, mm; see `PointCloud.fit` for how they weigh.
 
     Returns
     -------
@@ -81,28 +81,33 @@ def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | 
     ------
     InputError
         Fewer than three pixels, or all of them in one line.
+
+    Examples
+    --------
+    >>> round(fit_plane([[0, 1], [0, 1]], x=[0, 1], y=[1, 0]).tilt.value, 6)
+    45.0
     """
-    cloud, form = Cloud.of(height, x, y, sigma), _PlaneForm()
-    found = associate(form, cloud.points, cloud.sigma) if cloud.sigma.size >= _PLANE_POINTS else None
+    cloud, form = PointCloud.of(height, x, y, sigma), _PlaneForm()
+    found = cloud.fit(form) if cloud.sigma.size >= 3 else None
     if found is None:
         raise InputError("no plane fits: at least three pixels that are not in one line are needed")
     offset, p, q = found.parameters
     slope = math.hypot(p, q)
     level = slope < _LEVEL
     cos, sin = (1.0, 0.0) if level else (p / slope, q / slope)
-    along, across = spread(found.covariance, 0, cos, sin), spread(found.covariance, 0, -sin, cos)
+    along, across = found.sigma(0, cos, sin), found.sigma(0, -sin, cos)
     # A level plane falls nowhere: its azimuth is anything within half a turn.
-    turn = _ANYWHERE if level else min(across / slope, _ANYWHERE)
+    turn = _ANY_ANGLE if level else min(across / slope, _ANY_ANGLE)
     distance = form.distance(cloud.points, found.parameters) / math.sqrt(1 + slope**2)
     residual, rms = cloud.residual(distance)
     return Plane(
-        degrees(math.atan(slope), along / (1 + slope**2)),
-        degrees(0.0 if level else math.atan2(-q, -p), turn),
-        Quantity(float(offset), math.hypot(spread(found.covariance, 1, 0, 0), cloud.common), "mm"),
-        rms,
-        residual,
-        int(np.count_nonzero(~found.kept)),
-        found.birge,
+        tilt=degrees(math.atan(slope), along / (1 + slope**2)),
+        azimuth=degrees(0.0 if level else math.atan2(-q, -p), turn),
+        offset=Quantity(float(offset), math.hypot(found.sigma(1, 0, 0), cloud.common_sigma), "mm"),
+        rms=rms,
+        residual=residual,
+        outliers=int(np.count_nonzero(~found.kept)),
+        birge=found.birge,
     )
 
 
@@ -127,10 +132,6 @@ class _PlaneForm:
         return np.stack([-np.ones_like(x), -x, -y])
 
 
-_SPHERE_POINTS = 4
-_FLATTEST = 1e-9  # sagitta over extent, below which a surface has no radius
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Sphere:
     """The sphere that fits a height map: a ball, or where its centre lies towards the camera a hollow.
@@ -143,15 +144,9 @@ class Sphere:
         Its centre, mm.
     top : Quantity
         Height of its point that is nearest to the camera, of a hollow farthest from it, mm.
-    rms : Quantity
-        Root mean square of the distances that are left, of outliers too, µm.
-    residual : ndarray, (H, W), float64
-        Distances from it, mm, positive on the camera's side; NaN where there is no height.
-    outliers : int
-        Pixels that did not count.
+    rms, residual, outliers, birge
+        As of a `Plane`.
     hollow : bool
-    birge : float
-        Residual over what standard deviations make it; see `Association`.
     """
 
     radius: Quantity
@@ -166,7 +161,7 @@ class Sphere:
     birge: float
 
     def quantities(self) -> dict[str, Quantity]:
-        """Return what it tells, by name."""
+        """Return its quantities by name."""
         return {
             "sphere radius": self.radius,
             "sphere centre x": self.x,
@@ -195,48 +190,49 @@ def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike |
     ------
     InputError
         Fewer than four pixels, or a surface without curvature.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x = np.linspace(-1, 1, 9)
+    >>> round(fit_sphere(np.sqrt(25 - x**2 - x[:, None] ** 2), x, -x).radius.value, 6)
+    5.0
     """
-    cloud = Cloud.of(height, x, y, sigma)
+    cloud = PointCloud.of(height, x, y, sigma)
     form = _SphereForm.of(cloud.points)
-    found = None if form is None else associate(form, cloud.points, cloud.sigma)
+    found = None if form is None else cloud.fit(form)
     if form is None or found is None:
         raise InputError("no sphere fits: a curved surface of at least four pixels is needed")
     x_centre, y_centre, z_centre, radius = map(float, found.parameters)
     sigmas = np.sqrt(np.diag(found.covariance))
     residual, rms = cloud.residual(form.distance(cloud.points, found.parameters))
+    top_sigma = math.hypot(found.sigma(0, 0, 1, form.side), cloud.common_sigma)
     return Sphere(
-        Quantity(radius, float(sigmas[3]), "mm"),
-        Quantity(x_centre, float(sigmas[0]), "mm"),
-        Quantity(y_centre, float(sigmas[1]), "mm"),
-        Quantity(z_centre, math.hypot(sigmas[2], cloud.common), "mm"),
-        Quantity(
-            z_centre + form.side * radius,
-            math.hypot(spread(found.covariance, 0, 0, 1, form.side), cloud.common),
-            "mm",
-        ),
-        rms,
-        residual,
-        int(np.count_nonzero(~found.kept)),
-        form.side < 0,
-        found.birge,
+        radius=Quantity(radius, float(sigmas[3]), "mm"),
+        x=Quantity(x_centre, float(sigmas[0]), "mm"),
+        y=Quantity(y_centre, float(sigmas[1]), "mm"),
+        z=Quantity(z_centre, math.hypot(sigmas[2], cloud.common_sigma), "mm"),
+        top=Quantity(z_centre + form.side * radius, top_sigma, "mm"),
+        rms=rms,
+        residual=residual,
+        outliers=int(np.count_nonzero(~found.kept)),
+        hollow=form.side < 0,
+        birge=found.birge,
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _SphereForm:
     """Spheres by centre and radius; the side is 1 of a ball's top, -1 of a hollow."""
 
     side: int
     first: Doubles
-
-    @property
-    def lift(self) -> int:
-        return 2
+    lift: int = 2
 
     @classmethod
     def of(cls, points: Doubles) -> _SphereForm | None:
         """Begin with the paraboloid that fits, of which a sphere's cap is nearly one."""
-        if points.shape[1] < _SPHERE_POINTS:
+        if points.shape[1] < 4:
             return None
         x, y, z = points
         rows = np.stack([np.ones_like(x), x, y, x * x + y * y])

@@ -1,4 +1,4 @@
-"""All that can be told of a result in numbers."""
+"""All that can be measured of a result."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from mirrorskin.engine.metrology.extent import areas, border, levels, volume
+from mirrorskin.engine.metrology.extent import areas, border, heights, volume
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.patch import Patch, patch_of
 from mirrorskin.engine.metrology.quantity import Quantity
@@ -20,19 +20,19 @@ from mirrorskin.io import InputError, Region, Result
 
 FormName = Literal["plane", "sphere", "none"]
 
-_MUCH_BETTER = 0.5  # of a plane's residual, below which a sphere is taken for the form
-_CLEAR = 2.0  # standard uncertainties that a step must have to be told
-# With which power of the pixel size a quantity goes: by its unit or its name. For a cap that is not deep, the
-# radius goes with the square of its width, and its centre lies a radius away from its top.
+_MUCH_BETTER = 0.5  # share of a plane's residual, below which a sphere is taken for the form
+_CLEAR = 2.0  # standard uncertainties that a step must have to be reported
+# The power of the pixel size that a quantity is proportional to, by its unit or its name. The radius of a
+# shallow cap goes with the square of its width, and its centre lies a radius away from its top.
 _POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
 _POWERS |= dict.fromkeys(("sphere centre x", "sphere centre y", "section length", "distance in space"), 1)
 _POWERS |= dict.fromkeys(("step at", "plane tilt", "slope", "slope beside step"), 1)
-_RATIO = 2.0  # of what is left to what its errors make it, above which a surface is not of a form
+_RATIO = 2.0  # Birge's, above which a surface is not of a form
 
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """What was measured.
+    """The quantities of a height map.
 
     Attributes
     ----------
@@ -63,8 +63,8 @@ def measure(
     region : Region, optional
         In its pixels; by default all of it.
     form : {"plane", "sphere", "none"}, optional
-        What is fitted, and what roughness is measured from; by default the sphere where it leaves less than
-        half of what the plane leaves, else the plane. Without a form, roughness is that of the heights.
+        What is fitted, and what roughness is measured from; by default the sphere where its residual is
+        less than half of the plane's, else the plane. Without a form, roughness is that of the heights.
     cutoff : float, optional
         Longest waves that count as roughness, mm.
     section : ((float, float), (float, float)), optional
@@ -82,7 +82,7 @@ def measure(
         Nothing can be measured, or not as it was asked for.
     """
     patch, comparable = patch_of(result, region)
-    quantities, notes = levels(patch), list(patch.notes)
+    quantities, notes = heights(patch), list(patch.notes)
     quantities |= areas(patch)
     quantities |= _volumes(patch, quantities.get("rim height"))
     quantities |= _forms(patch, form, cutoff, notes)
@@ -95,25 +95,25 @@ def measure(
 
 def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
     """Return volumes above the rim, and below the sheet's rest plane where heights are absolute."""
-    told: dict[str, Quantity] = {}
+    found: dict[str, Quantity] = {}
     if base is not None:
-        told |= volume(patch, base.value, base.sigma, "volume above rim")
+        found |= volume(patch, base.value, base.sigma, "volume above rim")
     if patch.absolute:
         for name, above in volume(patch, 0.0, 0.0, "volume below rest plane").items():
-            told[name] = Quantity(-above.value, above.sigma, above.unit)
-    return told
+            found[name] = Quantity(-above.value, above.sigma, above.unit)
+    return found
 
 
 def _forms(
     patch: Patch, form: FormName | None, cutoff: float | None, notes: list[str]
 ) -> dict[str, Quantity]:
-    """Return what fits the surface, and how rough it is."""
+    """Return the form that fits the surface, and its roughness."""
     fitted = _fit(patch, form)
     about, residual = "their mean", patch.height
-    told: dict[str, Quantity] = {}
+    found: dict[str, Quantity] = {}
     if fitted is not None:
         kind = "plane" if isinstance(fitted, Plane) else "sphere"
-        about, residual, told = f"the {kind}", fitted.residual, fitted.quantities()
+        about, residual, found = f"the {kind}", fitted.residual, fitted.quantities()
         notes.extend(_fit_notes(fitted, kind))
     rough = roughness(residual, patch.pixel_size, cutoff=cutoff, sigma=patch.sigma)
     waves = "" if cutoff is None else f", of waves up to {cutoff:g} mm"
@@ -126,7 +126,7 @@ def _forms(
         notes.append(
             f"pixels left out of roughness and lowest point, far less sure than others: {rough.unsure}"
         )
-    return told | rough.quantities()
+    return found | rough.quantities()
 
 
 def _fit_notes(fitted: Plane | Sphere, kind: str) -> list[str]:
@@ -145,7 +145,7 @@ def _fit_notes(fitted: Plane | Sphere, kind: str) -> list[str]:
 
 
 def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
-    """Fit what was asked for; by default what leaves little, or nothing where nothing fits."""
+    """Fit the given form; by default the one of little residual, or none where none fits."""
     cloud = patch.height, patch.x, patch.y, patch.sigma
     if form == "plane":
         return fit_plane(*cloud)
@@ -163,9 +163,9 @@ def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
 
 
 def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dict[str, Quantity]:
-    """Return what a section tells, and a step where there is one."""
+    """Return the quantities of a section, and of a step where there is one."""
     profile = cut(result, *ends)
-    told = along(profile)
+    found = along(profile)
     ends_known = np.isfinite(profile.height[[0, -1]]) & ~profile.filled[[0, -1]]
     if not ends_known.all():
         notes.append(
@@ -174,34 +174,38 @@ def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dic
     with suppress(InputError):
         step = step_height(profile)
         if abs(step.height.value) > _CLEAR * step.height.sigma:
-            return told | {"step height": step.height, "step at": step.place, "slope beside step": step.slope}
+            return found | {
+                "step height": step.height,
+                "step at": step.place,
+                "slope beside step": step.slope,
+            }
     notes.append("no step along the section: no two levels that differ clearly")
-    return told
+    return found
 
 
 def _scaled(quantities: dict[str, Quantity], scale: float) -> dict[str, Quantity]:
-    """Add what comes of the uncertainty of the pixel size, given as a share of it."""
-    told: dict[str, Quantity] = {}
+    """Add the uncertainty of the pixel size, given as a share of it."""
+    scaled: dict[str, Quantity] = {}
     for name, quantity in quantities.items():
         if name == "sphere centre z":
             change = 2 * quantities["sphere radius"].value
         else:
             change = _POWERS.get(quantity.unit, _POWERS.get(name, 0)) * quantity.value
-        told[name] = replace(quantity, sigma=math.hypot(quantity.sigma, scale * change))
-    return told
+        scaled[name] = replace(quantity, sigma=math.hypot(quantity.sigma, scale * change))
+    return scaled
 
 
 def _assumed(patch: Patch, scale: float) -> list[str]:
-    """Say what values and their uncertainties take for granted."""
+    """Return notes on what values and their uncertainties assume."""
     size = f"known within {100 * scale:.2g} %" if scale else "taken as exact"
-    said = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
+    notes = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
     filled = int(np.count_nonzero(np.isfinite(patch.filled)))
     if filled:
-        said.append(f"pixels filled, not measured, that count only in what says 'filled': {filled}")
+        notes.append(f"pixels filled, not measured, that count only in what says 'filled': {filled}")
     if filled and np.nanmax(patch.filled) > np.nanmax(patch.height):
-        said.append("the top was filled, not measured: 'highest point' is the highest that was measured")
+        notes.append("the top was filled, not measured: 'highest point' is the highest that was measured")
     if np.count_nonzero(border(patch.contact, ends=True)) > np.count_nonzero(border(patch.contact)):
-        said.append("contact reaches the picture's border: areas and volumes are of what is seen")
+        notes.append("contact reaches the picture's border: areas and volumes are of what is seen")
     if patch.sigma is None:
-        said.append("the result has no standard deviations of heights: uncertainties of these are unknown")
-    return said
+        notes.append("the result has no standard deviations of heights: uncertainties of these are unknown")
+    return notes

@@ -20,15 +20,13 @@ class Patch:
 
     Attributes
     ----------
-    height : ndarray, (H, W), float64
-        Millimetres where heights were measured, else NaN.
-    filled : ndarray, (H, W), float64
-        Millimetres where they were filled, else NaN.
+    height, filled : ndarray, (H, W), float64
+        Millimetres where heights were measured, or where they were filled, else NaN.
     sigma : ndarray, (H, W), float64, or None
-        Standard deviations of the measured heights, mm; None where the result tells none.
+        Standard deviations of the measured heights, mm.
     contact : ndarray, (H, W), bool
-        Where the object was touched: as told, else where there is a height, filled ones too.
-    contact_told : bool
+        Where the object was touched: as the result has it (``contact_given``), else where there is a height,
+        filled ones too.
     secant : ndarray, (H, W), float64, or None
         Surface for each area of the picture, from the normals; NaN where they are unknown.
     normal_sigma : ndarray, (H, W), float64, or None
@@ -38,7 +36,7 @@ class Patch:
     pixel_size : (float, float)
         Millimetres along x and y.
     absolute : bool
-        Whether heights are above the sheet's rest plane; else above the mean of their piece.
+        Whether heights are above the sheet's rest plane; else above the mean of their component.
     notes : tuple of str
         What was left out.
     """
@@ -47,7 +45,7 @@ class Patch:
     filled: Doubles
     sigma: Doubles | None
     contact: Mask
-    contact_told: bool
+    contact_given: bool
     secant: Doubles | None
     normal_sigma: Doubles | None
     x: Doubles
@@ -68,19 +66,13 @@ class Patch:
         return width * height
 
     def sigmas(self) -> Doubles:
-        """Return the standard deviations of the measured heights, (n,), mm; NaN where none are told."""
+        """Return the standard deviations of the measured heights, (n,), mm; NaN where there are none."""
         where = self.measured
         return np.full(np.count_nonzero(where), np.nan) if self.sigma is None else self.sigma[where]
 
 
 def heights_of(result: Result) -> NDArray[np.float32]:
-    """Return the heights of one picture, (H, W).
-
-    Raises
-    ------
-    InputError
-        There are none, or one map for each turn.
-    """
+    """Return the heights of one picture, (H, W); InputError where there are none, or a map for each turn."""
     height = select_turn(result, None).height
     if height is None:
         raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
@@ -90,7 +82,7 @@ def heights_of(result: Result) -> NDArray[np.float32]:
 def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Result]:
     """Cut out what is to be measured.
 
-    Only heights that were measured and whose standard deviation is finite count. Of several pieces, those
+    Only heights that were measured and whose standard deviation is finite count. Of several components, those
     whose height is relative cannot be compared with others: they are left out where others are absolute, and
     all but the largest where none is.
 
@@ -104,7 +96,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
     Returns
     -------
     (Patch, Result)
-        And the whole result with no other heights than those that can be compared with the patch's.
+        And the result with no other heights than those that can be compared with the patch's.
 
     Raises
     ------
@@ -123,29 +115,29 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
     part = region.slices
     filled = np.zeros(height.shape, bool) if result.filled is None else result.filled != 0
     known, notes = _known(result, height, filled)
-    known, absolute, told = _comparable(result, known, part)
+    known, absolute, left_out = _comparable(result, known, part)
     if not np.any(known[part] & ~filled[part]):
         raise InputError("no height was measured there: choose another region, or another result")
     contact = known if result.contact is None else result.contact != 0
     patch = Patch(
-        np.where(known & ~filled, height, np.nan)[part].astype(np.float64),
-        np.where(known & filled, height, np.nan)[part].astype(np.float64),
-        None if result.height_sigma is None else result.height_sigma[part].astype(np.float64),
-        contact[part],
-        result.contact is not None,
-        None if result.normals is None else _secant(result.normals[part]),
-        None if result.normal_sigma is None else result.normal_sigma[part].astype(np.float64),
-        result.x[part[1]],
-        result.y[part[0]],
-        pixel_size,
-        absolute,
-        (*told, *notes),
+        height=np.where(known & ~filled, height, np.nan)[part].astype(np.float64),
+        filled=np.where(known & filled, height, np.nan)[part].astype(np.float64),
+        sigma=None if result.height_sigma is None else result.height_sigma[part].astype(np.float64),
+        contact=contact[part],
+        contact_given=result.contact is not None,
+        secant=None if result.normals is None else _secant(result.normals[part]),
+        normal_sigma=None if result.normal_sigma is None else result.normal_sigma[part].astype(np.float64),
+        x=result.x[part[1]],
+        y=result.y[part[0]],
+        pixel_size=pixel_size,
+        absolute=absolute,
+        notes=(*left_out, *notes),
     )
     return patch, replace(result, height=np.where(known, height, np.float32(np.nan)))
 
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:
-    """Return which heights count, and what is to be said of that."""
+    """Return which heights count, and notes on that."""
     known, notes = np.isfinite(height), []
     if result.height_sigma is not None:
         unsure = known & ~np.isfinite(result.height_sigma) & ~filled
@@ -158,7 +150,7 @@ def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[M
 
 
 def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple[Mask, bool, list[str]]:
-    """Return which heights can be compared, whether they are absolute, and what is to be said of that."""
+    """Return which heights can be compared, whether they are absolute, and notes on that."""
     component, unknown = result.component, result.offset_unknown
     if component is None or unknown is None or not np.any(unknown):
         return known, True, []
@@ -168,8 +160,8 @@ def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple
     inside[part] = known[part]
     if np.any(inside & ~relative):
         lost = np.unique(component[inside & relative]).size
-        told = f"pieces left out, whose height is only relative: {lost}"
-        return known & ~relative, True, [told] if lost else []
+        note = f"pieces left out, whose height is only relative: {lost}"
+        return known & ~relative, True, [note] if lost else []
     pieces, counts = np.unique(component[inside], return_counts=True)
     notes = ["heights are relative: their mean is 0"]
     if pieces.size > 1:
@@ -185,13 +177,7 @@ def _secant(normals: NDArray[np.float32]) -> Doubles:
 
 
 def pixel_size_of(x: Doubles, y: Doubles) -> tuple[float, float]:
-    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels.
-
-    Raises
-    ------
-    InputError
-        There is only one pixel.
-    """
+    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels."""
     steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
     known = [float(step) for step in steps if step is not None]
     if not known:

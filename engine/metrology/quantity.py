@@ -10,7 +10,7 @@ _ROUNDING = 1e-12  # of a value: an uncertainty below it is that of the arithmet
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """What was measured.
+    """A measured value.
 
     Attributes
     ----------
@@ -20,6 +20,11 @@ class Quantity:
         Standard uncertainty (k = 1), in the same unit; NaN where it is not known.
     unit : str
         As in ``mm``, ``mm2``, ``deg``.
+
+    Examples
+    --------
+    >>> print(Quantity(4.99923, 0.0312, "mm"))
+    4.999 ± 0.031 mm
     """
 
     value: float
@@ -40,3 +45,13 @@ class Quantity:
         shown = max(places, 0)
         # Adding zero takes the sign from a rounded -0.
         return f"{round(self.value, places) + 0.0:.{shown}f} ± {round(self.sigma, places):.{shown}f}"
+
+
+def micrometres(value: float, sigma: float) -> Quantity:
+    """Return a quantity in micrometres of numbers in millimetres."""
+    return Quantity(1e3 * value, 1e3 * sigma, "µm")
+
+
+def degrees(value: float, sigma: float) -> Quantity:
+    """Return a quantity in degrees of numbers in radians."""
+    return Quantity(math.degrees(value), math.degrees(sigma), "deg")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,9 @@ Point = tuple[float, float]
 
 _ROUNDING = 1e-6  # of a pixel
 _LEVEL = 0.01  # of the range of heights: what is as high as the highest point
-_WINDOW = 3  # pixels a side of the median that spikes do not get past
+_WINDOW = 3  # pixels a side of the median that removes spikes
+_LEAST = 4  # samples on either side of a step
+_LEFT_OUT = 1 / 3  # of either side, next to the step: it may be rounded or a ramp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,25 +102,19 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     """Return row and column of the highest point, after a median that leaves spikes out.
 
-    Parameters
-    ----------
-    height : ndarray, (H, W)
-        NaN where there is none; the median takes that for lower than everything.
-
-    Raises
-    ------
-    InputError
-        There is no height.
+    The median takes NaN for lower than everything. InputError where there is no height.
     """
+    import cv2
+
     known = np.isfinite(height)
     if not known.any():
         raise InputError("there is no height to look for the highest point")
     lowest = float(np.min(height[known]))
     below = np.nextafter(np.float32(lowest), np.float32(-np.inf)) - np.float32(1)
-    calm = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
-    calm[~known] = below
+    smooth = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
+    smooth[~known] = below
     # Where all that is known is thinner than the window, there is no median to go by.
-    chosen = calm if np.any(calm > below) else np.where(known, height, below)
+    chosen = smooth if np.any(smooth > below) else np.where(known, height, below)
     row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
     return int(row), int(column)
 
@@ -139,7 +134,7 @@ def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[f
 
 
 def _pixels(shape: tuple[int, ...]) -> tuple[Doubles, Doubles]:
-    """Place pixels of size 1."""
+    """Return the places of pixels of size 1."""
     return pixel_axes((shape[0], shape[1]), (1.0, 1.0))
 
 
@@ -155,33 +150,25 @@ def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubl
 def _between(result: Result, height: NDArray[np.float32], spots: Spots) -> tuple[Doubles, Doubles, Mask]:
     """Return heights, their standard deviations and whether they were filled, (n,), at places."""
     counts = spots.shares > _ROUNDING
-    whole = spots.whole
+    inside = spots.whole
     if result.component is not None:
-        whole = whole & np.all(spots.beside(result.component) | ~counts, axis=0)
+        inside = inside & np.all(spots.beside(result.component) | ~counts, axis=0)
     values = _mean(height, spots, counts)
     filled = np.zeros(values.shape, bool)
     if result.filled is not None:
         filled = np.any((result.filled.ravel()[spots.pixels] != 0) & counts, axis=0)
     sigma = np.full(values.shape, np.nan)
     if result.height_sigma is not None:
-        # Errors of neighbours go together, so those of a mean are no smaller.
+        # Errors of neighbours are correlated, so those of a mean are no smaller.
         sigma = _mean(result.height_sigma, spots, counts)
-    there = whole & np.isfinite(values)
-    return (
-        np.where(there, values, np.nan),
-        np.where(there & ~filled, sigma, np.nan),
-        filled & there,
-    )
+    there = inside & np.isfinite(values)
+    return np.where(there, values, np.nan), np.where(there & ~filled, sigma, np.nan), filled & there
 
 
 def _mean(values: NDArray[np.float32], spots: Spots, counts: Mask) -> Doubles:
     """Return weighted means of four pixels, NaN where one that counts is."""
     around = np.where(counts, values.ravel()[spots.pixels], 0).astype(np.float64)
     return np.asarray(np.sum(np.where(counts, spots.shares, 0) * around, axis=0))
-
-
-_LEAST = 4  # samples on either side of a step
-_LEFT_OUT = 1 / 3  # of either side, next to the step: it may be rounded or a ramp
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,9 +212,7 @@ def step_height(section: Section) -> Step:
     InputError
         Pixels of unknown size, too few measured samples, or a curve that fits better.
     """
-    if section.unit != "mm":
-        raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
-    known = np.isfinite(section.height) & ~section.filled
+    known = _measured(section)
     distance, height = section.distance[known], section.height[known]
     if distance.size < 2 * _LEAST:
         raise InputError(
@@ -237,8 +222,8 @@ def step_height(section: Section) -> Step:
     place = (distance[split - 1] + distance[split]) / 2
     half = (distance[split] - distance[split - 1]) / 2
     kept = _away(distance, split)
-    found, spread, left = _lines(distance[kept] - place, height[kept])
-    if _curve(distance[kept] - place, height[kept]) < left:
+    found, spread, rest = _lines(distance[kept] - place, height[kept])
+    if _curve(distance[kept] - place, height[kept]) < rest:
         raise InputError("there is no step along the section: a smooth curve fits it better than two levels")
     slope, rise = float(found[1]), float(found[2])
     across = math.sqrt(1 + slope**2)
@@ -249,19 +234,26 @@ def step_height(section: Section) -> Step:
     )
 
 
+def _measured(section: Section) -> Mask:
+    """Return which samples of a section in millimetres were measured."""
+    if section.unit != "mm":
+        raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
+    return np.isfinite(section.height) & ~section.filled
+
+
 def _split(distance: Doubles, height: Doubles) -> int:
-    """Return the number of the first sample after the step: where two parallel lines leave the least."""
+    """Return the number of the first sample after the step: where two parallel lines fit best."""
     x = distance - np.mean(distance)
     x /= np.linalg.norm(x)
-    left = height - np.mean(height)
-    left = left - x * (x @ left)
-    # Of a step before each sample, what a line does not take in: its length, and its share in what is left.
+    residual = height - np.mean(height)
+    residual = residual - x * (x @ residual)
+    # Of a step before each sample, what a line does not take in: its length, and its share in the residual.
     count = height.size
     after = count - np.arange(count)
     share = np.cumsum(x[::-1])[::-1]
     length = after * (count - after) / count - share**2
-    tells = np.cumsum(left[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
-    return _LEAST + int(np.argmax(tells[_LEAST : count - _LEAST + 1]))
+    gain = np.cumsum(residual[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
+    return _LEAST + int(np.argmax(gain[_LEAST : count - _LEAST + 1]))
 
 
 def _away(distance: Doubles, split: int) -> Mask:
@@ -275,42 +267,31 @@ def _away(distance: Doubles, split: int) -> Mask:
 def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
     """Fit parallel lines to samples before and after 0.
 
-    Returns
-    -------
-    (ndarray, ndarray, float)
-        Offset, slope and step; their covariance; and the sum of squares that is left.
+    Return offset, slope and step, their covariance, and the sum of squares of the residual.
     """
     up = (x > 0).astype(np.float64)
     rows = np.stack([np.ones_like(x), x, up])
     found, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
     own = x / np.abs(x).max()
     shapes = np.stack([up * own, own**2, up * own**2, own**3, up * own**3])
-    told = np.concatenate([rows, shapes, [z - found @ rows]])
-    gram = told @ told.T
+    every = np.concatenate([rows, shapes, [z - found @ rows]])
+    gram = every @ every.T
     return np.asarray(found), covariance(gram, len(rows), z.size), float(gram[-1, -1])
 
 
 def _curve(x: Doubles, z: Doubles) -> float:
-    """Return the sum of squares that a cubic leaves."""
-    own = x / np.abs(x).max()
-    rows = np.stack([np.ones_like(x), own, own**2, own**3])
+    """Return the sum of squares of a cubic's residual."""
+    rows = np.vander(x / np.abs(x).max(), 4).T
     found, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
     return float(np.sum((z - found @ rows) ** 2))
 
 
 def along(section: Section) -> dict[str, Quantity]:
-    """Return the length of a section, and what holds between the first and the last height measured on it.
+    """Return the length of a section, and difference, distance and slope between its outermost heights.
 
-    Errors of the two heights are taken to be independent.
-
-    Raises
-    ------
-    InputError
-        Fewer than two measured samples, or pixels of unknown size.
+    Errors of the two heights are taken to be independent. InputError where fewer than two were measured.
     """
-    if section.unit != "mm":
-        raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
-    known = np.flatnonzero(np.isfinite(section.height) & ~section.filled)
+    known = np.flatnonzero(_measured(section))
     if known.size < 2:
         raise InputError(
             "the section has fewer than two measured heights that can be compared: cut elsewhere"

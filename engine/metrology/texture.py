@@ -7,17 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
-from mirrorskin.engine.metrology.fitting import far_less_sure, micrometres
-from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology.fitting import far_less_sure
+from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
 
-ALPHA = math.sqrt(math.log(2) / math.pi)
-"""Of the Gaussian filter: it halves waves as long as the cutoff."""
-
+_ALPHA = math.sqrt(math.log(2) / math.pi)  # of the Gaussian filter: it halves waves as long as the cutoff
 _COVERED = 0.95  # of the filter's weight that must lie on known pixels
 _TAIL = 4.0  # standard deviations to which the filter's weights reach
 
@@ -48,9 +45,9 @@ class Roughness:
     unsure: int
 
     def quantities(self) -> dict[str, Quantity]:
-        """Return what it tells, by name."""
-        told = {"Sa": self.sa, "Sq": self.sq, "Sz": self.sz}
-        return told | {"Sq of noise": self.noise} if math.isfinite(self.noise.value) else told
+        """Return its quantities by name."""
+        found = {"Sa": self.sa, "Sq": self.sq, "Sz": self.sz}
+        return found | {"Sq of noise": self.noise} if math.isfinite(self.noise.value) else found
 
 
 def roughness(
@@ -60,13 +57,12 @@ def roughness(
     cutoff: float | None = None,
     sigma: ArrayLike | None = None,
 ) -> Roughness:
-    """Tell how rough a surface is.
+    """Return the roughness of a surface.
 
-    Values are those of the surface as it was measured, with its noise: the square of Sq is the sum of that
-    of the surface and that of the noise, where these have nothing to do with each other. Whatever they have
-    to do, noise changes Sq by no more than its own root mean square, and Sa by no more than its mean
-    magnitude: these are the uncertainties. Noise makes Sz larger by something between nothing and all that
-    noise spans; the errors of the highest and of the lowest pixel add to that.
+    Values include the noise: the square of Sq is the sum of that of the surface and that of the noise, where
+    these are uncorrelated. In any case noise changes Sq by no more than its own root mean square, and Sa by
+    no more than its mean magnitude: these are the uncertainties. Noise makes Sz larger by something between
+    nothing and all that noise spans; the errors of the highest and of the lowest pixel add to that.
 
     Pixels that are far less sure than others (see `far_less_sure`) are not part of the definition area: Sz
     would be their error. What a form's fit left out as outliers is: it may be the texture.
@@ -95,7 +91,7 @@ def roughness(
     height = np.asarray(residual, np.float64)
     known = np.isfinite(height)
     if not known.any():
-        raise InputError("there is no height to tell the roughness of")
+        raise InputError("there is no height to measure the roughness of")
     spread = np.full_like(height, np.nan) if sigma is None else np.asarray(sigma, np.float64)
     unsure = far_less_sure(spread, known)
     height = np.where(unsure, np.nan, height)
@@ -120,31 +116,14 @@ def roughness(
 
 
 def long_waves(height: Doubles, pixel_size: tuple[float, float], cutoff: float) -> Doubles:
-    """Smooth a height map by the areal Gaussian filter of ISO 16610-61.
+    """Smooth a height map by the areal Gaussian filter of ISO 16610-61, which halves waves of the cutoff, mm.
 
-    Parameters
-    ----------
-    height : ndarray, (H, W), float64
-        NaN where there is none.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    cutoff : float
-        Wavelength, mm, of which half of the amplitude passes.
-
-    Returns
-    -------
-    ndarray, (H, W), float64
-        Weighted means over known pixels; NaN where more than a twentieth of the weight lies elsewhere.
-
-    Raises
-    ------
-    InputError
-        The cutoff is shorter than two pixels.
+    Return weighted means over known pixels; NaN where more than a twentieth of the weight lies elsewhere.
     """
     if not cutoff >= 2 * max(pixel_size):
         raise InputError(f"a cutoff of {cutoff:g} mm is shorter than two pixels: choose a longer one")
     # exp(-pi (r / (alpha cutoff))^2) as a normal distribution.
-    spread = ALPHA * cutoff / math.sqrt(2 * math.pi)
+    spread = _ALPHA * cutoff / math.sqrt(2 * math.pi)
     known = np.isfinite(height)
     if min(count * size for count, size in zip(height.shape[::-1], pixel_size, strict=True)) < 2 * spread:
         return np.full(height.shape, np.nan)  # nowhere would enough weight lie on pixels
@@ -163,6 +142,8 @@ def _blur(values: Doubles, spread: float, pixel_size: tuple[float, float]) -> Do
 
 def _convolve(values: Doubles, weights: Doubles, axis: int) -> Doubles:
     """Convolve along an axis with weights whose middle is where the result goes; zeros lie outside."""
+    from scipy import fft
+
     count, reach = values.shape[axis], weights.size // 2
     length = fft.next_fast_len(count + 2 * reach, real=True)
     wave = fft.rfft(values, length, axis=axis) * np.expand_dims(fft.rfft(weights, length), 1 - axis)

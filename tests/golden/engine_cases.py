@@ -25,12 +25,12 @@ from scenes import (
 
 from mirrorskin import engine, io
 from mirrorskin.engine.fusion import fuse_sources as engine_fuse_sources
-from mirrorskin.engine.metrology.forms import fit_plane as engine_fit_plane
-from mirrorskin.engine.metrology.forms import fit_sphere as engine_fit_sphere
-from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.metrology.sections import section as engine_section
-from mirrorskin.engine.metrology.sections import step_height as engine_step_height
-from mirrorskin.engine.metrology.texture import roughness as engine_roughness
+from mirrorskin.engine.metrology import Quantity
+from mirrorskin.engine.metrology import fit_plane as engine_fit_plane
+from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
+from mirrorskin.engine.metrology import roughness as engine_roughness
+from mirrorskin.engine.metrology import section as engine_section
+from mirrorskin.engine.metrology import step_height as engine_step_height
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.rotation.rotation import correlate_source as engine_correlate_source
 from mirrorskin.engine.streaming import push_block

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from shown import ball, colours_at, rendered
 
 from mirrorskin import io
-from mirrorskin.engine.metrology.sections import section
+from mirrorskin.engine.metrology import section
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
 from mirrorskin.view.result.maps import (
     draw_azimuth,

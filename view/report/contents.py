@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.report.surface import surface_data

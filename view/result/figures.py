@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mirrorskin.engine.metrology.sections import Section
+    from mirrorskin.engine.metrology import Section
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
 """Where a section begins and ends, x and y, mm."""
@@ -145,7 +145,7 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
 
 def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
     """Cut the heights, if there are any, and more than one along the way."""
-    from mirrorskin.engine.metrology.sections import section
+    from mirrorskin.engine.metrology import section
 
     height = sheet.result.height
     if height is None or not np.isfinite(height).any():

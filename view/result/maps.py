@@ -18,7 +18,7 @@ from mirrorskin.view.result.sheet import SMALL, TEXT, Sheet, draw_map, entitle, 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mirrorskin.engine.metrology.sections import Section
+    from mirrorskin.engine.metrology import Section
 
 _BAR = 0.3  # of the picture's width: the longest scale bar
 _MARGIN = 0.05

@@ -16,7 +16,7 @@ from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mirrorskin.engine.metrology.sections import Section
+    from mirrorskin.engine.metrology import Section
 
 _ROOM = 1.15  # times the heights' range
 _NEAR = 0.1  # of the width: so near to the side words lean inwards
