@@ -247,7 +247,7 @@ def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterat
     from mirrorskin.cli.status import Newest
     from mirrorskin.view.live import LiveView
 
-    viewer = Newest(LiveView(where, shape, settings.camera.pixel_size))
+    viewer = Newest(LiveView(where, shape, settings.camera.pixel_sides))
     try:
         yield viewer
     finally:

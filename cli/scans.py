@@ -112,12 +112,15 @@ def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
 
 def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | None:
     """Open a calibration, if there is one, and refuse that of another camera before anything moves."""
+    import numpy as np
+
     from mirrorskin import io
 
     if path is None:
         return None
     calibration, camera = io.open_calibration(path), settings.camera
-    io.check_camera(calibration, io.CameraId(camera.name, camera.shape, camera.dtype), settings.name)
+    known = io.CameraId(camera.name, camera.shape, np.dtype(camera.dtype))
+    io.check_camera(calibration, known, settings.name)
     return calibration
 
 

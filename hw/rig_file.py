@@ -1,27 +1,43 @@
-"""What a rig file says: the stage's axes, the camera, and how both are opened."""
+"""The rig file: TOML that says how a stage and a camera are opened (``docs/rig.md``).
+
+Each class is a table of the file, and each of its fields a key, in the file's units; properties give mm,
+radians and seconds.
+"""
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-import tomllib
-from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
+import msgspec
+from msgspec import Meta
 
 from mirrorskin.hw.rig.references import SUFFIXES, check_references
 from mirrorskin.hw.stage import Limits
 from mirrorskin.io import InputError
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.settings_file import load_toml
+
+_USER = re.compile("//[^/]*@")
+_STEEPEST = 90.0  # degrees
+_CELL = 65535  # rows or columns
+
+Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
+Letter = Literal["X", "Y", "Z", "A", "B", "C"]
+Millimetres = Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
+_Side = Annotated[float, Meta(gt=0)]
+_Pixels = Annotated[int, Meta(ge=1, le=_CELL)]
+_Picture = Annotated[str, Meta(pattern=rf"(?i)^[^\x00-\x1f\x7f]*({'|'.join(map(re.escape, SUFFIXES))})\Z")]
+_Reference = Annotated[
+    float | _Picture,
+    Meta(description=f"a number of counts, or a file ({', '.join(SUFFIXES)}) in quotes,", examples=[12]),
+]
 
 
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """One axis of the machine, and the motion that it makes.
+class Axis(msgspec.Struct, frozen=True, kw_only=True):
+    """An axis of the machine, and the motion that it makes; see `TravelAxis` and `TiltAxis`.
 
     The machine's coordinate is ``zero + direction * value``, with the value in the axis's own unit.
 
@@ -29,30 +45,49 @@ class Axis:
     ----------
     letter : str
         The machine's name of it: X, Y, Z, A, B or C.
+    limits : (float, float)
+        Least and greatest value allowed, in ``unit``.
+    speed : float
+        Greatest speed, ``unit`` per second.
     direction : int
         1 if the value grows with the machine's coordinate, -1 if it falls.
     zero : float
         The machine's coordinate at which the value is 0, in ``unit``.
-    low, high : float
-        Least and greatest value allowed: mm of a travel, rad of a tilt.
-    speed : float
-        Greatest speed: mm/s or rad/s.
     unit : str
         What the machine counts this axis in: "mm" or "deg".
     """
 
-    letter: str
-    direction: int
-    zero: float
-    low: float
-    high: float
-    speed: float
+    letter: Annotated[Letter, Meta(description="one of X, Y, Z, A, B, C, in quotes,", examples=["Z"])]
+    direction: Annotated[Literal[1, -1], Meta(description="1 or -1", examples=[1])] = 1
     unit: str
+    zero: float
+    limits: tuple[float, float]
+    speed: float
+
+    def __post_init__(self) -> None:
+        low, high = self.limits
+        if not low < high:
+            raise ValueError(f"limits are out of order, {low:g} not below {high:g}: write [least, greatest]")
 
     @property
     def scale(self) -> float:
         """The machine's units in one mm or rad."""
         return math.degrees(1.0) if self.unit == "deg" else 1.0
+
+    @property
+    def low(self) -> float:
+        """Least value allowed, mm or rad."""
+        return self._converted(self.limits[0])
+
+    @property
+    def high(self) -> float:
+        """Greatest value allowed, mm or rad."""
+        return self._converted(self.limits[1])
+
+    @property
+    def top_speed(self) -> float:
+        """Greatest speed, mm/s or rad/s."""
+        return self._converted(self.speed)
 
     def coordinate(self, value: float) -> float:
         """Return the machine's coordinate at a value, mm or rad."""
@@ -62,9 +97,50 @@ class Axis:
         """Return the value, mm or rad, at a coordinate of the machine."""
         return self.direction * (coordinate - self.zero) / self.scale + 0.0  # no minus zero
 
+    def _converted(self, value: float) -> float:
+        return math.radians(value) if self.unit == "deg" else value
 
-@dataclass(frozen=True, slots=True)
-class StageSettings:
+
+class TravelAxis(Axis, frozen=True, kw_only=True):
+    """The axis along the sheet's normal; its value is the travel, positive down."""
+
+    zero: Annotated[float, Meta(description="a finite number of mm", examples=[0.0])] = 0.0
+    unit: Literal["mm"] = "mm"
+    limits: Annotated[
+        tuple[float, float],
+        Meta(description="a list of the least and the greatest value, in mm,", examples=[[-5.0, 3.0]]),
+    ]
+    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in mm a second,", examples=[5.0])]
+
+
+class TiltAxis(Axis, frozen=True, kw_only=True):
+    """An axis of the lean, pitch or roll; 0 is upright."""
+
+    zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
+    unit: Literal["deg"] = "deg"
+    limits: Annotated[
+        tuple[
+            Annotated[float, Meta(gt=-_STEEPEST, lt=_STEEPEST)],
+            Annotated[float, Meta(gt=-_STEEPEST, lt=_STEEPEST)],
+        ],
+        Meta(
+            description="a list of the least and the greatest angle, between -90 and 90 degrees,",
+            examples=[[-5.0, 5.0]],
+        ),
+    ]
+    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
+
+    def __post_init__(self) -> None:
+        Axis.__post_init__(self)
+        low, high = self.limits
+        if not low < 0 < high:
+            raise ValueError(
+                f"limits [{low:g}, {high:g}] do not have 0 (upright) within; "
+                "set zero to the machine's coordinate there, and limits on both sides of it"
+            )
+
+
+class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How the stage is reached, and what it may do.
 
     Attributes
@@ -79,26 +155,64 @@ class StageSettings:
         Longest wait for an answer, seconds.
     report_rate : float
         How often its position is asked for, Hz.
-    travel : Axis
-        Along the sheet's normal, positive down, mm.
-    pitch, roll : Axis or None
-        The two components of the lean, rad; a stage has both or none.
     press : float
         Greatest travel allowed, mm.
     pivot : (float, float, float) or None
         What the body turns about, mm from the sheet's centre.
+    travel : TravelAxis
+        Along the sheet's normal.
+    pitch, roll : TiltAxis or None
+        The two components of the lean; a stage has both or none.
     """
 
-    port: str
-    baud: int
-    home: bool
-    timeout: float
-    report_rate: float
-    travel: Axis
-    pitch: Axis | None
-    roll: Axis | None
-    press: float
-    pivot: tuple[float, float, float] | None
+    port: Annotated[
+        Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])
+    ]
+    baud: Annotated[
+        int,
+        Meta(
+            ge=300,
+            le=10_000_000,
+            description="a number of bits a second, from 300 to 10000000,",
+            examples=[115200],
+        ),
+    ] = 115200
+    home: Annotated[bool, Meta(description="true or false", examples=[True])] = True
+    timeout: Annotated[
+        float, Meta(ge=0.1, le=60, description="a time from 0.1 to 60 s", examples=[2.0])
+    ] = 2.0
+    report_rate: Annotated[
+        float, Meta(ge=1, le=100, description="a rate from 1 to 100 Hz", examples=[20.0])
+    ] = 20.0
+    press: Millimetres
+    pivot: Annotated[
+        tuple[float, float, float] | None,
+        Meta(description="a list of x, y and z, in mm,", examples=[[0.0, 0.0, 0.0]]),
+    ] = None
+    travel: TravelAxis
+    pitch: TiltAxis | None = None
+    roll: TiltAxis | None = None
+
+    def __post_init__(self) -> None:
+        if (self.pitch is None) != (self.roll is None):
+            has, lacks = ("pitch", "roll") if self.roll is None else ("roll", "pitch")
+            raise ValueError(
+                f"there is [stage.{has}] and no [stage.{lacks}]: a lean needs both; add the other, or leave "
+                "both out"
+            )
+        taken: dict[str, str] = {}
+        for name, axis in self.axes.items():
+            if axis.letter in taken:
+                raise ValueError(
+                    f'{name}.letter is "{axis.letter}", and so is {taken[axis.letter]}.letter: '
+                    "each motion needs an axis of its own; correct one of them"
+                )
+            taken[axis.letter] = name
+        if not self.press > self.travel.low:
+            raise ValueError(
+                f"press is {self.press:g}, not above travel.limits' {self.travel.low:g}; "
+                "write the greatest travel that the skin bears, in mm"
+            )
 
     @property
     def axes(self) -> dict[str, Axis]:
@@ -114,17 +228,19 @@ class StageSettings:
         return Limits(travel, max(0.0, min(reaches, default=0.0)), min(self.press, self.travel.high))
 
 
-@dataclass(frozen=True, slots=True)
-class CameraSettings:
+class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How the camera is opened, and what its counts mean.
 
     Attributes
     ----------
     source : int or str
         The number of a camera, or the path or URL of a stream.
-    shape : (int, int)
-        Rows and columns.
-    dtype : dtype
+    size : (int, int)
+        Columns and rows.
+    name : str
+        What it is called in recordings, and by which calibrations know it; by default the source, without a
+        password.
+    dtype : str
         Type of a sample: uint8, uint16 or float32.
     fourcc : str or None
         The format asked of the camera, four letters; None leaves it.
@@ -136,49 +252,88 @@ class CameraSettings:
         Frames per second; None leaves it.
     delay : float or None
         From the middle of the exposure to the frame's arrival, seconds; None if it is not known.
-    pixel_size : (float, float) or None
+    pixel_size : float or (float, float) or None
         Width and height of a pixel at the sheet, mm.
-    dark, bright : float or Path or None
+    dark, bright : float or str or None
         Counts without light, and off the contact: one number, or a picture's file.
     zenith_gain : float or None
-        Counts per radian of zenith.
+        Counts per degree of zenith.
     zenith_offset : float or None
         Counts at zenith 0.
-    name : str
-        What it is called in recordings, and by which calibrations know it.
     """
 
-    source: int | str
-    shape: tuple[int, int]
-    dtype: np.dtype[Any]
-    fourcc: str | None = None
-    exposure: float | None = None
-    gain: float | None = None
-    rate: float | None = None
-    delay: float | None = None
-    pixel_size: tuple[float, float] | None = None
-    dark: float | Path | None = None
-    bright: float | Path | None = None
-    zenith_gain: float | None = None
-    zenith_offset: float | None = None
-    name: str = ""
+    source: Annotated[
+        Annotated[int, Meta(ge=0, lt=1000)] | Text,
+        Meta(
+            description="a camera's number from 0 on, or the path or URL of a stream in quotes,", examples=[0]
+        ),
+    ]
+    size: Annotated[
+        tuple[_Pixels, _Pixels],
+        Meta(description=f"a list of columns and rows, each from 1 to {_CELL},", examples=[[640, 480]]),
+    ]
+    name: Annotated[Text, Meta(description="what the camera is called, in quotes,", examples=["left"])] = ""
+    dtype: Literal["uint8", "uint16", "float32"] = "uint8"
+    fourcc: Annotated[
+        Annotated[str, Meta(pattern=r"^[!-~]{2,4} {0,2}\Z", max_length=4)] | None,
+        Meta(description="a format of two to four letters, in quotes,", examples=["GREY"]),
+    ] = None
+    exposure: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="a time above 0, in seconds,", examples=[0.004]),
+    ] = None
+    gain: Annotated[float | None, Meta(description="a finite number", examples=[1.0])] = None
+    rate: Annotated[
+        Annotated[float, Meta(gt=0)] | None, Meta(description="a rate above 0, in Hz,", examples=[60.0])
+    ] = None
+    delay: Annotated[
+        Annotated[float, Meta(ge=0, le=10)] | None,
+        Meta(description="a time from 0 to 10 s", examples=[0.03]),
+    ] = None
+    pixel_size: Annotated[
+        _Side | tuple[_Side, _Side] | None,
+        Meta(description="a length above 0, in mm, or a list of a width and a height", examples=[0.03]),
+    ] = None
+    dark: _Reference | None = None
+    bright: _Reference | None = None
+    zenith_gain: Annotated[
+        float | None, Meta(description="a number of counts a degree, other than 0,", examples=[5.7])
+    ] = None
+    zenith_offset: Annotated[float | None, Meta(description="a number of counts", examples=[10])] = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            msgspec.structs.force_setattr(self, "name", _USER.sub("//", str(self.source)))
+        if self.fourcc is not None:
+            msgspec.structs.force_setattr(self, "fourcc", self.fourcc.ljust(4))
+        if self.zenith_gain == 0:
+            raise ValueError("zenith_gain is 0: write the counts per degree, e.g. 5.7, or leave it out")
+        if self.zenith_gain is None and self.zenith_offset is not None:
+            raise ValueError(
+                "zenith_offset is given and zenith_gain is not: the one means nothing without the other; "
+                "add it, or leave both out"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.size[1], self.size[0]
+
+    @property
+    def pixel_sides(self) -> tuple[float, float] | None:
+        """Width and height of a pixel at the sheet, mm."""
+        side = self.pixel_size
+        return (side, side) if isinstance(side, float | int) else side
+
+    @property
+    def counts_per_radian(self) -> float | None:
+        """The zenith gain, counts per radian."""
+        return None if self.zenith_gain is None else self.zenith_gain / math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class RigSettings:
-    """A rig: its file, its name, its stage and its camera.
-
-    Attributes
-    ----------
-    path : Path
-        The file that said so.
-    name : str
-        What the rig is called.
-    stage : StageSettings
-        The stage.
-    camera : CameraSettings
-        The camera.
-    """
+    """A rig: its file, its name, its stage and its camera."""
 
     path: Path
     name: str
@@ -186,176 +341,14 @@ class RigSettings:
     camera: CameraSettings
 
 
-# Reads a value; raises ValueError, which tells what is needed instead.
-Reader = Callable[[Any], Any]
+class RigFile(msgspec.Struct, frozen=True, kw_only=True):
+    """The whole file."""
 
-REQUIRED = object()
-"""The default of a key that must be said."""
-
-_LONGEST = 40  # letters of a value that a message quotes
-
-
-@dataclass(frozen=True, slots=True)
-class Key:
-    """What is known of a key.
-
-    Attributes
-    ----------
-    read : callable
-        Reads its value; raises ValueError, which tells what is needed instead.
-    example : str
-        A value, as TOML writes it.
-    default : object
-        What holds if it is not said; ``REQUIRED`` if it must be.
-    """
-
-    read: Reader
-    example: str
-    default: Any = REQUIRED
-
-
-def read_table(
-    said: Any, keys: Mapping[str, Key], where: str, name: str = "", tables: Collection[str] = ()
-) -> dict[str, Any]:
-    """Read the values of a table; what is not said gets its default.
-
-    Parameters
-    ----------
-    said : object
-        The table as TOML gives it.
-    keys : mapping
-        What it may hold.
-    where : str
-        The file, for messages.
-    name : str
-        The table's dotted name; empty at the top of the file.
-    tables : collection of str
-        Names of tables in it, which are read elsewhere.
-
-    Raises
-    ------
-    InputError
-        It is no table, a key is not known or missing, or a value is not what it may be.
-    """
-    if not isinstance(said, dict):
-        raise InputError(
-            f"{where}: {name} is {quote(said)}: write [{name}] alone in a line, and its keys below"
-        )
-    for key in said:
-        if key not in keys and key not in tables:
-            raise InputError(f"{where}: {_dotted(name, key)} is not known: {_suggest(key, [*keys, *tables])}")
-    return {key: _value(said, key, keys[key], where, name) for key in keys}
-
-
-def _value(said: Mapping[str, Any], key: str, known: Key, where: str, name: str) -> Any:
-    dotted = _dotted(name, key)
-    if key not in said:
-        if known.default is REQUIRED:
-            raise InputError(f"{where}: {dotted} is missing; write {key} = {known.example} in [{name}]")
-        return known.default
-    try:
-        return known.read(said[key])
-    except ValueError as error:
-        raise InputError(
-            f"{where}: {dotted} is {quote(said[key])}: {error}; write e.g. {key} = {known.example}"
-        ) from error
-
-
-def _dotted(table: str, key: str) -> str:
-    shown = key if key.isprintable() and key else repr(key)
-    return f"{table}.{shown}" if table else shown
-
-
-def _suggest(key: str, known: Collection[str]) -> str:
-    close = difflib.get_close_matches(key.lower().replace("-", "_"), known, n=1)
-    return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
-
-
-def quote(value: Any) -> str:
-    """Write a value as TOML does, near enough to be recognised."""
-    if isinstance(value, dict):
-        return "a table"
-    if isinstance(value, bool):
-        return str(value).lower()
-    try:
-        text = f'"{value}"' if isinstance(value, str) else str(value)
-    except ValueError:  # a whole number of thousands of digits
-        return "out of all bounds"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-
-
-def number(words: str, fits: Callable[[float], bool] = lambda value: True) -> Reader:
-    """Return what reads a finite number that fits; `words` name such a number."""
-
-    def read(value: Any) -> float:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            try:
-                known = float(value)
-            except OverflowError:  # whole numbers may have any length
-                known = math.inf
-            if math.isfinite(known) and fits(known):
-                return known
-        raise ValueError(f"{words} is needed")
-
-    return read
-
-
-def whole(words: str, least: int, most: int) -> Reader:
-    """Return what reads a whole number from `least` to `most`."""
-
-    def read(value: Any) -> int:
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise ValueError(f"{words} from {least} to {most} is needed")
-        return value
-
-    return read
-
-
-def one_of(*known: str | int) -> Reader:
-    """Return what reads one of several words or whole numbers."""
-
-    def read(value: Any) -> str | int:
-        for one in known:
-            if type(value) is type(one) and value == one:
-                return one
-        raise ValueError(f"one of {', '.join(map(quote, known))} is needed")
-
-    return read
-
-
-def several(count: int, words: str, read_one: Reader) -> Reader:
-    """Return what reads an array of `count` values of one kind."""
-
-    def read(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list) or len(value) != count:
-            raise ValueError(f"{words} are needed, in [ ]")
-        return tuple(map(read_one, value))
-
-    return read
-
-
-def text(words: str) -> Reader:
-    """Return what reads a text that is not empty, in one line."""
-
-    def read(value: Any) -> str:
-        if not isinstance(value, str) or not value.strip() or not value.isprintable():
-            raise ValueError(f"{words} is needed, a text in quotes")
-        return value
-
-    return read
-
-
-def flag(value: Any) -> bool:
-    """Read true or false."""
-    if not isinstance(value, bool):
-        raise ValueError("true or false is needed")
-    return value
-
-
-_TILTS = ("pitch", "roll")
-_STEEPEST = 90.0  # degrees
-_USER = re.compile("//[^/]*@")
+    name: Annotated[
+        Text | None, Meta(description="what the rig is called, in quotes,", examples=["bench 2"])
+    ] = None
+    stage: StageSettings
+    camera: CameraSettings
 
 
 def load_rig(path: Path | str) -> RigSettings:
@@ -369,115 +362,37 @@ def load_rig(path: Path | str) -> RigSettings:
     Returns
     -------
     RigSettings
-        In mm, radians and seconds.
+        With the paths of those files.
 
     Raises
     ------
     InputError
-        The file cannot be read, or says something that is not known or cannot be used. The message names the
+        The file cannot be read, or has something that is not known or cannot be used. The message names the
         file, the key and the remedy.
+
+    Examples
+    --------
+    >>> load_rig("rig.toml").stage.press  # doctest: +SKIP
+    2.0
     """
     path = Path(path)
-    said, where = _read(path), str(path)
-    top = read_table(said, KEYS[""], where, tables=("stage", "camera"))
-    stage = _stage(_present(said, "stage", where), where)
-    camera = _camera(_present(said, "camera", where), path)
-    check_references(camera, where)
-    return RigSettings(path, path.stem if top["name"] is None else top["name"], stage, camera)
-
-
-def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read: {error.strerror}; name a rig file, or write one: mirrorskin rig new"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text: write a rig in TOML, as docs/rig.md tells") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no TOML: {error}; correct it there") from error
-
-
-def _present(said: Mapping[str, Any], name: str, where: str) -> Any:
-    key = name.rpartition(".")[2]
-    if key not in said:
-        raise InputError(f"{where}: the table [{name}] is missing; add it, as docs/rig.md tells")
-    return said[key]
-
-
-def _stage(said: Any, where: str) -> StageSettings:
-    values = read_table(said, KEYS["stage"], where, "stage", ("travel", *_TILTS))
-    axes: dict[str, Axis | None] = {name: _axis(said[name], name, where) for name in _TILTS if name in said}
-    if len(axes) == 1:
-        has, lacks = axes, next(name for name in _TILTS if name not in axes)
-        raise InputError(
-            f"{where}: there is [stage.{next(iter(has))}] and no [stage.{lacks}]: "
-            "a lean needs both; add the other, or leave both out"
-        )
-    travel = _axis(_present(said, "stage.travel", where), "travel", where)
-    _check_letters({"travel": travel} | axes, where)
-    if not values["press"] > travel.low:
-        raise InputError(
-            f"{where}: stage.press is {values['press']:g}, not above stage.travel.limits' {travel.low:g}; "
-            "write the greatest travel that the skin bears, in mm"
-        )
-    return StageSettings(travel=travel, pitch=axes.get("pitch"), roll=axes.get("roll"), **values)
-
-
-def _axis(said: Any, name: str, where: str) -> Axis:
-    """Read an axis; radians leave here."""
-    table = f"stage.{name}"
-    values = read_table(said, KEYS[table], where, table)
-    low, high = values.pop("limits")
-    if not low < high:
-        raise InputError(
-            f"{where}: {table}.limits are out of order, {low:g} not below {high:g}: write [least, greatest]"
-        )
-    speed = values.pop("speed")
-    if values["unit"] == "deg":
-        if not low < 0 < high:
-            raise InputError(
-                f"{where}: {table}.limits [{low:g}, {high:g}] do not have 0 (upright) within; "
-                "set zero to the machine's coordinate there, and limits on both sides of it"
-            )
-        low, high, speed = map(math.radians, (low, high, speed))
-    return Axis(low=low, high=high, speed=speed, **values)
-
-
-def _check_letters(axes: Mapping[str, Axis | None], where: str) -> None:
-    """Refuse two motions of one axis."""
-    taken: dict[str, str] = {}
-    for name, axis in axes.items():
-        letter = axis.letter if axis else ""
-        if letter in taken:
-            raise InputError(
-                f'{where}: stage.{name}.letter is "{letter}", and so is stage.{taken[letter]}.letter: '
-                "each motion needs an axis of its own; correct one of them"
-            )
-        taken[letter] = name
-
-
-def _camera(said: Any, path: Path) -> CameraSettings:
-    values = read_table(said, KEYS["camera"], str(path), "camera")
-    columns, rows = values.pop("size")
-    if values["zenith_gain"] is not None:
-        values["zenith_gain"] = values["zenith_gain"] / math.radians(1.0)
-    elif values["zenith_offset"] is not None:
-        raise InputError(
-            f"{path}: camera.zenith_offset is said and camera.zenith_gain is not: "
-            "the one means nothing without the other; add it, or leave both out"
-        )
-    for name in ("dark", "bright"):
-        if isinstance(values[name], str):
-            values[name] = path.parent / values[name]
-    source = values.pop("source")
-    if values["name"] is None:
-        values["name"] = _USER.sub("//", str(source))  # without the password of a stream
-    if isinstance(source, str) and "://" not in source:
-        source = _beside(path, source)
-    return CameraSettings(source=source, shape=(rows, columns), **values)
+        file = load_toml(path, RigFile, "docs/rig.md")
+    except InputError as error:
+        if path.exists():
+            raise
+        raise InputError(f"{error}, or begin with 'mirrorskin rig new'") from error
+    camera = file.camera
+    beside: dict[str, Any] = {
+        name: str(path.parent / given)
+        for name in ("dark", "bright")
+        if isinstance(given := getattr(camera, name), str)
+    }
+    if isinstance(camera.source, str) and "://" not in camera.source:
+        beside["source"] = _beside(path, camera.source)
+    camera = msgspec.structs.replace(camera, **beside)
+    check_references(camera, str(path))
+    return RigSettings(path, file.name or path.stem, file.stage, camera)
 
 
 def _beside(path: Path, name: str) -> str:
@@ -487,101 +402,6 @@ def _beside(path: Path, name: str) -> str:
     except OSError:  # it is too long, or the folder may not be looked into
         return name
 
-
-def _source(value: Any) -> int | str:
-    if isinstance(value, str) and value.strip() and value.isprintable():
-        return value
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1000:
-        return value
-    raise ValueError("a camera's number from 0 on, or the path or URL of a stream in quotes is needed")
-
-
-def _dtype(value: Any) -> np.dtype[Any]:
-    return np.dtype(one_of(*(dtype.name for dtype in FRAME_DTYPES))(value))
-
-
-def _fourcc(value: Any) -> str:
-    if not isinstance(value, str) or not re.fullmatch("[!-~]{2,4} {0,2}", value) or len(value) > 4:
-        raise ValueError("the two to four letters of a format are needed, in quotes")
-    return value.ljust(4)
-
-
-def _pixel_size(value: Any) -> tuple[float, float]:
-    length = number("a length above 0, in mm,", lambda value: value > 0)
-    if isinstance(value, list):
-        x, y = several(2, "a width and a height in mm", length)(value)
-        return x, y
-    side = length(value)
-    return side, side
-
-
-def _counts(value: Any) -> float | str:
-    """Read counts, or the name of a picture's file."""
-    if isinstance(value, str):
-        if not value.isprintable() or Path(value).suffix.lower() not in SUFFIXES:
-            raise ValueError(f"a number of counts or a file ({', '.join(SUFFIXES)}) is needed")
-        return value
-    counts: float = number("a number of counts, or a file in quotes,")(value)
-    return counts
-
-
-def _axis_keys(letter: str, unit: str, limits: str, speed: str) -> dict[str, Key]:
-    words = {"mm": "mm", "deg": "degrees"}[unit]
-    place = number(f"a finite number of {words}")
-    bound = place if unit == "mm" else number("an angle between -90 and 90 degrees", _is_tilt)
-    return {
-        "letter": Key(one_of(*"XYZABC"), f'"{letter}"'),
-        "direction": Key(one_of(1, -1), "1", 1),
-        "zero": Key(place, "0.0", 0.0),
-        "unit": Key(one_of(unit), f'"{unit}"', unit),
-        "limits": Key(several(2, f"the least and the greatest value in {words}", bound), limits),
-        "speed": Key(number(f"a speed above 0, in {words} a second,", _is_positive), speed),
-    }
-
-
-def _is_tilt(value: float) -> bool:
-    return abs(value) < _STEEPEST
-
-
-def _is_positive(value: float) -> bool:
-    return value > 0
-
-
-KEYS: Mapping[str, Mapping[str, Key]] = {
-    "": {"name": Key(text("what the rig is called"), '"bench 2"', None)},
-    "stage": {
-        "port": Key(text("a serial port or a URL"), '"/dev/ttyUSB0"'),
-        "baud": Key(whole("a number of bits a second", 300, 10_000_000), "115200", 115200),
-        "home": Key(flag, "true", True),
-        "timeout": Key(number("a time from 0.1 to 60 s", lambda value: 0.1 <= value <= 60), "2.0", 2.0),
-        "report_rate": Key(number("a rate from 1 to 100 Hz", lambda value: 1 <= value <= 100), "20.0", 20.0),
-        "press": Key(number("a finite number of mm"), "2.0"),
-        "pivot": Key(several(3, "x, y and z in mm", number("each a finite number")), "[0.0, 0.0, 0.0]", None),
-    },
-    "stage.travel": _axis_keys("Z", "mm", "[-5.0, 3.0]", "5.0"),
-    "stage.pitch": _axis_keys("X", "deg", "[-5.0, 5.0]", "20.0"),
-    "stage.roll": _axis_keys("Y", "deg", "[-5.0, 5.0]", "20.0"),
-    "camera": {
-        "source": Key(_source, "0"),
-        "size": Key(several(2, "columns and rows", whole("each", 1, 65535)), "[640, 480]"),
-        "name": Key(text("what the camera is called"), '"left"', None),
-        "dtype": Key(_dtype, '"uint8"', np.dtype(np.uint8)),
-        "fourcc": Key(_fourcc, '"GREY"', None),
-        "exposure": Key(number("a time above 0, in seconds,", _is_positive), "0.004", None),
-        "gain": Key(number("a finite number"), "1.0", None),
-        "rate": Key(number("a rate above 0, in Hz,", _is_positive), "60.0", None),
-        "delay": Key(number("a time from 0 to 10 s", lambda value: 0 <= value <= 10), "0.03", None),
-        "pixel_size": Key(_pixel_size, "0.03", None),
-        "dark": Key(_counts, "12", None),
-        "bright": Key(_counts, '"bright.tif"', None),
-        "zenith_gain": Key(number("a number of counts a degree, other than 0,", bool), "5.7", None),
-        "zenith_offset": Key(number("a number of counts"), "10", None),
-    },
-}
-"""The keys of every table, by its dotted name; the top of the file has none."""
-
-
-"""A rig file to begin with."""
 
 TEMPLATE = """\
 # A rig for mirrorskin: what moves the sensor's body, and what looks at its skin (docs/rig.md).

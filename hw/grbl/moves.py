@@ -44,7 +44,7 @@ class Axes:
     def __init__(self, settings: StageSettings, name: str) -> None:
         self._axes = settings.axes
         self._name = name
-        self.speeds = {motion: axis.speed for motion, axis in self._axes.items()}
+        self.speeds = {motion: axis.top_speed for motion, axis in self._axes.items()}
 
     @property
     def letters(self) -> dict[str, str]:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.grbl.moves import SLOWEST
-from mirrorskin.hw.rig.check import unit_of
 from mirrorskin.hw.rig.delay import Delay, block_means, estimate_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig
@@ -89,8 +88,7 @@ def _speeds(axis: Axis | None) -> tuple[float, float]:
     """Return how fast and how slowly an axis may go, mm/s or rad/s."""
     if axis is None:  # cannot be: what does not lean does not go round
         return math.inf, 0.0
-    _, scale = unit_of(axis)
-    return _HURRY * axis.speed, SLOWEST / 60 / scale / _HURRY
+    return _HURRY * axis.top_speed, SLOWEST / 60 / axis.scale / _HURRY
 
 
 def _track(

@@ -88,11 +88,12 @@ class Scan(Closing):
     def header(self) -> Header:
         """What holds for all frames; it is made ready for the scan when it is asked for."""
         header = self._known()
-        dark = given_reference(self.rig, "dark")
-        bright = given_reference(self.rig, "bright")
+        settings = self.rig.settings
+        dark = read_reference(settings.camera, "dark", settings.path)
+        bright = read_reference(settings.camera, "bright", settings.path)
         lifted = self.lift()
         if dark is None:
-            late = max(UNKNOWN_DELAY, self.rig.settings.camera.delay or 0.0) + self.rig.period
+            late = max(UNKNOWN_DELAY, settings.camera.delay or 0.0) + self.rig.period
             dark = take_dark(self.rig, lifted.time + late)
         self._prepare()
         return replace(header, dark=dark, bright=bright)
@@ -190,8 +191,8 @@ class Scan(Closing):
             self.motion,
             title=f"{self.name}, {self.motion} motion",
             start_time=datetime.now(UTC).isoformat(timespec="seconds"),
-            pixel_size=camera.pixel_size,
-            zenith_gain=_scalar(camera.zenith_gain),
+            pixel_size=camera.pixel_sides,
+            zenith_gain=_scalar(camera.counts_per_radian),
             zenith_offset=_scalar(camera.zenith_offset),
             camera=camera.name,
         )
@@ -287,41 +288,8 @@ def _check_there(rest: Report, place: Position, name: str) -> None:
         )
 
 
-def given_reference(rig: Rig, name: str) -> NDArray[np.float32] | None:
-    """Return a reference that the rig file gives, (H, W), or None.
-
-    Parameters
-    ----------
-    rig : Rig
-    name : {"dark", "bright"}
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or does not fit the camera.
-    """
-    camera = rig.settings.camera
-    value = camera.dark if name == "dark" else camera.bright
-    return None if value is None else read_reference(value, camera, f"{rig.settings.path}: camera.{name}")
-
-
 def take_dark(rig: Rig, since: float, count: int = _DARK_FRAMES) -> NDArray[np.float32]:
-    """Take the mean of some frames of a sheet that touches nothing, (H, W), float32.
-
-    Parameters
-    ----------
-    rig : Rig
-        The body is lifted.
-    since : float
-        Frames that arrived earlier do not count, seconds of `time.monotonic`.
-    count : int
-        How many frames.
-
-    Raises
-    ------
-    HardwareError
-        The camera gives none.
-    """
+    """Return the mean of some frames that arrived after a time, (H, W): the sheet must touch nothing."""
     total = np.zeros(rig.camera.shape)
     left = count
     rig.camera.flush()

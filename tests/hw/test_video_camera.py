@@ -20,10 +20,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from mirrorskin.hw import video
 from mirrorskin.hw.camera import Tally
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
-from mirrorskin.hw.video import VideoCamera, camera, capture, source, to_grey
+from mirrorskin.hw.video import VideoCamera, to_grey
 from mirrorskin.io import InputError
 
 FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
@@ -35,7 +36,7 @@ _BITS = 16
 
 
 def settings(source, shape=SHAPE, dtype=BYTE, **more) -> CameraSettings:
-    return CameraSettings(source, shape, np.dtype(dtype), **more)
+    return CameraSettings(source=source, size=shape[::-1], dtype=np.dtype(dtype).name, **more)
 
 
 def noise(count: int, shape=SMALL, dtype=np.uint8) -> np.ndarray:
@@ -279,7 +280,7 @@ def test_no_file_no_device_and_no_video_are_refused(tmp_path, monkeypatch) -> No
     (tmp_path / "text.avi").write_text("no film")
     with pytest.raises(InputError, match="cannot be opened: it is damaged, or no video"):
         VideoCamera(settings(str(tmp_path / "text.avi")))
-    monkeypatch.setattr(source, "_DEVICES", tmp_path)
+    monkeypatch.setattr(video, "_DEVICES", tmp_path)
     with pytest.raises(InputError, match="there is no such device; no camera is connected"):
         VideoCamera(settings(3))
     (tmp_path / "video0").touch()
@@ -335,8 +336,8 @@ class Driver:
 def driver(tmp_path, monkeypatch):
     made = Driver()
     (tmp_path / "video0").touch()
-    monkeypatch.setattr(source, "_DEVICES", tmp_path)
-    monkeypatch.setattr(capture.cv2, "VideoCapture", made)
+    monkeypatch.setattr(video, "_DEVICES", tmp_path)
+    monkeypatch.setattr(video.cv2, "VideoCapture", made)
     return made
 
 
@@ -444,7 +445,7 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
 
 
 def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(camera, "PATIENCE", 0.3)
+    monkeypatch.setattr(video, "PATIENCE", 0.3)
     driver.pictures.put(noise(1)[0])
     opened = open_camera()
     opened.take(1, SOON)
@@ -457,8 +458,8 @@ def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monke
 
 
 def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(camera, "_FIRST", 0.2)
-    monkeypatch.setattr(camera, "_CLOSING", 0.2)
+    monkeypatch.setattr(video, "_FIRST", 0.2)
+    monkeypatch.setattr(video, "_CLOSING", 0.2)
     driver.begins.clear()
     begun = time.monotonic()
     with pytest.raises(InputError, match=r"gave no picture within 0.2 s"):
@@ -469,7 +470,7 @@ def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera
 
 
 def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(camera, "_CLOSING", 0.2)
+    monkeypatch.setattr(video, "_CLOSING", 0.2)
     driver.pictures.put(noise(1)[0])
     opened = open_camera()
     begun = time.monotonic()
@@ -481,12 +482,12 @@ def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, monk
 
 
 def test_a_password_is_not_told() -> None:
-    found = source.find_source("rtsp://me:secret@host/film")
+    found = video.find_source("rtsp://me:secret@host/film")
     assert (found.name, found.target) == ("camera rtsp://host/film", "rtsp://me:secret@host/film")
 
 
 def test_a_picture_that_does_not_say_when_is_due_a_period_later() -> None:
-    pace = camera._Pace(0.25)
+    pace = video._Pace(0.25)
     start = pace.due(3.0)
     due = [pace.due(position) - start for position in (3.5, 3.5, 0.0, 4.5)]
     np.testing.assert_allclose(due, [0.5, 0.75, 1.0, 1.5], atol=1e-9)

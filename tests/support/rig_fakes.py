@@ -13,7 +13,7 @@ import numpy as np
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.plans import Trapezoid
-from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings, TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Limits, Position, Report
 
 LIMITS = Limits((-5.0, 3.0), 0.1, 2.0)
@@ -21,12 +21,20 @@ PERIOD = 0.05  # seconds between reports
 
 
 def settings(shape=(8, 8), **camera):
-    axis = Axis("Z", 1, 0.0, -5.0, 3.0, 20.0, "mm")
-    pitch, roll = (Axis(letter, 1, 0.0, -0.1, 0.1, 20.0, "deg") for letter in "XY")
-    stage = StageSettings("none", 115200, False, 1.0, 20.0, axis, pitch, roll, 2.0, (0.0, 0.0, 0.0))
-    return RigSettings(
-        Path("rig.toml"), "fake", stage, CameraSettings(0, shape, np.dtype(np.uint8), **camera)
+    degrees = math.degrees(0.1)
+    pitch, roll = (TiltAxis(letter=one, limits=(-degrees, degrees), speed=math.degrees(20.0)) for one in "XY")
+    stage = StageSettings(
+        port="none",
+        timeout=1.0,
+        home=False,
+        press=2.0,
+        pivot=(0.0, 0.0, 0.0),
+        travel=TravelAxis(letter="Z", limits=(-5.0, 3.0), speed=20.0),
+        pitch=pitch,
+        roll=roll,
     )
+    eye = CameraSettings(source=0, size=shape[::-1], **camera)
+    return RigSettings(Path("rig.toml"), "fake", stage, eye)
 
 
 class FakeStage:

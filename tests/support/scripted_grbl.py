@@ -10,7 +10,7 @@ import time
 import serial
 
 from mirrorskin.hw.grbl.link import SLICE
-from mirrorskin.hw.rig_file import Axis, StageSettings
+from mirrorskin.hw.rig_file import StageSettings, TiltAxis, TravelAxis
 
 SLOTS = 4
 SETTINGS = {
@@ -31,16 +31,15 @@ FULL = 256
 
 def stage_settings(**changes):
     """Travel down on Z, pitch on X, roll on Y in degrees; nothing is at 0."""
-    lean = math.radians(5)
     given = {
         "port": "in memory",
         "baud": 115200,
         "home": False,
         "timeout": 1.0,
         "report_rate": 100.0,
-        "travel": Axis("Z", -1, 10.0, -5.0, 6.0, 20.0, "mm"),
-        "pitch": Axis("X", 1, 30.0, -lean, lean, math.radians(100), "deg"),
-        "roll": Axis("Y", 1, 40.0, -lean, lean, math.radians(100), "deg"),
+        "travel": TravelAxis(letter="Z", direction=-1, zero=10.0, limits=(-5.0, 6.0), speed=20.0),
+        "pitch": TiltAxis(letter="X", zero=30.0, limits=(-5.0, 5.0), speed=100.0),
+        "roll": TiltAxis(letter="Y", zero=40.0, limits=(-5.0, 5.0), speed=100.0),
         "press": 3.0,
         "pivot": None,
     }

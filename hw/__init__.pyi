@@ -1,0 +1,35 @@
+from .twin import Live, Twin
+
+from .camera import Camera
+from .camera_thread import ThreadedCamera
+from .emulator.rig import EmulatedRig
+from .errors import HardwareError
+from .grbl.stage import GrblStage
+from .rig.plans import AxialPlan, VerticalPlan
+from .rig.rig import Rig, open_rig
+from .rig.scan import StepScan
+from .rig.sweep import SweepScan
+from .rig_file import load_rig
+from .stage import Limits, Position, Stage
+from .video import VideoCamera
+
+__all__ = [
+    "AxialPlan",
+    "Camera",
+    "EmulatedRig",
+    "GrblStage",
+    "HardwareError",
+    "Limits",
+    "Live",
+    "Position",
+    "Rig",
+    "Stage",
+    "StepScan",
+    "SweepScan",
+    "ThreadedCamera",
+    "Twin",
+    "VerticalPlan",
+    "VideoCamera",
+    "load_rig",
+    "open_rig",
+]
