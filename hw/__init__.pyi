@@ -1,5 +1,3 @@
-from .twin import Live, Twin
-
 from .camera import Camera
 from .camera_thread import ThreadedCamera
 from .emulator.rig import EmulatedRig
@@ -11,6 +9,7 @@ from .rig.scan import StepScan
 from .rig.sweep import SweepScan
 from .rig_file import load_rig
 from .stage import Limits, Position, Stage
+from .twin import Live, Twin
 from .video import VideoCamera
 
 __all__ = [

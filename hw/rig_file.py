@@ -165,9 +165,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         The two components of the lean; a stage has both or none.
     """
 
-    port: Annotated[
-        Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])
-    ]
+    port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
     baud: Annotated[
         int,
         Meta(
@@ -178,9 +176,9 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         ),
     ] = 115200
     home: Annotated[bool, Meta(description="true or false", examples=[True])] = True
-    timeout: Annotated[
-        float, Meta(ge=0.1, le=60, description="a time from 0.1 to 60 s", examples=[2.0])
-    ] = 2.0
+    timeout: Annotated[float, Meta(ge=0.1, le=60, description="a time from 0.1 to 60 s", examples=[2.0])] = (
+        2.0
+    )
     report_rate: Annotated[
         float, Meta(ge=1, le=100, description="a rate from 1 to 100 Hz", examples=[20.0])
     ] = 20.0

@@ -5,19 +5,21 @@ from __future__ import annotations
 import functools
 import json
 import math
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Literal, Self, cast
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.emulator.camera import TwinCamera
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
-from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig_file import CameraSettings, RigFile, RigSettings, StageSettings, TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Body, Camera, ContactName, Object, OpticsName, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement
@@ -26,13 +28,11 @@ from mirrorskin.io.types import InputError
 PRESS = 3.0
 """Greatest travel that the emulated stage allows, mm."""
 
-TILT = math.radians(9.0)
-"""Greatest pitch and roll, radians."""
+TILT = 9.0
+"""Greatest pitch and roll, degrees."""
 
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
-_BAUD = 115200
-_SPEEDS = {"tilt": math.radians(20.0), "travel": 10.0}  # rad/s, mm/s
 # What GRBL is told of homing, in units a minute, ms and units; and of its axes X, Y, Z, which are pitch, roll
 # (these count degrees) and travel: greatest speeds in units a minute, accelerations, lengths.
 _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
@@ -43,6 +43,7 @@ _MACHINE = (
     | dict(enumerate(_ACCELERATION, 120))
     | dict(enumerate(_LENGTH, 130))
 )
+_FIRST = "# An emulated rig; it is there as long as the program that wrote this runs.\n"
 
 
 class EmulatedRig:
@@ -126,7 +127,7 @@ class EmulatedRig:
             device=device,
         )
         self._pivot, self._home = pivot, home
-        farthest = Axial(np.arange(8) * np.pi / 4, math.hypot(TILT, TILT), PRESS, pivot)
+        farthest = Axial(np.arange(8) * np.pi / 4, math.radians(math.hypot(TILT, TILT)), PRESS, pivot)
         self._seen = self._make(movement=farthest)
         self._axes = _axes(home)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
@@ -170,14 +171,7 @@ class EmulatedRig:
     def settings(self) -> RigSettings:
         """What a rig file would say."""
         stage = StageSettings(
-            port=self.port.url,
-            baud=_BAUD,
-            home=self._home,
-            timeout=2.0,
-            report_rate=20.0,
-            press=PRESS,
-            pivot=self._pivot,
-            **self._axes,
+            port=self.port.url, home=self._home, press=PRESS, pivot=self._pivot, **self._axes
         )
         return RigSettings(Path("emulated"), "emulated rig", stage, self._camera_settings())
 
@@ -186,10 +180,30 @@ class EmulatedRig:
         return FrameServer(self.camera, self._seen.frame_rate, port)
 
     def write(self, folder: Path, source: str) -> Path:
-        """Write a rig file and the bright reference, with the stream's URL as camera; see `write_rig`."""
-        settings = self.settings
-        camera = replace(settings.camera, source=source)
-        return write_rig(replace(settings, camera=camera), self.references()[1], folder)
+        """Write ``rig.toml`` with a stream's URL as camera, and the bright reference beside it.
+
+        The folder is made where it is missing; files of an emulated rig that was there before are replaced.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written to, or has a rig file of someone else's.
+        """
+        path, picture = folder / "rig.toml", folder / "bright.npy"
+        camera = msgspec.structs.replace(self._camera_settings(), source=source, bright=picture.name)
+        file = RigFile(name=self.settings.name, stage=self.settings.stage, camera=camera)
+        text = "\n".join(_toml(msgspec.to_builtins(file)))
+        try:
+            if path.exists() and not path.read_text(errors="replace").startswith(_FIRST):
+                raise InputError(f"{path} is a rig file that someone else wrote: name another folder with -o")
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(picture, self.references()[1])
+            path.write_text(f"{_FIRST}{text}\n")
+        except OSError as error:
+            raise InputError(
+                f"{folder} cannot be written to: {error.strerror}; name another with -o"
+            ) from None
+        return path
 
     def _camera_settings(self) -> CameraSettings:
         header = self._seen.header
@@ -197,115 +211,37 @@ class EmulatedRig:
             None if counts is None else float(np.mean(counts))
             for counts in (header.zenith_gain, header.zenith_offset)
         )
+        rows, columns = self._seen.shape[1:]
         return CameraSettings(
             source=self._seen.name,
-            shape=self._seen.shape[1:],
-            dtype=self._seen.dtype,
+            size=(columns, rows),
+            dtype=cast(Literal["uint8", "uint16", "float32"], self._seen.dtype.name),
             rate=self._seen.frame_rate,
             pixel_size=header.pixel_size,
             bright=self._levels.bright,
-            zenith_gain=gain,
+            zenith_gain=None if gain is None else gain * math.radians(1.0),
             zenith_offset=offset,
             name=header.camera,
         )
 
 
-def _axes(home: bool) -> dict[str, Axis]:
+def _axes(home: bool) -> dict[str, Any]:
     """Describe the axes: one that has homed counts from its upper end, another from where it began."""
     middle, upper = (-10.0, -_HIGHEST - 0.5) if home else (0.0, -_LIFT)
-    return {
-        "travel": Axis("Z", -1, upper, -_HIGHEST, PRESS, _SPEEDS["travel"], "mm"),
-        "pitch": Axis("X", 1, middle, -TILT, TILT, _SPEEDS["tilt"], "deg"),
-        "roll": Axis("Y", 1, middle, -TILT, TILT, _SPEEDS["tilt"], "deg"),
-    }
-
-
-_FIRST = "# An emulated rig; it is there as long as the program that wrote this runs.\n"
-
-
-def write_rig(settings: RigSettings, bright: NDArray[np.float32], folder: Path) -> Path:
-    """Write ``rig.toml``, and the bright reference as ``bright.npy`` beside it.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        What to write but the references; see ``docs/rig.md`` for the keys.
-    bright : ndarray, (H, W), float32
-        Counts in full light.
-    folder : Path
-        Made where it is missing. Files of an emulated rig that was there before are replaced.
-
-    Returns
-    -------
-    Path
-        The rig file.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to, or has a rig file of someone else's.
-    """
-    path, picture = folder / "rig.toml", folder / "bright.npy"
-    try:
-        if path.exists() and not path.read_text(errors="replace").startswith(_FIRST):
-            raise InputError(f"{path} is a rig file that someone else wrote: name another folder with -o")
-        folder.mkdir(parents=True, exist_ok=True)
-        np.save(picture, bright)
-        camera = replace(settings.camera, bright=Path(picture.name))
-        path.write_text(_FIRST + _text(replace(settings, camera=camera)))
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written to: {error.strerror}; name another with -o") from None
-    return path
-
-
-def _text(settings: RigSettings) -> str:
-    stage, camera = settings.stage, settings.camera
-    tables: dict[str, dict[str, object]] = {
-        "": {"name": settings.name},
-        "stage": {
-            "port": stage.port,
-            "baud": stage.baud,
-            "home": stage.home,
-            "timeout": stage.timeout,
-            "report_rate": stage.report_rate,
-            "press": stage.press,
-            "pivot": stage.pivot,
-        },
-        **{f"stage.{name}": _axis(axis) for name, axis in stage.axes.items()},
-        "camera": {
-            "name": camera.name,
-            "source": camera.source,
-            "size": camera.shape[::-1],
-            "dtype": camera.dtype.name,
-            "rate": camera.rate,
-            "delay": camera.delay,
-            "pixel_size": camera.pixel_size,
-            "dark": camera.dark,
-            "bright": camera.bright,
-            "zenith_gain": None if camera.zenith_gain is None else camera.zenith_gain * math.radians(1.0),
-            "zenith_offset": camera.zenith_offset,
-        },
-    }
-    return "\n".join(
-        (f"[{table}]\n" if table else "")
-        + "".join(f"{key} = {_value(value)}\n" for key, value in said.items() if value is not None)
-        for table, said in tables.items()
+    pitch, roll = (
+        TiltAxis(letter=letter, zero=middle, limits=(-TILT, TILT), speed=20.0) for letter in ("X", "Y")
     )
+    travel = TravelAxis(letter="Z", direction=-1, zero=upper, limits=(-_HIGHEST, PRESS), speed=10.0)
+    return {"travel": travel, "pitch": pitch, "roll": roll}
 
 
-def _axis(axis: Axis) -> dict[str, object]:
-    """Tell an axis in its own unit."""
-    scale = axis.scale
-    return {
-        "letter": axis.letter,
-        "direction": axis.direction,
-        "zero": axis.zero,
-        "unit": axis.unit,
-        "limits": (round(axis.low * scale, 9), round(axis.high * scale, 9)),
-        "speed": round(axis.speed * scale, 9),
-    }
-
-
-def _value(value: object) -> str:
-    """Write a value in TOML: what JSON writes of text, numbers and lists is TOML as well."""
-    return json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)
+def _toml(table: Mapping[str, Any], name: str = "") -> Iterator[str]:
+    """Yield the lines of a table, and of those in it: what JSON writes of a value is TOML as well."""
+    if name:
+        yield f"\n[{name}]"
+    for key, value in table.items():
+        if value is not None and not isinstance(value, dict):
+            yield f"{key} = {json.dumps(value, ensure_ascii=False)}"
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _toml(value, f"{name}.{key}".lstrip("."))

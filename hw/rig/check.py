@@ -8,18 +8,17 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.camera import Camera, Counts
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Limits, Position, Report, Stage
+from mirrorskin.hw.video import VideoCamera
 from mirrorskin.io import InputError
-
-if TYPE_CHECKING:
-    from mirrorskin.hw.camera import Camera, Counts
-    from mirrorskin.hw.grbl.stage import GrblStage
-    from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 
 Verdict = Literal["ok", "warning", "failed"]
 
@@ -71,8 +70,8 @@ def check_rig(
     settings: RigSettings,
     *,
     move: bool = False,
-    open_stage: Callable[[StageSettings], GrblStage] | None = None,
-    open_camera: Callable[[CameraSettings], Camera] | None = None,
+    open_stage: Callable[[StageSettings], GrblStage] = GrblStage,
+    open_camera: Callable[[CameraSettings], Camera] = VideoCamera,
 ) -> Generator[Finding, None, None]:
     """Open the stage and the camera, and yield what is found, one thing at a time.
 
@@ -85,8 +84,8 @@ def check_rig(
     move : bool
         Home the stage if the file says so, and move each axis a little, there and back, unless something
         failed before. Without it nothing moves.
-    open_stage, open_camera : callable, optional
-        What opens them; by default a `GrblStage` and a `VideoCamera`.
+    open_stage, open_camera : callable
+        What opens them.
 
     Yields
     ------
@@ -99,10 +98,6 @@ def check_rig(
     HardwareError
         One of them was lost, or raised an alarm.
     """
-    if open_stage is None:
-        from mirrorskin.hw.grbl.stage import GrblStage as open_stage
-    if open_camera is None:
-        from mirrorskin.hw.video import VideoCamera as open_camera
     sound = True
     with closing(open_stage(settings.stage)) as stage:
         for finding in check_stage(stage, settings.stage):

@@ -109,7 +109,7 @@ def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
 
 def test_a_rotation_is_told_and_kept(fake, tmp_path):
     fake.picture = slanted()
-    fake.camera_settings |= {"zenith_gain": GAIN, "zenith_offset": OFFSET}
+    fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     output = tmp_path / "res.h5"
     done = fake.run(*TURN, "-o", str(output), "--latency", "5s")
     assert done.exit_code == 0, done.output
@@ -164,7 +164,7 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
 
 def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
     fake.picture = slanted()
-    fake.camera_settings |= {"zenith_gain": GAIN, "zenith_offset": OFFSET}
+    fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     picture = fake.picture
 
     def lost(place):

@@ -150,7 +150,7 @@ def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(con
         ([("press", "pres")], "rig.toml: stage.pres is not known: did you mean press?"),
         (
             [("limits = [-5.0, 3.0]", "limits = [3, -4]")],
-            "stage.travel.limits are out of order, 3 not below -4",
+            "[stage.travel] limits are out of order, 3 not below -4",
         ),
         ([('letter = "Z"', 'letter = "A"')], "the controller has no axis A"),
     ],

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import pytest
+from msgspec import structs
 from scripted_grbl import stage_settings
 
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
@@ -22,7 +22,7 @@ def stage():
     """A stage on an emulated controller whose axes begin at 0."""
     machine = GrblMachine(QUICK)
     with GrblPort(machine) as port:
-        axes = {name: replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
+        axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
         with GrblStage(stage_settings(port=port.url, timeout=2.0, **axes)) as opened:
             yield opened, machine, port
 

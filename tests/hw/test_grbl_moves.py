@@ -9,7 +9,7 @@ import pytest
 from scripted_grbl import stage_settings
 
 from mirrorskin.hw.grbl.moves import Axes
-from mirrorskin.hw.rig_file import Axis
+from mirrorskin.hw.rig_file import TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
@@ -19,7 +19,9 @@ LEAN = math.radians(2.5)
 
 
 def axis(letter, direction=1, zero=0.0, unit="deg"):
-    return Axis(letter, direction, zero, -1.0, 1.0, 10.0, unit)
+    kind = TiltAxis if unit == "deg" else TravelAxis
+    scale = math.degrees(1.0) if unit == "deg" else 1.0
+    return kind(letter=letter, direction=direction, zero=zero, limits=(-scale, scale), speed=10.0 * scale)
 
 
 def axes(**changes):

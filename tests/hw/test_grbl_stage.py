@@ -10,7 +10,7 @@ from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig_file import Axis
+from mirrorskin.hw.rig_file import TiltAxis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
@@ -203,7 +203,7 @@ def test_a_controller_that_cannot_be_worked_with_is_refused(port, told):
 def test_an_axis_that_the_controller_has_not_is_refused():
     port = ScriptedGrbl()
     with pytest.raises(InputError, match="no axis A"):
-        GrblStage(stage_settings(pitch=Axis("A", 1, 0.0, -1, 1, 1, "deg")), port)
+        GrblStage(stage_settings(pitch=TiltAxis(letter="A", limits=(-57, 57), speed=57)), port)
     assert port.closed
 
 

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.check import check_camera, check_moves, check_rig, check_stage
-from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings, TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 
 DEGREE = math.pi / 180
-TILT = {"low": -5 * DEGREE, "high": 4 * DEGREE, "speed": 20 * DEGREE, "unit": "deg"}
-TRAVEL = Axis("Z", -1, -20.0, -10.0, 3.0, 5.0, "mm")
+TILT = {"limits": (-5.0, 4.0), "speed": 20.0}
+TRAVEL = TravelAxis(letter="Z", direction=-1, zero=-20.0, limits=(-10.0, 3.0), speed=5.0)
 STAGE = StageSettings(
     port="nowhere",
     baud=115200,
@@ -25,12 +26,12 @@ STAGE = StageSettings(
     timeout=1.0,
     report_rate=20.0,
     travel=TRAVEL,
-    pitch=Axis("X", 1, 0.0, **TILT),
-    roll=Axis("Y", 1, 0.0, **TILT),
+    pitch=TiltAxis(letter="X", **TILT),
+    roll=TiltAxis(letter="Y", **TILT),
     press=2.0,
     pivot=None,
 )
-CAMERA = CameraSettings(source=0, shape=(5, 7), dtype=np.dtype(np.uint8))
+CAMERA = CameraSettings(source=0, size=(7, 5))
 RIG = RigSettings(Path("r.toml"), "r", STAGE, CAMERA)
 # GRBL's settings of a machine that can do all that the file says.
 ABLE = {22: 1.0, 112: 300.0, 110: 1200.0, 111: 1200.0, 132: 13.0, 130: 9.0, 131: 9.0}
@@ -124,7 +125,7 @@ def look(stage, settings=STAGE):
 
 
 def film(camera, **settings):
-    return {one.what: one for one in check_camera(camera, replace(CAMERA, **settings))}
+    return {one.what: one for one in check_camera(camera, structs.replace(CAMERA, **settings))}
 
 
 def test_a_stage_that_is_as_its_file_says_is_sound():
@@ -162,8 +163,8 @@ def test_a_file_beyond_the_controller_is_warned_of(number, value, what, said):
 )
 def test_limits_that_the_controller_s_soft_limits_cut_are_warned_of(zero, soft, verdict):
     # -3 to 3 mm from that zero; the machine goes from -6 to 0, or from 0 to 6.
-    travel = replace(TRAVEL, zero=zero, direction=1, low=-3.0, high=3.0)
-    settings = replace(STAGE, travel=travel)
+    travel = structs.replace(TRAVEL, zero=zero, direction=1, limits=(-3.0, 3.0))
+    settings = structs.replace(STAGE, travel=travel)
     found = look(Stage(settings, ABLE | {20: soft, 132: 6.0}), settings)["travel: limits against $132"]
     assert found.verdict == verdict, found
 
@@ -178,19 +179,19 @@ def test_homing_that_the_controller_cannot_do_fails():
     found = look(Stage(parameters=ABLE | {22: 0.0}))["homing ($22)"]
     assert (found.verdict, found.found) == ("failed", "off")
     assert "home = false" in found.remedy
-    by_hand = replace(STAGE, home=False)
+    by_hand = structs.replace(STAGE, home=False)
     assert look(Stage(by_hand, ABLE | {22: 0.0}, (0.0, 0.0, 0.0)), by_hand)["homing ($22)"].verdict == "ok"
 
 
 @pytest.mark.parametrize(("at", "verdict"), [((3.0, 0.0, 0.0), "warning"), ((2.0, 0.0, 0.0), "ok")])
 def test_a_stage_without_homing_is_told_if_it_stands_beyond_its_limits(at, verdict):
-    settings = replace(STAGE, home=False)
+    settings = structs.replace(STAGE, home=False)
     assert look(Stage(settings, at=at), settings)["position"].verdict == verdict
 
 
 def test_an_alarm_is_a_fault_unless_homing_ends_it():
     assert look(Stage(state="alarm"))["state"].verdict == "ok"
-    found = look(Stage(state="alarm"), replace(STAGE, home=False))["state"]
+    found = look(Stage(state="alarm"), structs.replace(STAGE, home=False))["state"]
     assert (found.verdict, found.found) == ("failed", "alarm")
     assert look(Stage(state="door"))["state"].verdict == "failed"
 
@@ -206,7 +207,7 @@ def test_slow_and_missing_reports_are_told():
 
 
 def test_a_stage_that_only_presses_is_looked_at_without_tilts():
-    settings = replace(STAGE, pitch=None, roll=None)
+    settings = structs.replace(STAGE, pitch=None, roll=None)
     found = look(Stage(settings), settings)
     assert found["position"].found == "travel -15.000 mm (before homing)"
     assert not [what for what in found if "pitch" in what]
@@ -240,14 +241,16 @@ def test_each_axis_goes_a_little_there_and_back_within_the_limits():
 
 
 def test_travel_goes_up_where_it_can_and_the_body_is_set_upright_first():
-    settings = replace(STAGE, home=False)
+    settings = structs.replace(STAGE, home=False)
     stage = Stage(settings, at=(5.0, 0.2, 0.1))
     moves(stage, settings)
     assert stage.did[:3] == [Position(2.0), Position(1.5), Position(2.0)]
 
 
 def test_a_short_travel_is_moved_by_a_tenth_of_it():
-    settings = replace(STAGE, travel=replace(TRAVEL, low=0.0), press=0.2, pitch=None, roll=None)
+    settings = structs.replace(
+        STAGE, travel=structs.replace(TRAVEL, limits=(0.0, 3.0)), press=0.2, pitch=None, roll=None
+    )
     stage = Stage(settings)
     moves(stage, settings)
     assert stage.did == ["home", Position(0.0), Position(pytest.approx(0.02)), Position(0.0)]
@@ -400,5 +403,7 @@ def test_nothing_is_moved_where_something_failed():
     ("pitch", "roll", "verdict"), [("Y", "X", "ok"), ("X", "A", "warning"), ("A", "B", "warning")]
 )
 def test_axes_that_have_no_arcs_are_told(pitch, roll, verdict):
-    settings = replace(STAGE, pitch=Axis(pitch, 1, 0.0, **TILT), roll=Axis(roll, 1, 0.0, **TILT))
+    settings = structs.replace(
+        STAGE, pitch=TiltAxis(letter=pitch, **TILT), roll=TiltAxis(letter=roll, **TILT)
+    )
     assert look(Stage(settings, {22: 1.0}), settings)["arcs"].verdict == verdict

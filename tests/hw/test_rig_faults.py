@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from mirrorskin import io
 from mirrorskin.hw.emulator.rig import EmulatedRig
@@ -48,7 +49,7 @@ def capture(name, path):
     at = None
     with EmulatedRig(shape=(24, 32), pixel_size=0.2, rate=50.0, delay=0.01) as emulated:
         settings = emulated.settings
-        settings = replace(settings, camera=replace(settings.camera, delay=0.01, dark=16.0))
+        settings = replace(settings, camera=structs.replace(settings.camera, delay=0.01, dark=16.0))
         try:
             with Rig(GrblStage(settings.stage), emulated.camera, settings) as rig:
                 # Emulators are late where other programs have the processors; that is no fault here.

@@ -1,16 +1,27 @@
 """Rig files: every key arrives in our units, and what cannot be used is told with file, key and remedy."""
 
+import json
 import math
 import re
 import tomllib
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 
 from mirrorskin.hw.rig.references import read_reference
-from mirrorskin.hw.rig_file import KEYS, REQUIRED, TEMPLATE, Axis, CameraSettings, StageSettings, load_rig
+from mirrorskin.hw.rig_file import (
+    TEMPLATE,
+    CameraSettings,
+    RigFile,
+    StageSettings,
+    TiltAxis,
+    TravelAxis,
+    load_rig,
+)
 from mirrorskin.hw.stage import Limits
 from mirrorskin.io import InputError
 
@@ -111,74 +122,39 @@ def refusal(rig):
     return read
 
 
-def test_every_key_arrives_in_millimetres_radians_and_seconds(rig):
+def test_every_key_arrives(rig):
     found = rig(EVERYTHING)
-    assert found.path == Path("r.toml")
-    assert found.name == "bench 2"
+    assert (found.path, found.name) == (Path("r.toml"), "bench 2")
+    said = tomllib.loads(EVERYTHING)
+    said["camera"]["fourcc"] = "Y16 "
+    stage, camera = (json.loads(msgspec.json.encode(one)) for one in (found.stage, found.camera))
+    assert stage == said["stage"]
+    assert camera == said["camera"]
     degree = math.pi / 180
-    assert found.stage == StageSettings(
-        port="socket://localhost:23",
-        baud=9600,
-        home=False,
-        timeout=1.0,
-        report_rate=10.0,
-        travel=Axis("Z", -1, -20.0, -5.0, 3.0, 4.0, "mm"),
-        pitch=Axis("A", 1, 7.5, -6 * degree, 4 * degree, 90 * degree, "deg"),
-        roll=Axis("C", -1, 0.25, -5 * degree, 5 * degree, 45 * degree, "deg"),
-        press=2.0,
-        pivot=(0.0, 1.0, -10.5),
-    )
-    assert found.camera == CameraSettings(
-        source="http://localhost:8000/video",
-        shape=(48, 64),
-        dtype=np.dtype(np.uint16),
-        fourcc="Y16 ",
-        exposure=0.004,
-        gain=2.0,
-        rate=60.0,
-        delay=0.03,
-        pixel_size=(0.03, 0.04),
-        dark=12.0,
-        bright=4000.5,
-        zenith_gain=pytest.approx(5.7 / degree),
-        zenith_offset=10.0,
-        name="left",
-    )
-
-
-def test_what_is_not_said_has_its_default(rig):
-    found = rig(LEAST)
-    assert found.name == "r"
-    assert found.stage == StageSettings(
-        port="COM3",
-        baud=115200,
-        home=True,
-        timeout=2.0,
-        report_rate=20.0,
-        travel=Axis("X", 1, 0.0, -5.0, 3.0, 4.0, "mm"),
-        pitch=None,
-        roll=None,
-        press=2.0,
-        pivot=None,
-    )
-    assert found.camera == CameraSettings(source=0, shape=(3, 4), dtype=np.dtype(np.uint8), name="0")
+    pitch, travel = found.stage.pitch, found.stage.travel
+    assert (pitch.low, pitch.high, pitch.top_speed) == pytest.approx((-6 * degree, 4 * degree, 90 * degree))
+    assert (travel.low, travel.high, travel.top_speed) == (-5.0, 3.0, 4.0)
+    assert pitch.coordinate(2 * degree) == pytest.approx(9.5)
+    assert travel.value(-21.0) == 1.0
+    assert found.camera.shape == (48, 64)
+    assert found.camera.counts_per_radian == pytest.approx(5.7 / degree)
 
 
 @pytest.mark.parametrize(
     ("source", "name"),
     [
+        ("0", "0"),
         ('"/dev/video2"', "/dev/video2"),
-        ('"rtsp://me:a:secret@10.0.0.7/left"', "rtsp://10.0.0.7/left"),
-        ('"rtsp://10.0.0.7/left@2"', "rtsp://10.0.0.7/left@2"),
+        ('"rtsp://me:a:secret@10.0.0.7/left@2"', "rtsp://10.0.0.7/left@2"),
     ],
 )
 def test_a_camera_without_a_name_is_called_as_its_source_without_a_password(rig, source, name):
-    found = rig(LEAST.replace("source = 0", f"source = {source}")).camera
-    assert (found.source, found.name) == (source.strip('"'), name)
+    found = rig(LEAST.replace("source = 0", f"source = {source}"))
+    assert (str(found.camera.source), found.camera.name, found.name) == (source.strip('"'), name, "r")
 
 
 def test_one_pixel_size_is_of_both_sides(rig):
-    assert rig(LEAST + "pixel_size = 0.25").camera.pixel_size == (0.25, 0.25)
+    assert rig(LEAST + "pixel_size = 0.25").camera.pixel_sides == (0.25, 0.25)
 
 
 def test_a_source_beside_the_rig_file_is_found_from_anywhere(tmp_path, monkeypatch):
@@ -188,10 +164,6 @@ def test_a_source_beside_the_rig_file_is_found_from_anywhere(tmp_path, monkeypat
     (tmp_path / "a" / "r.toml").write_text(text)
     monkeypatch.chdir(tmp_path)
     assert load_rig("a/r.toml").camera.source == str(Path("a", "film.avi"))
-
-
-def test_a_source_that_is_no_file_there_is_left_as_it_is(rig):
-    assert rig(LEAST.replace("source = 0", 'source = "/dev/video7"')).camera.source == "/dev/video7"
 
 
 # What the stage may do
@@ -210,178 +182,80 @@ def test_a_press_beyond_the_axis_ends_with_the_axis(rig):
     assert rig(LEAST.replace("press = 2.0", "press = 100")).stage.limits.press == 3.0
 
 
-def test_axes_are_told_by_their_motion(rig):
-    assert {name: axis.letter for name, axis in rig(EVERYTHING).stage.axes.items()} == {
-        "travel": "Z",
-        "pitch": "A",
-        "roll": "C",
-    }
-    assert list(rig(LEAST).stage.axes) == ["travel"]
-
-
 # What is refused: a line of EVERYTHING, what it is changed to, and what is said.
 
 WRONG = [
     (
         'name = "bench 2"',
         "name = 5",
-        'name is 5: what the rig is called is needed, a text in quotes; write e.g. name = "',
+        "name is 5: what the rig is called, in quotes, is needed; write e.g. name =",
     ),
     ('name = "bench 2"', 'nome = "x"', "nome is not known: did you mean name?"),
     ('name = "bench 2"', 'name = "a\\nb"', 'name is "a?b": what'),
-    ('port = "socket://localhost:23"', 'port = ""', 'stage.port is "": a serial port or a URL is needed'),
-    ('port = "socket://localhost:23"', "", 'stage.port is missing; write port = "/dev/ttyUSB0" in [stage]'),
-    ("baud = 9600", "baud = 9600.0", "stage.baud is 9600.0: a number of bits a second from 300 to"),
-    ("baud = 9600", "baud = true", "stage.baud is true: a number of bits"),
     (
-        "baud = 9600",
-        f"baud = 1{'0' * 60}",
-        "stage.baud is 1000000000000000000000000000000000000000...: a number",
+        'port = "socket://localhost:23"',
+        'port = ""',
+        'stage.port is "": a serial port or a URL, in quotes, is',
     ),
-    ("baud = 9600", "bauds = 9600", "stage.bauds is not known: did you mean baud?"),
-    ("baud = 9600", "Report-Rate = 9", "stage.Report-Rate is not known: did you mean report_rate?"),
+    ('port = "socket://localhost:23"', "", 'stage.port is missing: add port = "/dev/ttyUSB0" in [stage]'),
+    ("baud = 9600", "baud = true", "stage.baud is true: a number of bits a second, from 300 to 10000000, is"),
     ("baud = 9600", '"\\u0007" = 9', r"stage.'\x07' is not known: there are port, baud, home"),
     ("home = false", 'home = "no"', 'stage.home is "no": true or false is needed; write e.g. home = true'),
     ("timeout = 1", "timeout = 0", "stage.timeout is 0: a time from 0.1 to 60 s is needed"),
     ("timeout = 1", "timeout = inf", "stage.timeout is inf: a time"),
-    ("timeout = 1", "timeout = false", "stage.timeout is false: a time"),
-    ("timeout = 1", "timeout = 12:30:00", "stage.timeout is 12:30:00: a time"),
     ("report_rate = 10", "report_rate = 101", "stage.report_rate is 101: a rate from 1 to 100 Hz is needed"),
-    (
-        "press = 2",
-        "press = nan",
-        "stage.press is nan: a finite number of mm is needed; write e.g. press = 2.0",
-    ),
-    (
-        "press = 2",
-        f"press = 1{'0' * 400}",
-        "stage.press is 1000000000000000000000000000000000000000...: a finite",
-    ),
+    ("press = 2", "press = nan", "stage.press is nan: a finite number of mm is needed; write e.g. press = 2"),
+    ("press = 2", f"press = 1{'0' * 400}", "stage.press is 1000000000000000000000000000000000000000...: a"),
     (
         "press = 2",
         "press = -5",
-        "stage.press is -5, not above stage.travel.limits' -5; write the greatest travel",
+        "[stage] press is -5, not above travel.limits' -5; write the greatest travel",
     ),
-    ("pivot = [0, 1, -10.5]", "pivot = [0, 1]", "stage.pivot is [0, 1]: x, y and z in mm are needed, in [ ]"),
-    (
-        "pivot = [0, 1, -10.5]",
-        "pivot = [0, 1, nan]",
-        "stage.pivot is [0, 1, nan]: each a finite number is needed",
-    ),
-    ("pivot = [0, 1, -10.5]", "pivot = 0", "stage.pivot is 0: x, y and z in mm are needed"),
-    (
-        'letter = "Z"',
-        'letter = "z"',
-        'stage.travel.letter is "z": one of "X", "Y", "Z", "A", "B", "C" is needed',
-    ),
-    ('letter = "Z"', "letter = 3", "stage.travel.letter is 3: one of"),
+    ("pivot = [0, 1, -10.5]", "pivot = [0, 1]", "stage.pivot is [0, 1]: a list of x, y and z, in mm, is"),
+    ("pivot = [0, 1, -10.5]", "pivot = [0, 1, nan]", "stage.pivot is [0, 1, nan]: a list of"),
+    ('letter = "Z"', 'letter = "z"', 'stage.travel.letter is "z": one of X, Y, Z, A, B, C, in quotes, is'),
     ('letter = "Z"', "letter = {a = 1}", "stage.travel.letter is a table: one of"),
-    ('letter = "Z"', "", 'stage.travel.letter is missing; write letter = "Z" in [stage.travel]'),
-    ('letter = "C"', 'letter = "A"', 'stage.roll.letter is "A", and so is stage.pitch.letter: each motion'),
-    ('letter = "C"', 'letter = "Z"', 'stage.roll.letter is "Z", and so is stage.travel.letter: each motion'),
+    ('letter = "C"', 'letter = "A"', '[stage] roll.letter is "A", and so is pitch.letter: each motion'),
     ("zero = 7.5\n", "zero = -inf\n", "stage.pitch.zero is -inf: a finite number of degrees is needed"),
     ('zero = -20\nunit = "mm"', 'unit = "deg"', 'stage.travel.unit is "deg": one of "mm" is needed'),
-    ('zero = 7.5\nunit = "deg"', 'unit = "mm"', 'stage.pitch.unit is "mm": one of "deg" is needed'),
-    (
-        "limits = [-5, 3]",
-        "limits = [3, -5]",
-        "stage.travel.limits are out of order, 3 not below -5: write [least, ",
-    ),
-    (
-        "limits = [-5, 3]",
-        "limits = [3, 3]",
-        "stage.travel.limits are out of order, 3 not below 3: write [least, ",
-    ),
-    (
-        "limits = [-5, 3]",
-        "limits = [-5, nan]",
-        "stage.travel.limits is [-5, nan]: a finite number of mm is needed",
-    ),
-    ("limits = [-5, 3]", "limits = [-5, true]", "stage.travel.limits is [-5, True]: a finite number of mm"),
-    (
-        "limits = [-5, 3]",
-        "limits = 3",
-        "stage.travel.limits is 3: the least and the greatest value in mm are",
-    ),
-    (
-        "limits = [-6.0, 4.0]",
-        "limits = [0, 4]",
-        "stage.pitch.limits [0, 4] do not have 0 (upright) within; set",
-    ),
-    (
-        "limits = [-6.0, 4.0]",
-        "limits = [-90, 4]",
-        "stage.pitch.limits is [-90, 4]: an angle between -90 and 90",
-    ),
+    ("limits = [-5, 3]", "limits = [3, 3]", "[stage.travel] limits are out of order, 3 not below 3: write ["),
+    ("limits = [-5, 3]", "limits = [-5, true]", "stage.travel.limits is [-5, True]: a list of the least and"),
+    ("limits = [-6.0, 4.0]", "limits = [0, 4]", "[stage.pitch] limits [0, 4] do not have 0 (upright) within"),
+    ("limits = [-6.0, 4.0]", "limits = [-90, 4]", "stage.pitch.limits is [-90, 4]: a list of the least and"),
     ("speed = 45", "speed = 0", "stage.roll.speed is 0: a speed above 0, in degrees a second, is needed"),
-    (
-        "speed = 45",
-        "speed = 45\naccel = 1",
-        "stage.roll.accel is not known: there are letter, direction, zero",
-    ),
-    ("speed = 4\n", "", "stage.travel.speed is missing; write speed = 5.0 in [stage.travel]"),
     (
         'source = "http://localhost:8000/video"',
         "source = -1",
-        "camera.source is -1: a camera's number from 0 on",
+        "camera.source is -1: a camera's number from 0",
     ),
-    ('source = "http://localhost:8000/video"', "source = true", "camera.source is true: a camera's number"),
     ('source = "http://localhost:8000/video"', 'source = " "', 'camera.source is " ": a camera\'s number'),
-    ("size = [64, 48]", "size = [64, 0]", "camera.size is [64, 0]: each from 1 to 65535 is needed"),
-    ("size = [64, 48]", 'size = "64x48"', 'camera.size is "64x48": columns and rows are needed, in [ ]'),
-    ("size = [64, 48]", "", "camera.size is missing; write size = [640, 480] in [camera]"),
     (
-        'dtype = "uint16"',
-        'dtype = "int8"',
-        'camera.dtype is "int8": one of "uint8", "uint16", "float32" is needed',
+        "size = [64, 48]",
+        "size = [64, 0]",
+        "camera.size is [64, 0]: a list of columns and rows, each from 1 to",
     ),
-    (
-        'fourcc = "Y16"',
-        'fourcc = "GREYS"',
-        'camera.fourcc is "GREYS": the two to four letters of a format are',
-    ),
+    ('dtype = "uint16"', 'dtype = "int8"', 'camera.dtype is "int8": one of "uint8", "uint16", "float32" is'),
+    ('fourcc = "Y16"', 'fourcc = "GREYS"', 'camera.fourcc is "GREYS": a format of two to four letters, in'),
     ("exposure = 0.004", "exposure = 0", "camera.exposure is 0: a time above 0, in seconds, is needed"),
     ("gain = 2\n", "gain = nan\n", "camera.gain is nan: a finite number is needed"),
-    ("rate = 60", "rate = -60", "camera.rate is -60: a rate above 0, in Hz, is needed"),
     ("delay = 0.03", "delay = -0.03", "camera.delay is -0.03: a time from 0 to 10 s is needed"),
     (
         "pixel_size = [0.03, 0.04]",
-        "pixel_size = 0",
-        "camera.pixel_size is 0: a length above 0, in mm, is needed",
-    ),
-    (
-        "pixel_size = [0.03, 0.04]",
         "pixel_size = [1]",
-        "camera.pixel_size is [1]: a width and a height in mm are",
+        "camera.pixel_size is [1]: a length above 0, in mm, or",
     ),
     (
-        "pixel_size = [0.03, 0.04]",
-        "pixel-size = 1",
-        "camera.pixel-size is not known: did you mean pixel_size?",
+        "dark = 12",
+        'dark = "dark.jpg"',
+        'camera.dark is "dark.jpg": a number of counts, or a file (.npy, .png',
     ),
-    ("dark = 12", "dark = true", "camera.dark is true: a number of counts, or a file in quotes, is needed"),
-    ("dark = 12", 'dark = "dark.jpg"', 'camera.dark is "dark.jpg": a number of counts or a file (.npy, .png'),
     ("dark = 12", "dark = -1", "camera.dark: it is -1, and counts of uint16 go from 0 to 65535"),
     ("dark = 12", "dark = 4001", "camera.bright is not above camera.dark at most of the pixels"),
-    (
-        "bright = 4000.5",
-        "bright = 70000",
-        "camera.bright: it is 70000, and counts of uint16 go from 0 to 65535",
-    ),
-    (
-        "bright = 4000.5",
-        'bright = "bright.tif"',
-        "camera.bright: bright.tif cannot be read: No such file or directory; put",
-    ),
-    (
-        "zenith_gain = 5.7",
-        "zenith_gain = 0",
-        "camera.zenith_gain is 0: a number of counts a degree, other than 0,",
-    ),
-    ("zenith_gain = 5.7", "", "camera.zenith_offset is said and camera.zenith_gain is not"),
-    ("[camera]", "[kamera]", "kamera is not known: did you mean camera?"),
+    ("bright = 4000.5", 'bright = "b.tif"', "camera.bright: b.tif cannot be read: No such file or directory"),
+    ("zenith_gain = 5.7", "zenith_gain = 0", "[camera] zenith_gain is 0: write the counts per degree"),
+    ("zenith_gain = 5.7", "", "[camera] zenith_offset is given and zenith_gain is not"),
     ("[stage.roll]", "[stage.rol]", "stage.rol is not known: did you mean roll?"),
-    ("[stage.travel]", "[stage.lift]", "stage.lift is not known: there are port, baud"),
+    ("[camera]", "[kamera]", "kamera is not known: did you mean camera?"),
 ]
 
 
@@ -401,44 +275,15 @@ def test_pitch_without_roll_is_refused_and_roll_without_pitch(refusal):
 @pytest.mark.parametrize("table", ["stage", "camera", "stage.travel"])
 def test_a_missing_table_is_told(refusal, table):
     tables = re.split(r"(?=\n\[)", LEAST)
-    assert [one for one in tables if one.startswith(f"\n[{table}]")]
     left = "".join(one for one in tables if not one.startswith(f"\n[{table}"))
-    assert f"the table [{table}] is missing; add it" in refusal(left)
+    assert f"{table} is missing: add table [{table}]" in refusal(left)
 
 
-@pytest.mark.parametrize("text", ["stage = 5", "[stage]\nport='a'\npress=1\ntravel=[1]"])
-def test_what_should_be_a_table_and_is_none_is_told(refusal, text):
-    assert re.search(r": write \[[a-z.]+\] alone in a line, and its keys below", refusal(text))
-
-
-# The file itself
-
-
-@pytest.mark.parametrize("text", ["", "\n# nothing\n"])
-def test_an_empty_file_lacks_its_tables(refusal, text):
-    assert "the table [stage] is missing" in refusal(text)
-
-
-def test_a_syntax_error_is_told_with_its_line(refusal):
-    said = refusal(LEAST.replace('"COM3"', '"COM3'))
-    assert re.match(r"r\.toml is no TOML: .*line 3", said)
-
-
-@pytest.mark.parametrize("text", ["a = " + "[" * 5000, f"a = {'1' * 5000}", "a = 1\na = 2", "\ufeffa = 1"])
-def test_what_no_reader_of_toml_takes_is_told_too(refusal, text):
-    assert refusal(text).startswith("r.toml is no TOML: ")
-
-
-def test_a_file_that_is_no_text_is_told(tmp_path):
-    (tmp_path / "r.toml").write_bytes(b'name = "\xff\xfe"')
-    with pytest.raises(InputError, match=r"r\.toml is no text: write a rig in TOML"):
-        load_rig(tmp_path / "r.toml")
-
-
-@pytest.mark.parametrize(("name", "said"), [("none.toml", "No such file"), (".", "Is a directory")])
-def test_a_missing_file_or_a_folder_is_told(tmp_path, name, said):
-    with pytest.raises(InputError, match=f"cannot be read: {said}.*; name a rig file"):
-        load_rig(tmp_path / name)
+def test_what_is_no_table_or_no_toml_is_told(refusal, tmp_path):
+    assert ": write [stage] alone in a line, and its keys below" in refusal("stage = 5")
+    assert re.match(r"r\.toml is not TOML: .*line 3", refusal(LEAST.replace('"COM3"', '"COM3')))
+    with pytest.raises(InputError, match=r"cannot be read: No such file.* 'mirrorskin rig new'"):
+        load_rig(tmp_path / "none.toml")
 
 
 # References
@@ -458,12 +303,12 @@ def with_reference(name):
 PICTURE = np.arange(100, 112, dtype=np.uint8).reshape(3, 4)
 
 
-@pytest.mark.parametrize("name", ["b.npy", "b.png", "b.tif", "B.TIFF"])
+@pytest.mark.parametrize("name", ["b.npy", "b.png", "B.TIFF"])
 def test_a_reference_beside_the_rig_file_is_read(rig, tmp_path, name):
     save(tmp_path / name, PICTURE)
     camera = rig(with_reference(name)).camera
-    assert camera.bright == Path(name)
-    found = read_reference(camera.bright, camera, "r.toml")
+    assert camera.bright == name
+    found = read_reference(camera, "bright", "r.toml")
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, PICTURE)
 
@@ -474,15 +319,15 @@ def test_a_mean_of_frames_may_be_a_reference_and_pixels_may_have_none(rig, tmp_p
     counts[0, 0] = np.nan
     np.save(tmp_path / "b.npy", counts)
     camera = rig(with_reference("b.npy") + "dark = 10").camera
-    np.testing.assert_array_equal(read_reference(camera.bright, camera, ""), counts.astype(np.float32))
-    np.testing.assert_array_equal(read_reference(camera.dark, camera, ""), np.full((3, 4), 10, np.float32))
+    np.testing.assert_array_equal(read_reference(camera, "bright", "r.toml"), counts.astype(np.float32))
+    np.testing.assert_array_equal(read_reference(camera, "dark", "r.toml"), np.full((3, 4), 10, np.float32))
 
 
 def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
     np.save(tmp_path / "b.npy", np.full((3, 4), -7.5, np.float32))
     text = with_reference("b.npy").replace("[4, 3]", '[4, 3]\ndtype = "float32"')
     camera = rig(text).camera
-    assert (read_reference(camera.bright, camera, "") == -7.5).all()
+    assert (read_reference(camera, "bright", "r.toml") == -7.5).all()
 
 
 @pytest.mark.parametrize(
@@ -509,9 +354,9 @@ def test_a_damaged_reference_is_refused(refusal, tmp_path):
     (tmp_path / "b.png").write_bytes((tmp_path / "b.png").read_bytes()[:50])
     assert "camera.bright: b.png is damaged or cut off" in refusal(with_reference("b.png"))
     (tmp_path / "b.npy").write_bytes(b"")
-    assert "camera.bright: b.npy is no array" in refusal(with_reference("b.npy"))
+    assert "camera.bright: b.npy is not an array" in refusal(with_reference("b.npy"))
     np.save(tmp_path / "b.npy", np.array([{}], object))
-    assert "camera.bright: b.npy is no array" in refusal(with_reference("b.npy"))
+    assert "camera.bright: b.npy is not an array" in refusal(with_reference("b.npy"))
     with (tmp_path / "b.npy").open("wb") as file:
         np.savez(file, PICTURE, PICTURE)
     assert "camera.bright: b.npy holds several arrays" in refusal(with_reference("b.npy"))
@@ -534,25 +379,28 @@ def documented():
     return tables
 
 
-def test_documentation_and_code_name_the_same_keys():
-    assert {table: list(keys) for table, keys in documented().items()} == {
-        table: list(keys) for table, keys in KEYS.items()
-    }
+TABLES = {
+    "": RigFile,
+    "stage": StageSettings,
+    "stage.travel": TravelAxis,
+    "stage.pitch": TiltAxis,
+    "stage.roll": TiltAxis,
+    "camera": CameraSettings,
+}
 
 
-def test_documentation_and_code_agree_on_what_is_needed_and_on_defaults():
-    for table, keys in documented().items():
-        for key, default in keys.items():
-            known = KEYS[table][key].default
-            assert (default == "needed") == (known is REQUIRED), (table, key)
-            if isinstance(known, int | float):
-                assert tomllib.loads(f"a = {default}") == {"a": known}, (table, key)
-
-
-def test_every_example_in_a_message_can_be_written():
-    for table, keys in KEYS.items():
-        for key, known in keys.items():
-            known.read(tomllib.loads(f"a = {known.example}")["a"]), (table, key)
+def test_documentation_and_code_agree_on_keys_and_defaults():
+    told = documented()
+    assert set(told) == set(TABLES)
+    for table, model in TABLES.items():
+        fields = {field.encode_name: field for field in structs.fields(model)}
+        keys = {key for key in fields if not (f"stage.{key}" in TABLES or key in TABLES)}
+        assert keys == set(told[table]), table
+        for key in keys:
+            field, default = fields[key], told[table][key]
+            assert (default == "needed") == field.required, (table, key)
+            if isinstance(field.default, int | float):
+                assert tomllib.loads(f"a = {default}") == {"a": field.default}, (table, key)
 
 
 def test_the_example_of_the_documentation_is_the_template():
@@ -563,12 +411,9 @@ def test_the_template_loads_with_all_its_keys_and_says_their_defaults(rig, tmp_p
     plain = rig(TEMPLATE)
     save(tmp_path / "bright.tif", np.full((480, 640), 200, np.uint8))
     whole = re.sub(r"^# (?=\w+ = )", "", TEMPLATE, flags=re.MULTILINE)
-    everything = rig(whole)
     said = tomllib.loads(whole)
     tables = {"": said} | {name: said[name] for name in ("stage", "camera")}
     tables |= {f"stage.{name}": said["stage"][name] for name in ("travel", "pitch", "roll")}
-    for table, keys in KEYS.items():
-        assert set(keys) <= set(tables[table]), table
-    assert everything.stage == StageSettings(
-        **{name: getattr(plain.stage, name) for name in plain.stage.__slots__} | {"pivot": (0.0, 0.0, 0.0)}
-    )
+    for table, model in TABLES.items():
+        assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
+    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0))

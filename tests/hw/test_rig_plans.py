@@ -1,8 +1,8 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from rig_fakes import settings
 
 from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan, check_plan
@@ -179,7 +179,7 @@ def test_what_the_stage_can_just_do_is_not(plan):
 
 
 def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
-    stage = replace(STAGE, pitch=replace(STAGE.pitch, letter="A"))
+    stage = structs.replace(STAGE, pitch=structs.replace(STAGE.pitch, letter="A"))
     with pytest.raises(InputError, match="no arcs in the axes A and Y"):
         check_plan(AxialPlan(1.0, 0.04, rate=1.0), stage, "stage")
     check_plan(AxialPlan(1.0, 0.04, phase_step=1.0), stage, "stage")
@@ -188,7 +188,7 @@ def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
 @pytest.mark.parametrize("way", [{"rate": 1.0}, {"phase_step": 1.0}])
 def test_a_stage_that_does_not_lean_goes_round_in_no_way(way):
     with pytest.raises(InputError, match="tilt"):
-        check_plan(AxialPlan(1.0, 0.04, **way), replace(STAGE, pitch=None, roll=None), "stage")
+        check_plan(AxialPlan(1.0, 0.04, **way), structs.replace(STAGE, pitch=None, roll=None), "stage")
 
 
 @pytest.mark.parametrize("turns", [1.0, 3.0])

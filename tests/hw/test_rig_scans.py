@@ -185,7 +185,7 @@ def test_the_dark_reference_is_of_the_lifted_body():
 
 
 def test_references_and_scale_of_the_rig_file_are_the_scans():
-    with make_rig(pixel_size=(0.1, 0.2), zenith_gain=300.0, zenith_offset=7.0) as rig:
+    with make_rig(pixel_size=(0.1, 0.2), zenith_gain=math.radians(300.0), zenith_offset=7.0) as rig:
         header = StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).header
     np.testing.assert_array_equal(header.dark, np.full(SHAPE, 5, np.float32))
     assert header.bright is None

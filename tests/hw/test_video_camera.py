@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -605,5 +604,5 @@ def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
 
 def test_the_settings_of_a_stream_are_not_ours(caplog, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
-    VideoCamera(replace(settings(str(tmp_path / "film.y4m"), SMALL), exposure=0.1, gain=2.0)).close()
+    VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, exposure=0.1, gain=2.0)).close()
     assert "exposure and gain can only be set where it is sent from" in caplog.text

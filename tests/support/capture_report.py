@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from mirrorskin import engine
@@ -123,7 +124,7 @@ def capture(
 ) -> tuple[Kept, StepScan | SweepScan]:
     """Return what a scan gave, and the scan."""
     settings = emulated.settings
-    settings = replace(settings, camera=replace(settings.camera, **known))
+    settings = replace(settings, camera=structs.replace(settings.camera, **known))
     with Rig(GrblStage(settings.stage), emulated.camera, settings) as rig:
         numbers = _note_numbers(rig)
         blocks = []

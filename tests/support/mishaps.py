@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from mirrorskin import io
 from mirrorskin.hw.emulator.rig import EmulatedRig
@@ -79,7 +80,7 @@ def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
         emulated = stack.enter_context(make_rig(seed, rate=60.0))
         emulated.camera.take(1, _START)
         settings = emulated.settings
-        settings = replace(settings, camera=replace(settings.camera, delay=0.0))
+        settings = replace(settings, camera=structs.replace(settings.camera, delay=0.0))
         over = threading.Event()
         trouble = _Trouble(emulated, mishap, seed, chance.uniform(0, _LATEST), over)
         try:

@@ -1,0 +1,98 @@
+"""The emulated controller behind a pseudo-terminal: right in time, and with the faults of a real one."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import serial
+
+from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
+
+SOON = 2.0  # seconds: far more than anything here takes
+
+
+@pytest.fixture
+def port() -> Iterator[GrblPort]:
+    with GrblPort(GrblMachine()) as port:
+        yield port
+
+
+@pytest.fixture
+def line(port: GrblPort) -> Iterator[serial.Serial]:
+    with serial.Serial(port.url, timeout=SOON) as line:
+        line.read_until(b"help]\r\n")
+        yield line
+
+
+def ask(line: serial.Serial) -> dict[str, str]:
+    line.write(b"?")
+    state, *fields = line.read_until(b">\r\n").decode().strip("<>\r\n").split("|")
+    return {"": state} | dict(field.split(":", 1) for field in fields)
+
+
+def test_it_answers_moves_and_reports_right_in_time(port: GrblPort, line: serial.Serial) -> None:
+    line.write(b"G1X2F600\n")
+    assert line.read_until() == b"ok\r\n"
+    begun = time.monotonic()
+    while port.machine.moving() and time.monotonic() < begun + SOON:
+        before, told, after = (
+            port.machine.position()["X"],
+            float(ask(line)["MPos"].split(",")[0]),
+            port.machine.position()["X"],
+        )
+        assert before - 1e-3 <= told <= after + 1e-3
+    assert 0.15 < time.monotonic() - begun < 0.5  # 0.22 s, on a machine that is not too busy
+
+
+def test_a_host_that_comes_again_finds_it_as_it_was(port: GrblPort) -> None:
+    for place in (b"1.000,0.000,0.000", b"2.000,0.000,0.000"):
+        with serial.Serial(port.url, timeout=SOON) as line:
+            line.write(b"G91G0X1\n")
+            line.read_until(b"ok\r\n")
+            time.sleep(0.15)
+            line.write(b"?")
+            assert place in line.read_until(b">\r\n")
+
+
+def test_a_silent_controller_still_hears(port: GrblPort, line: serial.Serial) -> None:
+    port.silence()
+    line.timeout = 0.1
+    line.write(b"G0X1\n?")
+    assert line.read(1) == b""
+    time.sleep(0.1)
+    assert port.machine.position()["X"] == 1
+
+
+def test_noise_comes_with_the_replies_among_it(port: GrblPort, line: serial.Serial) -> None:
+    port.garble(5000)
+    line.write(b"$I\n")
+    heard = line.read(5000 + 40)
+    assert len(heard) > 5000
+    assert b"[VER:1.1h" in heard
+
+
+def test_an_alarm_from_another_thread_is_told_at_once(port: GrblPort, line: serial.Serial) -> None:
+    threading.Thread(target=port.alarm, args=(1,)).start()
+    assert line.read_until() == b"ALARM:1\r\n"
+
+
+def test_a_reader_that_waits_learns_that_the_port_is_gone(port: GrblPort, line: serial.Serial) -> None:
+    line.write(b"G1X50F600\n")
+    line.read_until()
+    threading.Timer(0.05, port.unplug).start()
+    with pytest.raises((serial.SerialException, OSError)):
+        line.read(1)
+    assert not port.machine.moving()
+    with contextlib.suppress(OSError):
+        line.close()
+
+
+def test_it_can_be_closed_twice_in_the_middle_of_a_move() -> None:
+    port = GrblPort(GrblMachine())
+    port.machine.receive(b"G1X10F600\n")
+    port.close()
+    port.close()
