@@ -110,29 +110,8 @@ class Sensor:
     """The pixels of a camera, on a device: they turn light into counts.
 
     A pixel's counts are ``offset + (full - offset) light`` and noise; integers are rounded, half to even, and
-    clipped to the camera's bits.
-
-    Parameters
-    ----------
-    camera : Camera
-    shape : (int, int)
-        Rows and columns.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-
-    Attributes
-    ----------
-    camera : Camera
-    dtype : dtype
-        Of a sample.
-    device : Device
-    offset, full : ndarray, (H, W), float32
-        Each pixel's exact counts without light and in full light, read-only.
-
-    Raises
-    ------
-    mirrorskin.kernels.errors.DeviceError
-        There is no device, or it has no room for a frame.
+    clipped to the camera's bits. ``offset`` and ``full``, (H, W), are each pixel's exact counts without light
+    and in full light.
     """
 
     def __init__(self, camera: Camera, shape: tuple[int, int], device: str | Device | None = None) -> None:
@@ -154,17 +133,10 @@ class Sensor:
         self._counts.upload()
 
     def expose(self, light: NDArray[np.float32], frame: int, out: NDArray[Any]) -> None:
-        """Write one frame.
+        """Write one frame, by the mean light over its exposure.
 
-        Parameters
-        ----------
-        light : ndarray, (H, W), float32
-            From 0 to 1, the mean over the exposure.
-        frame : int
-            Its number, which decides the noise: a whole number of 64 bits. Negative ones can stand for frames
-            outside the stack.
-        out : ndarray, (H, W), the camera's dtype
-            Where to write.
+        The frame's number, a whole number of 64 bits, decides the noise; negative ones can stand for frames
+        outside the stack.
         """
         self._light.claim()
         self._light.host[: self._pixels].reshape(self._shape)[...] = self._spread(light)

@@ -25,11 +25,7 @@ _MADE_ALREADY: dict[str, Object] = {
 
 
 def make_object(
-    name: str | Path,
-    shape: tuple[int, int],
-    pixel_size: tuple[float, float],
-    *,
-    scale: float = DEFAULT_SCALE,
+    name: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float], *, scale: float = DEFAULT_SCALE
 ) -> Object:
     """Make the object that a user asked for, as it lies in a given field of view.
 
@@ -73,20 +69,7 @@ def make_object(
 
 
 def check_fits(thing: Object, body_radius: float) -> None:
-    """Make sure that the sensor is large enough to lie on an object.
-
-    Parameters
-    ----------
-    thing : Object
-        What it is pressed on.
-    body_radius : float
-        Of the sensor's body, mm.
-
-    Raises
-    ------
-    InputError
-        The object's radius is greater.
-    """
+    """Raise InputError where a sensor with a body of this radius, mm, is too small to lie on an object."""
     if thing.radius > body_radius:
         raise InputError(
             f"{thing.name} is larger than the sensor: it needs a circle of {2 * thing.radius:.4g} mm,"

@@ -22,20 +22,10 @@ class HalfSpace:
     Boussinesq's and Cerruti's solutions for a point (Johnson, Contact Mechanics, 1985, sections 3.2, 3.3 and
     3.6). At Poisson ratio 0.5 pressure moves the surface along its normal only, traction along the surface
     only. The sums are convolutions, done by FFT on a grid padded with zeros, so nothing outside the grid
-    presses and nothing comes round from the other side.
+    presses and nothing comes round from the other side. Displacements are those seen from far inside the
+    body, where nothing moves.
 
-    Displacements of an elastic body are told as seen from far inside it, where nothing moves.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the grid.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    modulus : float
-        Young's modulus E, N/mm^2.
-    depth : float
-        Of the mirror below the surface, mm.
+    Lengths are mm, and Young's modulus E N/mm^2; ``depth`` is that of the mirror below the surface.
     """
 
     def __init__(
@@ -65,18 +55,7 @@ class HalfSpace:
         return HalfSpace((rows, columns), self.pixel_size, self.modulus, self.depth)
 
     def surface(self, pressure: Floats) -> Floats:
-        """Return how deep pressure pushes the surface in.
-
-        Parameters
-        ----------
-        pressure : ndarray, (H, W), float64
-            N/mm^2, towards the inside of the body.
-
-        Returns
-        -------
-        ndarray, (H, W), float64
-            Millimetres at the pixels' centres, in the direction of the pressure.
-        """
+        """Return how deep pressure, N/mm^2, pushes the surface in at the pixels' centres, mm."""
         return self._normal(pressure, 0.0)
 
     def mirror(self, pressure: Floats) -> Floats:
@@ -85,26 +64,14 @@ class HalfSpace:
         Below a point force P the displacement is P / (4 pi G) (1 / s + z^2 / s^3), s the distance and z the
         depth (Johnson 1985, eq. 3.19); integrated over a pixel it is Love's formula for the surface with z in
         its distances. The spectrum of this is the surface's times (1 + q z) exp(-q z), q the wavenumber.
-
-        Parameters and result are those of `surface`.
         """
         return self._normal(pressure, self.depth)
 
     def tangential(self, traction: Floats) -> Floats:
-        """Return how traction shifts the surface along itself.
+        """Return how traction, (2, H, W), N/mm^2 along x and y, shifts the surface along itself, mm.
 
         A point force Q along x shifts by Q / (4 pi G) times 1 / r + x^2 / r^3 along x and x y / r^3 along y
         (Cerruti; Johnson 1985, eq. 3.75 at Poisson ratio 0.5).
-
-        Parameters
-        ----------
-        traction : ndarray, (2, H, W), float64
-            N/mm^2, along x (to the right) and along y (up the picture).
-
-        Returns
-        -------
-        ndarray, (2, H, W), float64
-            Millimetres along x and y at the pixels' centres.
         """
         xx, xy, yy = _tangential_spectra(self._padded, self.pixel_size)
         along_x, along_y = self._spectrum(traction[0]), self._spectrum(traction[1])
@@ -200,16 +167,7 @@ ITERATIONS = 1000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """How an object and the silicone have come to rest.
-
-    Attributes
-    ----------
-    space : HalfSpace
-    pressure : ndarray, (H, W), float64
-        N/mm^2, 0 or more; they touch where it is above 0.
-    iterations : int
-        That it took.
-    """
+    """How an object and the silicone have come to rest: they touch where the pressure, N/mm^2, is above 0."""
 
     space: HalfSpace
     pressure: Floats
@@ -237,30 +195,17 @@ def press(
     at a given depth instead of a given force, and preconditioned by the inverse of an endless half-space.
 
     Where the object is below the rest plane it cannot touch, as pressure anywhere pushes all of it in. The
-    rest is iterated on, in the smallest rectangle round it.
+    rest is iterated on, in the smallest rectangle round it, until the gap is right to `TOLERANCE` times the
+    obstacle's greatest height.
 
     Parameters
     ----------
     space : HalfSpace
-    obstacle : ndarray, (H, W), float64
-        The object's surface in the body's frame if the stage were stiff, mm above the rest plane; NaN where
-        there is no object.
-    start : ndarray, (H, W), float64, optional
-        A pressure to start from, as of the step before; it does not change the answer beyond the tolerance.
-    compliance : float
-        How far a force lifts the body, mm/N: the stage's flexure.
-
-    Returns
-    -------
-    Contact
-        The gap is right to `TOLERANCE` times the greatest height of the obstacle above the rest plane.
-
-    Raises
-    ------
-    RuntimeError
-        It does not converge in `ITERATIONS`.
-    ValueError
-        The obstacle or the start is not of the half-space's shape.
+    obstacle : (H, W), the object's surface in the body's frame if the stage were stiff, mm above the rest
+        plane; NaN where
+        there is no object
+    start : (H, W), a pressure to start from, as of the step before
+    compliance : how far a force lifts the body, mm/N: the stage's flexure
     """
     for given in (obstacle, start):
         if given is not None and given.shape != space.shape:

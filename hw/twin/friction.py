@@ -29,22 +29,11 @@ class Friction:
     Traction does not raise the surface of an incompressible body, nor does pressure shift it: the contact and
     its pressure p stay what they are (Johnson, Contact Mechanics, 1985, section 7.2). In a step the object
     goes on by dU and the surface by du = C dq, C being Cerruti's response to the traction q. Where |q| < mu p
-    it sticks, du = dU; where |q| = mu p it may slip, and then q points along the slip dU - du. Among all
-    |q| <= mu p this q is the one of least dq C dq / 2 - dq dU (Kalker's principle for one step). It is found
-    by conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure.
+    it sticks, du = dU; where |q| = mu p it may slip, and then q points along the slip dU - du. Among all |q|
+    <= mu p this q is the one of least dq C dq / 2 - dq dU (Kalker's principle for one step). It is found by
+    conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure.
 
-    Parameters
-    ----------
-    space : HalfSpace
-    pressure : ndarray, (H, W), float64
-        N/mm^2; they touch where it is above 0.
-    coefficient : float
-        Coulomb's mu.
-
-    Attributes
-    ----------
-    traction : ndarray, (2, H, W), float64
-        Of the object on the body, N/mm^2, along x (to the right) and along y (up the picture).
+    ``traction``, (2, H, W), is that of the object on the body, N/mm^2, along x and y.
     """
 
     def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
@@ -60,23 +49,10 @@ class Friction:
             self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
 
     def move(self, displacement: Floats) -> NDArray[np.bool_]:
-        """Move the object to another place; on the way it goes straight there.
+        """Move the object straight on to another place; return where it slips over the sheet in this step.
 
-        Parameters
-        ----------
-        displacement : ndarray, (2, H, W), float64
-            Of the object against the body since the press, mm along x and y: the same everywhere if it is
-            pushed, a rotation if it is twisted.
-
-        Returns
-        -------
-        ndarray, (H, W), bool
-            Where it slips over the sheet in this step, by more than the tolerance; False outside the contact.
-
-        Raises
-        ------
-        RuntimeError
-            The step does not converge in `ITERATIONS`.
+        ``displacement``, (2, H, W), is that of the object against the body since the press, mm along x and y:
+        the same everywhere if it is pushed, a rotation if it is twisted. Slip is what exceeds the tolerance.
         """
         slips = np.zeros_like(self._contact)
         if not self._contact.any():
@@ -124,15 +100,9 @@ class Friction:
 class _Limited:
     """The pixels whose traction is at its limit and pushed beyond it: it can only turn.
 
-    Attributes
-    ----------
-    where : ndarray, (h, w), bool
-    along : ndarray, (2, h, w), float64
-        The traction's direction there, 0 elsewhere.
-    slip : ndarray, (h, w), float64
-        By how much the surface lags behind in that direction, mm.
-    curvature : ndarray, (h, w), float64
-        Of the energy where the limit's circle bends away from a straight turn: slip / limit, mm^3/N.
+    ``along`` is the traction's direction there, ``slip`` by how much the surface lags behind in that
+    direction, mm, and ``curvature`` that of the energy where the limit's circle bends away from a straight
+    turn: slip / limit, mm^3/N.
     """
 
     where: NDArray[np.bool_]

@@ -17,14 +17,7 @@ TILT_MAX = math.radians(30.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid move: the object's point p is at ``rotation @ p + shift`` in the body's frame.
-
-    Attributes
-    ----------
-    rotation : ndarray, (3, 3), float64
-    shift : ndarray, (3,), float64
-        Millimetres.
-    """
+    """A rigid move: the object's point p is at ``rotation @ p + shift`` in the body's frame, mm."""
 
     rotation: Floats
     shift: Floats
@@ -83,14 +76,7 @@ def pose_at_lean(
 ) -> Pose:
     """Lower the body, upright, by a travel; then tilt it about its pivot at a phase, see `Axial`.
 
-    Parameters
-    ----------
-    travel : float
-        Millimetres.
-    tilt, phase : float
-        Radians; without a tilt the body stays upright, whatever the phase.
-    pivot : (float, float, float)
-        From the rest sheet's centre, mm, in the body's frame.
+    Without a tilt the body stays upright, whatever the phase.
     """
     if tilt == 0:
         return pose_at_press(travel)
@@ -187,11 +173,7 @@ class Axial:
     motion: Motion = "axial"
 
     def __init__(
-        self,
-        phase: ArrayLike,
-        tilt: float,
-        press: float,
-        pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        self, phase: ArrayLike, tilt: float, press: float, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
         self.positions = check_phase(phase, _count(phase), "phase")
         _check_frames(self.positions, "phase")

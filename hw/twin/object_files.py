@@ -268,24 +268,11 @@ _PART = 300_000
 
 
 def top_surface(triangles: Floats, shape: tuple[int, int], pixel_size: tuple[float, float]) -> Floats:
-    """Return the height of the highest triangle at each sample of a grid about the origin.
+    """Return the height of the highest triangle at each sample of a grid about the origin; NaN without any.
 
-    Each triangle is cut along the grid's rows; a cut is a straight line between two edges, on which the
-    height is linear. Where triangles overlap the highest counts (a depth buffer).
-
-    Parameters
-    ----------
-    triangles : ndarray, (N, 3, 3), float64
-        x, y and z of the corners, mm; both sides of a triangle can be seen.
-    shape : (int, int)
-        Rows and columns of the grid.
-    pixel_size : (float, float)
-        Millimetres between its samples along x and y; its centre is the origin.
-
-    Returns
-    -------
-    ndarray, (H, W), float64
-        Millimetres; row 0 is the upper edge; NaN where no triangle is.
+    Each triangle, of three corners (x, y, z) in mm, is cut along the grid's rows; a cut is a straight line
+    between two edges, on which the height is linear. Where triangles overlap the highest counts (a depth
+    buffer); both their sides can be seen.
     """
     rows, columns = shape
     x = triangles[..., 0] / pixel_size[0] + (columns - 1) / 2

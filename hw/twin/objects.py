@@ -39,19 +39,8 @@ def difference_slope(
 ) -> tuple[Floats, Floats]:
     """Differentiate a height function by central differences, one-sided where the object ends.
 
-    Parameters
-    ----------
-    height : callable
-        Height in mm at (x, y); NaN where there is no object.
-    x, y : ndarray, float64
-        Where, mm.
-    step : (float, float)
-        Distance to the neighbours on either side along x and y, mm.
-
-    Returns
-    -------
-    dz_dx, dz_dy : ndarray, float64
-        NaN where the height is, and where both neighbours along that axis are missing.
+    NaN where the height is, and where both neighbours along that axis are missing; ``step`` is the distance
+    to these.
     """
     centre = height(x, y)
     dx, dy = step
@@ -63,17 +52,7 @@ def difference_slope(
 def zenith_azimuth(dz_dx: Floats, dz_dy: Floats) -> tuple[Floats, Floats]:
     """Turn slopes into the angles of the normal, which is proportional to (-dz/dx, -dz/dy, 1).
 
-    Parameters
-    ----------
-    dz_dx, dz_dy : ndarray, float64
-        Slopes; dz_dy is along y, up the picture.
-
-    Returns
-    -------
-    zenith : ndarray, float64
-        Radians from the camera's axis.
-    azimuth : ndarray, float64
-        Radians in (-pi, pi], counter-clockwise from x; NaN where the surface is level and has none.
+    The azimuth, in (-pi, pi], is NaN where the surface is level and has none.
     """
     zenith = np.arctan(np.hypot(dz_dx, dz_dy))
     # 0.0 - s, not -s: a negative zero would put the azimuth at -pi.

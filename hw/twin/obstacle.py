@@ -64,17 +64,6 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
     is then narrowed down to 1e-9 mm: by secants, and where these do not get there by Chandrupatla's method.
     Where G jumps, the ray meets an upright side of the object, which is as steep as can be. What a ray meets
     and leaves again within a pixel it misses.
-
-    Parameters
-    ----------
-    thing : Object
-    pose : Pose
-    view : View
-        The rays; its pixels tell what no part of the object is smaller than.
-
-    Returns
-    -------
-    Obstacle
     """
     inside, sideways = np.zeros(view.shape, bool), 0.0
     for first in range(0, inside.size, _RAYS):

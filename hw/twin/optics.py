@@ -56,16 +56,7 @@ class Ideal:
         self._body, self._pattern = body, pattern
 
     def light(self, sheet: Sheet) -> NDArray[np.float32]:
-        """Return the share of full light that each pixel sees, 0 to 1.
-
-        Parameters
-        ----------
-        sheet : Sheet
-
-        Returns
-        -------
-        ndarray, (H, W), float32
-        """
+        """Return the share of full light that each pixel sees, (H, W), float32."""
         square = sheet.dz_dx**2 + sheet.dz_dy**2
         light = np.full(square.shape, self.response(np.zeros(1))[0], np.float32)
         leans = square != 0  # most of a sheet often lies level
@@ -73,18 +64,7 @@ class Ideal:
         return light
 
     def response(self, zenith: Floats) -> Floats:
-        """Return the share of full light that a mirror of given zenith shows.
-
-        Parameters
-        ----------
-        zenith : ndarray, float64
-            Radians.
-
-        Returns
-        -------
-        ndarray, float64
-            0 to 1, shaped as the zenith; NaN where that is NaN.
-        """
+        """Return the share of full light that a mirror of a zenith, radians, shows; NaN for NaN."""
         if isinstance(self._pattern, Linear):
             return _ramp_response(zenith, self._pattern, self._body.scatter)
         return uniform_response(zenith, self._body)
@@ -93,22 +73,10 @@ class Ideal:
 def uniform_response(zenith: Floats, body: Body = _PAPER) -> Floats:
     """Return the share of full light that a camera sees from a mirror under a uniformly lit wall.
 
-    Its window of zenith (see `Ideal`) convolved with a box of half-width w = scatter / 2: two ramps, each
-    2w = 3 degrees wide for the paper's body ::
+    Its window of zenith (see `Ideal`) convolved with a box of half-width w = scatter / 2: two ramps, each 2w
+    = 3 degrees wide for the paper's body ::
 
         g(t) = (clip(t + w, t0, t1) - clip(t - w, t0, t1)) / 2w
-
-    Parameters
-    ----------
-    zenith : ndarray, float64
-        Radians.
-    body : Body
-        By default the paper's.
-
-    Returns
-    -------
-    ndarray, float64
-        0 (dark) to 1 (full light), shaped as the zenith; NaN where that is NaN.
     """
     first, last = zenith_window(body)
     if body.scatter == 0:
@@ -249,23 +217,9 @@ class Wall:
     The sheet does not hide the wall from itself: a ray that would meet another part of the raised sheet
     passes through it. Between steep walls of a narrow groove that is too bright.
 
-    Light agrees with the float64 reference within 2e-5, and within 1e-3 across a gap or less than 0.2 mm
-    from the body's side. Without scatter, a ray that meets an edge within the rounding of float32 may fall
-    on either side.
-
-    Parameters
-    ----------
-    body : Body
-    pattern : Pattern
-    view : View
-        The camera's lines of sight.
-    device : Device
-        Where it is computed.
-
-    Raises
-    ------
-    mirrorskin.kernels.errors.DeviceError
-        The device cannot hold the maps, or cannot run the kernel.
+    Light agrees with the float64 reference within 2e-5, and within 1e-3 across a gap or less than 0.2 mm from
+    the body's side. Without scatter, a ray that meets an edge within the rounding of float32 may fall on
+    either side.
     """
 
     def __init__(self, body: Body, pattern: Pattern, view: View, device: Device) -> None:
@@ -287,19 +241,10 @@ class Wall:
         }
 
     def light(self, sheet: Sheet) -> NDArray[np.float32]:
-        """Return the share of full light that each pixel sees.
+        """Return the share of full light that each pixel sees, (H, W), float32.
 
-        Full is what the pattern's clear places give where the lamps are brightest.
-
-        Parameters
-        ----------
-        sheet : Sheet
-            At the points that the pixels see, finite everywhere.
-
-        Returns
-        -------
-        ndarray, (H, W), float32
-            0 to 1.
+        Full is what the pattern's clear places give where the lamps are brightest. The sheet is finite
+        everywhere.
         """
         self._sheet.claim()
         for plane, values in zip(self._sheet.host, (sheet.height, sheet.dz_dx, sheet.dz_dy), strict=True):

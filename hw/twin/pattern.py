@@ -119,22 +119,9 @@ class Picture:
 def make_pattern(name: str | Path, body: Body) -> Pattern:
     """Make a pattern that a user named.
 
-    Parameters
-    ----------
-    name : str or Path
-        "uniform"; "linear", from dark at the zenith that shows the wall's rim to clear at the one that
-        shows the horizon; or the path of a picture, PNG or TIFF, grey or made so.
-    body : Body
-        What it stands round.
-
-    Returns
-    -------
-    Pattern
-
-    Raises
-    ------
-    InputError
-        It is unknown, or its file cannot be used.
+    It is "uniform"; "linear", from dark at the zenith that shows the wall's rim to clear at the one that
+    shows the horizon; or the path of a picture, PNG or TIFF, grey or made so. InputError if it is unknown, or
+    its file cannot be used.
     """
     if name == "uniform":
         return Uniform()

@@ -21,7 +21,7 @@ _BLUR = (np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5  # when, as shares of
 class Skin(Protocol):
     """How the sheet lies in a pose."""
 
-    def lie(self, pose: Pose, /) -> Sheet:
+    def drape(self, pose: Pose, /) -> Sheet:
         """Lay the sheet on the object."""
 
 
@@ -39,22 +39,11 @@ class Scene(Protocol):
         """Return the mean light over a frame's exposure, (H, W), float32; not to be written to."""
 
 
-class Film:
-    """Any movement: sheet and optics are worked out for each place where the body is.
+class CachedScene:
+    """Any movement: sheet and optics are found for each place where the body is.
 
     Places that come back, as those of a rotation do, are kept as long as there is memory for their light.
-
-    Parameters
-    ----------
-    skin : Skin
-    optics : Optics
-    movement : Movement
-    share : float
-        Part of the time between frames that an exposure takes.
-    shape : (int, int)
-        Rows and columns of a frame.
-    memory_limit : int
-        Bytes that kept light may take.
+    ``share`` is the part of the time between frames that an exposure takes.
     """
 
     def __init__(
@@ -95,25 +84,17 @@ class Film:
         return self._kept[place]
 
     def _lie(self, place: int) -> Sheet:
-        sheet = self._skin.lie(self._movement.pose(self._places[place]))
+        sheet = self._skin.drape(self._movement.pose(self._places[place]))
         self._visited[place] = True
         self._touched &= sheet.contact
         return sheet
 
 
-class Anywhere:
-    """The body wherever it is, asked of someone who knows: for a camera that watches a stage.
+class PoseScene:
+    """The body wherever it is, for a camera that watches a stage.
 
     Upright above its own place it is seen by the `Imprint`, where there is one. Of other poses the light of
-    the last few is kept: a body that stands still is worked out once.
-
-    Parameters
-    ----------
-    skin : Skin
-    optics : Optics
-    imprint : Imprint or None
-    exposure : float
-        Seconds.
+    the last few is kept: a body that stands still is rendered once.
     """
 
     def __init__(self, skin: Skin, optics: Optics, imprint: Imprint | None, exposure: float) -> None:
@@ -123,12 +104,9 @@ class Anywhere:
         self._kept: dict[bytes, Light] = {}
 
     def light(self, pose_at: Callable[[float], Pose], /) -> Light:
-        """Return the mean light over an exposure; it holds until the next is asked for.
+        """Return the mean light over an exposure; it holds until the next call.
 
-        Parameters
-        ----------
-        pose_at : callable
-            Tells the pose so many seconds after the exposure's middle.
+        ``pose_at`` returns the pose so many seconds after the exposure's middle.
         """
         if self._imprint is not None:
             poses = [pose_at(float(late)) for late in self._ends]
@@ -142,21 +120,16 @@ class Anywhere:
         if key not in self._kept:
             if len(self._kept) >= _BLUR_POSES:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._optics.light(self._skin.lie(pose))
+            self._kept[key] = self._optics.light(self._skin.drape(pose))
         return self._kept[key]
 
 
 class Imprint:
     """A press without resistance, seen from straight above, under a light that goes by slope alone.
 
-    Then a pixel that touches looks the same however deep it is, and no frame needs more than its travel.
-
-    Parameters
-    ----------
-    height : ndarray, (H, W), float64
-        Of the object, mm; NaN where there is none.
-    touched, untouched : ndarray, (H, W), float32
-        Light of each pixel in contact and out of it.
+    Then a pixel that touches looks the same however deep it is, and no frame needs more than its travel: of
+    the object its ``height``, mm, NaN where there is none, and the light of each pixel in contact and out of
+    it.
     """
 
     def __init__(self, height: Floats, touched: Light, untouched: Light) -> None:
@@ -168,13 +141,10 @@ class Imprint:
         self._touches, self._light = np.empty(height.shape, bool), np.empty_like(touched)
 
     def light(self, *passed: float) -> Light:
-        """Return the light at one travel, or the mean over an exposure; it holds until the next is asked for.
+        """Return the light at one travel, or the mean over an exposure; it holds until the next call.
 
-        Parameters
-        ----------
-        passed : float
-            The travel, or those at the exposure's begin, middle and end, with constant velocity in between,
-            mm.
+        ``passed`` is the travel, or those at the exposure's begin, middle and end, with constant velocity in
+        between, mm.
         """
         time: NDArray[Any] = self._touches
         if len(passed) == 1:
@@ -197,16 +167,7 @@ class Imprint:
 
 
 class Press:
-    """The frames of a vertical movement, by the `Imprint` of its press.
-
-    Parameters
-    ----------
-    imprint : Imprint
-    travel : ndarray, (T,), float64
-        Millimetres.
-    share : float
-        Part of the time between frames that an exposure takes.
-    """
+    """The frames of a vertical movement, by the `Imprint` of its press."""
 
     def __init__(self, imprint: Imprint, travel: Floats, share: float) -> None:
         self._imprint = imprint
@@ -219,14 +180,7 @@ class Press:
 
 
 def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the places where the body is in some exposure, each once.
-
-    Returns
-    -------
-    places : ndarray, (n, ...), float64
-    number : ndarray, (T, m), intp
-        Of each frame's m places.
-    """
+    """Return the places where the body is in some exposure, each once, and their numbers of each frame."""
     offsets = share * _BLUR if share > 0 else np.zeros(1)
     passed = movement.reduced(_passed(movement.path, offsets))
     count, each, *place = passed.shape

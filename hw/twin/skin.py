@@ -40,20 +40,13 @@ class Sheet:
 
 
 class Conform:
-    """Equation 1 of the paper, F = f H(-vt - f): the object's shape where it stands above the rest plane.
-
-    Parameters
-    ----------
-    thing : Object
-    view : View
-        Of the camera.
-    """
+    """Equation 1 of the paper, F = f H(-vt - f): the object's shape where it stands above the rest plane."""
 
     def __init__(self, thing: Object, view: View) -> None:
         self._thing = thing
         self._view = view
 
-    def lie(self, pose: Pose) -> Sheet:
+    def drape(self, pose: Pose) -> Sheet:
         """Lay the sheet on the object in a pose."""
         obstacle = meet(self._thing, pose, self._view)
         contact = np.isfinite(obstacle.height) & self._view.on_body
@@ -69,25 +62,9 @@ _VIEW_ROUNDS = 6  # fixed-point steps along an oblique ray; each gains a factor 
 class Elastic:
     """Frictionless contact of the rigid object with the body, taken for an incompressible half-space.
 
-    The pressure is worked out on the pixel grid, grown to all that the object can reach. The mirror lies a
-    sheet's thickness below the surface. A pose is solved for itself: a start from the pose before would save
-    a fifth of the time, and make a frame depend on what was read before it.
-
-    Parameters
-    ----------
-    thing : Object
-    poses : iterable of Pose
-        Some that show how far the object reaches.
-    view : View
-        Of the camera.
-    body : Body
-    compliance : float
-        Of the stage, mm/N.
-
-    Raises
-    ------
-    InputError
-        The object reaches over too many pixels.
+    The pressure is found on the pixel grid, grown to all that the object can reach in the given poses. The
+    mirror lies a sheet's thickness below the surface. A pose is solved for itself: a start from the pose
+    before would save a fifth of the time, and make a frame depend on what was read before it.
     """
 
     def __init__(
@@ -114,7 +91,7 @@ class Elastic:
         obstacle = np.where(self._grid.on_body, height, np.nan)
         return press(self.space, obstacle, compliance=self._compliance)
 
-    def lie(self, pose: Pose) -> Sheet:
+    def drape(self, pose: Pose) -> Sheet:
         """Press the sheet on the object in a pose."""
         return self.sheet(self.solve(pose).pressure)
 

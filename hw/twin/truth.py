@@ -20,7 +20,7 @@ from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, Truth
 
 
-def tell_truth(
+def make_truth(
     thing: Object,
     movement: Movement,
     skin: Conform | Elastic,
@@ -28,27 +28,13 @@ def tell_truth(
     body: Body,
     touched: NDArray[np.bool_] | None,
 ) -> Truth:
-    """Tell what the upright body stands on, and what touches, sticks and slips.
+    """Return what the upright body stands on, and what touches, sticks and slips.
 
-    Parameters
-    ----------
-    thing : Object
-    movement : Movement
-    skin : Conform or Elastic
-    view : View
-        Under an oblique one, what a pixel sees depends on the depth. Then the maps of a vertical movement
-        tell of the point at which its ray meets the rest plane, and those of another of the point that it
-        sees of the object pressed, NaN where the object does not reach the rest plane.
-    body : Body
-    touched : ndarray, (H, W), bool, or None
-        Where sheet and object touch in all frames; needed of all movements but the vertical.
-
-    Returns
-    -------
-    Truth
-        ``azimuth`` is NaN where the surface is level. ``contact`` is that at the greatest travel of a
-        vertical movement, and what lasts through all frames of another. ``slip`` is known of horizontal
-        movements and twists in elastic contact.
+    Under an oblique view, what a pixel sees depends on the depth. Then the maps of a vertical movement are
+    those of the point at which its ray meets the rest plane, and those of another of the point that it sees
+    of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN where the
+    surface is level. Contact is that at the greatest travel of a vertical movement, and what lasts through
+    all frames of another (``touched``). Slip is known of horizontal movements and twists in elastic contact.
     """
     vertical = isinstance(movement, Vertical)
     pressed = pose_at_press(movement.deepest)
@@ -58,7 +44,7 @@ def tell_truth(
         obstacle = meet(thing, pressed, view)
         height, slopes = obstacle.height - movement.deepest, (obstacle.dz_dx, obstacle.dz_dy)
     zenith, azimuth = zenith_azimuth(*slopes)
-    contact = skin.lie(pressed).contact if vertical or touched is None else touched
+    contact = skin.drape(pressed).contact if vertical or touched is None else touched
     slip = None
     if isinstance(movement, Horizontal | Twist) and isinstance(skin, Elastic):
         slip = _slipped(movement, skin, body.friction).astype(np.uint8)
@@ -94,7 +80,7 @@ _STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact: all t
 
 
 def exact_references(sensor: Sensor) -> tuple[_Counts, _Counts]:
-    """Tell what no lab knows: each pixel's own counts without light and in full light, (H, W), float32.
+    """Return what no lab knows: each pixel's own counts without light and in full light, (H, W), float32.
 
     They are free of noise, and within what a sample can hold.
     """
@@ -103,7 +89,7 @@ def exact_references(sensor: Sensor) -> tuple[_Counts, _Counts]:
 
 
 def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_Counts, _Counts]:
-    """Take each pixel's counts without light and in full light, as a lab does.
+    """Return each pixel's counts without light and in full light as a lab takes them; NaN where none are.
 
     A sheet at rest shows no light, so the dark reference is the mean of 16 frames before the touch. It shows
     no full light either. For the bright reference a lab rolls a ball over the field, here one twice as wide
@@ -113,17 +99,7 @@ def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_
     tells only roughly, as it stops at slopes some 15 degrees apart. Pixels that never get a tenth of the
     light of the others, as those beyond the body, have no references.
 
-    Parameters
-    ----------
-    optics : Ideal or Wall
-        Of the clear wall: a lab takes the printed sheet out.
-    sensor : Sensor
-    view : View
-
-    Returns
-    -------
-    dark, bright : ndarray, (H, W), float32
-        NaN where a pixel has none.
+    The optics are those of the clear wall: a lab takes the printed sheet out.
     """
     reach = max(size * pixel for size, pixel in zip(view.shape, view.pixel_size[::-1], strict=True))
     ball = Conform(Sphere(2 * reach), view)
@@ -131,14 +107,14 @@ def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_
 
     counts = np.empty(view.shape, sensor.dtype)
     dark = np.zeros(view.shape)
-    untouched = optics.light(ball.lie(pose_at_press(-depth)))
+    untouched = optics.light(ball.drape(pose_at_press(-depth)))
     for number in range(_DARK_FRAMES):
         sensor.expose(untouched, -1 - number, counts)  # a frame's number below 0 is one of no recording
         dark += counts / _DARK_FRAMES
 
     brightest = np.zeros((_BRIGHTEST, *view.shape), np.float32)
     for number, (x, y) in enumerate(_places(view, reach), _DARK_FRAMES):
-        light = optics.light(ball.lie(Pose(np.eye(3), np.array([x, y, depth]))))
+        light = optics.light(ball.drape(Pose(np.eye(3), np.array([x, y, depth]))))
         sensor.expose(light, -1 - number, counts)
         left = counts.astype(np.float32)
         for kept in brightest:

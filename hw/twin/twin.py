@@ -18,9 +18,9 @@ from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
-from mirrorskin.hw.twin.scene import Anywhere, Film, Imprint, Press, Scene
+from mirrorskin.hw.twin.scene import CachedScene, Imprint, PoseScene, Press, Scene
 from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
-from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, tell_truth
+from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, make_truth
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
 from mirrorskin.kernels.device import Device, open_device
@@ -161,14 +161,14 @@ class Twin(Closing):
 
         Worked out when it is asked for; after the last frame most of it is known.
         """
-        film = self._scene if self.motion != "vertical" and isinstance(self._scene, Film) else None
+        film = self._scene if self.motion != "vertical" and isinstance(self._scene, CachedScene) else None
         touched = None if film is None else film.touched_throughout()
-        return tell_truth(self._thing, self.movement, self._skin, self._view, self._body, touched)
+        return make_truth(self._thing, self.movement, self._skin, self._view, self._body, touched)
 
     def sheet(self, frame: int) -> Sheet:
         """Return how the sheet lies at the middle of a frame's exposure, worked out anew."""
         place = self.movement.reduced(self.movement.path[frame])
-        return self._skin.lie(self.movement.pose(place))
+        return self._skin.drape(self.movement.pose(place))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -232,8 +232,8 @@ class Twin(Closing):
         self._sensor.expose(self._anywhere.light(pose_at), number, out)
 
     @functools.cached_property
-    def _anywhere(self) -> Anywhere:
-        return Anywhere(self._skin, self._optics, self._imprint, self._camera.exposure)
+    def _anywhere(self) -> PoseScene:
+        return PoseScene(self._skin, self._optics, self._imprint, self._camera.exposure)
 
     @functools.cached_property
     def _imprint(self) -> Imprint | None:
@@ -241,7 +241,7 @@ class Twin(Closing):
         skin, optics, view = self._skin, self._optics, self._view
         if not (isinstance(skin, Conform) and isinstance(optics, Ideal) and view.orthographic):
             return None
-        touched, untouched = (skin.lie(pose_at_press(depth)) for depth in (_ALL, -_ALL))
+        touched, untouched = (skin.drape(pose_at_press(depth)) for depth in (_ALL, -_ALL))
         height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
         return Imprint(height, optics.light(touched), optics.light(untouched))
 
@@ -278,7 +278,7 @@ class Twin(Closing):
         share = self._camera.exposure * self._camera.frame_rate
         if isinstance(self.movement, Vertical) and self._imprint is not None:
             return Press(self._imprint, self.movement.positions, share)
-        return Film(self._skin, self._optics, self.movement, share, self._view.shape, _MEMORY)
+        return CachedScene(self._skin, self._optics, self.movement, share, self._view.shape, _MEMORY)
 
     def _zenith_scale(self) -> tuple[Floats, Floats] | None:
         """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""

@@ -17,48 +17,24 @@ class View:
 
     The pixel grid lies on the sheet's rest plane: pixel (x, y) sees all points ``(x + z slope_x, y + z
     slope_y, z)``. An orthographic camera looks straight down everywhere. A pinhole on the body's axis looks
-    through the body's flat top, where each line is refracted: with the pinhole h above the top, the line
-    that meets the rest plane at distance r from the axis has tan(air) = w and tan(inside) = v where ::
+    through the body's flat top, where each line is refracted: with the pinhole h above the top, the line that
+    meets the rest plane at distance r from the axis has tan(air) = w and tan(inside) = v where ::
 
         h w + height v = r,     sin(air) = index sin(inside)
 
     and its slope is v towards the axis.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    pixel_size : (float, float)
-        Millimetres at the rest plane along x and y.
-    body : Body
-    distance : float
-        Of the pinhole above the rest plane, mm; infinite for an orthographic camera.
-
     Attributes
     ----------
-    shape, pixel_size
-        As given.
-    x, y : ndarray, (H, W), float64
-        Where a pixel meets the rest plane, mm.
-    on_body : ndarray, (H, W), bool
-        Whether that is on the body: there is no sheet beyond it.
-    slope_x, slope_y : ndarray, (H, W), float64
-        By how much its line of sight moves along x and y for each millimetre of z.
-    orthographic : bool
-        Whether all slopes are zero.
-
-    Raises
-    ------
-    InputError
-        The pinhole is not above the body.
+    shape, pixel_size : as given
+    x, y : (H, W), where a pixel meets the rest plane, mm
+    on_body : (H, W), whether that is on the body: there is no sheet beyond it
+    slope_x, slope_y : (H, W), by how much its line of sight moves along x and y for each millimetre of z
+    orthographic : whether all slopes are zero
     """
 
     def __init__(
-        self,
-        shape: tuple[int, int],
-        pixel_size: tuple[float, float],
-        body: Body,
-        distance: float = math.inf,
+        self, shape: tuple[int, int], pixel_size: tuple[float, float], body: Body, distance: float = math.inf
     ) -> None:
         if not distance > body.height:
             raise InputError(

@@ -10,7 +10,7 @@ from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
 from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
 from mirrorskin.hw.twin.optics import Ideal
 from mirrorskin.hw.twin.pattern import Uniform
-from mirrorskin.hw.twin.scene import Film, Imprint, Press
+from mirrorskin.hw.twin.scene import CachedScene, Imprint, Press
 from mirrorskin.hw.twin.skin import Conform, Sheet
 from mirrorskin.hw.twin.view import View
 
@@ -38,7 +38,7 @@ class Recall:
         self.poses: list[Pose] = []
         self.lit = 0
 
-    def lie(self, pose: Pose) -> Sheet:
+    def drape(self, pose: Pose) -> Sheet:
         self.poses.append(pose)
         return Sheet(np.full(SHAPE, tell(pose)), np.zeros(SHAPE), np.zeros(SHAPE), np.ones(SHAPE, bool))
 
@@ -53,17 +53,17 @@ def tell(pose: Pose) -> float:
     return float(np.sum(pose.rotation * weights) + pose.shift @ [0.7, 0.4, 0.9])
 
 
-def recalling(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> tuple[Film, Recall]:
+def recalling(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> tuple[CachedScene, Recall]:
     contact = Recall()
-    return Film(contact, contact, movement, share, SHAPE, limit), contact
+    return CachedScene(contact, contact, movement, share, SHAPE, limit), contact
 
 
-def real(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> Film:
+def real(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> CachedScene:
     contact, optics = Conform(BALL, VIEW), Ideal(Body(), Uniform())
-    return Film(contact, optics, movement, share, SHAPE, limit)
+    return CachedScene(contact, optics, movement, share, SHAPE, limit)
 
 
-def all_light(scene: Film | Press, movement: Movement) -> NDArray[np.float32]:
+def all_light(scene: CachedScene | Press, movement: Movement) -> NDArray[np.float32]:
     return np.array([scene.light(frame).copy() for frame in range(len(movement.path))])
 
 
@@ -190,11 +190,11 @@ def test_what_lasts_is_the_contact_in_every_pose(name: str, share: float, limit:
     contact = Conform(BALL, VIEW)
     expected = np.ones(SHAPE, bool)
     for place in exposed(movement, share, 5) if share else movement.path:
-        expected &= contact.lie(movement.pose(place)).contact
+        expected &= contact.drape(movement.pose(place)).contact
     np.testing.assert_array_equal(film.touched_throughout(), expected)
     film.light(0)
     np.testing.assert_array_equal(film.touched_throughout(), expected)
-    always = contact.lie(movement.pose(movement.path[0])).contact
+    always = contact.drape(movement.pose(movement.path[0])).contact
     assert 50 < expected.sum() < always.sum()
 
 
@@ -218,7 +218,9 @@ def test_an_exposure_is_the_mean_over_the_poses_that_the_body_passes(name: str) 
     contact, optics = Conform(BALL, VIEW), Ideal(Body(), Uniform())
 
     def mean(count: int) -> NDArray[np.float32]:
-        light = [optics.light(contact.lie(movement.pose(place))) for place in exposed(movement, share, count)]
+        light = [
+            optics.light(contact.drape(movement.pose(place))) for place in exposed(movement, share, count)
+        ]
         return np.mean(np.reshape(light, (-1, count, *SHAPE)), axis=1, dtype=np.float64)
 
     found = all_light(real(movement, share), movement)
@@ -296,7 +298,7 @@ def test_a_press_can_be_asked_in_any_order() -> None:
 def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
     movement = Vertical(STROKES[stroke])
     optics, contact = Ideal(Body(), Uniform()), Conform(BALL, VIEW)
-    touched, untouched = (optics.light(contact.lie(pose_at_press(depth))) for depth in (10.0, -10.0))
+    touched, untouched = (optics.light(contact.drape(pose_at_press(depth))) for depth in (10.0, -10.0))
     height = BALL.height(VIEW.x, VIEW.y)
 
     def make(share: float) -> Press:

@@ -35,8 +35,8 @@ def elastic(
     )
 
 
-def lie(thing: Object, pose: Pose, shape: tuple[int, int], pixel: float, body: Body = BODY) -> Sheet:
-    return elastic(thing, pose, shape, pixel, body).lie(pose)
+def drape(thing: Object, pose: Pose, shape: tuple[int, int], pixel: float, body: Body = BODY) -> Sheet:
+    return elastic(thing, pose, shape, pixel, body).drape(pose)
 
 
 def inner(values: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
@@ -108,7 +108,7 @@ def test_the_sheet_lies_on_the_object_in_contact_and_bulges_beside_it() -> None:
     body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
     thing = Sphere(20.0)
     found = lie(thing, pose, shape, pixel, body)
-    soft = Conform(thing, view(shape, pixel)).lie(pose)
+    soft = Conform(thing, view(shape, pixel)).drape(pose)
     x, y = pixel_centres(shape, pixel)
     theory = contact_theory.sphere(10.0, 2.4164, 1.0)
     assert theory.depth == pytest.approx(0.6, rel=0.01)
@@ -129,7 +129,7 @@ def test_slopes_are_those_of_the_height_along_x_and_y() -> None:
     body = Body(sheet=0.0)
     field = View((40, 30), (0.2, 0.1), body)
     pose = Pose(np.eye(3), np.array([0.5, -0.4, 1.0]))
-    found = Elastic(Sphere(20.0), [pose], field, body).lie(pose)
+    found = Elastic(Sphere(20.0), [pose], field, body).drape(pose)
     by_row, by_column = np.gradient(found.height)
     some = np.s_[1:-1, 1:-1]  # the grid goes on beyond the edge
     np.testing.assert_allclose(found.dz_dx[some], by_column[some] / 0.2, atol=1e-12)
@@ -180,7 +180,7 @@ def test_the_modulus_changes_the_force_but_not_where_the_sheet_is() -> None:
     pose, shape = pose_at_press(0.7), (50, 50)
     soft, hard = (elastic(Sphere(), pose, shape, 0.1, Body(modulus=modulus)) for modulus in (0.2, 4.0))
     assert hard.solve(pose).force == pytest.approx(20 * soft.solve(pose).force, rel=1e-4)
-    np.testing.assert_allclose(hard.lie(pose).height, soft.lie(pose).height, atol=1e-5)
+    np.testing.assert_allclose(hard.drape(pose).height, soft.drape(pose).height, atol=1e-5)
 
 
 def test_there_is_no_sheet_beyond_the_body() -> None:
@@ -192,7 +192,7 @@ def test_there_is_no_sheet_beyond_the_body() -> None:
         contact = elastic(
             Plane(radius=RADIUS, reach=10.0), pose_at_press(9.0), shape, pixel, distance=distance
         )
-        sheet = contact.lie(pose_at_press(9.0))
+        sheet = contact.drape(pose_at_press(9.0))
         assert sheet.height[~outside].max() > 2
         assert sheet.contact[~outside & (np.hypot(x, y) > RADIUS - 1)].any()
         assert not sheet.contact[outside].any()
@@ -253,7 +253,7 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
 def test_a_pinhole_camera_sees_a_small_field_as_a_part_of_a_large_one() -> None:
     small, large, pixel, pose = (20, 24), (90, 90), 0.4, pose_at_press(1.7)
     found, expected = (
-        elastic(Coin(), pose, shape, pixel, distance=80.0).lie(pose) for shape in (small, large)
+        elastic(Coin(), pose, shape, pixel, distance=80.0).drape(pose) for shape in (small, large)
     )
     for here, there in zip(parts(found), parts(expected), strict=True):
         np.testing.assert_allclose(here, inner(there, small), atol=2e-5)
@@ -262,9 +262,9 @@ def test_a_pinhole_camera_sees_a_small_field_as_a_part_of_a_large_one() -> None:
 def test_a_pose_is_solved_for_itself() -> None:
     stroke = [pose_at_press(depth) for depth in (0.3, 0.6, 0.9)]
     contact = elastic(Coin(), stroke[-1], (50, 50), 0.2)
-    down = [contact.lie(pose) for pose in stroke]
-    up = [contact.lie(pose) for pose in reversed(stroke)][::-1]
-    alone = [elastic(Coin(), stroke[-1], (50, 50), 0.2).lie(pose) for pose in stroke]
+    down = [contact.drape(pose) for pose in stroke]
+    up = [contact.drape(pose) for pose in reversed(stroke)][::-1]
+    alone = [elastic(Coin(), stroke[-1], (50, 50), 0.2).drape(pose) for pose in stroke]
     for first, *others in zip(down, up, alone, strict=True):
         assert first.height.max() > 0.1
         for other in others:
@@ -291,7 +291,7 @@ def test_the_object_shifts_on_the_grown_grid_as_its_points_do() -> None:
 def test_an_object_out_of_reach_leaves_the_sheet_flat() -> None:
     contact = elastic(Sphere(), pose_at_press(-0.2), (12, 13), 0.3)
     for pose in (pose_at_press(-0.2), Pose(np.eye(3), np.array([60.0, 0.0, 1.0]))):
-        sheet = contact.lie(pose)
+        sheet = contact.drape(pose)
         assert not sheet.contact.any()
         assert not any(part.any() for part in parts(sheet))
 
