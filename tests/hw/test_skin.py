@@ -63,7 +63,7 @@ def test_a_small_field_shows_what_a_field_as_large_as_the_body_shows(reach: str)
     # What touches beyond the field's edge pushes the sheet in within it, too.
     thing, pose = REACHES[reach]
     small, large, pixel = (10, 16), (90, 90), 0.4
-    found, expected = lie(thing, pose, small, pixel), lie(thing, pose, large, pixel)
+    found, expected = drape(thing, pose, small, pixel), drape(thing, pose, large, pixel)
     assert expected.contact.sum() > inner(expected.contact, small).sum() + 10
     assert found.height.max() > 0.05
     np.testing.assert_array_equal(found.contact, inner(expected.contact, small))
@@ -107,7 +107,7 @@ def test_the_sheet_lies_on_the_object_in_contact_and_bulges_beside_it() -> None:
     # A ball of 20 mm, and a sheet without thickness. Hertz: contact to sqrt(10 mm x 0.6 mm).
     body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
     thing = Sphere(20.0)
-    found = lie(thing, pose, shape, pixel, body)
+    found = drape(thing, pose, shape, pixel, body)
     soft = Conform(thing, view(shape, pixel)).drape(pose)
     x, y = pixel_centres(shape, pixel)
     theory = contact_theory.sphere(10.0, 2.4164, 1.0)
@@ -145,19 +145,19 @@ def test_slopes_are_those_of_the_height_along_x_and_y() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1)])
 def test_a_field_of_one_row_or_column_has_slopes(shape: tuple[int, int]) -> None:
-    sheet = lie(Sphere(2.0), pose_at_press(0.05), shape, 0.5)
+    sheet = drape(Sphere(2.0), pose_at_press(0.05), shape, 0.5)
     assert all(part.shape == shape and np.isfinite(part).all() for part in parts(sheet))
 
 
 @pytest.mark.parametrize("thing", [Sphere(), Coin()])
 def test_a_symmetric_object_is_seen_symmetric(thing: Object) -> None:
     if isinstance(thing, Coin):
-        sheet = lie(thing, pose_at_press(0.5), (110, 110), 0.25)
+        sheet = drape(thing, pose_at_press(0.5), (110, 110), 0.25)
         # Only the hole and the flanks are symmetric.
         x, y = pixel_centres((110, 110), 0.25)
         where = np.hypot(x, y) < 2.0
     else:
-        sheet = lie(thing, pose_at_press(1.0), (60, 60), 0.1)
+        sheet = drape(thing, pose_at_press(1.0), (60, 60), 0.1)
         where = np.ones((60, 60), bool)
     close = 1e-4 * float(sheet.height.max()) if where.all() else 0.05
     np.testing.assert_allclose(sheet.height[where], sheet.height[::-1][where], atol=close)
@@ -170,7 +170,7 @@ def test_a_symmetric_object_is_seen_symmetric(thing: Object) -> None:
 
 def test_a_thick_sheet_shows_softer_slopes() -> None:
     slopes = [
-        float(np.abs(lie(Coin(), pose_at_press(0.4), (60, 60), 0.2, Body(sheet=depth)).dz_dx).max())
+        float(np.abs(drape(Coin(), pose_at_press(0.4), (60, 60), 0.2, Body(sheet=depth)).dz_dx).max())
         for depth in (0.0, 0.2)
     ]
     assert slopes[0] > 1.3 * slopes[1] > 0
