@@ -5,13 +5,11 @@ from __future__ import annotations
 import errno
 import math
 import os
-import statistics
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import serial
 
@@ -31,55 +29,21 @@ from mirrorskin.hw.grbl.replies import (
     parse,
     salvage,
 )
+from mirrorskin.hw.grbl.report_times import SLICE, Answer, ReportTimes
 from mirrorskin.io import InputError
 
-SLICE = 0.02
-"""Longest time that a read waits, seconds: how finely a silence is measured."""
-
 _WRITE = 0.25  # seconds after which a line that takes nothing more is broken
+_NO_PORT = "there is no such port; plug the controller in, or correct the rig file's port"
+_BUSY = "another program uses it; close that first"
 _REMEDIES = {
-    errno.ENOENT: "there is no such port; plug the controller in, or correct the rig file's port",
-    errno.ENODEV: "there is no such port; plug the controller in, or correct the rig file's port",
-    errno.ENXIO: "there is no such port; plug the controller in, or correct the rig file's port",
+    **dict.fromkeys((errno.ENOENT, errno.ENODEV, errno.ENXIO), _NO_PORT),
+    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), _BUSY),
     errno.EACCES: "no permission to open it; join the group that owns it (dialout, uucp)",
-    errno.EBUSY: "another program uses it; close that first",
-    errno.EAGAIN: "another program uses it; close that first",
 }
 
 
-class Port(Protocol):
-    """What of a serial port is used: pyserial's, or anything alike."""
-
-    @property
-    def in_waiting(self) -> int:
-        """Bytes that can be read at once."""
-
-    def read(self, size: int = 1, /) -> bytes:
-        """Wait for so many bytes, `SLICE` seconds at most, and return what came."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Send."""
-
-    def close(self) -> None:
-        """Let the port go."""
-
-
-def open_port(url: str, baud: int, name: str) -> Port:
-    """Open a serial port, or what a URL of pyserial names, for us alone.
-
-    Parameters
-    ----------
-    url : str
-        Such as ``/dev/ttyUSB0``, ``socket://host:port`` or ``rfc2217://host:port``.
-    baud : int
-        Bits per second.
-    name : str
-        What to call the stage in messages.
-
-    Returns
-    -------
-    Port
-        Its reads wait `SLICE` seconds at most.
+def open_port(url: str, baud: int, name: str) -> serial.Serial:
+    """Open a serial port, or what a URL of pyserial names, for us alone; reads wait `SLICE` at most.
 
     Raises
     ------
@@ -96,11 +60,10 @@ def open_port(url: str, baud: int, name: str) -> Port:
     except (OSError, ValueError) as error:
         known = _REMEDIES.get(getattr(error, "errno", None) or 0)
         raise InputError(f"{name}: {known or f'cannot be opened ({error}); correct the rig file'}") from error
-    opened: Port = port
-    return opened
+    return port
 
 
-def close_port(port: Port) -> None:
+def close_port(port: serial.Serial) -> None:
     """Close a port, also one that is gone."""
     socket = getattr(port, "_socket", None)  # pyserial forgets it where the other side has left
     try:
@@ -109,98 +72,6 @@ def close_port(port: Port) -> None:
             socket.close()
     except Exception:  # pyserial raises many kinds, and there is nothing left to do
         return
-
-
-_DELAYED = 2 * SLICE  # of our own sleep: a busy computer may hush others, too
-_PART = 0.5  # of a slice that such a sleep counts as silence
-_SURELY = 0.4  # seconds after which nobody is that busy
-_MEDIAN_OF = 15  # round trips that the usual one is the median of
-_TIMES, _LATE = 3.0, 0.004  # of the usual, and seconds more, that a round trip may take to be trusted
-_AGAIN = 0.04  # seconds, and at least two usual round trips, after which a question is asked again
-_FIRST = 0.2  # the same before any was answered
-_WIDER = 2.0  # times what an answer took that several questions were open for: the same until one is trusted
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """When an answer was asked for, when it was so, and whether that can be trusted."""
-
-    asked: float
-    time: float
-    sure: bool
-
-
-class Watch:
-    """Keeps the times of questions and answers.
-
-    A question that stays open is asked again. From then on nobody knows which one an answer is meant for,
-    until a period has passed without any; and it is waited longer before the next is asked again.
-
-    Parameters
-    ----------
-    period : float
-        Seconds from one question to the next; may be changed at any time.
-    """
-
-    def __init__(self, period: float) -> None:
-        self.period = period
-        self._quiet = -math.inf  # since when nothing was asked, nor answered that cannot be trusted
-        self._wider = 0.0
-        self._resume = 0.0  # when no answers to earlier questions are to be expected any more
-        self._open: list[float] = []
-        self._unsure = False
-        self._silence = 0.0
-        self._trips: deque[float] = deque(maxlen=_MEDIAN_OF)
-
-    @property
-    def usual(self) -> float:
-        """Seconds of the usual round trip; NaN before the first."""
-        return statistics.median(self._trips) if self._trips else math.nan
-
-    def listened(self, began: float, now: float) -> None:
-        """Note that somebody listened for `SLICE` seconds at most; an answer that came is told afterwards."""
-        if self._open:
-            delayed = now - began > _DELAYED
-            self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._open[0]))
-
-    def silence(self, now: float) -> float:
-        """Return for how long a question has been open, as far as somebody listened for an answer."""
-        if self._open and now - self._open[0] > _SURELY:
-            return now - self._open[0]
-        return self._silence
-
-    def due(self, now: float) -> bool:
-        """Return whether to ask now."""
-        if not self._open:
-            return now - self._quiet >= self.period and now >= self._resume
-        wait = max(_AGAIN, 2 * self.usual) if self._trips else _FIRST
-        return now - self._open[-1] >= max(wait, self._wider)
-
-    def ask(self, now: float) -> None:
-        """Note that the question was sent."""
-        self._unsure = bool(self._open)
-        self._open.append(now)
-        self._quiet = now
-
-    def answer(self, now: float) -> Answer:
-        """Note that an answer came: it was so in the middle between question and answer.
-
-        It cannot be trusted if no question was open or several were, which makes it as if asked for never,
-        or if it came late.
-        """
-        asked, self._open = self._open, []
-        self._silence = 0.0
-        if self._unsure or not asked:
-            self._quiet = now
-            if asked:
-                self._wider = min(_WIDER * (now - asked[0]), _SURELY)  # homing answers nothing for long
-                self._resume = asked[-1] + self._wider
-            return Answer(-math.inf, now, False)
-        trip = now - asked[0]
-        late = bool(self._trips) and trip > _LATE + _TIMES * self.usual
-        self._trips.append(trip)
-        self._wider = self._wider if late else 0.0
-        return Answer(asked[0], now - trip / 2, not late)
 
 
 HOLDING = 0.3
@@ -213,18 +84,11 @@ LONGEST = HOLDING + _RESETTING
 
 
 class Stopping:
-    """Where a stop has got to; it needs no lock, so that anyone can begin it at any moment.
-
-    Attributes
-    ----------
-    over : bool
-        Whether it is done.
-    """
+    """Where a stop has got to; it needs no lock, so that anyone can begin it at any moment."""
 
     def __init__(self) -> None:
         self.over = False
-        self._began = math.inf
-        self._reset = math.inf
+        self._began = self._reset = math.inf
 
     @property
     def begun(self) -> bool:
@@ -243,14 +107,7 @@ class Stopping:
     def reset(self, now: float, rested: float, gone: bool) -> bool:
         """Return whether to reset now: the machine rests, the line is gone, or the time is up.
 
-        Parameters
-        ----------
-        now : float
-            Seconds.
-        rested : float
-            When the newest report was asked for, if it tells of rest.
-        gone : bool
-            Whether there is nobody to wait for.
+        `rested` is when the newest report was asked for, if it tells of rest.
         """
         if self.resetting or not (gone or rested > self._began or now - self._began > HOLDING):
             return False
@@ -278,15 +135,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A report: what it says, when it was asked for, and when it was so.
-
-    ``working`` tells whether it goes where it was sent: not before `Link.begin`, while it is locked or homes,
-    nor in a stop.
-    """
+    """A report: what it says, when it was asked for, and when it was so."""
 
     status: Status
     answer: Answer
-    working: bool
+    working: bool  # it goes where it was sent: not before `begin`, while it is locked or homes, nor in a stop
 
 
 class Link:
@@ -294,65 +147,33 @@ class Link:
 
     At first it only listens: noise, silence and alarms are no errors until `begin`.
 
-    Parameters
-    ----------
-    port : Port
-        Open; the link closes it.
-    name : str
-        What to call the stage in messages.
-    timeout : float
-        Seconds that a stage at rest may be silent.
-    period : float
-        Seconds between two questions for a report, at rest; there are more in motion.
-    on_report : callable
-        Told each report.
-
-    Attributes
-    ----------
-    error : HardwareError or None
-        What went wrong, first of all.
-    lock : Condition
-        Notified whenever something was heard.
-    window : Window
-        The lines on their way.
-    seen : Seen or None
-        The newest report.
-    rests : int
-        Reports of rest in a row, all asked for after the last line was taken.
-    banner : Banner or None
-        What the controller said when it started, since it was last told to.
-    gone : bool
-        Whether the port is lost.
-    locked : bool
-        Whether an alarm is no error, because the stage is to be homed first.
-    patience : float or None
-        Seconds that it may be silent, where it was told to do what keeps it from answering.
+    Each report is handed to `on_report`, with `lock` held; `lock` is notified whenever something was heard.
     """
 
     def __init__(
         self,
-        port: Port,
+        port: serial.Serial,
         name: str,
         timeout: float,
         period: float,
         on_report: Callable[[Seen], None],
     ) -> None:
-        self.error: HardwareError | None = None
+        self.error: HardwareError | None = None  # what went wrong, first of all
         self.lock = threading.Condition()
         self.window = Window()
         self.noise = Noise()
-        self.seen: Seen | None = None
-        self.rests = 0
-        self.banner: Banner | None = None
-        self.gone = False
-        self.locked = False
-        self.patience: float | None = None
+        self.seen: Seen | None = None  # the newest report
+        self.rests = 0  # reports of rest in a row, all asked for after the last line was taken
+        self.banner: Banner | None = None  # what it said when it started, since it was last told to
+        self.gone = False  # whether the port is lost
+        self.locked = False  # whether an alarm is no error, because the stage is to be homed first
+        self.patience: float | None = None  # seconds that it may be silent while it homes
         self._port = port
         self._name = name
         self._timeout = timeout
         self._period = period
         self._tell = on_report
-        self._watch = Watch(period)
+        self._times = ReportTimes(period)
         self._splitter = Splitter()
         self._said: list[Reply] = []
         self._refused: Refusal | None = None
@@ -372,7 +193,7 @@ class Link:
     def round_trip(self) -> float:
         """Seconds from a question to its answer, of late; NaN before the first."""
         with self.lock:
-            return self._watch.usual
+            return self._times.usual
 
     # What others call
 
@@ -392,13 +213,7 @@ class Link:
         return numbers[0]
 
     def ask(self, line: str, timeout: float) -> list[Reply]:
-        """Send a line, wait until it is answered, and return what was said in between.
-
-        Raises
-        ------
-        HardwareError
-            It was refused, or not answered within `timeout` seconds.
-        """
+        """Send a line, wait until it is answered, and return what was said in between."""
         with self.lock:
             self._said = []
             number = self.enqueue(line)
@@ -409,13 +224,7 @@ class Link:
             return self._said
 
     def until(self, ready: Callable[[], T | None], timeout: float, what: str) -> T:
-        """Wait until `ready` gives something.
-
-        Raises
-        ------
-        HardwareError
-            When something goes wrong, or did not happen within `timeout` seconds.
-        """
+        """Wait until `ready` gives something; HardwareError if something goes wrong, or it takes too long."""
         end = time.monotonic() + timeout
         with self.lock:
             while True:
@@ -497,7 +306,7 @@ class Link:
 
     def _hear(self, data: bytes, since: float, now: float) -> None:
         with self.lock:
-            self._watch.listened(since, now)
+            self._times.listened(since, now)
             for line, began in self._splitter.feed(data, now):
                 reply, noise = parse(line), 0
                 if reply is None:
@@ -532,7 +341,7 @@ class Link:
     def _report(self, status: Status, began: float) -> None:
         homed = not self.locked and self.patience is None
         working = self._active and homed and not self._stopping.begun
-        self.seen = Seen(status, self._watch.answer(began), working)
+        self.seen = Seen(status, self._times.answer(began), working)
         self._tell(self.seen)
         if status.state != "idle":
             self.rests = 0
@@ -572,10 +381,10 @@ class Link:
                 self._look(now)
                 if self._stopping.begun:
                     self._end(now)
-                self._watch.period = self._pace()
-                ask = self._watch.due(now) and not self.gone
+                self._times.period = self._pace()
+                ask = self._times.due(now) and not self.gone
                 if ask:
-                    self._watch.ask(time.monotonic())
+                    self._times.ask(time.monotonic())
             if ask:
                 if self._stopping.begun and not self._stopping.resetting:  # lest one was lost, or undone
                     self.send(HOLD)
@@ -589,7 +398,7 @@ class Link:
         """Tell when it has been silent for too long, or lost an answer."""
         if not self._active or self._stopping.begun:
             return
-        if self._watch.silence(now) > self._limit() and not self._waiting():
+        if self._times.silence(now) > self._limit() and not self._waiting():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
         idle = self.seen is not None and self.seen.status.state == "idle"
         if idle and self.patience is None and self.window.busy and now - self._moved > _LOST:
@@ -598,7 +407,7 @@ class Link:
     def _limit(self) -> float:
         if self.patience is not None:
             return self.patience
-        return max(_SILENCE, _TRIPS * self._watch.usual) if self._moving() else self._timeout
+        return max(_SILENCE, _TRIPS * self._times.usual) if self._moving() else self._timeout
 
     def _moving(self) -> bool:
         if self.window.busy or self.seen is None:

@@ -31,15 +31,7 @@ class Command:
 
 
 class Axes:
-    """The axes of a stage: which letter moves what.
-
-    Parameters
-    ----------
-    settings : StageSettings
-        Letters, directions, zeros, units and greatest speeds.
-    name : str
-        What to call the stage in messages.
-    """
+    """The axes of a stage, as the rig file gives them: which letter moves what."""
 
     def __init__(self, settings: StageSettings, name: str) -> None:
         self._axes = settings.axes
@@ -73,19 +65,8 @@ class Axes:
     def straight(self, start: Position, place: Position, speed: float | None) -> Command | None:
         """Return the straight move from one place to another, None if it is none.
 
-        It names the machine's coordinates, whatever the work coordinates are.
-
-        Parameters
-        ----------
-        start, place : Position
-            From where to where.
-        speed : float or None
-            mm/s, or rad/s if only the lean changes; None for the greatest.
-
-        Raises
-        ------
-        InputError
-            It would be faster than an axis goes, or slower than GRBL does.
+        The speed is in mm/s, or rad/s if only the lean changes; None for the greatest. The line names the
+        machine's coordinates, whatever the work coordinates are.
         """
         before, after = self.machine(start), self.machine(place)
         length = math.dist(list(before.values()), list(after.values()))
@@ -99,21 +80,8 @@ class Axes:
     ) -> list[Command]:
         """Return the arcs of a precession: pieces of half a turn at most, after the choice of their plane.
 
-        Parameters
-        ----------
-        tilt, start : float
-            Half-angle and the phase to begin at, radians.
-        turns : float
-            Counter-clockwise if positive.
-        rate : float
-            Turns a second.
-        offset : mapping
-            Where the work coordinates begin, machine units.
-
-        Raises
-        ------
-        InputError
-            The axes span no plane of arcs, or it would be too fast or too slow.
+        It turns from phase `start`, counter-clockwise if `turns` are positive, `rate` times a second;
+        `offset` is where the work coordinates begin, in machine units.
         """
         plane, sense = self._plane()
         self._check_rate(tilt, turns, rate)

@@ -86,24 +86,13 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The answer to ``?``.
+    """The answer to ``?``: coordinates by letter, in the machine's units, of which a report has some."""
 
-    Attributes
-    ----------
-    state : str
-        Lower case: idle, run, hold, jog, alarm, home, door, check, sleep, tool.
-    detail : int or None
-        The number behind the state: Hold:0 has come to rest, Hold:1 has not.
-    machine, work, offset : mapping of a letter to a number, or None
-        Coordinates of the machine, of the work piece, and how far the first are ahead of the second, in the
-        machine's units. A report has some of them.
-    """
-
-    state: str
-    detail: int | None = None
+    state: str  # lower case: idle, run, hold, jog, alarm, home, door, check, sleep, tool
+    detail: int | None = None  # behind the state: Hold:0 has come to rest, Hold:1 has not
     machine: Mapping[str, float] | None = None
     work: Mapping[str, float] | None = None
-    offset: Mapping[str, float] | None = None
+    offset: Mapping[str, float] | None = None  # how far the machine's are ahead of the work piece's
 
     @property
     def rests(self) -> bool:
@@ -134,18 +123,7 @@ Reply = Banner | Ok | Refusal | Alarm | Status | Setting | Message
 
 
 def parse(line: bytes) -> Reply | None:
-    """Read one reply.
-
-    Parameters
-    ----------
-    line : bytes
-        Without the line's end.
-
-    Returns
-    -------
-    Reply or None
-        None if this is nothing that a controller says.
-    """
+    """Read one reply, without the line's end; None if this is nothing that a controller says."""
     try:
         text = line.decode("ascii").strip()
     except UnicodeDecodeError:
@@ -166,15 +144,7 @@ def parse(line: bytes) -> Reply | None:
 
 
 def salvage(line: bytes) -> tuple[Reply | None, int]:
-    """Read the reply that ends a line which began as something else: the half of another reply, or noise.
-
-    Returns
-    -------
-    Reply or None
-        None if there is none.
-    int
-        How many bytes are noise.
-    """
+    """Return the reply, if any, that ends a line which began as something else, and the bytes of noise."""
     match = _LAST.search(line)
     reply = parse(match[0]) if match else None
     return reply, match.start() if match and reply else len(line)
@@ -212,7 +182,7 @@ def _coordinates(text: str) -> Mapping[str, float] | None:
 
 
 BUFFER = 128
-"""Bytes of a line or of several that a controller keeps while it works, unless it says otherwise."""
+"""Bytes of lines that a controller keeps while it works, unless it says otherwise."""
 
 _WINDOW = 1.0  # seconds over which noise is counted
 _BEARABLE = 256  # bytes of it
@@ -243,13 +213,7 @@ class Splitter:
 
 
 class Noise:
-    """Counts what cannot be understood: a little of it is borne.
-
-    Attributes
-    ----------
-    total : int
-        All bytes of it.
-    """
+    """Counts the bytes that cannot be understood: a little of it is borne."""
 
     def __init__(self) -> None:
         self.total = 0
@@ -267,19 +231,11 @@ class Noise:
 
 
 class Window:
-    """Character counting: sends ahead as many lines as the controller's buffer holds, and no byte more.
-
-    Attributes
-    ----------
-    size : int
-        Bytes of the controller's buffer.
-    done : int
-        How many lines were answered.
-    """
+    """Character counting: sends ahead as many lines as the controller's buffer holds, and no byte more."""
 
     def __init__(self, size: int = BUFFER) -> None:
-        self.size = size
-        self.done = 0
+        self.size = size  # bytes of the controller's buffer
+        self.done = 0  # lines answered
         self._waiting: deque[bytes] = deque()
         self._sent: deque[bytes] = deque()
         self._filled = 0
@@ -289,19 +245,8 @@ class Window:
         """Whether any line waits or is unanswered."""
         return bool(self._waiting or self._sent)
 
-    @property
-    def unanswered(self) -> int:
-        """Bytes that may lie in the controller's buffer."""
-        return self._filled
-
     def add(self, line: str) -> int:
-        """Let a line wait for its turn; return the value of `done` once it is answered.
-
-        Raises
-        ------
-        ValueError
-            It is longer than the buffer.
-        """
+        """Let a line wait for its turn; return the value of `done` once it is answered."""
         data = line.encode("ascii") + b"\n"
         if len(data) > self.size:
             raise ValueError(f"a line of {len(data)} bytes does not fit a buffer of {self.size}")

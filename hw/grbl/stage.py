@@ -6,12 +6,13 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.link import RESET, Link, Port, Seen, open_port
+from mirrorskin.hw.grbl.link import RESET, Link, Seen, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.replies import Message, Setting, Status
 from mirrorskin.hw.rig_file import StageSettings
@@ -19,121 +20,30 @@ from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
-PREPARE = "G21G90G94"
-"""Millimetres, absolute places, feeds a minute."""
+if TYPE_CHECKING:
+    import serial
 
+_PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute
 _OLDEST = (1, 1)
-_UNLOCK = "$X"
 _REFRESH = 2.0  # seconds in which a report gives the work offset, at 20 questions a second
-
-
-@dataclass(frozen=True, slots=True)
-class Controller:
-    """What a controller is.
-
-    Attributes
-    ----------
-    firmware : str
-        Its name and version, as it says them.
-    settings : dict of int to float
-        Its ``$`` settings, those that are numbers.
-    """
-
-    firmware: str
-    settings: dict[int, float]
-
-    def on(self, number: int) -> bool:
-        """Return whether a switch among the settings is on; the first bit of a mask of bits."""
-        return bool(int(self.settings.get(number, 0)) & 1)
-
-
-def greet(link: Link, name: str, timeout: float) -> Controller:
-    """Find out that GRBL answers, bring it to rest, and read its settings.
-
-    Raises
-    ------
-    InputError
-        Nothing answers, or something that is not GRBL 1.1, or it is set to what cannot be worked with.
-    """
-    seen = _first(link, name, timeout)
-    if seen.status.state not in ("idle", "alarm"):  # left so by whoever spoke to it before
-        link.restart(timeout)
-        _first(link, name, timeout)
-    controller = _identity(link, name, timeout)
-    if controller.on(13):
-        raise InputError(f"{name}: it reports in inches; set $13=0")
-    return controller
-
-
-def unlock(link: Link, name: str, timeout: float) -> None:
-    """Lift the lock after an alarm or a start, where there are no switches to home against."""
-    if link.seen is not None and link.seen.status.state == "alarm":
-        link.ask(_UNLOCK, timeout)
-        link.until(lambda: _state(link, "idle"), timeout, "unlock")
-
-
-def offset_known(link: Link, name: str, timeout: float, known: Callable[[], bool]) -> None:
-    """Wait until a report has told where the work coordinates begin.
-
-    Raises
-    ------
-    InputError
-        None does.
-    """
-    try:
-        link.until(lambda: known() or None, max(timeout, _REFRESH), "tell its work offset")
-    except HardwareError as error:
-        raise InputError(f"{name}: its reports lack the work offset (WCO); switch it on in $10") from error
-
-
-def _first(link: Link, name: str, timeout: float) -> Seen:
-    """Wait for the first report; a controller that is locked hard answers only after a reset."""
-    try:
-        try:
-            return link.until(lambda: link.seen, timeout / 2, "answer")
-        except HardwareError:
-            link.send(RESET)
-            return link.until(lambda: link.seen, timeout / 2, "answer")
-    except HardwareError as error:
-        if link.gone:
-            raise InputError(f"{name}: the line closed at once; is anything behind this port?") from error
-        if link.banner is not None:
-            raise InputError(f"{name}: {link.banner.text!r} does not report as GRBL 1.1 does") from error
-        heard = link.noise.total > 0
-        what = (
-            "what answers is not GRBL 1.1 or grblHAL" if heard else f"nothing answers within {timeout:.3g} s"
-        )
-        raise InputError(f"{name}: {what}; look at the port, the baud rate and the power") from error
-
-
-def _identity(link: Link, name: str, timeout: float) -> Controller:
-    told = {m.text.partition(":")[0]: m.text for m in link.ask("$I", timeout) if isinstance(m, Message)}
-    version = told.get("VER", "").removeprefix("VER:").strip(":")
-    match = re.match(r"(\d+)\.(\d+)", version)
-    number = (int(match[1]), int(match[2])) if match else link.banner.version if link.banner else (0, 0)
-    if number < _OLDEST:
-        raise InputError(f"{name}: it says that it is version {version or '?'}; GRBL 1.1 or later is needed")
-    size = re.match(r"OPT:[^,]*,\d+,(\d+)", told.get("OPT", ""))
-    if size:
-        link.window.size = int(size[1])
-    settings = {}
-    for said in link.ask("$$", timeout):
-        if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):
-            settings[said.number] = float(said.value)
-    firmware = link.banner.text.partition(" [")[0] if link.banner else f"Grbl {version}"
-    return Controller(firmware, settings)
-
-
-def _state(link: Link, state: str) -> bool | None:
-    return True if link.seen is not None and link.seen.status.state == state else None
-
-
 _KEPT = 1 << 17  # reports: an hour of motion
 _THERE = 0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
 _RESTS = 3  # reports of rest elsewhere, until that is where it stays
 _MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
 _HOMING = 60.0  # seconds, where the settings do not tell how long it takes
 _LETTERS = "XYZABC"
+
+
+@dataclass(frozen=True, slots=True)
+class Controller:
+    """What a controller is."""
+
+    firmware: str  # its name and version, as it says them
+    settings: dict[int, float]  # those ``$`` settings that are numbers
+
+    def on(self, number: int) -> bool:
+        """Return whether a switch among the settings is on; the first bit of a mask of bits."""
+        return bool(int(self.settings.get(number, 0)) & 1)
 
 
 class GrblStage(Closing):
@@ -145,7 +55,7 @@ class GrblStage(Closing):
     ----------
     settings : StageSettings
         Where it is plugged in, its axes and limits.
-    port : Port, optional
+    port : serial.Serial, optional
         What to speak through instead of opening ``settings.port``; it is closed with the stage.
 
     Attributes
@@ -161,7 +71,7 @@ class GrblStage(Closing):
         No such port, one in use, or one behind which there is no GRBL 1.1.
     """
 
-    def __init__(self, settings: StageSettings, port: Port | None = None) -> None:
+    def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:
         self.name = f"stage {settings.port}"
         self.limits = settings.limits
         self._settings = settings
@@ -221,7 +131,7 @@ class GrblStage(Closing):
                 self._excess = math.inf  # the switches may be beyond the limits
                 self._link.patience = None  # not after a failure: what stops homing is told by it
                 self._link.locked = False
-            self._link.ask(PREPARE, self._settings.timeout)
+            self._link.ask(_PREPARE, self._settings.timeout)
             self._target = None
             self._target = self.wait().position
 
@@ -238,7 +148,8 @@ class GrblStage(Closing):
         """Begin to go round; see `Stage.precess`."""
         before = self._stand()
         self.limits.check_precession(before.travel, tilt, self.name)
-        commands = self._axes.arcs(tilt, turns, rate, start, self._work())
+        assert self._offset is not None  # it is open only when this is known
+        commands = self._axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
         if self._axes.apart(before, begin) > _THERE:
             raise InputError(
@@ -259,8 +170,7 @@ class GrblStage(Closing):
         """Return what the stage said last; see `Stage.report`."""
         if self._link.error is not None:
             raise self._link.error.with_traceback(None)
-        if self._latest is None:  # cannot be: it is open only after a report
-            raise HardwareError(f"{self.name}: it has not reported yet")
+        assert self._latest is not None  # it is open only after a report
         return self._latest
 
     def history(self, since: float = -math.inf) -> list[Report]:
@@ -284,19 +194,34 @@ class GrblStage(Closing):
     def _open(self) -> Controller:
         link, timeout = self._link, self._settings.timeout
         try:
-            controller = greet(link, self.name, timeout)
+            controller = _greet(link, self.name, timeout)
             self._check(controller)
-            if not self._settings.home:
-                unlock(link, self.name, timeout)
-            link.locked = link.seen is not None and link.seen.status.state == "alarm"
-            offset_known(link, self.name, timeout, lambda: self._offset is not None)
+            if self._in_state("alarm") and not self._settings.home:  # there are no switches to home against
+                link.ask("$X", timeout)
+                link.until(lambda: self._in_state("idle") or None, timeout, "unlock")
+            link.locked = self._in_state("alarm")
+            self._await_offset()
             if not link.locked:
-                link.ask(PREPARE, timeout)
+                link.ask(_PREPARE, timeout)
             link.until(lambda: link.rests or link.locked or None, timeout, "report")
         except HardwareError as error:
             raise InputError(str(error)) from error
         link.begin()
         return controller
+
+    def _in_state(self, state: str) -> bool:
+        return self._link.seen is not None and self._link.seen.status.state == state
+
+    def _await_offset(self) -> None:
+        """Wait until a report has told where the work coordinates begin."""
+        try:
+            self._link.until(
+                lambda: self._offset, max(self._settings.timeout, _REFRESH), "tell its work offset"
+            )
+        except HardwareError as error:
+            raise InputError(
+                f"{self.name}: its reports lack the work offset (WCO); switch it on in $10"
+            ) from error
 
     def _check(self, controller: Controller) -> None:
         """Refuse a controller that lacks an axis; go no faster than it does, and learn how soon."""
@@ -361,11 +286,6 @@ class GrblStage(Closing):
             raise HardwareError(f"{self.name}: it is locked until it is homed; home it first")
         return self.report().position if self._target is None else self._target
 
-    def _work(self) -> Mapping[str, float]:
-        if self._offset is None:  # cannot be: it is open only when this is known
-            raise HardwareError(f"{self.name}: its work offset is not known")
-        return self._offset
-
     def _send(self, commands: list[Command], target: Position) -> None:
         """Send lines that end at a target, and wait until the controller took the first that moves."""
         duration = sum(command.duration for command in commands) + self._ramp
@@ -410,6 +330,56 @@ class GrblStage(Closing):
         except BaseException:
             self.stop()
             raise
+
+
+def _greet(link: Link, name: str, timeout: float) -> Controller:
+    """Find out that GRBL 1.1 answers, bring it to rest, and read its settings."""
+    seen = _first(link, name, timeout)
+    if seen.status.state not in ("idle", "alarm"):  # left so by whoever spoke to it before
+        link.restart(timeout)
+        _first(link, name, timeout)
+    controller = _identity(link, name, timeout)
+    if controller.on(13):
+        raise InputError(f"{name}: it reports in inches; set $13=0")
+    return controller
+
+
+def _first(link: Link, name: str, timeout: float) -> Seen:
+    """Wait for the first report; a controller that is locked hard answers only after a reset."""
+    try:
+        try:
+            return link.until(lambda: link.seen, timeout / 2, "answer")
+        except HardwareError:
+            link.send(RESET)
+            return link.until(lambda: link.seen, timeout / 2, "answer")
+    except HardwareError as error:
+        if link.gone:
+            raise InputError(f"{name}: the line closed at once; is anything behind this port?") from error
+        if link.banner is not None:
+            raise InputError(f"{name}: {link.banner.text!r} does not report as GRBL 1.1 does") from error
+        heard = link.noise.total > 0
+        what = (
+            "what answers is not GRBL 1.1 or grblHAL" if heard else f"nothing answers within {timeout:.3g} s"
+        )
+        raise InputError(f"{name}: {what}; look at the port, the baud rate and the power") from error
+
+
+def _identity(link: Link, name: str, timeout: float) -> Controller:
+    told = {m.text.partition(":")[0]: m.text for m in link.ask("$I", timeout) if isinstance(m, Message)}
+    version = told.get("VER", "").removeprefix("VER:").strip(":")
+    match = re.match(r"(\d+)\.(\d+)", version)
+    number = (int(match[1]), int(match[2])) if match else link.banner.version if link.banner else (0, 0)
+    if number < _OLDEST:
+        raise InputError(f"{name}: it says that it is version {version or '?'}; GRBL 1.1 or later is needed")
+    size = re.match(r"OPT:[^,]*,\d+,(\d+)", told.get("OPT", ""))
+    if size:
+        link.window.size = int(size[1])
+    settings = {}
+    for said in link.ask("$$", timeout):
+        if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):
+            settings[said.number] = float(said.value)
+    firmware = link.banner.text.partition(" [")[0] if link.banner else f"Grbl {version}"
+    return Controller(firmware, settings)
 
 
 def _leaning(travel: float, tilt: float, phase: float) -> Position:

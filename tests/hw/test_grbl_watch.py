@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from mirrorskin.hw.grbl.link import HOLDING, LONGEST, Stopping, Watch
+from mirrorskin.hw.grbl.link import HOLDING, LONGEST, Stopping
+from mirrorskin.hw.grbl.report_times import ReportTimes
 
 
 def answered(watch, asked, trip):
@@ -13,7 +14,7 @@ def answered(watch, asked, trip):
 
 
 def test_an_answer_tells_of_the_middle_between_question_and_answer():
-    watch = Watch(0.05)
+    watch = ReportTimes(0.05)
     assert watch.due(10.0)
     watch.ask(10.0)
     answer = watch.answer(10.02)
@@ -23,7 +24,7 @@ def test_an_answer_tells_of_the_middle_between_question_and_answer():
 
 
 def test_the_usual_round_trip_is_the_median():
-    watch = Watch(0.1)
+    watch = ReportTimes(0.1)
     assert math.isnan(watch.usual)
     for asked, trip in (1.0, 0.001), (2.0, 0.003), (3.0, 0.05):
         answered(watch, asked, trip)
@@ -31,7 +32,7 @@ def test_the_usual_round_trip_is_the_median():
 
 
 def test_an_answer_that_comes_late_is_not_trusted():
-    watch = Watch(0.1)
+    watch = ReportTimes(0.1)
     assert all(answered(watch, float(k), 0.002).sure for k in range(5))
     late = answered(watch, 5.0, 0.03)
     assert not late.sure
@@ -40,7 +41,7 @@ def test_an_answer_that_comes_late_is_not_trusted():
 
 
 def test_a_slow_line_is_trusted_once_it_is_known():
-    watch = Watch(0.05)
+    watch = ReportTimes(0.05)
     assert all(answered(watch, float(k), 0.06).sure for k in range(5))
     watch.ask(6.0)
     assert not watch.due(6.11)
@@ -48,7 +49,7 @@ def test_a_slow_line_is_trusted_once_it_is_known():
 
 
 def test_an_answer_to_one_of_two_questions_has_no_time_until_all_is_quiet():
-    watch = Watch(0.05)
+    watch = ReportTimes(0.05)
     answered(watch, 0.5, 0.001)
     watch.ask(1.0)
     assert watch.due(1.045)
@@ -62,7 +63,7 @@ def test_an_answer_to_one_of_two_questions_has_no_time_until_all_is_quiet():
 
 
 def test_silence_is_what_somebody_listened_to_while_a_question_was_open():
-    watch = Watch(0.05)
+    watch = ReportTimes(0.05)
     watch.listened(0.99, 1.01)
     assert watch.silence(1.01) == 0
     watch.ask(1.02)
@@ -74,7 +75,7 @@ def test_silence_is_what_somebody_listened_to_while_a_question_was_open():
 
 
 def test_a_reader_who_sleeps_hears_no_silence():
-    watch = Watch(0.05)
+    watch = ReportTimes(0.05)
     watch.ask(1.0)
     assert watch.silence(1.3) == 0, "nobody listened"
     for k in range(3):
@@ -85,7 +86,7 @@ def test_a_reader_who_sleeps_hears_no_silence():
 
 @pytest.mark.parametrize("trip", [0.03, 0.045, 0.06, 0.085])
 def test_a_line_that_becomes_slow_is_trusted_again(trip):
-    now, watch, coming, sure = 0.0, Watch(0.025), [], []
+    now, watch, coming, sure = 0.0, ReportTimes(0.025), [], []
     while now < 5:
         now += 0.005
         while coming and coming[0][1] <= now:

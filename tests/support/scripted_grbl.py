@@ -9,7 +9,7 @@ import time
 
 import serial
 
-from mirrorskin.hw.grbl.link import SLICE
+from mirrorskin.hw.grbl.report_times import SLICE
 from mirrorskin.hw.rig_file import StageSettings, TiltAxis, TravelAxis
 
 SLOTS = 4
