@@ -36,7 +36,8 @@ def reconstruct(
     Examples
     --------
     >>> from mirrorskin import engine, hw
-    >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26)
+    >>> from mirrorskin.hw.twin import Vertical
+    >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> engine.reconstruct(press).height.shape
     (40, 40)
     """

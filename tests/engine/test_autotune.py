@@ -1,4 +1,4 @@
-"""Which shape of work a device gets: the fastest, measured once."""
+"""Which layout a device gets: the fastest, measured once."""
 
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ def trial(clock, seconds):
         ({CPU_LAYOUT: None, GPU_LAYOUT: 9}, GPU_LAYOUT),
     ],
 )
-def test_the_fastest_shape_is_taken_and_remembered(memory, clock, seconds, best):
+def test_the_fastest_layout_is_taken_and_remembered(memory, clock, seconds, best):
     prepare, prepared = trial(clock, seconds)
     first, second = fake_device(), fake_device()
     for device in (first, first, second):
@@ -84,7 +84,7 @@ def test_what_is_remembered_wrongly_is_measured_anew(memory, clock):
         assert device.layout is GPU_LAYOUT
 
 
-def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
+def test_a_device_that_runs_in_no_layout_says_so_each_time(memory, clock):
     prepare, _ = trial(clock, {CPU_LAYOUT: None, GPU_LAYOUT: None})
     device = fake_device()
     for _ in range(2):
@@ -93,7 +93,8 @@ def test_a_device_that_runs_in_no_shape_says_so_each_time(memory, clock):
     assert not memory
 
 
-def test_the_trial_runs_in_every_shape(device, monkeypatch):
+@pytest.mark.slow
+def test_the_trial_runs_in_every_layout(device, monkeypatch):
     for shape in (CPU_LAYOUT, GPU_LAYOUT):
         monkeypatch.setattr(device, "layout", shape)
         device.profile.clear()
@@ -101,8 +102,9 @@ def test_the_trial_runs_in_every_shape(device, monkeypatch):
         assert "onset_scan" in [record.name for record in device.profile.records()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_both_shapes_give_the_same(device, monkeypatch, dtype):
+def test_both_layouts_give_the_same(device, monkeypatch, dtype):
     frames = np.random.default_rng(0).integers(0, 256, (70, 13, 29)).astype(dtype)
     found = []
     for shape in (CPU_LAYOUT, GPU_LAYOUT):

@@ -27,25 +27,29 @@ class Source:
             return None
         out[: stop - start] = np.arange(start, stop)[:, None, None]
         self.next = stop
-        return Block(out[: stop - start], start)
+        return Block(out[: stop - start], start, travel=0.1 * np.arange(start, stop))
 
 
 class Estimator:
     """Keeps a copy of what it is given."""
+
+    position = "travel"
 
     def __init__(self, device, room, fails=None):
         self.device = device
         self.room = np.zeros((room, 3, 5), np.uint16)
         self.seen, self.fails = [], fails
 
-    def push(self, block):
-        if self.fails in range(block.index, block.index + len(block.frames)):
+    def push(self, frames, *, travel, lent):
+        numbers = frames[:, 0, 0].tolist()
+        if self.fails in numbers:
             raise InputError("no")
-        self.seen += [int(number) for frame in block.frames for number in np.unique(frame)]
+        assert np.allclose(travel, 0.1 * np.array(numbers))
+        self.seen += numbers
 
 
-@pytest.mark.parametrize("room", [1, 2, 3, 10, 100])
-@pytest.mark.parametrize("wanted", [range(10), range(4, 10), range(2, 7), range(9, 10), range(0)])
+@pytest.mark.parametrize("room", [1, 3, 100])
+@pytest.mark.parametrize("wanted", [range(10), range(2, 7), range(9, 10), range(0)])
 def test_each_frame_is_pushed_once_and_in_order(device, room, wanted):
     told = []
     estimator = Estimator(device, room)

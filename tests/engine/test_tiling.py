@@ -15,7 +15,7 @@ LARGEST = 2 * 768 * 4  # two planes of floats, 23 x 31 pixels in whole words
 SMALLEST = 3 * 64 * 4  # the travel must fit too
 
 
-@pytest.mark.parametrize("limit", [40_000, LARGEST, LARGEST - 1, 1500, SMALLEST])
+@pytest.mark.parametrize("limit", [LARGEST, LARGEST - 1, SMALLEST])
 def test_less_room_gives_the_same_answer(small_device, limit):
     whole = find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=small_device)
     small_device.max_allocation = limit
@@ -87,9 +87,10 @@ def lent(frames, offset):
     return placed
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("size", [(23, 31), (16, 64)])
-@pytest.mark.parametrize("offset", [0, 64, 1448, 8])
+@pytest.mark.parametrize(
+    ("dtype", "size", "offset"),
+    [("uint8", (23, 31), 8), ("uint8", (16, 64), 64), ("uint16", (16, 64), 1448), ("float32", (23, 31), 0)],
+)
 def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size, offset):
     frames = random_press(dtype, 40, size, seed=6)
     travel = np.arange(40) * 0.1

@@ -7,7 +7,6 @@ import numpy as np
 from mirrorskin.engine.frames import reference_maps
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.kernels import onset as reference
-from mirrorskin.kernels.layout import CPU_LAYOUT
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
 LEVELS = {dtype: {"dark": dark, "bright": bright} for dtype, (dark, bright) in SPEC.items()}
@@ -26,15 +25,6 @@ def random_press(dtype, frames, shape, seed=0, noise=0.008):
     if dtype == "float32":
         return counts.astype(dtype)
     return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
-
-
-def looks_between(device, dtype, hold):
-    """Tell whether to look between the frames: for every other dtype and hold; the other shape does the rest.
-
-    A kernel of its own is compiled for each, which takes longer than the test. So each shape of work is given
-    half of the combinations, in which any two values meet.
-    """
-    return (sorted(SPEC).index(dtype) + hold // 2 + (device.layout is CPU_LAYOUT)) % 2 == 0
 
 
 def numpy_onset(
