@@ -71,18 +71,6 @@ def test_what_is_finished_is_kept_until_the_settings_change():
     assert io.open_result("out/a-result.h5").process["threshold"] == 0.3
 
 
-def test_settings_reach_each_motion():
-    for name, make in SOUND.items():
-        make(Path(name))
-    settings = '[stack]\npixel-size = "0.2mm"\n[press]\nhold = 1\n[rotation]\nmethod = "paper"\n'
-    Path("batch.toml").write_text(settings)
-    assert run("batch", *SOUND, "-o", "out", "--settings", "batch.toml").code == 0
-    pressed, turned = (io.open_result(f"out/{name}-result.h5") for name in ("press", "turn"))
-    assert (pressed.process["hold"], turned.process["method"]) == (1, "paper")
-    for result in (pressed, turned):
-        assert result.x[1] - result.x[0] == pytest.approx(0.2)
-
-
 def test_patterns_are_understood_when_quoted():
     presses("a.h5", "b.h5", "deep/er/c.h5", "deep/d.nxs")
     Path("e.h5").mkdir()
@@ -91,12 +79,6 @@ def test_patterns_are_understood_when_quoted():
     assert "2 done" in run("batch", "deep/**", "-o", "three").out
     assert "2 done" in run("batch", str(Path("[ab].h5").absolute()), "b.h5", "-o", "four").out
     assert results("three") == ["c-result.h5", "d-result.h5"]
-
-
-def test_a_file_whose_name_is_a_pattern_is_itself():
-    presses("[ab].h5", "a.h5")
-    run("batch", "[ab].h5", "-o", "out")
-    assert results() == ["[ab]-result.h5"]
 
 
 def test_results_are_no_recordings():
@@ -110,23 +92,6 @@ def test_results_are_no_recordings():
     )
     code, _, said = run("batch", "a-result.h5", "-o", ".")
     assert (code, said) == (2, "mirrorskin: a-result.h5: nothing but results: name recordings\n")
-
-
-def test_a_damaged_result_among_the_recordings_is_made_anew():
-    presses("a.h5")
-    run("batch", "*.h5", "-o", ".")
-    Path("a-result.h5").write_bytes(b"no more")
-    assert "1 recordings: 1 done" in run("batch", "*.h5", "-o", ".").out
-    assert io.open_result("a-result.h5").height is not None
-
-
-def test_a_result_that_cannot_be_written_is_one_failure():
-    presses("a.h5", "b.h5")
-    Path("out/a-result.h5").mkdir(parents=True)
-    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out")
-    assert code == 1
-    assert "failed: a.h5: out/a-result.h5 is a folder" in out
-    assert "1 done, 0 kept, 1 failed" in out
 
 
 def test_remedies_are_those_of_a_batch():
@@ -157,12 +122,6 @@ def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding
     ]
     assert lines[3] == lines[4] == "failed: no?: no such file"
     assert "3 done, 0 kept, 1 failed" in lines[5]
-
-
-def test_recordings_of_one_name_keep_their_folders():
-    presses("mon/x.h5", "tue/x.h5", "y.h5")
-    run("batch", "**/*.h5", "-o", "out")
-    assert results() == ["mon/x-result.h5", "tue/x-result.h5", "y-result.h5"]
 
 
 def test_json_tells_of_every_file():

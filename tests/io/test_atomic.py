@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from mirrorskin.io import InputError, atomic
+from mirrorskin.io import atomic
 from mirrorskin.io.atomic import new_hdf5, remove_leftovers
 
 # Begins a file, says so, and waits to be killed.
@@ -68,24 +68,6 @@ def test_a_file_that_was_taken_for_a_leftover_is_begun_again(tmp_path, monkeypat
         new.root["x"] = 1
     assert len(locked) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
-
-
-def without_locks(*_):
-    raise OSError(95, "no locks here")
-
-
-def test_where_there_are_no_locks_all_is_written_and_nothing_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(atomic.fcntl, "flock", without_locks)
-    with new_hdf5(tmp_path / "a.h5") as new:
-        new.root["x"] = 1
-        assert remove_leftovers(tmp_path) == []
-    assert (tmp_path / "a.h5").is_file()
-
-
-def test_a_folder_that_is_not_there_has_no_leftovers(tmp_path):
-    assert remove_leftovers(tmp_path / "no") == []
-    with pytest.raises(InputError, match="there is no folder"), new_hdf5(tmp_path / "no" / "a.h5"):
-        pass
 
 
 def test_a_program_that_is_ended_while_the_file_is_made_leaves_none(tmp_path, monkeypatch):

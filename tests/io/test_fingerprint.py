@@ -110,15 +110,6 @@ def test_files_that_frames_are_taken_from_count(tmp_path, monkeypatch):
         assert fingerprint(tmp_path / name, **given) == before
 
 
-def test_frames_in_the_header_are_beside_the_frames(tmp_path):
-    made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    made.set_layout(h5py.h5d.COMPACT)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        space = h5py.h5s.create_simple((8, 5, 7))
-        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.STD_U8LE, space, made))[...] = 7
-    assert fingerprint(tmp_path / "a.h5") == expected((tmp_path / "a.h5").read_bytes(), [])
-
-
 def test_the_time_of_the_last_change_is_told_to_the_nanosecond(tmp_path):
     path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"))
     os.utime(path, ns=(0, 1_700_000_000_012_345_678))
@@ -127,24 +118,6 @@ def test_the_time_of_the_last_change_is_told_to_the_nanosecond(tmp_path):
     os.utime(path)
     with io.open_recording(path, **GIVEN) as recording:
         assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", recording.modified)
-
-
-def test_the_youngest_of_its_files_tells_when_it_was_changed(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "part.h5", compressible(SHAPE, "u1"))
-    layout = h5py.VirtualLayout(SHAPE, "u1")
-    layout[...] = h5py.VirtualSource("part.h5", "x", SHAPE)
-    with h5py.File("virtual.h5", "w", libver="latest") as file:
-        file.create_virtual_dataset("x", layout)
-    with h5py.File("external.h5", "w") as file:
-        file.create_dataset("x", SHAPE, "u1", external=[("raw.bin", 0, h5py.h5f.UNLIMITED)])
-        file["x"][...] = compressible(SHAPE, "u1")
-    for name, other in (("virtual.h5", "part.h5"), ("external.h5", "raw.bin")):
-        os.utime(name, ns=(0, 1_600_000_000_000_000_001))
-        for year in ("2020", "2023"):
-            os.utime(other, ns=(0, {"2020": 1_500_000_000, "2023": 1_700_000_000}[year] * 10**9))
-            with io.open_recording(tmp_path / name, **GIVEN, dataset="x") as recording:
-                assert recording.modified.startswith(year)
 
 
 @pytest.mark.parametrize("packing", [{}, {"chunks": (1, 50, 70), "compression": "gzip"}])

@@ -16,21 +16,6 @@ def heights():
     return values
 
 
-def test_the_heights_of_a_result(tmp_path):
-    io.save_result(io.Result(height=heights()), tmp_path / "r.h5")
-    found = io.open_heights(tmp_path / "r.h5")
-    np.testing.assert_array_equal(found, heights())
-    assert found.dtype == np.float32
-
-
-def test_the_true_heights_of_a_simulation(tmp_path):
-    twin = sphere()
-    record(twin, tmp_path / "r.h5", truth=twin.truth)
-    found = io.open_heights(str(tmp_path / "r.h5"))
-    np.testing.assert_array_equal(found, twin.truth.height)
-    assert np.isfinite(found).any()
-
-
 def nothing(path):
     path.unlink(missing_ok=True)
 
@@ -74,14 +59,6 @@ def test_heights_whose_offset_nobody_knows_are_left_out(tmp_path):
     found = io.open_heights(tmp_path / "r.h5")
     assert np.isnan(found[:, :4]).all()
     np.testing.assert_array_equal(found[:, 4:], heights()[:, 4:])
-
-
-def test_heights_that_are_all_relative_are_refused(tmp_path):
-    piece = np.zeros((5, 7), np.int32)
-    result = io.Result(height=heights(), component=piece, offset_unknown=np.ones(1, np.uint8))
-    io.save_result(result, tmp_path / "r.h5")
-    with pytest.raises(io.InputError, match="offset"):
-        io.open_heights(tmp_path / "r.h5")
 
 
 ROWS, COLUMNS = (1, 4), (2, 6)

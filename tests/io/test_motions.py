@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from stacks import SHAPE, TRAVEL, MadeUp, assert_same, plot_of, random_stack, read_all, record
+from stacks import SHAPE, TRAVEL, MadeUp, assert_same, random_stack, read_all, record
 
 from mirrorskin import hw, io
 
@@ -75,17 +75,6 @@ def test_where_the_body_was_comes_back_to_the_last_bit(tmp_path, motion, size):
     np.testing.assert_array_equal(found.time, TIME)
 
 
-@EACH
-def test_a_rewound_recording_says_the_same_again(tmp_path, motion):
-    name, positions = SERIES[motion]
-    with io.open_recording(make(tmp_path, motion)) as recording:
-        recording.read(np.empty((5, *SHAPE[1:]), np.uint8))
-        block = recording.read(np.empty((2, *SHAPE[1:]), np.uint8))
-        np.testing.assert_array_equal(getattr(block, name), positions[5:7])
-        recording.rewind()
-        np.testing.assert_array_equal(getattr(recording.read(), name), positions[:1])
-
-
 @pytest.mark.parametrize(("motion", "shape", "unit"), [("horizontal", (8, 2), "mm"), ("twist", (8,), "rad")])
 def test_the_stage_has_the_layout_of_the_design(tmp_path, motion, shape, unit):
     with h5py.File(make(tmp_path, motion)) as file:
@@ -96,59 +85,6 @@ def test_the_stage_has_the_layout_of_the_design(tmp_path, motion, shape, unit):
         assert (stage[name].shape, stage[name].dtype, stage[name].attrs["units"]) == (shape, "f8", unit)
         assert (stage["travel"].shape, stage["travel"].attrs["units"]) == ((), "mm")
         assert stage["travel"][()] == 1.25
-
-
-@pytest.mark.parametrize(
-    ("motion", "axis"),
-    [("vertical", "travel"), ("axial", "phase"), ("horizontal", "frame_time"), ("twist", "twist")],
-)
-def test_viewers_plot_the_frames_along_what_changes(tmp_path, motion, axis):
-    group, signal, axes = plot_of(make(tmp_path, motion))
-    assert axes == [axis, ".", "."]
-    np.testing.assert_array_equal(signal, random_stack())
-    np.testing.assert_array_equal(group[axis], TIME if motion == "horizontal" else SERIES[motion][1])
-    assert set(group) == {"frames", axis}
-
-
-@pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_viewers_need_neither_time_nor_positions(tmp_path, motion):
-    name = SERIES[motion][0]
-    assert plot_of(make(tmp_path, motion, **{name: None}))[2] == ["frame_time", ".", "."]
-    assert plot_of(make(tmp_path, motion, **{name: None, "time": None}))[2] == []
-
-
-@pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_no_method_needs_these_positions_so_they_may_be_unknown(tmp_path, motion):
-    name = SERIES[motion][0]
-    path = make(tmp_path, motion, **{name: None})
-    with io.open_recording(path) as recording:
-        assert recording.motion == motion
-        assert getattr(recording, name) is None
-        assert getattr(recording.read(), name) is None
-    assert not [fact for fact in io.describe(path) if fact.startswith(name)]
-
-
-@pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_another_s_file_says_nothing_of_positions(tmp_path, motion):
-    path = tmp_path / "theirs.h5"
-    with h5py.File(path, "w") as file:
-        file["frames"] = random_stack()
-        file[f"{STAGE}/{motion}"] = "not ours, and not looked at"
-    with io.open_recording(path, motion=motion) as recording:
-        found = read_all(recording, 3)
-    np.testing.assert_array_equal(found.frames, random_stack())
-    assert found[1:] == (None,) * 5
-
-
-@pytest.mark.parametrize("motion", ["vertical", "horizontal"])
-def test_positions_of_another_motion_are_not_looked_at(tmp_path, motion):
-    path = make(tmp_path, motion)
-    put(path, f"{STAGE}/twist", "no numbers")
-    put(path, f"{STAGE}/{'travel' if motion == 'horizontal' else 'displacement'}", 0.5)
-    with io.open_recording(path) as recording:
-        assert recording.twist is None
-    with pytest.raises(io.InputError, match=r"stage/twist holds no numbers$"):
-        io.open_recording(path, motion="twist")
 
 
 @pytest.mark.parametrize(
@@ -169,18 +105,6 @@ def test_positions_are_turned_into_our_units(tmp_path, motion, name, value, unit
         found = getattr(recording, name)
     assert found.dtype == np.float64
     np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize("motion", ["axial", "horizontal", "twist"])
-def test_the_press_is_turned_into_millimetres(tmp_path, motion):
-    path = make(tmp_path, motion)
-    put(path, f"{STAGE}/travel", [700.0], "um")
-    with io.open_recording(path) as recording:
-        assert recording.header.press == pytest.approx(0.7)
-    put(path, f"{STAGE}/travel", None)
-    with io.open_recording(path) as recording:
-        assert recording.header.press is None
-    assert "press" not in io.describe(path)
 
 
 BAD: list[tuple[str, str, Any, str | None, str]] = [
@@ -218,24 +142,6 @@ def test_what_a_recording_says_wrongly_is_told_in_one_line(tmp_path, motion, nam
     assert "\n" not in str(caught.value)
 
 
-@EACH
-def test_a_recording_is_described(tmp_path, motion):
-    facts = io.describe(make(tmp_path, motion))
-    own = {
-        "vertical": {"travel": "0 to 2.1 mm"},
-        "axial": {"phase": "0 to 315 deg", "press": "1.25 mm", "tilt": f"{np.degrees(0.04):g} deg"},
-        "horizontal": {
-            "displacement x": "0 to 0.07 mm",
-            "displacement y": "-0.3 to 0.68 mm",
-            "press": "1.25 mm",
-        },
-        "twist": {"twist": "0 to 0.6 to -0.2 deg", "press": "1.25 mm"},
-    }
-    names = {"travel", "phase", "press", "tilt", "displacement x", "displacement y", "twist"}
-    assert facts["motion"] == motion
-    assert {name: text for name, text in facts.items() if name in names} == own[motion]
-
-
 @pytest.mark.parametrize(
     ("slip", "known"),
     [(None, "height, zenith, azimuth, contact"), (np.eye(5, 7, 2), "height, zenith, azimuth, contact, slip")],
@@ -248,24 +154,6 @@ def test_slip_may_be_known(tmp_path, slip, known):
     assert io.describe(path)["truth"] == known
     with h5py.File(path) as file:
         assert set(file[TRUTH]) == set(known.split(", "))
-
-
-def test_slip_is_read_however_it_is_written_and_must_fit(tmp_path):
-    path = make(tmp_path, "horizontal", some_truth())
-    put(path, f"{TRUTH}/slip", np.eye(5, 7, 1, dtype=bool))
-    with io.open_recording(path) as recording:
-        np.testing.assert_array_equal(recording.truth.slip, np.eye(5, 7, 1))
-        assert recording.truth.slip.dtype == np.uint8
-    put(path, f"{TRUTH}/slip", np.eye(7, 5))
-    with pytest.raises(io.InputError, match=r"truth/slip has shape \(7, 5\) where \(5, 7\) is needed"):
-        io.open_recording(path)
-
-
-def test_slip_alone_is_no_truth(tmp_path):
-    path = make(tmp_path, "horizontal")
-    put(path, f"{TRUTH}/slip", np.eye(5, 7))
-    with pytest.raises(io.InputError, match="truth has no height, zenith, azimuth, contact: simulate it"):
-        io.open_recording(path)
 
 
 MOVEMENTS = {

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 import sys
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from stacks import TRAVEL, MadeUp, assert_same, plot_of, random_stack, read_all, record, sphere
+from stacks import TRAVEL, MadeUp, assert_same, random_stack, read_all, record, sphere
 
 from mirrorskin import io
 
@@ -115,47 +113,6 @@ def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
         assert file[f"{stage}/motion"].asstr()[()] == "axial"
 
 
-@pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_other_motions_are_plotted_along_the_time(tmp_path, motion):
-    header = io.Header(motion, press=1.5)
-    path = record(MadeUp(random_stack(), header, time=TRAVEL), tmp_path / "other.h5")
-    assert plot_of(path)[2] == ["frame_time", ".", "."]
-    with io.open_recording(path) as recording:
-        assert (recording.motion, recording.header.press) == (motion, 1.5)
-
-
-@pytest.mark.parametrize("known", [{}, {"time": TRAVEL}])
-def test_frames_without_positions_can_be_recorded(tmp_path, known):
-    path = record(MadeUp(random_stack(), io.Header("vertical"), **known), tmp_path / "still.h5")
-    _, signal, axes = plot_of(path)
-    assert axes == (["frame_time", ".", "."] if known else [])
-    np.testing.assert_array_equal(signal, random_stack())
-    with io.open_recording(path, travel=io.Steps(0.3)) as recording:
-        np.testing.assert_allclose(recording.travel, TRAVEL)
-        assert (recording.time is None) == (not known)
-
-
-def test_positions_that_are_missing_for_some_frames_are_told_when_read(tmp_path):
-    class Forgetful(MadeUp):
-        def read(self, out=None, /):
-            block = super().read(out)
-            if block is None or block.index != 5:
-                return block
-            return io.Block(block.frames, 5)
-
-    source = Forgetful(random_stack(), io.Header("vertical"), travel=TRAVEL)
-    path = record(source, tmp_path / "gap.h5")
-    with pytest.raises(io.InputError, match=r"gap\.h5: /entry/instrument/stage/travel is nan at frame 5"):
-        io.open_recording(path)
-
-
-def test_a_header_without_a_start_says_when_it_was_written(tmp_path):
-    path = record(MadeUp(random_stack(), io.Header("vertical"), travel=TRAVEL), tmp_path / "now.h5")
-    with io.open_recording(path) as recording:
-        start = datetime.fromisoformat(recording.header.start_time)
-    assert abs(datetime.now(UTC) - start) < timedelta(minutes=1)
-
-
 @pytest.mark.parametrize("block", [1, 3, 8])
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 @pytest.mark.parametrize("compression", io.COMPRESSIONS)
@@ -186,14 +143,6 @@ def test_the_twin_s_recording_is_the_twin(tmp_path, dtype):
         assert_same(recording.truth, twin.truth)
         for name in ("title", "pixel_size", "motion"):
             assert getattr(recording.header, name) == getattr(twin.header, name)
-
-
-def test_the_recorder_passes_on_what_it_writes(tmp_path):
-    frames = random_stack()
-    with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=TRAVEL), tmp_path / "a.h5") as recorder:
-        found = read_all(recorder, 3)
-    np.testing.assert_array_equal(found.frames, frames)
-    np.testing.assert_array_equal(found.travel, TRAVEL)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
@@ -246,33 +195,6 @@ def test_an_output_that_cannot_be_is_refused_before_the_source_starts(tmp_path):
 
     with pytest.raises(io.InputError, match="there is no folder"):
         record(Hardware(random_stack(), io.Header("vertical")), tmp_path / "missing" / "a.h5")
-
-
-def test_an_unknown_compression_is_refused(tmp_path):
-    with pytest.raises(io.InputError, match="unknown compression 'zip'; known are raw, bitshuffle, blosc"):
-        io.Recorder(sphere(), tmp_path / "a.h5", "zip")
-
-
-def test_a_recorder_cannot_be_rewound(tmp_path):
-    with pytest.raises(RuntimeError, match="cannot be rewound"):
-        io.Recorder(sphere(), tmp_path / "a.h5").rewind()
-
-
-@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
-def test_permissions_follow_the_umask(tmp_path, umask, mode):
-    before = os.umask(umask)
-    try:
-        path = record(sphere(), tmp_path / "a.h5")
-        assert os.umask(umask) == umask
-    finally:
-        os.umask(before)
-    assert path.stat().st_mode & 0o777 == mode
-
-
-def test_long_and_foreign_names_can_be_written(tmp_path):
-    for name in ("Münze für 5 Yen.h5", "\u4e94\u5186.h5", "x" * 252 + ".h5"):
-        with io.open_recording(record(sphere(), tmp_path / name)) as recording:
-            assert recording.name == str(tmp_path / name)
 
 
 FULL_DISK = """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import h5py
 import hdf5plugin
 import numpy as np
@@ -96,16 +94,6 @@ def test_the_truth_is_turned_into_our_units_and_types(press):
         assert (recording.truth.height.dtype, recording.truth.contact.dtype) == (np.float32, np.uint8)
 
 
-def test_text_may_be_written_in_other_ways(press):
-    put(press, f"{STAGE}/motion", np.array(["vertical"], dtype="S"))
-    put(press, "entry/title", np.bytes_("M\u00fcnze".encode("latin-1")))
-    put(press, "entry/start_time", None)
-    with io.open_recording(press) as recording:
-        assert recording.motion == "vertical"
-        assert recording.header.title == "M\ufffdnze"
-        assert recording.header.start_time == ""
-
-
 def test_what_is_given_overrides_the_file(press):
     with io.open_recording(press, travel=io.Steps(0.5, 1.0), pixel_size=(0.1, 0.2), tilt=0.3) as recording:
         np.testing.assert_allclose(recording.travel, 1.0 + 0.5 * np.arange(8))
@@ -118,55 +106,6 @@ def test_what_is_given_overrides_the_file(press):
         assert (recording.travel, recording.phase) == (None, None)
 
 
-@pytest.mark.parametrize("phase", [PHASE[::-1] ** 2, list(PHASE), PHASE.astype(np.float32), range(8)])
-def test_phases_may_be_given_one_by_one(press, turn, phase):
-    for path in (press, turn):
-        with io.open_recording(path, motion="axial", phase=phase) as recording:
-            np.testing.assert_array_equal(recording.phase, np.asarray(phase, float))
-            assert recording.phase.dtype == np.float64
-            np.testing.assert_array_equal(recording.read().phase, recording.phase[:1])
-
-
-def test_travel_may_be_given_one_by_one(press):
-    travel = np.arange(8) ** 2
-    with io.open_recording(press, travel=travel) as recording:
-        np.testing.assert_array_equal(recording.travel, travel)
-
-
-def test_positions_may_depend_on_the_number_of_frames(turn):
-    class Halves:
-        def positions(self, count, /):
-            return np.arange(count) / 2
-
-    with io.open_recording(turn, phase=Halves()) as recording:
-        np.testing.assert_array_equal(recording.phase, np.arange(8) / 2)
-
-
-@pytest.mark.parametrize(
-    ("phase", "line"),
-    [
-        (PHASE[:7], "the phase given has shape (7,) for 8 frames: one number a frame is needed"),
-        (PHASE[:, None], "the phase given has shape (8, 1) for 8 frames: one number a frame is needed"),
-        (1.0, "the phase given has shape () for 8 frames: one number a frame is needed"),
-        (["1deg"] * 8, "the phase given is of type <U4: numbers are needed"),
-        (np.where(PHASE > 3, np.inf, PHASE), "the phase given is inf at frame 4: every frame needs a finite"),
-    ],
-)
-def test_given_phases_that_do_not_fit_are_told(turn, phase, line):
-    with pytest.raises(io.InputError, match=re.escape(f"{turn}: {line}")):
-        io.open_recording(turn, phase=phase)
-
-
-def test_what_is_given_need_not_be_right_in_the_file(press):
-    put(press, f"{STAGE}/travel", None)
-    put(press, f"{DETECTOR}/x_pixel_size", -1.0, "furlong/fortnight")
-    put(press, f"{STAGE}/tilt", "much")
-    put(press, f"{STAGE}/motion", None)
-    given = {"motion": "vertical", "travel": io.Steps(0.3), "pixel_size": (0.5, 0.5), "tilt": 0.1}
-    with io.open_recording(press, **given) as recording:
-        np.testing.assert_allclose(recording.travel, TRAVEL)
-
-
 def test_another_stack_of_a_recording_can_be_named(press):
     other = random_stack("uint16", seed=3)
     put(press, "entry/filtered", other)
@@ -174,13 +113,6 @@ def test_another_stack_of_a_recording_can_be_named(press):
         np.testing.assert_array_equal(read_all(recording, 8)[0], other)
         np.testing.assert_allclose(recording.travel, TRAVEL)
         assert recording.dataset == "/entry/filtered"
-
-
-def test_one_frame_is_read_where_no_room_is_given(press):
-    with io.open_recording(press) as recording:
-        frames = [recording.read().frames for _ in range(8)]
-        assert recording.read() is None
-    assert {frame.shape for frame in frames} == {(1, 5, 7)}
 
 
 def test_frames_are_read_into_the_room_that_is_given(tmp_path):
@@ -202,12 +134,6 @@ def test_frames_in_one_piece_are_lent_instead(press):
         assert block.lent
         assert block.frames.shape == (3, 5, 7)
         assert (room == 255).all()
-
-
-@pytest.mark.parametrize(("shape", "dtype"), [((2, 5, 7), "u2"), ((2, 7, 5), "u1"), ((0, 5, 7), "u1")])
-def test_room_that_does_not_fit_is_refused(press, shape, dtype):
-    with io.open_recording(press) as recording, pytest.raises(ValueError, match="needed is"):
-        recording.read(np.empty(shape, dtype))
 
 
 @pytest.mark.parametrize(("chunk", "sizes"), [(4, [2, 2, 3, 1, 3, 1, 3, 1]), (1, [3, 3, 3, 3, 3, 1])])
@@ -344,29 +270,6 @@ def test_what_an_axial_recording_says_wrongly_is_told(turn):
         io.open_recording(turn)
 
 
-@pytest.mark.parametrize("step", [np.nan, np.inf])
-def test_steps_that_cannot_be_are_told(press, step):
-    with pytest.raises(io.InputError, match=re.escape(f"{press}: the travel given is ")):
-        io.open_recording(press, travel=io.Steps(step))
-
-
-@pytest.mark.parametrize("pixel_size", [(0.0, 1.0), (1.0, -1.0), (np.nan, 1.0), (np.inf, 1.0)])
-def test_pixel_sizes_that_cannot_be_are_told(press, pixel_size):
-    with pytest.raises(io.InputError, match="give --pixel-size, above zero"):
-        io.open_recording(press, pixel_size=pixel_size)
-
-
-def test_references_may_be_unknown_at_some_pixels(press):
-    dark = np.full((5, 7), 16.0)
-    dark[2, 3] = np.nan
-    put(press, f"{DETECTOR}/dark", dark)
-    with io.open_recording(press) as recording:
-        np.testing.assert_array_equal(recording.header.dark, dark)
-    assert io.describe(press)["dark reference"] == "16 counts (median)"
-    put(press, f"{DETECTOR}/dark", np.full((5, 7), np.nan))
-    assert io.describe(press)["dark reference"] == "no pixel known"
-
-
 def test_a_recording_is_described(press):
     assert {name: text for name, text in io.describe(press).items() if name != "start"} == {
         "kind": "recording",
@@ -381,17 +284,6 @@ def test_a_recording_is_described(press):
         "bright reference": "224 counts (median)",
         "truth": "height, zenith, azimuth, contact",
     }
-
-
-def test_the_scale_of_a_rotation_s_brightness_is_described(press, turn):
-    facts = io.describe(turn)
-    assert (facts["zenith gain"], facts["zenith offset"]) == ("50 counts/rad (median)", "none")
-    put(turn, f"{DETECTOR}/zenith_gain", 5.5, "1/deg")
-    put(turn, f"{DETECTOR}/zenith_offset", 20.0)
-    facts = io.describe(turn)
-    gain = f"{np.degrees(5.5):g} counts/rad"
-    assert (facts["zenith gain"], facts["zenith offset"]) == (gain, "20 counts")
-    assert "zenith gain" not in io.describe(press)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
-from stacks import SHAPE, TRAVEL, MadeUp, ball, random_stack, read_all, record
+from stacks import SHAPE, MadeUp, random_stack, read_all, record
 
 from mirrorskin import io
 
@@ -50,14 +50,6 @@ def test_everything_is_cut_alike(tmp_path):
     assert (header.press, header.tilt, header.pixel_size) == (0.7, 0.04, (0.1, 0.2))
 
 
-def test_blocks_say_where_they_begin(tmp_path):
-    with io.open_recording(axial(tmp_path / "a.h5"), region=REGION, frames=(2, None)) as recording:
-        blocks = [recording.read() for _ in range(6)]
-        assert recording.read() is None
-    assert [block.index for block in blocks] == list(range(6))
-    assert {block.origin for block in blocks} == {(1, 2)}
-
-
 def test_the_pivot_stays_where_it_is_on_the_object(tmp_path):
     path = axial(tmp_path / "a.h5", pivot=(0.5, -0.25, 40.0))
     x, y = io.pixel_axes((5, 7), (0.1, 0.2))
@@ -71,14 +63,6 @@ def test_the_pivot_stays_where_it_is_on_the_object(tmp_path):
         np.testing.assert_allclose(recording.header.pivot, (0.5 - 1, -0.25 + 0, 40))
     with io.open_recording(path) as recording:
         assert recording.header.pivot == (0.5, -0.25, 40)
-
-
-def test_the_truth_is_cut(tmp_path):
-    twin = ball(SHAPE[1:], (0.5, 0.6), TRAVEL)
-    path = record(twin, tmp_path / "a.h5", truth=twin.truth)
-    with io.open_recording(path) as whole, io.open_recording(path, region=REGION) as part:
-        for name in ("height", "zenith", "azimuth", "contact"):
-            np.testing.assert_array_equal(getattr(part.truth, name), getattr(whole.truth, name)[PART])
 
 
 def test_other_series_are_cut(tmp_path):
@@ -124,17 +108,3 @@ def test_a_region_outside_the_picture_is_refused(tmp_path, rows, columns, line):
     with pytest.raises(io.InputError, match=line) as caught:
         io.open_recording(path, region=io.Region(rows, columns))
     assert str(caught.value).startswith(str(path))
-
-
-@pytest.mark.parametrize("frames", [(-1, 4), (0, 9), (3, 4), (4, 3), (7, None), (8, None), (0, 1)])
-def test_frames_that_are_not_there_are_refused(tmp_path, frames):
-    path = axial(tmp_path / "a.h5")
-    line = f"{path}: frames {frames[0]} to {frames[1] or 8} of 8: give a start from 0, and an end up to 8"
-    with pytest.raises(io.InputError, match=re.escape(line)):
-        io.open_recording(path, frames=frames)
-
-
-def test_two_frames_of_one_pixel_are_enough(tmp_path):
-    path = axial(tmp_path / "a.h5")
-    with io.open_recording(path, region=io.Region((4, 5), (6, 7)), frames=(6, 8)) as recording:
-        np.testing.assert_array_equal(read_all(recording, 9).frames, random_stack()[6:, 4:, 6:])

@@ -128,27 +128,6 @@ def test_a_rotation_s_result_comes_back_and_its_zenith_is_plotted(path, turns, p
         np.testing.assert_array_equal(group["turn"], range(turns[0]))
 
 
-def test_a_rotation_s_maps_say_their_units(path):
-    io.save_result(a_turn(2, 5, 7), path)
-    with h5py.File(path) as file:
-        maps = file["entry/result"]
-        assert list(maps) == sorted([*PLOTTED, "normals", "turn"])
-        units = {name: node.attrs.get("units") for name, node in maps.items()}
-        assert {name for name, unit in units.items() if unit == "rad"} == {*PLOTTED[:3]}
-        assert {name for name, unit in units.items() if unit == "counts"} == {*PLOTTED[3:8]}
-        assert {name for name, unit in units.items() if unit is None} == {
-            "normals",
-            "edges",
-            "contact",
-            "turn",
-        }
-        # Of pictures viewers are told; a picture of vectors they would take for colours, or for a stack.
-        pictures = {name for name, node in maps.items() if node.attrs.get("interpretation") == "image"}
-        assert pictures == {*PLOTTED}
-        assert {maps[name].dtype.str[1:] for name in ("edges", "contact")} == {"u1"}
-        assert (maps["normals"].shape, maps["normals"].dtype.str[1:]) == ((2, 5, 7, 3), "f4")
-
-
 def pieces(*size):
     """Return what tells of two pieces, of which one is relative, and of filled pixels."""
     component = np.full(size, -1, np.int32)
@@ -179,23 +158,6 @@ def test_pieces_of_a_surface_come_back(path, turns):
     assert plot_of(path)[1].name == "/entry/result/height"
 
 
-def test_a_surface_without_an_answer_comes_back(path):
-    nothing = {"component": np.full((5, 7), -1, np.int32), "offset_unknown": np.empty(0, np.uint8)}
-    result = a_turn(5, 7, **nothing)
-    io.save_result(result, path)
-    assert_same(io.open_result(path), result)
-    assert io.describe(path)["components"] == "0, of which 0 have an unknown offset"
-
-
-def test_pieces_of_a_surface_are_described(path):
-    io.save_result(a_turn(5, 7, **pieces(5, 7)), path)
-    facts = io.describe(path)
-    assert facts["map component"] == "5 x 7 int32"
-    assert facts["filled"] == "1 pixels"
-    assert facts["components"] == "2, of which 1 have an unknown offset"
-    assert "map offset_unknown" not in facts
-
-
 @pytest.mark.parametrize(
     ("name", "value", "line"),
     [
@@ -219,73 +181,6 @@ def test_damaged_pieces_are_one_line(path, name, value, line):
         with pytest.raises(io.InputError, match=line) as caught:
             read(path)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("names", "signal"),
-    [
-        (["azimuth", "mean", "modulation"], "azimuth"),
-        (["mean", "contact"], "mean"),
-        (["normals", "contact"], "contact"),
-    ],
-)
-def test_what_is_plotted_without_a_zenith(path, names, signal):
-    result = a_turn(5, 7, only=names)
-    io.save_result(result, path)
-    assert_same(io.open_result(path), result)
-    assert plot_of(path)[1].name == f"/entry/result/{signal}"
-
-
-def test_heights_are_plotted_before_normals(path):
-    result = a_turn(5, 7, height=a_result().height, **PLACES)
-    io.save_result(result, path)
-    group, signal, _ = plot_of(path)
-    assert signal.name == "/entry/result/height"
-    assert list(group.attrs["auxiliary_signals"]) == PLOTTED
-
-
-@pytest.mark.parametrize("size", [(5, 7), (3, 5, 7)])
-def test_vectors_alone_are_kept_but_not_plotted(path, size):
-    result = a_turn(*size, only=["normals"], **PLACES)
-    io.save_result(result, path)
-    assert_same(io.open_result(path), result)
-    with h5py.File(path) as file:
-        assert "signal" not in file["entry/result"].attrs
-
-
-@pytest.mark.parametrize(
-    ("turns", "name", "value", "line"),
-    [
-        ((), "normals", np.zeros((5, 7)), "/entry/result holds no maps"),
-        ((), "normals", np.zeros((5, 7, 2)), r"normals has shape \(5, 7, 2\) where \(5, 7, 3\) is needed"),
-        ((), "zenith", np.zeros((5, 7, 3)), r"zenith has shape \(5, 7, 3\) where \(5, 7\) is needed"),
-        ((), "azimuth", np.zeros((1, 5, 7)), r"azimuth has shape \(1, 5, 7\) where \(5, 7\) is needed"),
-        ((), "edges", np.zeros(7), r"edges has shape \(7,\) where \(5, 7\) is needed"),
-        ((3,), "contact", np.zeros((5, 7)), r"contact has shape \(5, 7\) where \(3, 5, 7\) is needed"),
-        ((3,), "residual", np.zeros((2, 5, 7)), r"residual has shape \(2, 5, 7\) where \(3, 5, 7\) is"),
-        ((3,), "normals", np.zeros((3, 5, 7, 4)), r"normals has shape \(3, 5, 7, 4\) where \(3, 5, 7, 3\)"),
-        ((3,), "normals", np.zeros((2, 3, 5, 7, 3)), "/entry/result holds no maps"),
-        ((3,), "x", np.zeros(5), r"x has shape \(5,\) where \(7,\) is needed"),
-    ],
-)
-def test_a_damaged_rotation_s_result_is_one_line(path, turns, name, value, line):
-    io.save_result(a_turn(*turns, 5, 7, **PLACES), path)
-    with h5py.File(path, "r+") as file:
-        del file[f"entry/result/{name}"]
-        file[f"entry/result/{name}"] = value
-    for read in (io.open_result, io.describe):
-        with pytest.raises(io.InputError, match=line) as caught:
-            read(path)
-        assert str(caught.value).startswith(str(path))
-        assert str(caught.value).endswith("reconstruct it again")
-
-
-def test_a_rotation_s_result_is_described(path):
-    io.save_result(a_turn(3, 5, 7), path)
-    facts = io.describe(path)
-    assert facts["map normals"] == "3 x 5 x 7 x 3 float32"
-    assert facts["map zenith"] == "3 x 5 x 7 float32"
-    assert facts["map contact"] == "3 x 5 x 7 uint8"
 
 
 def test_parameters_keep_their_types(path):
@@ -357,17 +252,6 @@ def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
             refuse(tmp_path / name)
         assert "\n" not in str(caught.value)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_the_input_is_not_overwritten(tmp_path):
-    original, other = tmp_path / "a.h5", tmp_path / "b.h5"
-    original.touch()
-    (tmp_path / "link.h5").symlink_to("a.h5")
-    for path in (original, tmp_path / "link.h5", tmp_path / "." / "a.h5"):
-        with pytest.raises(io.InputError, match="is the input, or part of it: name another output"):
-            io.check_output(path, other, original)
-    io.check_output(other, original)
-    io.check_output(original, other)
 
 
 def test_what_is_no_result_is_refused(tmp_path, path):

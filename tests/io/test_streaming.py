@@ -21,7 +21,6 @@ from stacks import plot_of, read_all
 
 from mirrorskin import io
 from mirrorskin.io import growing, streaming
-from mirrorskin.io.growing import Reserve
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -69,13 +68,6 @@ def test_frames_of_any_size_in_blocks_of_any_cut_read_back(tmp_path, shape, cuts
     np.testing.assert_array_equal(found.travel, 0.01 * np.arange(20) + 0.001)
 
 
-@pytest.mark.parametrize("announced", [3, 400])
-def test_more_frames_or_fewer_may_come_than_were_expected(tmp_path, announced):
-    stream(Feed(150, (4,), announced=announced), tmp_path / "a.h5")
-    with io.open_recording(tmp_path / "a.h5") as recording:
-        np.testing.assert_array_equal(read_all(recording, 40).frames, frames_of(np.arange(150)))
-
-
 def test_raw_frames_lie_in_one_piece_behind_little_else(tmp_path):
     stream(Feed(3000, (7,), shape=(16, 32)), tmp_path / "a.h5", period=0.001)
     with io.open_recording(tmp_path / "a.h5") as recording:
@@ -113,11 +105,6 @@ def test_blocks_go_by_as_they_came_and_the_recorder_is_a_live_source(tmp_path):
             recorder.rewind()
 
 
-def test_frames_that_are_not_lent_are_copied(tmp_path):
-    stream(Feed(40, (3,), lent=False), tmp_path / "a.h5", period=60)
-    np.testing.assert_array_equal(held(tmp_path / "a.h5")["data"], frames_of(np.arange(40)))
-
-
 def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
     with io.StreamRecorder(Feed(10), tmp_path / "a.h5", period=60) as recorder:
         lent = [weakref.ref(recorder.read().frames) for _ in range(2)]
@@ -141,22 +128,6 @@ def test_marks_reach_frames_that_are_written_and_frames_that_are_yet_to_come(tmp
     np.testing.assert_array_equal(held(tmp_path / "a.h5")["used"], [1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 0])
 
 
-def test_blocks_without_time_and_positions_are_told_when_read(tmp_path):
-    class Blind(Feed):
-        def read(self, out=None, /):
-            block = super().read(out)
-            return block and io.Block(block.frames, block.index, lent=True)
-
-        def positions(self):
-            return {}
-
-    stream(Blind(4), tmp_path / "a.h5")
-    with pytest.raises(io.InputError, match=r"travel is nan at frame 0"):
-        io.open_recording(tmp_path / "a.h5")
-    with io.open_recording(tmp_path / "a.h5", travel=np.arange(4)) as recording:
-        np.testing.assert_array_equal(read_all(recording, 4).frames, frames_of(np.arange(4)))
-
-
 def test_corrected_positions_replace_those_that_are_known(tmp_path):
     class Partly(Feed):
         def positions(self):
@@ -164,16 +135,6 @@ def test_corrected_positions_replace_those_that_are_known(tmp_path):
 
     stream(Partly(5), tmp_path / "a.h5")
     np.testing.assert_array_equal(held(tmp_path / "a.h5")["travel"], [7.0, 0.01, 9.0, 0.03, 0.04])
-
-
-def test_a_source_of_other_frames_than_it_announced_is_a_defect(tmp_path):
-    class Other(Feed):
-        def read(self, out=None, /):
-            return replace(super().read(), frames=np.zeros((1, 5, 8), "u1"))
-
-    with pytest.raises(ValueError, match="and announced"):
-        stream(Other(4), tmp_path / "a.h5")
-    assert not list(tmp_path.iterdir())
 
 
 # What is there before and after.
@@ -201,36 +162,6 @@ def test_a_source_that_cannot_be_entered_leaves_nothing(tmp_path):
     with pytest.raises(io.InputError, match="no such port"):
         stream(Broken(), tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
-
-
-def test_what_is_being_written_is_not_overwritten(tmp_path):
-    path, line = tmp_path / "a.h5", r"a\.h5 is being written by another program: name another output"
-    with io.StreamRecorder(Feed(20), path) as recorder:
-        while not path.exists():
-            recorder.read()
-        second = Feed()
-        with pytest.raises(io.InputError, match=line):
-            stream(second, path)
-        assert not second.entered
-        with pytest.raises(io.InputError, match=line):
-            io.check_output(path)
-    stream(Feed(4), path)
-    with io.open_recording(path):  # who reads a file loses nothing when another takes its name
-        stream(Feed(5), path)
-    assert len(held(path)["data"]) == 5
-
-
-@pytest.mark.parametrize("name", ["no/a.h5", "."])
-def test_a_place_that_cannot_be_written_to_is_refused_before_the_source_is_entered(tmp_path, name):
-    source = Feed()
-    with pytest.raises(io.InputError):
-        stream(source, tmp_path / name)
-    assert not source.entered
-
-
-def test_an_unknown_compression_is_refused(tmp_path):
-    with pytest.raises(io.InputError, match="unknown compression 'zip'"):
-        io.StreamRecorder(Feed(), tmp_path / "a.h5", "zip")
 
 
 # What is left when something fails.
@@ -274,27 +205,6 @@ def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_pat
     with pytest.raises(io.InputError, match="camera"):
         stream(Lost(5, fails=(3, io.InputError("camera"))), tmp_path / "a.h5")
     assert held(tmp_path / "a.h5")["state"] == "cut short: camera"
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
-def test_a_program_that_is_ended_while_positions_are_corrected_keeps_what_was_taken(tmp_path, error):
-    class Late(Feed):
-        def positions(self):
-            raise error
-
-    with pytest.raises(error):
-        stream(Late(5), tmp_path / "a.h5")
-    assert held(tmp_path / "a.h5")["state"].startswith("cut short: ")
-
-
-def test_a_source_that_fails_when_it_is_left_cuts_it_short(tmp_path):
-    class Stuck(Feed):
-        def __exit__(self, *error):
-            raise io.InputError("the stage does not stop")
-
-    with pytest.raises(io.InputError, match="does not stop"):
-        stream(Stuck(5), tmp_path / "a.h5")
-    assert held(tmp_path / "a.h5")["state"] == "cut short: the stage does not stop"
 
 
 def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch):
@@ -373,33 +283,6 @@ except io.InputError as error:
     hold_full(tmp_path / "a.h5", limit)
 
 
-@pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
-def test_whatever_is_packed_a_full_disk_is_met_between_two_writes(tmp_path, monkeypatch, packing):
-    limit, fallocate = 4_000_000, os.posix_fallocate
-
-    def most(descriptor, start, size):
-        if start + size > limit:
-            raise OSError(errno.EFBIG, "full")
-        fallocate(descriptor, start, size)
-
-    monkeypatch.setattr(os, "posix_fallocate", most)
-    with pytest.raises(io.InputError, match=FULL):
-        stream(Feed(10**6, (5,), shape=(100, 300), announced=200), tmp_path / "a.h5", packing, period=0.01)
-    hold_full(tmp_path / "a.h5", limit)
-
-
-def test_a_disk_that_is_full_from_the_first_frame_on_leaves_the_older_file(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "full")
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    (tmp_path / "a.h5").write_bytes(b"older")
-    with pytest.raises(io.InputError, match=r"a\.h5: the disk is full \(No space left on device\)"):
-        stream(Feed(100), tmp_path / "a.h5")
-    assert (tmp_path / "a.h5").read_bytes() == b"older"
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def test_a_disk_that_promises_nothing_is_believed(tmp_path, monkeypatch):
     def unable(*_):
         raise OSError(errno.EOPNOTSUPP, "unable")
@@ -426,40 +309,3 @@ def test_a_block_that_was_written_in_part_is_left_out(tmp_path):
     assert found.pop("state").startswith("cut short: ")
     assert {len(values) for values in found.values()} == {6}
     np.testing.assert_array_equal(found["data"], frames_of(np.arange(6)))
-
-
-def test_the_last_bytes_of_a_disk_are_used_and_lost_ones_are_asked_for_again(tmp_path, monkeypatch):
-    asked, left = [], 1000
-
-    def most(_, start, size):
-        asked.append((start, size))
-        if start + size > left:
-            raise OSError(errno.ENOSPC, "full")
-        os.ftruncate(file.fileno(), start + size)
-
-    monkeypatch.setattr(os, "posix_fallocate", most)
-    with (tmp_path / "a").open("wb") as file:
-        reserve = Reserve(tmp_path / "a", file.fileno(), 400)
-        reserve.hold(100)
-        reserve.hold(500)
-        reserve.hold(800)
-        assert asked == [(0, 500), (500, 700), (500, 300)]
-        file.truncate(700)
-        asked.clear()
-        reserve.hold(750)
-        assert asked == [(700, 450), (700, 50)]
-        with pytest.raises(io.InputError, match="the disk is full"):
-            reserve.hold(1001)
-    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(errno.EIO, "dead")))
-    with (tmp_path / "a").open("wb") as file, pytest.raises(OSError, match="dead"):
-        Reserve(tmp_path / "a", file.fileno(), 400).hold(1)
-
-
-def test_where_there_are_no_locks_it_is_written_all_the_same(tmp_path, monkeypatch):
-    def without(*_):
-        raise OSError(errno.ENOLCK, "no locks here")
-
-    monkeypatch.setattr("mirrorskin.io.atomic.fcntl.flock", without)
-    for count in (4, 5):
-        stream(Feed(count), tmp_path / "a.h5")
-        assert len(held(tmp_path / "a.h5")["data"]) == count

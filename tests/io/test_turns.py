@@ -66,8 +66,3 @@ def test_a_turn_that_is_not_there_is_one_line(size, turn, line):
     with pytest.raises(io.InputError, match=line) as caught:
         io.select_turn(a_result(*size), turn)
     assert "\n" not in str(caught.value)
-
-
-def test_a_result_without_maps_passes():
-    empty = io.Result()
-    assert io.select_turn(empty, None) is empty

@@ -115,13 +115,6 @@ def growing(path, frames, **given):
     return path
 
 
-@pytest.mark.parametrize("frames", [0, 1])
-def test_fewer_frames_than_two_are_told(tmp_path, frames):
-    path = growing(tmp_path / "a.h5", frames)
-    with pytest.raises(io.InputError, match=rf"a\.h5: {DETECTOR}/data holds {frames} frames: at least 2 are"):
-        io.open_recording(path)
-
-
 @pytest.mark.parametrize("shorter", ["data", "frame_time", "used", "dropped", "travel_live"])
 def test_what_is_short_of_something_is_left_out(tmp_path, shorter):
     path = growing(tmp_path / "a.h5", 9)
@@ -134,55 +127,6 @@ def test_what_is_short_of_something_is_left_out(tmp_path, shorter):
         assert recording.state == "cut short: its writer was killed"
     with pytest.raises(io.InputError, match="frames 2 to 7 of 6"):
         io.open_recording(path, frames=(2, 7))
-
-
-def test_frames_that_have_room_but_are_yet_to_be_written_are_not_read(tmp_path):
-    path = growing(tmp_path / "a.h5", 5)
-    with h5py.File(path, "r+") as file:
-        file[f"{DETECTOR}/data"].resize(8, axis=0)
-    with io.open_recording(path) as recording:
-        assert hold(recording) == 5
-
-
-def test_a_file_of_ours_that_did_not_grow_may_not_miss_anything(tmp_path):
-    stream(Feed(9), tmp_path / "a.h5")
-    with h5py.File(tmp_path / "a.h5", "r+") as file:
-        file[f"{STAGE}/travel"].resize(6, axis=0)
-        del file["/entry/state"]
-    with pytest.raises(io.InputError, match=r"travel has shape \(6,\) where \(9,\) is needed"):
-        io.open_recording(tmp_path / "a.h5")
-
-
-def test_others_grow_files_too(tmp_path):
-    path, frames = tmp_path / "theirs.h5", frames_of(np.arange(5))
-    with h5py.File(path, "w", libver="latest") as file:
-        file.create_dataset("x", data=frames, chunks=(1, *SHAPE), maxshape=(None, *SHAPE))
-        file.swmr_mode = True
-        file.flush()
-        (tmp_path / "left.h5").write_bytes(path.read_bytes())  # as if its writer had been killed now
-    with io.open_recording(tmp_path / "left.h5", motion="vertical", travel=io.Steps(0.1)) as recording:
-        np.testing.assert_array_equal(read_all(recording, 2).frames, frames)
-        assert recording.state == "complete"
-        first = recording.fingerprint()
-    with h5py.File(path, "r+") as file:
-        file["x"][4, 0, 0] ^= 1
-    with io.open_recording(path, motion="vertical", travel=io.Steps(0.1)) as recording:
-        assert recording.fingerprint() != first
-
-
-def test_a_process_may_look_at_what_it_writes(tmp_path):
-    path = tmp_path / "a.h5"
-    with io.StreamRecorder(Feed(20), path, period=0.001) as recorder:
-        while not path.exists() or recorder.count < 10:
-            recorder.read()
-        with opened(path) as recording:
-            assert recording.state == "under way"
-            frames = read_all(recording, 3).frames
-            np.testing.assert_array_equal(frames, frames_of(np.arange(len(frames))))
-        while recorder.read() is not None:
-            pass
-    with io.open_recording(path) as recording:
-        assert (recording.state, recording.shape[0]) == ("complete", 20)
 
 
 def test_info_tells_how_it_was_taken(tmp_path):

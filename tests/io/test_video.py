@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.io import Header, InputError, Source, Steps, open_frames
+from mirrorskin.io import Header, InputError, Source
 from mirrorskin.io.video import Video, _times
 
 HEADER = Header("axial", tilt=0.04)
@@ -103,14 +103,6 @@ def test_blocks_of_any_size_give_the_same_frames(video, size):
     assert {b.dropped for b in blocks} == {0}
 
 
-def test_the_frames_of_a_block_are_a_view_of_the_callers_buffer(exact):
-    room = np.full((COUNT + 2, *SHAPE), 99, np.uint8)
-    block = Video(exact, HEADER).read(room)
-    assert block.frames.base is room
-    assert len(block.frames) == COUNT
-    assert np.all(room[COUNT:] == 99)
-
-
 @pytest.mark.parametrize("read_before", [1, 3, COUNT])
 def test_a_video_can_be_rewound_anywhere(video, read_before):
     with Video(video, HEADER) as source:
@@ -123,22 +115,6 @@ def test_a_video_can_be_rewound_anywhere(video, read_before):
     assert blocks[0].index == 0
     assert len(first) == COUNT
     np.testing.assert_array_equal(again, first)
-
-
-@pytest.mark.parametrize(
-    "room",
-    [np.empty((2, 64, 48), np.uint8), np.empty((2, *SHAPE), np.uint16), np.empty((0, *SHAPE), np.uint8)],
-)
-def test_a_buffer_that_does_not_fit_is_refused(exact, room):
-    with pytest.raises(ValueError, match="needed is"):
-        Video(exact, HEADER).read(room)
-
-
-@pytest.mark.parametrize("name", ["travel", "phase"])
-@pytest.mark.parametrize("values", [[0.1], np.arange(COUNT + 1), np.full(COUNT, np.nan)])
-def test_positions_that_do_not_fit_are_refused(exact, name, values):
-    with pytest.raises(InputError, match=f"{exact}: {name} "):
-        Video(exact, HEADER, **{name: values})
 
 
 @pytest.mark.parametrize("declared", [0, 3])
@@ -181,18 +157,6 @@ def test_what_is_no_video_is_refused(tmp_path, content):
         Video(file, HEADER)
 
 
-def test_a_video_without_frames_is_refused(tmp_path):
-    video = encode(tmp_path / "empty.avi", "MJPG", count=0)
-    with pytest.raises(InputError, match=rf"{video} has no frames"):
-        Video(video, HEADER)
-
-
-@pytest.mark.parametrize("name", ["none.avi", "."])
-def test_a_path_that_is_no_file_is_refused(tmp_path, name):
-    with pytest.raises(InputError, match="no such file"):
-        Video(tmp_path / name, HEADER)
-
-
 def test_samples_of_16_bits_are_not_cut_down(tmp_path):
     parameters = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
     pictures = [frame(k).astype(np.uint16) * 257 for k in range(3)]
@@ -212,14 +176,6 @@ def test_a_rotation_that_the_file_asks_for_is_applied(tmp_path):
     np.testing.assert_array_equal(drain(source)[0], np.rot90(upright, -1, axes=(1, 2)))
 
 
-def test_a_file_that_changes_under_the_reader_is_noticed(exact):
-    source = Video(exact, HEADER)
-    encode(exact, "FFV1", count=COUNT - 2)
-    source.rewind()
-    with pytest.raises(InputError, match=f"{exact}: frame {COUNT - 2} cannot be decoded"):
-        drain(source)
-
-
 @pytest.mark.parametrize(
     ("stamps", "rate", "expected"),
     [
@@ -233,18 +189,6 @@ def test_a_file_that_changes_under_the_reader_is_noticed(exact):
 )
 def test_times_are_the_files_where_they_increase_else_the_rates(stamps, rate, expected):
     np.testing.assert_allclose(_times(np.array(stamps), rate), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf])
-def test_without_times_and_rate_there_is_no_time(rate):
-    assert _times(np.zeros(3), rate) is None
-
-
-def test_open_frames_takes_other_files_as_videos(video):
-    source = open_frames(str(video), HEADER, phase=Steps(0.5, 1.0))
-    assert isinstance(source, Video)
-    assert source.left_out == ()
-    np.testing.assert_array_equal(drain(source, COUNT)[1][0].phase, 1 + 0.5 * np.arange(COUNT))
 
 
 def test_decoders_print_nothing_and_the_environment_stays(video):

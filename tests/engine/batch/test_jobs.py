@@ -37,11 +37,6 @@ def test_recordings_that_differ_in_their_ending_keep_it():
     ]
 
 
-def test_jobs_keep_the_order_of_the_recordings():
-    words = ["b.h5", "a/x.h5", "c.h5", "b/x.h5"]
-    assert [str(job.source) for job in make_jobs(map(Path, words), Path("out"))] == words
-
-
 def test_a_result_that_is_a_recording_of_the_batch_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(io.InputError, match=r"x-result\.h5 is one of the recordings"):
@@ -55,7 +50,3 @@ def test_a_result_that_is_a_recording_of_the_batch_is_refused(tmp_path, monkeypa
 def test_two_recordings_with_one_result_are_refused():
     with pytest.raises(io.InputError, match=r"x\.h5-result\.h5 would be the result of two"):
         make_jobs([Path("x.h5"), Path("x.nxs"), Path("x.h5.h5")], Path("out"))
-
-
-def test_no_recordings_make_no_jobs():
-    assert make_jobs([], Path("out")) == []

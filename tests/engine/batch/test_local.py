@@ -9,10 +9,10 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from batches import BAD, half_written, press
+from batches import half_written, press
 
 from mirrorskin import io
-from mirrorskin.engine.batch import local, work
+from mirrorskin.engine.batch import local
 from mirrorskin.engine.batch.jobs import Plan, make_jobs
 from mirrorskin.engine.batch.local import default_devices, run_local
 from mirrorskin.kernels import device as device_layer
@@ -36,15 +36,6 @@ def test_all_jobs_are_done(jobs, device):
     assert {one.state for one in run_local(jobs, Plan(), [device])} == {"kept"}
 
 
-def test_bad_recordings_do_not_stop_the_rest(tmp_path, jobs, device):
-    bad = make_jobs([make(tmp_path / f"{make.__name__}.h5") for make in BAD], tmp_path / "out")
-    mixed = [job for pair in zip(bad, jobs, strict=False) for job in pair] + bad[len(jobs) :]
-    outcomes = list(run_local(mixed, Plan(), [device]))
-    assert {one.job for one in outcomes if one.state == "failed"} == set(bad)
-    assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {job.target.name for job in jobs}
-
-
 def test_several_devices_work_at_the_same_time(jobs):
     devices = [Device(device_layer._find()[0]) for _ in range(2)]
     met = threading.Barrier(2)
@@ -59,12 +50,6 @@ def test_several_devices_work_at_the_same_time(jobs):
     assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
     assert len(set(threads.values())) == 2
     assert all(one.profile.records() for one in devices)
-
-
-def test_progress_is_told_job_by_job(jobs, device):
-    told = []
-    list(run_local(jobs[:2], Plan(), [device], lambda *words: told.append(words)))
-    assert told == [(jobs[0], 0), (jobs[0], 8), (jobs[1], 0), (jobs[1], 8)]
 
 
 def test_leaving_early_ends_the_batch(jobs, device):
@@ -92,23 +77,6 @@ def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, dev
     assert [path.name for path in jobs[0].target.parent.iterdir()] == [jobs[0].target.name]
     states = [one.state for one in run_local(jobs, Plan(memory_limit=4 * 5 * 7), [device])]
     assert states == ["kept", "done", "done", "done"]
-
-
-def test_what_ends_the_program_reaches_it(jobs, device, monkeypatch):
-    def end(*_, **__):
-        raise SystemExit(7)
-
-    monkeypatch.setattr(work, "reconstruct", end)
-    with pytest.raises(SystemExit, match="7"):
-        list(run_local(jobs, Plan(), [device]))
-
-
-def test_no_jobs_are_no_batch(device):
-    assert not list(run_local([], Plan(), [device]))
-
-
-def test_the_default_is_the_default_device(device):
-    assert (default_devices() == [device]) == (device.info.kind != "gpu")
 
 
 def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):

@@ -1,7 +1,6 @@
 """A plan's key changes with what changes results, and with nothing else."""
 
 import json
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -65,15 +64,3 @@ def test_a_key_is_json_that_tells_defaults_too():
     assert told["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}
     assert (told["press"]["dark"], told["press"]["threshold"]) == (2.0, 0.5)
     assert "memory_limit" not in told["press"]
-
-
-def test_a_plan_goes_to_other_processes():
-    plan = Plan({"travel": io.Steps(0.1)}, {"hold": 3}, {"tilt": "estimate"}, 5)
-    assert pickle.loads(pickle.dumps(plan)) == plan
-
-
-def test_each_motion_gets_its_own_options():
-    plan = Plan(press={"hold": 3}, rotation={"robust": True}, memory_limit=7)
-    assert plan.options("vertical") == {"hold": 3, "memory_limit": 7}
-    assert plan.options("axial") == {"robust": True, "memory_limit": 7}
-    assert plan.options("twist") == {"memory_limit": 7}

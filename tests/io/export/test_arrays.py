@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,10 +34,3 @@ def test_arrays_need_neither_heights_nor_places(tmp_path, shape):
         assert set(file) == {"zenith", "units", "process"}
         assert json.loads(str(file["units"])) == {"zenith": "rad"}
         assert json.loads(str(file["process"])) == {"threshold": 0.5, "subframe": True}
-
-
-def test_the_unit_of_a_wave_is_told(slope, tmp_path):
-    path = tmp_path / "out.npz"
-    io.export_result(replace(slope, modulation=slope.height), path)
-    with np.load(path, allow_pickle=False) as file:
-        assert json.loads(str(file["units"]))["modulation"] == "counts"

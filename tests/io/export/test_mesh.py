@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
@@ -72,14 +70,6 @@ def test_three_of_a_cell_are_one_triangle(missing, hole):
     assert areas_from_above(mesh) == pytest.approx(0.5 * 0.25 / 2)
 
 
-@pytest.mark.parametrize("known", list(combinations(range(4), 2)))
-def test_two_of_a_cell_are_no_surface(known):
-    height = np.full(4, np.nan)
-    height[list(known)] = 1
-    mesh = io.surface_mesh(height.reshape(2, 2), X[:2], Y[:2])
-    assert (mesh.vertices.shape, mesh.faces.shape, mesh.pixels.shape) == ((0, 3), (0, 3), (0,))
-
-
 @pytest.mark.parametrize("pieces_too", [False, True])
 def test_holes_and_pieces_stay_apart_and_all_else_is_covered(pieces_too):
     rng = np.random.default_rng(3)
@@ -108,13 +98,3 @@ def test_holes_and_pieces_stay_apart_and_all_else_is_covered(pieces_too):
         assert len(found) == expected
         np.testing.assert_array_equal(mesh.pixels, sorted(set().union(*found)))
     assert several == pieces_too
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 10), (7, 1), (0, 0)])
-def test_a_single_row_or_column_is_no_surface(shape):
-    mesh = io.surface_mesh(np.zeros(shape), X[: shape[1]], Y[: shape[0]])
-    assert (mesh.vertices.shape, mesh.faces.shape, mesh.pixels.shape) == ((0, 3), (0, 3), (0,))
-
-
-def test_nothing_known_is_no_surface():
-    assert not io.surface_mesh(np.full((7, 10), np.nan), X, Y).faces.size

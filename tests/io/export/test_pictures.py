@@ -93,13 +93,6 @@ def test_a_tiff_tells_imagej_and_gdal_what_they_ask_for(slope, tmp_path):
     assert told["date"] == "2026-01-02T03:04:05+00:00"
 
 
-def test_a_path_of_windows_is_no_escape_to_imagej(slope, tmp_path):
-    path = tmp_path / "out.tif"
-    io.export_result(replace(slope, process={"source": r"C:\users\me.h5"}), path)
-    with tifffile.TiffFile(path) as file:
-        assert r"source=C:\\users\\me.h5" in file.pages[0].description.splitlines()
-
-
 def test_a_png_tells_gwyddion_what_it_asks_for(slope, tmp_path):
     path = tmp_path / "out.png"
     # Of a part of the picture, so that the middle of it is not the origin.
@@ -146,22 +139,3 @@ def test_heights_that_are_all_one_come_back(tmp_path, suffix):
     offset, step = scale_of(path)
     assert counts[0, 0] == 0
     np.testing.assert_allclose(offset + step * np.delete(counts.ravel(), 0), -1.25, atol=1e-12)
-
-
-@pytest.mark.parametrize("shape", [(1, 4), (4, 1)])
-@pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_pixels_in_a_single_row_are_as_high_as_wide(tmp_path, shape, suffix):
-    path = tmp_path / f"out.{suffix}"
-    x, y = io.pixel_axes(shape, (0.5, 0.5))
-    io.export_result(io.Result(height=np.arange(4, dtype=np.float32).reshape(shape), x=x, y=y), path)
-    with Image.open(path) as picture:
-        assert picture.info["dpi"] == pytest.approx((50.8, 50.8))
-        assert picture.size == shape[::-1]
-
-
-def test_a_single_pixel_has_no_size_that_is_known(tmp_path):
-    x, y = io.pixel_axes((1, 1), (0.5, 0.5))
-    path = tmp_path / "out.png"
-    with pytest.raises(io.InputError, match=r"out.png: a result of one pixel does not tell how large"):
-        io.export_result(io.Result(height=np.zeros((1, 1), np.float32), x=x, y=y), path)
-    assert not path.exists()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -21,14 +19,6 @@ def test_a_ply_of_points_has_no_triangles(slope, tmp_path):
     np.testing.assert_allclose(cloud.bounds[:, :2], [[-2, -0.625], [2, 0.625]])
     np.testing.assert_array_equal(cloud.vertices[:, 2], slope.height[np.isfinite(slope.height)])
     assert b"element face" not in path.read_bytes()
-
-
-def test_points_that_are_in_no_triangle_are_points_all_the_same(slope, tmp_path):
-    height = np.full((6, 9), np.nan, np.float32)
-    height[::2, ::2] = 1
-    alone = replace(slope, height=height)
-    assert io.export_result(alone, tmp_path / "out.ply", points=True) == "15 points"
-    assert io.export_result(alone, tmp_path / "out.xyz") == "15 points"
 
 
 def test_text_is_one_line_a_point_and_names_its_columns(slope, tmp_path):

@@ -67,10 +67,6 @@ def test_a_package_that_is_missing_is_named(slope, tmp_path, monkeypatch):
     assert io.export_result(slope, tmp_path / "out.ply")
 
 
-def test_a_table_takes_a_cross_section(slope, tmp_path):
-    assert "none is given" in refused(slope, tmp_path / "out.csv")
-
-
 @pytest.mark.parametrize("name", ["ply", "stl", "xyz", "png", "tif", "npz", "csv"])
 def test_a_file_that_cannot_be_written_is_one_line(slope, tmp_path, name):
     section = {"distance": np.zeros(2), "height": np.zeros(2)}
@@ -88,14 +84,4 @@ def test_a_full_disk_is_one_line_and_leaves_the_older_file(slope, tmp_path, monk
         patched.setattr("os.fdopen", lambda *given, **options: Full())
         assert " could not be written: No space left on device; make room" in refused(slope, path)
     assert path.read_text() == "older"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_an_older_file_stays_if_a_new_one_cannot_be_made(slope, tmp_path):
-    path = tmp_path / "out.ply"
-    path.write_text("older")
-    refused(replace(slope, component=np.arange(54, dtype=np.int32).reshape(6, 9)), path)
-    assert path.read_text() == "older"
-    io.export_result(slope, path)
-    assert path.read_bytes().startswith(b"ply\n")
     assert list(tmp_path.iterdir()) == [path]

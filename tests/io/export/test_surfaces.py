@@ -39,14 +39,6 @@ def test_a_surface_has_its_size_in_millimetres(slope, path):
     assert len(mesh.faces) == 76
 
 
-def test_a_surface_is_the_right_way_round(slope, path):
-    io.export_result(slope, path)
-    mesh = opened(path)
-    x, y, _ = mesh.vertices[np.argmax(mesh.vertices[:, 2])]
-    assert (x, y) == (1, 0.375)  # right of the middle and above it
-    assert (mesh.face_normals[:, 2] > 0).all()
-
-
 def test_a_plane_faces_where_it_should(path):
     x, y = io.pixel_axes((5, 4), (0.5, 0.25))
     io.export_result(io.Result(height=(0.2 * x - 0.7 * y[:, None]).astype(np.float32), x=x, y=y), path)
@@ -93,13 +85,6 @@ def test_a_ply_tells_what_is_known_of_each_vertex(slope, tmp_path):
     np.testing.assert_allclose(mesh.vertex_normals[0], slope.normals[0, 1], atol=1e-6)
 
 
-def test_a_ply_of_heights_alone_has_places_alone(slope, tmp_path):
-    path = tmp_path / "out.ply"
-    io.export_result(io.Result(height=slope.height, x=slope.x, y=slope.y), path)
-    assert properties_of(opened(path)).dtype.names == ("x", "y", "z")
-    assert head_of(path)[2:4] == ["comment unit: mm", "comment heights: from the sheet at rest"]
-
-
 def test_a_ply_says_its_unit_and_its_origin_in_ascii(slope, tmp_path):
     path = tmp_path / "out.ply"
     io.export_result(slope, path)
@@ -113,20 +98,6 @@ def test_a_ply_says_its_unit_and_its_origin_in_ascii(slope, tmp_path):
         "filled: 1 of 53 heights were not measured but filled",
         "normals: of the result where it has them, elsewhere of the triangles around",
     ]
-
-
-def test_a_source_of_two_lines_is_one_comment(slope, tmp_path):
-    path = tmp_path / "out.ply"
-    io.export_result(replace(slope, process={"source": "a\nelement vertex 5\n"}), path)
-    assert "comment source: a element vertex 5" in head_of(path)
-    assert len(opened(path).vertices) == 53
-
-
-@pytest.mark.parametrize("suffix", ["ply", "stl", "xyz", "png", "tif", "npz"])
-def test_a_source_that_is_no_text_does_no_harm(slope, tmp_path, suffix):
-    # As Python names a file of bytes that are no UTF-8.
-    odd = replace(slope, process={"source": "a\udcff.h5"})
-    assert io.export_result(odd, tmp_path / f"out.{suffix}")
 
 
 def test_an_stl_says_its_unit_and_does_not_pass_for_text(slope, tmp_path):
@@ -146,10 +117,3 @@ def test_relative_heights_are_told(slope, tmp_path, suffix):
     section = {"distance": np.arange(3.0), "height": np.arange(3.0)}
     told = io.export_result(relative, tmp_path / f"out.{suffix}", section=section)
     assert told.endswith(", heights relative: the mean of a piece is 0")
-
-
-def test_only_the_pieces_that_are_relative_are_said_to_be(slope, tmp_path):
-    component = np.where(np.isnan(slope.height), -1, np.arange(9) // 3).astype(np.int32)
-    some = replace(slope, component=component, offset_unknown=np.array([0, 1, 0], np.uint8))
-    told = io.export_result(some, tmp_path / "out.ply")
-    assert told.endswith(", heights relative in 1 of 3 pieces: the mean of a piece is 0")

@@ -52,23 +52,6 @@ def test_a_table_comes_back_in_full(path):
     np.testing.assert_array_equal(again, found)
 
 
-def test_a_name_with_a_comma_is_one_cell(path):
-    io.save_table(path, {'a, "b"': np.arange(2)}, {}, {})
-    with path.open(encoding="utf-8", newline="") as file:
-        assert list(csv.reader(file)) == [['a, "b"'], ["0"], ["1"]]
-
-
-def test_no_rows_are_a_head(path):
-    io.save_table(path, {"distance": np.zeros(0)}, {"distance": "mm"}, {})
-    assert path.read_text(encoding="utf-8") == "distance [mm]\n"
-
-
-def test_columns_of_unlike_lengths_leave_nothing_behind(path):
-    with pytest.raises(ValueError, match="zip"):
-        io.save_table(path, {"a": np.zeros(2), "b": np.zeros(3)}, {}, {})
-    assert not list(path.parent.iterdir())
-
-
 def test_a_cross_section_of_a_result_has_its_units_and_origin(slope, path):
     told = io.export_result(slope, path, section=COLUMNS)
     assert told == "3 points of a cross-section"

@@ -36,14 +36,6 @@ def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
         assert how == "mapped"
 
 
-def test_lent_frames_cannot_be_written_to(path):
-    with io.open_recording(path, **GIVEN) as recording:
-        block = recording.read()
-        assert block.lent
-        with pytest.raises(ValueError, match="read-only"):
-            block.frames[...] = 0
-
-
 def test_lent_frames_outlive_their_recording(path):
     frames = compressible(SHAPE, "u2")
     with io.open_recording(path, **GIVEN) as recording:
@@ -65,17 +57,6 @@ def test_pages_go_with_the_last_frame(path):
     assert maps() == 1
     del frames
     assert maps() == 0
-
-
-def test_a_region_or_a_range_is_cut_out(path):
-    for region in (None, Region((0, 50), (0, 70)), Region((3, 4), (0, 70)), Region((0, 50), (69, 70))):
-        for frames in ((0, None), (2, 4), (5, 9)):
-            found, _ = ours(path, 2, region=region, frames=frames)
-            np.testing.assert_array_equal(found, theirs(path, frames, region))
-    with io.open_recording(path, **GIVEN, region=Region((0, 50), (0, 69))) as recording:
-        assert not recording.read().lent
-    with io.open_recording(path, **GIVEN, frames=(4, None)) as recording:
-        assert recording.read().lent
 
 
 @pytest.mark.parametrize("spare", [0, 1, PADDING - 1, PADDING, PADDING + 1, mmap.PAGESIZE - 1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import itertools
 import zlib
 from pathlib import Path
@@ -67,16 +66,6 @@ def test_what_we_cannot_unpack_goes_through_hdf5(tmp_path, packing):
     assert how.startswith("through HDF5 (")
 
 
-@pytest.mark.parametrize("dtype", [">u2", ">f4"])
-@pytest.mark.parametrize("chunks", [None, (1, 13, 17), (4, 5, 6)])
-def test_the_other_byte_order_goes_through_hdf5(tmp_path, dtype, chunks):
-    path = write(tmp_path / "a.h5", compressible(SHAPE, dtype[1:]).astype(dtype), chunks)
-    for room in (1, 3, 11):
-        frames, how = ours(path, room)
-        np.testing.assert_array_equal(frames, theirs(path))
-        assert how in ("through HDF5 (byte order)", "unpacked into memory")
-
-
 @pytest.mark.parametrize("left_out", [0, 1, 2, 3])
 def test_chunks_may_have_been_left_out_by_filters(tmp_path, left_out):
     frames = compressible(SHAPE, "u2")
@@ -113,15 +102,6 @@ def test_chunks_at_the_edge_may_be_raw(tmp_path, packing):
     assert how == "through HDF5 (raw chunks at the edge)"
 
 
-def test_a_user_block_goes_through_hdf5(tmp_path):
-    frames = compressible(SHAPE, "u1")
-    with h5py.File(tmp_path / "a.h5", "w", userblock_size=1024) as file:
-        file.create_dataset("x", data=frames, chunks=(1, 13, 17), compression="gzip")
-    found, how = ours(tmp_path / "a.h5", 3)
-    np.testing.assert_array_equal(found, frames)
-    assert how == "through HDF5 (user block)"
-
-
 @pytest.mark.parametrize("libver", ["earliest", "latest"])
 @pytest.mark.parametrize("maxshape", [SHAPE, (None, 13, 17), (None, None, 17)])
 def test_every_kind_of_index_is_read(tmp_path, libver, maxshape):
@@ -132,14 +112,6 @@ def test_every_kind_of_index_is_read(tmp_path, libver, maxshape):
                 "x", data=frames, chunks=(*chunks[:2], 17), maxshape=maxshape, compression="lzf"
             )
         np.testing.assert_array_equal(ours(tmp_path / "a.h5", 4)[0], frames)
-
-
-@pytest.mark.parametrize("threads", [1, 2, 7])
-def test_more_threads_give_the_same(tmp_path, threads):
-    path = write(tmp_path / "a.h5", compressible((40, 30, 31), "u2"), (2, 7, 8), PACKINGS["bitshuffle"])
-    frames, how = ours(path, 16, threads=threads)
-    np.testing.assert_array_equal(frames, theirs(path))
-    assert how == f"chunks decoded by {'one thread' if threads == 1 else f'{threads} threads'}"
 
 
 @st.composite
@@ -199,18 +171,6 @@ def test_damage_is_told_with_the_frames(tmp_path):
             ours(path, 9, region=region)
 
 
-def test_chunks_that_are_not_in_the_file_are_told(tmp_path):
-    path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
-    data = path.read_bytes()
-    with h5py.File(path) as file:
-        chunk = file["x"].id.get_chunk_info(8)
-    where = chunk.byte_offset.to_bytes(8, "little")
-    assert data.count(where) == 1
-    path.write_bytes(data.replace(where, (len(data) - 1).to_bytes(8, "little")))
-    with pytest.raises(io.InputError, match=r"a\.h5: /x: it is truncated: copy it again"):
-        ours(path, 9)
-
-
 def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
     path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
     with io.open_recording(path, motion="horizontal") as recording:
@@ -241,46 +201,3 @@ def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
         out[:] = 0
         assert not out.any()
     assert not out.any()
-
-
-@pytest.mark.parametrize("chunks", [None, (1, 13, 17), (4, 13, 17)])
-def test_closing_twice_does_no_harm(tmp_path, chunks):
-    path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"), chunks, chunks and PACKINGS["bitshuffle"])
-    with io.open_recording(path, motion="horizontal") as recording:
-        recording.read(np.empty((3, 13, 17), "u1"))
-        recording.close()
-        others = [path.open("rb") for _ in range(3)]
-        recording.close()
-        assert all(other.read(4) == b"\x89HDF" for other in others)
-        with pytest.raises(io.InputError, match=r"frames? .* cannot be read"):
-            recording.read(np.empty((11, 13, 17), "u1"))
-    for other in others:
-        other.close()
-
-
-def test_what_is_dropped_is_closed(tmp_path):
-    path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"), (1, 13, 17), PACKINGS["bitshuffle"])
-    count = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(5):
-        recording = io.open_recording(path, motion="horizontal", threads=2)
-        recording.read(np.empty((3, 13, 17), "u1"))
-    del recording
-    gc.collect()
-    assert len(list(Path("/proc/self/fd").iterdir())) <= count + 1
-
-
-@pytest.mark.parametrize("second", ["deflate", "lzf"])
-def test_what_is_packed_twice_goes_through_hdf5(tmp_path, second):
-    frames, made = compressible(SHAPE, "u2"), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    made.set_chunk((1, 13, 17))
-    made.set_deflate(1)
-    if second == "lzf":
-        made.set_filter(h5py.h5z.FILTER_LZF, h5py.h5z.FLAG_OPTIONAL)
-    else:
-        made.set_shuffle()
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        space = h5py.h5s.create_simple(SHAPE)
-        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, made))[...] = frames
-    found, how = ours(tmp_path / "a.h5", 3)
-    np.testing.assert_array_equal(found, frames)
-    assert how == "through HDF5 (packed twice)"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gc
-import logging
-import tempfile
 
 import h5py
 import numpy as np
@@ -36,14 +34,6 @@ def test_long_chunks_are_unpacked_once(tmp_path, monkeypatch, chunks, packing, l
         chunk = 2 * int(np.prod(chunks))
         threads = 1 if packing == "blosc2" or limit < 8 * chunk else 2
         assert how == ("unpacked into memory" if kept + threads * chunk <= limit else "unpacked to disk")
-
-
-def test_raw_chunks_are_never_kept(tmp_path):
-    for chunks in ((8, 13, 17), (24, 4, 4)):
-        path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"), chunks)
-        frames, how = ours(path, 3, threads=1)
-        np.testing.assert_array_equal(frames, theirs(path))
-        assert how == "chunks read by one thread"
 
 
 @pytest.mark.parametrize("limit", [60 * FRAME, 8 * FRAME])
@@ -80,33 +70,6 @@ def test_whole_chunks_go_where_they_are_wanted(tmp_path):
             sizes.append(len(block.frames))
         assert sizes == [16, 8]
         assert recording.how == "chunks decoded by 2 threads"
-
-
-def test_a_second_look_gives_the_same(tmp_path):
-    for limit in (60 * FRAME, 8 * FRAME):
-        path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"), (8, 13, 17), BITSHUFFLE)
-        with io.open_recording(path, **GIVEN, memory_limit=limit) as recording:
-            out = np.empty((5, 13, 17), "u2")
-            for _ in range(2):
-                found = []
-                while (block := recording.read(out)) is not None:
-                    found.append(block.frames.copy())
-                np.testing.assert_array_equal(np.concatenate(found), theirs(path))
-                recording.rewind()
-            recording.read(out[:2])
-            recording.rewind()
-            np.testing.assert_array_equal(recording.read(out).frames, theirs(path)[:5])
-
-
-@pytest.mark.parametrize("limit", [60 * FRAME, 8 * FRAME])
-def test_it_is_told_in_the_log(tmp_path, caplog, limit):
-    path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"), (8, 13, 17), BITSHUFFLE)
-    with caplog.at_level(logging.INFO, "mirrorskin.io"):
-        ours(path, 3, memory_limit=limit)
-    [line] = [record.getMessage() for record in caplog.records]
-    where = f"disk: 1.06e-05 GB in {tempfile.gettempdir()}" if limit == 8 * FRAME else "memory"
-    told = "chunks of /x hold 8 frames each, more than are read at a time: unpacked to"
-    assert line == f"{path}: {told} {where}"
 
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):
