@@ -1,3 +1,4 @@
+from . import twin as twin
 from .camera import Camera
 from .camera_thread import ThreadedCamera
 from .emulator.rig import EmulatedRig
