@@ -65,13 +65,10 @@ def cap(size: float) -> surfaces.Shape:
 
 
 CASES: dict[str, Callable[[], Case]] = {
-    "ball on a plane": lambda: on_grid(cap(32), (66, 71), 32),
     "ball on a plane, through a disc": lambda: on_grid(cap(32), (66, 71), 32, mask=surfaces.disc((66, 71))),
     "ball on a plane, long pixels": lambda: on_grid(cap(32), (50, 71), 32, (0.02, 0.028)),
     "stairs": lambda: on_grid(surfaces.stairs(2, 20, 30, 36), (24, 130), 30),
-    "a single ramp": lambda: on_grid(surfaces.stairs(1, 20, 30, 43), (23, 91), 30),
     "coin: writing": lambda: on_coin(-4.5, -5.3, (120, 120)),
-    "coin: rim": lambda: on_coin(9.8, 1.0, (80, 110)),
     # One lip rises along the tear; below, where the sheet is whole, normals tell how far above the other.
     "torn sheet": lambda: on_grid(surfaces.tear(24, 30), (96, 96), 24),
 }

@@ -172,22 +172,6 @@ def tear(height: float, length: float, steep: float = 0.0) -> Shape:
     )
 
 
-def helicoid(rise: float) -> Shape:
-    """Return a winding stair of one turn round the origin; it falls by `rise` across the negative x axis.
-
-    Its slope grows towards the axis: cut out the middle.
-    """
-
-    def slope(x: Map, y: Map) -> tuple[Map, Map]:
-        square = np.maximum(x * x + y * y, 1e-9)
-        return -y / square * rise / (2 * np.pi), x / square * rise / (2 * np.pi)
-
-    def side(x: Map, y: Map) -> NDArray[np.intp]:
-        return np.where(x < 0, 1 + (y > 0), 0).astype(np.intp)
-
-    return Shape(lambda x, y: rise * np.arctan2(y, x) / (2 * np.pi), slope, side)
-
-
 def joined(sides: NDArray[np.intp]) -> tuple[Mask, Mask]:
     """Return whether the depth is continuous from each pixel to the next, along x (H, W-1) and y (H-1, W)."""
 

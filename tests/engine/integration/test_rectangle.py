@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse
-from rectangles import put, scene, source_of
+from rectangles import put, scene, solve_by_cosines, source_of
 from scipy.sparse.linalg import spsolve
 
 from mirrorskin.engine.integration.rectangle import Rectangle, are_rows_easier
@@ -28,7 +28,7 @@ def solve_sparse(source, wx, wy, screening):
 
 
 @pytest.mark.parametrize("screening", [0.0, 0.02])
-@pytest.mark.parametrize("shape", [(1, 7), (7, 1), (2, 2), (48, 64), (31, 47), (53, 41), (24, 22), (16, 200)])
+@pytest.mark.parametrize("shape", [(1, 7), (2, 2), (48, 64), (31, 47), (53, 41)])
 def test_heights_solve_the_links_of_any_shape(device, shape, screening):
     wx, wy = 2.5 / 0.03**2, 2.5 / 0.04**2
     source = np.random.default_rng(0).normal(size=shape)
@@ -86,3 +86,30 @@ def test_modes_are_taken_along_the_side_of_small_factors():
     assert not are_rows_easier((1024, 1021), side_by_side=False)
     assert are_rows_easier((1024, 1024), side_by_side=False)
     assert not are_rows_easier((1024, 1024), side_by_side=True)
+
+
+@pytest.mark.parametrize(("shape", "lean"), [((250, 256), 0.0), ((256, 251), 30.0)])
+def test_errors_are_less_than_a_millionth_of_the_range(device, shape, lean):
+    source = source_of(scene(shape, lean)).astype(np.float32)
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
+    told = solve_by_cosines(source)
+    assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
+    assert abs(height.mean(dtype=np.float64)) < 1e-7 * np.ptp(told)
+
+
+def test_a_long_slope_stays_straight(device):
+    """The slowest modes add up what each line rounds: they carry twice the digits."""
+    surface = scene((3000, 48), 1.0)
+    height = Rectangle((3000, 48), (1.0, 1.0), device).solve(put(device, source_of(surface))).download()
+    told = solve_by_cosines(source_of(surface).astype(np.float32))
+    assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
+
+
+@pytest.mark.parametrize("columns", [1531, 4800])
+def test_a_long_strip_is_solved_whether_its_columns_or_its_long_rows_are_transformed(device, columns):
+    shape = (37, columns)  # 4800 is more than an item's own memory holds
+    assert are_rows_easier(shape, side_by_side=False) == (columns == 4800)
+    source = source_of(scene(shape, 0.01, noise=0.0)).astype(np.float32)
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
+    told = solve_by_cosines(source)
+    assert np.abs(height - told).max() < 1e-6 * np.ptp(told)

@@ -1,0 +1,524 @@
+"""Heights from slopes: against formulas, and against a direct float64 solution (tests/support/slope_oracle.py)."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import pickle
+import threading
+from functools import cache
+
+import numpy as np
+import pytest
+import slope_oracle
+import surfaces
+from slope_oracle import Problem
+
+from mirrorskin import engine, io
+from mirrorskin.engine.integration import integration
+
+SHAPE, PIXEL = (49, 62), (0.03, 0.05)
+ROW, COLUMN = np.indices(SHAPE)
+DISC = surfaces.disc(SHAPE)
+MASKS = {
+    "rectangle": np.ones(SHAPE, bool),
+    "disc": DISC,
+    "blobs": surfaces.blobs(SHAPE),
+    "two contacts": surfaces.two_contacts(SHAPE),
+    "one-pixel bridge": surfaces.two_contacts(SHAPE, bridge=True),
+    "single pixels": surfaces.specks(SHAPE),
+    "20 % holes": surfaces.holes(SHAPE),
+    "comb": surfaces.comb(SHAPE),
+    "spiral": surfaces.spiral(SHAPE),
+}
+STEEP, BOWL = surfaces.plane(*surfaces.STEEP), surfaces.quadratic(0.02, 0.004, 0.015, 0.1, -0.2)
+BUMP, WAVES = surfaces.bump(9, 12, 3, -2), surfaces.cosines(17, 2.5)
+
+
+def problem(surface, noise=0.0, pixel_size=PIXEL, shape=SHAPE, **options):
+    """Sample a surface, with noise of the slopes."""
+    seen = surfaces.sample(surface, shape, pixel_size)
+    added = np.random.default_rng([0, 11]).normal(0, noise, (2, *shape))
+    return Problem(seen.dz_dx + added[0], seen.dz_dy + added[1], pixel_size, **options)
+
+
+def truth(surface, pixel_size=PIXEL, shape=SHAPE):
+    return surfaces.sample(surface, shape, pixel_size).height
+
+
+def integrated(asked, device=None, **more):
+    return engine.integrate(*asked.arguments, **asked.options, **{"sigma": False, **more}, device=device)
+
+
+def worst(found, expected, mask):
+    """Return the largest error as a share of the range, each component about its own mean."""
+    assert np.array_equal(np.isfinite(found.height), mask)
+    assert np.array_equal(found.component >= 0, mask)
+    error = np.where(mask, found.height - expected, np.nan)
+    for label in range(len(found.offset_unknown)):
+        within = found.component == label
+        error[within] -= error[within].mean()
+    return np.abs(error[mask]).max() / np.ptp(expected[mask])
+
+
+@cache
+def _solved(pickled):
+    return slope_oracle.solve(pickle.loads(pickled))
+
+
+def apart(found, asked):
+    """Return how far heights are from the direct solution's, as a share of their range."""
+    expected = _solved(pickle.dumps(asked))  # once for all devices
+    np.testing.assert_array_equal(found.component, expected.component)
+    np.testing.assert_array_equal(found.offset_unknown, expected.offset_unknown)
+    np.testing.assert_array_equal(np.isfinite(found.height), np.isfinite(expected.height))
+    return np.nanmax(np.abs(found.height - expected.height)) / np.ptp(
+        expected.height[expected.component >= 0]
+    )
+
+
+def uneven(shape=SHAPE):
+    """Return weights (2, H, W) as normals have them: other on other flanks, and from pixel to pixel."""
+    x, y = surfaces.places(shape)
+    smooth = np.exp(np.stack([np.sin(x / 9 + y / 14), np.cos(y / 8 - x / 21)]))
+    return smooth * np.exp(np.random.default_rng([0, 12]).normal(0, 0.3, smooth.shape))
+
+
+def some(level=0.0, share=0.05):
+    """Return known heights of a few pixels."""
+    known = np.random.default_rng(7).random(SHAPE) < share
+    return np.where(known, level + truth(BUMP), np.nan)
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_planes_and_quadratics_are_exact_on_any_mask(device, mask):
+    for surface in (STEEP, BOWL):
+        found = integrated(problem(surface, mask=MASKS[mask]), device)
+        assert found.converged
+        assert found.invalid == 0
+        assert worst(found, truth(surface), MASKS[mask]) <= 1e-4
+
+
+@pytest.mark.parametrize("sigma", [3, 40])
+@pytest.mark.parametrize("region", ["rectangle", "disc"])
+def test_a_bump_of_any_size_has_its_height(device, sigma, region):
+    shape, square = (240, 320), (0.03, 0.03)
+    mask = surfaces.disc(shape) if region == "disc" else np.ones(shape, bool)
+    bump = surfaces.bump(sigma, 0.6 * sigma)
+    found = integrated(problem(bump, pixel_size=square, shape=shape, mask=mask), device)
+    expected = np.ptp(truth(bump, square, shape)[mask])
+    assert np.nanmax(found.height) - np.nanmin(found.height) == pytest.approx(expected, rel=0.002)
+
+
+GIVEN = {
+    "noise": {},
+    "weights of each axis": {"slope_weights": uneven() * np.where((ROW > 20) & (ROW < 23), 0, 1e5)},
+    "weights": {"slope_weights": uneven()[0] * 1e-9},
+    "edges": {"edges": surfaces.random_cuts(SHAPE, 8)},
+    "heights": {"known_heights": some(-20.0)},
+    "light heights": {"known_heights": some(), "known_height_weights": 1e-3},
+    "all at once": {
+        "slope_weights": uneven(),
+        "edges": surfaces.random_cuts(SHAPE, 8),
+        "known_heights": some(-20.0),
+        "known_height_weights": uneven()[1] * 1e3,
+    },
+}
+
+
+@pytest.mark.parametrize("given", GIVEN)
+@pytest.mark.parametrize("mask", ["rectangle", "disc", "20 % holes"])
+def test_heights_are_those_of_a_direct_solution_in_float64(device, mask, given):
+    asked = problem(WAVES, 0.2, mask=MASKS[mask], **GIVEN[given])
+    found = integrated(asked, device)
+    assert apart(found, asked) <= 1e-4
+    assert found.height.dtype == np.float32
+    assert found.residual <= 1e-5
+    assert found.method == ("direct" if (mask, given) == ("rectangle", "noise") else "multigrid")
+
+
+def test_a_full_rectangle_with_heights_known_everywhere_is_solved_directly(device):
+    asked = problem(WAVES, 0.2, known_heights=truth(BUMP), known_height_weights=300.0)
+    found = integrated(asked, device)
+    assert found.method == "direct"
+    assert apart(found, asked) <= 1e-4
+
+
+@pytest.mark.parametrize("region", ["rectangle", "disc"])
+def test_refinement_is_of_second_order(region):
+    errors = []
+    for size in (32, 64, 128):
+        shape = size, size
+        mask = surfaces.disc(shape, 0.99) if region == "disc" else np.ones(shape, bool)
+        surface, pixel = surfaces.cosines(size / 3.3, size / 12), 3.0 / size
+        found = integrated(problem(surface, pixel_size=(pixel, pixel), shape=shape, mask=mask))
+        errors.append(worst(found, truth(surface, (pixel, pixel), shape), mask))
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert errors[0] < 0.05
+    assert (orders >= 1.9).all() or errors[-1] < 1e-5, (errors, orders)
+
+
+@pytest.mark.parametrize("pixel", [1e-3, 1e3])
+@pytest.mark.parametrize("mask", ["rectangle", "disc"])
+def test_pixels_of_any_size(pixel, mask):
+    size = pixel, 1.6 * pixel
+    heights = np.where(np.random.default_rng(11).random(SHAPE) < 0.02, truth(BUMP, size), np.nan)
+    for options in ({}, {"known_heights": heights, "known_height_weights": 100 / pixel**2}):
+        asked = problem(BUMP, 0.1, pixel_size=size, mask=MASKS[mask], **options)
+        assert apart(integrated(asked), asked) <= 1e-4
+
+
+def test_y_runs_up_the_picture(device):
+    level, rising = np.zeros((6, 4)), np.ones((6, 4))
+    up = engine.integrate(level, rising, (2.0, 0.5), device=device).height
+    np.testing.assert_allclose(np.diff(up, axis=0), -0.5, atol=1e-6)
+    right = engine.integrate(rising, level, (2.0, 0.5), device=device).height
+    np.testing.assert_allclose(np.diff(right, axis=1), 2.0, atol=1e-6)
+
+
+def test_a_component_is_held_by_its_own_known_heights_and_has_the_mean_0_without(device):
+    mask = MASKS["two contacts"]
+    right = mask & (surfaces.places(SHAPE)[0] > 0)
+    heights = np.where(right, 5 + truth(BOWL), np.nan)
+    found = integrated(problem(BOWL, mask=mask, known_heights=heights), device)
+    assert not found.offset_unknown[found.component[24, 46]]
+    assert found.offset_unknown[found.component[24, 15]]
+    np.testing.assert_allclose(found.height[right], heights[right], atol=1e-4)
+    assert np.nanmean(found.height[mask & ~right]) == pytest.approx(0, abs=1e-5)
+
+
+def test_known_heights_need_no_slope_and_alone_are_taken_as_they_are(device):
+    dz_dx, dz_dy, _ = problem(BOWL).arguments
+    dz_dx[10, 10], heights = np.nan, np.full(SHAPE, np.nan)
+    heights[10, 10] = 7.0
+    found = engine.integrate(dz_dx, dz_dy, PIXEL, known_heights=heights, sigma=False, device=device)
+    assert found.height[10, 10] == pytest.approx(7, abs=1e-5)
+    assert found.offset_unknown.tolist() == [True, False]
+    assert found.invalid == 1
+    alone = engine.integrate(dz_dx, dz_dy, PIXEL, slope_weights=0, known_heights=some(), sigma=False)
+    np.testing.assert_allclose(alone.height, some(), rtol=3e-7, atol=1e-6)
+    assert not alone.offset_unknown.any()
+
+
+def test_heights_without_weight_or_value_are_as_good_as_none():
+    plain = integrated(problem(BUMP, 0.1))
+    for options in (
+        {"known_heights": np.full(SHAPE, np.nan)},
+        {"known_heights": np.ones(SHAPE), "known_height_weights": 0},
+    ):
+        other = integrated(problem(BUMP, 0.1, **options))
+        np.testing.assert_array_equal(other.height, plain.height)
+        assert other.offset_unknown.tolist() == [True]
+    masked = integrated(problem(BUMP, 0.1, known_heights=np.where(DISC, 1.0, np.nan))).height
+    far = {"known_heights": np.where(DISC, 1.0, -1e5), "known_height_weights": 1.0 * DISC}
+    np.testing.assert_allclose(integrated(problem(BUMP, 0.1, **far)).height, masked, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 57), (43, 1), (3, 2)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_thin_and_tiny_pictures(device, shape, masked):
+    mask = np.ones(shape, bool)
+    mask.flat[0] = not masked or shape == (1, 1)
+    found = integrated(problem(BOWL, shape=shape, mask=mask), device)
+    expected = truth(BOWL, shape=shape)
+    expected = expected - expected[mask].mean()
+    atol = 1e-4 * max(np.ptp(expected[mask]), 1e-3)
+    np.testing.assert_allclose(found.height[mask], expected[mask], atol=atol)
+    np.testing.assert_array_equal(np.isnan(found.height), ~mask)
+
+
+def test_pieces_of_one_pixel_have_their_known_height_or_none():
+    random = np.random.default_rng(3)
+    specks, known = random.random(SHAPE) < 0.25, random.normal(size=SHAPE)
+    weights = {"slope_weights": 60.0, "known_height_weights": 6.0}
+    found = integrated(problem(WAVES, mask=specks, known_heights=known, **weights))
+    alone = specks & (np.bincount(found.component[specks])[found.component] == 1)
+    np.testing.assert_allclose(found.height[alone], known[alone], atol=1e-5)
+    assert alone.sum() > 20
+    chess = np.indices((9, 12)).sum(axis=0) % 2 == 0
+    found = integrated(problem(BOWL, shape=(9, 12), mask=chess))
+    np.testing.assert_array_equal(found.height[chess], 0)
+    np.testing.assert_array_equal(found.component[chess], np.arange(chess.sum()))
+
+
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
+def test_slopes_that_are_no_numbers_are_left_out_and_counted(device, bad):
+    spots = np.random.default_rng(10).random((2, *SHAPE)) < 0.03
+    asked = problem(BUMP, 0.1, mask=DISC)
+    asked.dz_dx[spots[0]], asked.dz_dy[spots[1]] = bad, np.nan
+    found = integrated(asked, device)
+    assert found.invalid == (spots.any(axis=0) & DISC).sum() > 50
+    assert apart(found, asked) <= 1e-4
+
+
+def test_any_array_will_do_and_stays_as_it_was():
+    dz_dx, dz_dy, _ = problem(BUMP, 0.1).arguments
+    slopes = [dz_dx.astype(np.float32), dz_dy.astype(np.float32)]
+    expected = engine.integrate(*slopes, PIXEL, mask=DISC, sigma=False).height
+    for parts in (
+        [part.astype(np.float64) for part in slopes],
+        [np.asfortranarray(part) for part in slopes],
+        [np.repeat(part, 2, axis=1)[:, ::2] for part in slopes],
+        [part.tolist() for part in slopes],
+    ):
+        found = engine.integrate(*parts, np.array(PIXEL), mask=7 * DISC.astype(np.int16), sigma=False)
+        np.testing.assert_array_equal(found.height, expected)
+    np.testing.assert_array_equal(slopes[0], dz_dx.astype(np.float32))
+
+
+@pytest.mark.parametrize("weight", [1e-30, 1e8, 1e30])
+def test_one_weight_however_odd_changes_little(weight):
+    asked = problem(WAVES, mask=DISC)
+    plain, weights = integrated(asked).height, np.ones(SHAPE)
+    weights[20, 20] = weight
+    found = integrated(problem(WAVES, mask=DISC, slope_weights=weights)).height
+    np.testing.assert_allclose(found, plain, atol=0.02 * np.ptp(plain[DISC]))
+    pinned = np.full(SHAPE, np.nan)
+    pinned[20, 20] = 5.0
+    heights = {"known_heights": pinned, "known_height_weights": weight}
+    if weight > 1:  # it only moves the surface
+        found = integrated(problem(WAVES, mask=DISC, **heights)).height
+        np.testing.assert_allclose(found, plain - plain[20, 20] + 5, atol=1e-4 * np.ptp(plain[DISC]))
+
+
+def test_a_comb_is_solved_by_plain_cycles():
+    shape, square = (97, 130), (0.03, 0.03)
+    mask, bowl = surfaces.comb(shape), surfaces.quadratic(0.004, 0.001, 0.003, 0.1, -0.2)
+    found = integrated(problem(bowl, pixel_size=square, shape=shape, mask=mask))
+    assert worst(found, truth(bowl, square, shape), mask) <= 1e-4
+
+
+def test_initial_heights_do_not_change_the_answer():
+    asked = problem(WAVES, 0.2, mask=DISC)
+    plain = integrated(asked)
+    again = integrated(asked, initial_heights=plain.height + 40)
+    np.testing.assert_allclose(again.height, plain.height, atol=1e-4 * np.ptp(plain.height[DISC]))
+    assert again.iterations <= plain.iterations
+
+
+def test_without_tolerance_or_with_a_budget_nothing_is_raised():
+    asked = problem(WAVES, 0.2, mask=DISC)
+    for options in ({"tolerance": None}, {"budget": 1e-6}, {"budget": 10.0}):
+        assert apart(integrated(asked, **options), asked) < 0.1
+
+
+def test_a_surface_that_did_not_converge_is_not_returned(monkeypatch):
+    found = integration.Multigrid.solve
+
+    def stubborn(self, start=None, **options):
+        return found(self, start, **{**options, "limit": 1})
+
+    monkeypatch.setattr(integration.Multigrid, "solve", stubborn)
+    expected = r"1 iteration.*residual of .*more than 1e-06.*tolerance"
+    with pytest.raises(engine.NotConverged, match=expected) as error:
+        integrated(problem(WAVES, 0.2, mask=MASKS["20 % holes"]), tolerance=1e-6)
+    assert error.value.exit_code == 1
+    assert "\n" not in str(error.value)
+
+
+MAP = np.zeros(SHAPE)
+BAD = {
+    "shapes (49, 62) and (62, 49)": {"dz_dy": MAP.T},
+    "shapes (49,) and": {"dz_dx": MAP[:, 0]},
+    "shapes (0, 5) and": {"dz_dx": MAP[:0, :5], "dz_dy": MAP[:0, :5]},
+    "pixel size 0": {"pixel_size": 0},
+    "pixel size [1, 2, 3]": {"pixel_size": [1, 2, 3]},
+    "pixel size (0.1, -1)": {"pixel_size": (0.1, -1)},
+    "mask: shape (48, 62)": {"mask": MAP[1:]},
+    "known_heights: shape (48, 62)": {"known_heights": MAP[1:]},
+    "initial_heights: shape (48, 62)": {"initial_heights": MAP[1:]},
+    "slope_weights: shape (3, 49, 62)": {"slope_weights": np.ones((3, *SHAPE))},
+    "known_height_weights: shape (2, 49, 62)": {"known_height_weights": np.ones((2, *SHAPE))},
+    "slope_weights: some are negative": {"slope_weights": np.where(DISC, np.nan, 1)},
+    "slope_weights -1.0": {"slope_weights": -1},
+    "known_height_weights nan": {"known_height_weights": np.nan},
+    "bilateral_sharpness 0": {"robust": True, "bilateral_sharpness": 0},
+    "tolerance -0.1": {"tolerance": -0.1},
+    "budget 0": {"budget": 0},
+    "nothing to integrate": {"mask": MAP},
+    "nothing to integrate: no pixel": {"dz_dx": MAP * np.nan},
+    "nothing to integrate: no pixel that": {"slope_weights": 0},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_refused_in_one_line(message):
+    options = {"dz_dx": MAP, "dz_dy": MAP, "pixel_size": 0.03} | BAD[message]
+    with pytest.raises(io.InputError) as error:
+        engine.integrate(**options)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# One call after the other, and frame after frame.
+
+SLOPES = problem(WAVES, 0.2).arguments[:2]
+CASES = [
+    {},
+    {"slope_weights": 4.0},
+    {"mask": DISC},
+    {"mask": DISC, "slope_weights": 4.0},
+    {"mask": DISC, "known_heights": some()},
+    {"mask": DISC, "known_heights": some(), "known_height_weights": 5.0},
+    {"mask": DISC, "slope_weights": 1 + DISC},
+    {"edges": np.eye(*SHAPE)},
+]
+
+
+def heights(case):
+    return engine.integrate(*SLOPES, 0.1, sigma=False, **CASES[case]).height
+
+
+@pytest.fixture(scope="module")
+def alone():
+    found = []
+    for case in range(len(CASES)):
+        integration._spare.clear()
+        found.append(heights(case))
+    return found
+
+
+@pytest.mark.parametrize("order", [range(8), range(7, -1, -1), [2, 3, 2, 4, 2, 5]])
+def test_the_order_of_calls_does_not_matter(alone, order):
+    for case in order:
+        np.testing.assert_array_equal(heights(case), alone[case])
+    first = heights(2)
+    heights(3)
+    np.testing.assert_array_equal(first, alone[2])
+
+
+def test_threads_do_not_meet(alone):
+    found = {}
+
+    def work(case):
+        found[case] = [heights(case) for _ in range(3)]
+
+    threads = [threading.Thread(target=work, args=(case,)) for case in (2, 4, 7)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for case, answers in found.items():
+        for answer in answers:
+            np.testing.assert_array_equal(answer, alone[case])
+    assert len(found) == 3
+
+
+def test_a_picture_that_failed_leaves_nothing_behind(alone):
+    with pytest.raises(engine.NotConverged):
+        engine.integrate(SLOPES[0] * 1e20, SLOPES[1], 0.1, mask=DISC, sigma=False)
+    np.testing.assert_array_equal(heights(2), alone[2])
+
+
+def frame(number, **options):
+    """Slopes that change by a hundredth from frame to frame."""
+    random = np.random.default_rng(1)
+    first, change = random.normal(0, 0.3, (2, 2, *SHAPE))
+    return Problem(*(first + 0.01 * number * change).astype(np.float32), (0.03, 0.03), **options)
+
+
+def surface(integrator, asked, **options):
+    integrator.push(asked.dz_dx, asked.dz_dy, **asked.options, **options)
+    return integrator.result()
+
+
+FRAMES = [
+    {"mask": DISC},
+    {"mask": DISC},
+    {"mask": DISC & (COLUMN > 15)},
+    {},
+    {"mask": DISC, "slope_weights": 1 + ROW / 9},
+    {"mask": DISC, "slope_weights": np.stack([2 + COLUMN / 9, 1 + ROW / 9])},
+    {"mask": DISC, "edges": COLUMN == 30},
+    {"mask": DISC, "known_heights": np.where(COLUMN == 20, -3.0, np.nan)},
+    {"mask": DISC, "known_heights": np.where(COLUMN == 20, -3.0, np.nan), "known_height_weights": 50.0},
+    {"mask": DISC},
+]
+
+
+def test_from_frame_to_frame_everything_may_change(device):
+    integrator = engine.Integrator(SHAPE, 0.03, device=device)
+    kept = []
+    for number, options in enumerate(FRAMES):
+        asked = frame(number, **options)
+        found = surface(integrator, asked, tolerance=1e-5)
+        assert apart(found, asked) <= 1e-4
+        assert found.sigma is None
+        assert integrator.result() is found
+        kept.append((found.height, found.height.copy()))
+    for height, copy in kept:
+        np.testing.assert_array_equal(height, copy)
+
+
+def test_a_frame_starts_from_the_last():
+    integrator, asked = engine.Integrator(SHAPE, 0.03), frame(0, mask=DISC)
+    first = surface(integrator, asked, tolerance=1e-5).iterations
+    assert surface(integrator, asked, tolerance=1e-4).iterations <= 1
+    integrator.reset()
+    with pytest.raises(io.InputError, match="push"):
+        integrator.result()
+    assert surface(integrator, asked, tolerance=1e-5).iterations == first
+
+
+def test_without_a_tolerance_frames_get_truer():
+    integrator, asked = engine.Integrator(SHAPE, 0.03), frame(0, mask=DISC)
+    errors = [apart(surface(integrator, asked), asked) for _ in range(3)]
+    assert errors[0] < 0.05
+    assert errors[2] < 1e-4
+
+
+@pytest.mark.parametrize("factor", [1e20, np.nan])
+def test_a_frame_that_is_wrong_does_not_spoil_the_next(factor):
+    integrator, asked = engine.Integrator(SHAPE, 0.03), frame(0, mask=DISC)
+    wrong = frame(0, mask=DISC)
+    wrong.dz_dx[20, 20] *= factor
+    surface(integrator, asked, tolerance=1e-5)
+    with contextlib.suppress(engine.NotConverged):
+        surface(integrator, wrong)
+    assert apart(surface(integrator, asked), asked) < 2e-3
+
+
+def test_a_budget_is_kept_and_a_tolerance_with_it_may_be_missed():
+    integrator, asked = engine.Integrator(SHAPE, 0.03), frame(0, mask=MASKS["20 % holes"])
+    assert surface(integrator, asked, budget=1e-6, tolerance=1e-5).iterations == 1
+    assert surface(integrator, asked, budget=10.0, tolerance=1e-5).residual <= 1e-5
+
+
+def test_frames_of_another_shape_are_refused():
+    with pytest.raises(io.InputError, match="another Integrator"):
+        engine.Integrator(SHAPE, 0.03).push(MAP[1:], MAP[1:])
+    with pytest.raises(io.InputError, match="pixel size"):
+        engine.Integrator(SHAPE, -1)
+
+
+# Noise.
+
+NOISY = (24, 27)
+
+
+@pytest.mark.parametrize("region", ["rectangle", "disc"])
+def test_noise_spreads_as_in_the_best_linear_estimate(region):
+    """What the best estimate errs by is uncorrelated with what another errs by beyond it."""
+    mask = surfaces.disc(NOISY) if region == "disc" else np.ones(NOISY, bool)
+    weights = None if region == "rectangle" else 400 * uneven(NOISY)
+    asked = Problem(np.zeros(NOISY), np.zeros(NOISY), PIXEL, mask=mask, slope_weights=weights)
+    best, sigma = slope_oracle.propagation(asked, best=True), np.sqrt(slope_oracle.variance(asked))
+    generator, beyond = np.random.default_rng(8), []
+    for _ in range(6):
+        noise = sigma * generator.normal(size=sigma.shape)
+        found = integrated(Problem(*noise.reshape(2, *NOISY), PIXEL, **asked.options))
+        beyond.append(found.height[mask] - best @ noise)
+    assert np.any(beyond)
+    assert np.sqrt(1 + np.mean(np.square(beyond)) / np.mean(best**2 @ sigma**2)) <= 1.05
+
+
+def test_levels_halve_and_never_overlap():
+    from mirrorskin.engine.integration.levels import cut_levels
+
+    for shape in [(480, 640), (1, 1), (5, 4), (1, 1000), (33, 17)]:
+        levels = cut_levels(shape)
+        assert (levels[0].rows, levels[0].columns) == shape
+        assert max(levels[-1].rows, levels[-1].columns) <= 4
+        for fine, coarse in itertools.pairwise(levels):
+            assert (coarse.rows, coarse.columns) == (-(-fine.rows // 2), -(-fine.columns // 2))
+            assert coarse.base >= fine.end
