@@ -1,4 +1,4 @@
-"""Which shape of work a device likes: measured once on each, and remembered."""
+"""Choosing a device's layout by trial: measured once for each device and driver, and kept on disk."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ _lock = threading.RLock()
 _log = logging.getLogger("mirrorskin.engine")
 
 
-def fit(device: Device, prepare: Callable[[Device], Run]) -> None:
-    """Give a device the shape in which it does a trial fastest, unless it has been measured before.
+def choose_layout(device: Device, prepare: Callable[[Device], Run]) -> None:
+    """Give a device the layout in which it does a trial fastest, unless that has been measured before.
 
     Parameters
     ----------
     device : Device
     prepare : callable
-        Makes the trial ready for a device in its present shape; what it returns does the work and waits.
+        Prepares the trial for a device in its present layout; what it returns does the work and waits.
 
     Raises
     ------
     mirrorskin.kernels.errors.DeviceError
-        The trial runs in no shape.
+        The trial runs in no layout.
     """
     with _lock:
         if device.tuned:
             return
         info = device.info
-        circumstances = info.title, info.driver, info.compute_units, LAYOUTS, program_version()
-        known = recall("shape", circumstances)
-        device.tuned = True
+        key = info.title, info.driver, info.compute_units, LAYOUTS, program_version()
+        known = recall("shape", key)
+        device.tuned = True  # the trial itself chooses none
         if known is not None and known.isdecimal() and int(known) < len(LAYOUTS):
             device.layout = LAYOUTS[int(known)]
             return
@@ -49,23 +49,23 @@ def fit(device: Device, prepare: Callable[[Device], Run]) -> None:
         except DeviceError:
             device.tuned = False
             raise
-        keep("shape", circumstances, str(LAYOUTS.index(device.layout)))
+        keep("shape", key, str(LAYOUTS.index(device.layout)))
         _log.info("%s is fastest with %s", info.title, device.layout)
 
 
 def _fastest(device: Device, prepare: Callable[[Device], Run]) -> Layout:
     seconds: dict[Layout, float] = {}
     problem = None
-    for shape in LAYOUTS:
-        device.layout = shape
+    for layout in LAYOUTS:
+        device.layout = layout
         try:
-            seconds[shape] = _time(prepare(device))
+            seconds[layout] = _time(prepare(device))
         except DeviceError as error:
-            _log.info("%s does not run with %s: %s", device.info.title, shape, error)
+            _log.info("%s does not run with %s: %s", device.info.title, layout, error)
             problem = error
     if problem is not None and not seconds:
         raise problem
-    return min(seconds, key=lambda shape: seconds[shape])
+    return min(seconds, key=lambda layout: seconds[layout])
 
 
 def _time(run: Run) -> float:

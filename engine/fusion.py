@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.fusion_solver import Joint, Known
 from mirrorskin.engine.integration.surface import Surface
-from mirrorskin.engine.nearest import with_nearest
+from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.press import reconstruct_press
-from mirrorskin.engine.provenance import sign
+from mirrorskin.engine.provenance import attach_provenance
 from mirrorskin.engine.reconstruction import calibrated, undistorted
 from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, find_slopes
 from mirrorskin.engine.rotation.response import wall_response_of
@@ -206,19 +206,19 @@ def fuse_sources(
         found = estimate_rotation(
             axial,
             **rotation,
-            heights=with_nearest(known) if register else None,
+            heights=fill_with_nearest(known) if register else None,
             progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
             **common,
         )
         joint = Joint(onset, _slopes_of(found), pixel_size, robust, opened)
-        before, known = with_nearest(known), joint.heights()
+        before, known = fill_with_nearest(known), joint.heights()
         moved = _moved(before, known, found.normals.tilt, pixel_size)
         if moved <= _STILL:
             break
     surface = joint.finish()
     if progress:
         progress(frames_to_read(vertical, axial, register))
-    turned = sign(Result(), axial, opened, found.process)
+    turned = attach_provenance(Result(), axial, opened, found.process)
     process = _both(heights.process, turned.process) | describe_integration([surface]) | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}

@@ -106,6 +106,3 @@ def naming(source: Source) -> Iterator[None]:
         raise (error if source.name in message else io.InputError(f"{source.name}: {message}")) from error
     except NotConverged as error:
         raise NotConverged(f"{source.name}: {error}") from error
-
-
-sign, told, told_level = attach_provenance, parameter_origin, level_origin  # until all say the new names

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mirrorskin.engine.angles import angle_between, true_normals
 from mirrorskin.io import UNDISTORTED, InputError, Result, Truth
 
 Doubles = NDArray[np.float64]
@@ -395,3 +394,18 @@ def _chi_square(error: Doubles, sigma: NDArray[np.float32] | None, answered: Mas
         return np.nan
     usable = answered & (sigma > 0)
     return float(np.mean((error[usable] / sigma[usable].astype(np.float64)) ** 2)) if usable.any() else np.nan
+
+
+def true_normals(truth: Truth) -> NDArray[np.float64]:
+    """Return the normals that a simulation knows, (H, W, 3) float64; NaN where there is no object."""
+    zenith = truth.zenith.astype(np.float64)
+    azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # a level one has none
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
+    )
+
+
+def angle_between(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the angles between vectors, (..., 3), radians."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.arctan2(across, np.sum(first * second, axis=-1)))

@@ -82,9 +82,6 @@ def feed(source: Source, estimator: Estimator, frames: range, progress: Progress
 
 def push_block(estimator: Estimator, block: Block, part: slice = slice(None)) -> None:
     """Push what a source yields, or a part of it: frames and their positions."""
-    if not hasattr(estimator, "position"):  # until every estimator follows the protocol
-        estimator.push(block)
-        return
     where = getattr(block, estimator.position)
     known = {estimator.position: None if where is None else where[part]}
     estimator.push(block.frames[part], **known, lent=block.lent)

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.autotune import fit
+from mirrorskin.engine.autotune import choose_layout
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, check_threshold, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError, check_travel
@@ -160,7 +160,7 @@ class OnsetSearch:
         self._release, self._subframe = check_event(event) == "release", subframe
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.device = open_device(device)
-        fit(self.device, _trial)
+        choose_layout(self.device, _trial)
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), length)
         self.room = room_of(self._bands, length)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.integration import integrate
-from mirrorskin.engine.nearest import with_nearest
+from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.kernels.device import Device
 
@@ -83,7 +83,7 @@ def coarse_heights(
     tops = ndimage.maximum(surface.height, piece, np.arange(surface.component.max() + 1))
     heights = np.where(piece >= 0, surface.height - np.asarray(tops)[piece], np.nan)
     places = np.meshgrid(*((np.arange(length) + 0.5) / step - 0.5 for length in shape), indexing="ij")
-    found = ndimage.map_coordinates(with_nearest(heights), places, order=1, mode="nearest")
+    found = ndimage.map_coordinates(fill_with_nearest(heights), places, order=1, mode="nearest")
     return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))
 
 

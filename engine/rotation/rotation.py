@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.nearest import with_nearest
-from mirrorskin.engine.provenance import naming, sign, told, told_level
+from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.provenance import attach_provenance, level_origin, naming, parameter_origin
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlator
 from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_turns, longest_turn
@@ -148,7 +148,7 @@ def reconstruct_rotation(
     )
     result, pixel_size = rotation_maps(found), source.header.pixel_size
     if pixel_size is None:
-        return sign(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
+        return attach_provenance(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
     with naming(source):
         surface = integrate_normals(
             found.normals, found.independent_sigma, pixel_size, robust=robust, device=found.device
@@ -161,7 +161,7 @@ def reconstruct_rotation(
         offset_unknown=surface.offset_unknown,
         edges=found.edges if surface.edges is None else found.edges | surface.edges,
     )
-    return sign(result, source, found.device, {**found.process, **surface.process})
+    return attach_provenance(result, source, found.device, {**found.process, **surface.process})
 
 
 def estimate_rotation(
@@ -188,10 +188,10 @@ def estimate_rotation(
     if wall is None:
         found = passes.linear(heights)
         scale: dict[str, ProcessValue] = {
-            "zenith_gain": told(gain, source.header.zenith_gain, "none"),
-            "zenith_offset": told(offset, source.header.zenith_offset, "0"),
-            "low": told_level(source, "dark"),
-            "high": told_level(source, "bright"),
+            "zenith_gain": parameter_origin(gain, source.header.zenith_gain, "none"),
+            "zenith_offset": parameter_origin(offset, source.header.zenith_offset, "0"),
+            "low": level_origin(source, "dark"),
+            "high": level_origin(source, "bright"),
             "heights": "none" if heights is None else "given",
         }
         found = replace(found, process=scale)
@@ -251,7 +251,9 @@ def correlate_source(
         modulation=wave.modulation,
         residual=wave.residual,
     )
-    return sign(result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN})
+    return attach_provenance(
+        result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
+    )
 
 
 def rotation_maps(rotation: Rotation) -> Result:
@@ -321,7 +323,7 @@ class _Passes:
         response = initial_response(wall, self.source, self.header)
         if heights is not None:
             known = check_heights(heights, self.source.shape[1:])
-            origin, stand = "given", with_nearest(known).astype(np.float64)
+            origin, stand = "given", fill_with_nearest(known).astype(np.float64)
         elif self.source.rewindable:
             origin, stand = "found in the first turn", self._stand(response)
         else:

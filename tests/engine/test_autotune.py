@@ -59,7 +59,7 @@ def test_the_fastest_layout_is_taken_and_remembered(memory, clock, seconds, best
     prepare, prepared = trial(clock, seconds)
     first, second = fake_device(), fake_device()
     for device in (first, first, second):
-        autotune.fit(device, prepare)
+        autotune.choose_layout(device, prepare)
         assert device.layout is best
         assert device.tuned
     assert len(prepared) == 2
@@ -67,20 +67,20 @@ def test_the_fastest_layout_is_taken_and_remembered(memory, clock, seconds, best
 
 def test_another_driver_is_measured_anew(memory, clock):
     prepare, prepared = trial(clock, {CPU_LAYOUT: 1, GPU_LAYOUT: 2})
-    autotune.fit(fake_device(), prepare)
+    autotune.choose_layout(fake_device(), prepare)
     other = fake_device()
     other.info.driver = "2"
-    autotune.fit(other, prepare)
+    autotune.choose_layout(other, prepare)
     assert len(prepared) == 4
 
 
 def test_what_is_remembered_wrongly_is_measured_anew(memory, clock):
     prepare, _ = trial(clock, {CPU_LAYOUT: 2, GPU_LAYOUT: 1})
-    autotune.fit(fake_device(), prepare)
+    autotune.choose_layout(fake_device(), prepare)
     for nonsense in ("", "7", "-1", "a shape"):
         memory.update(dict.fromkeys(memory, nonsense))
         device = fake_device()
-        autotune.fit(device, prepare)
+        autotune.choose_layout(device, prepare)
         assert device.layout is GPU_LAYOUT
 
 
@@ -89,7 +89,7 @@ def test_a_device_that_runs_in_no_layout_says_so_each_time(memory, clock):
     device = fake_device()
     for _ in range(2):
         with pytest.raises(DeviceError, match="no kernel with 4 lanes"):
-            autotune.fit(device, prepare)
+            autotune.choose_layout(device, prepare)
     assert not memory
 
 

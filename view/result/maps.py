@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from mirrorskin.engine.nearest import with_nearest
+from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
 from mirrorskin.view.colours import MISSING, MISSING_RGB, Colours, normal_colours, span
@@ -159,7 +159,7 @@ def shaded(
 
 def _light(height: NDArray[np.float32], pixel: tuple[float, float], lamp: Floats) -> NDArray[np.float32]:
     """Return the light on a surface, from 0 to 1; level ground has 0.5."""
-    whole = gaussian_filter(with_nearest(height), _SMOOTH, mode="nearest")
+    whole = gaussian_filter(fill_with_nearest(height), _SMOOTH, mode="nearest")
     dz_dx, dz_dy = _slope(whole, pixel[0], 1), -_slope(whole, pixel[1], 0)
     change = (lamp[2] - lamp[0] * dz_dx - lamp[1] * dz_dy) / np.sqrt(1 + dz_dx**2 + dz_dy**2) - lamp[2]
     usual = float(np.percentile(np.abs(change[np.isfinite(height)]), _SHOWN_SLOPES))

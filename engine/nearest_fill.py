@@ -1,4 +1,4 @@
-"""Maps with holes, made whole roughly."""
+"""Maps without gaps: each pixel without a number takes that of the nearest one with it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 
-def with_nearest(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map, (H, W), in which what is no number is that of the nearest pixel that has one."""
+def fill_with_nearest(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a map, (H, W), whose NaN are replaced by the nearest number."""
+    from scipy import ndimage
+
     nearest = ndimage.distance_transform_edt(
         ~np.isfinite(values), return_distances=False, return_indices=True
     )
