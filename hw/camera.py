@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,11 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.errors import HardwareError
-
-_WINDOW = 128  # frames that the rate is measured over
-_REVIEW = 16  # frames from one look at the rate to the next, to tell late ones
-_PAUSE = 16  # usual frames; what is longer is a pause
-_LATE = 1.5  # periods
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,50 +116,3 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let the camera go, whatever its state; a second time does nothing."""
-
-
-class Tally:
-    """Counts frames as they arrive, and measures how many a second do. Any thread may ask.
-
-    The rate is that of the last 128 frames without the pauses between them: intervals that are longer
-    than 16 frames usually take. Neither jitter nor bursts of frames move it much.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._times = np.full(_WINDOW, math.nan)
-        self._frames = 0
-        self._late = 0
-        self._last = -math.inf
-        self._longest = math.inf
-
-    @property
-    def latest(self) -> float:
-        """When the newest frame arrived; -inf before the first."""
-        return self._last
-
-    def add(self, time: float) -> None:
-        """Count a frame that arrived at a time, seconds."""
-        with self._lock:
-            if time - self._last > self._longest:
-                self._late += 1
-            self._times[self._frames % _WINDOW] = self._last = time
-            self._frames += 1
-            if self._frames % _REVIEW == 0:
-                self._longest = _LATE / self._rate()
-
-    def counts(self, dropped: int = 0, reconnects: int = 0) -> Counts:
-        """Tell what was counted, with what others counted."""
-        with self._lock:
-            return Counts(self._frames, dropped, self._late, self._rate(), reconnects)
-
-    def _rate(self) -> float:
-        held = min(self._frames, _WINDOW)
-        if held < 2:
-            return math.nan
-        times = np.roll(self._times, -self._frames)[-held:] if held == _WINDOW else self._times[:held]
-        step = min(_PAUSE, held // 2)
-        intervals = np.diff(times)
-        counted = intervals[intervals <= np.median(times[step:] - times[:-step])]
-        # A clock need not tell two frames of a burst apart.
-        return float(len(counted) / max(counted.sum(), 1e-9))

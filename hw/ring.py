@@ -15,25 +15,14 @@ from numpy.typing import DTypeLike, NDArray
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.errors import HardwareError
 
-MEMORY = 64_000_000
-"""Bytes that a ring takes, where nothing else is said."""
-
+MEMORY = 64_000_000  # bytes that a ring takes, where nothing else is said
 _SECONDS = 0.5
 _LEAST, _MOST = 4, 1024  # frames
 _BEYOND = 64  # bytes behind the frames, so that a kernel may load its last word whole
 
 
 def usual_slots(shape: tuple[int, int], dtype: DTypeLike, rate: float | None = None) -> int:
-    """Return how many frames a ring should hold: 64 MB, but 4 to 1024 frames; more where 0.5 s takes more.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-    rate : float, optional
-        Frames a second, if it is known.
-    """
+    """Return how many frames a ring should hold: 64 MB, but 4 to 1024 frames; more where 0.5 s takes more."""
     room = MEMORY // max(1, math.prod(shape) * np.dtype(dtype).itemsize)
     return max(_LEAST, min(room, _MOST), math.ceil(_SECONDS * (rate or 0.0)))
 
@@ -55,18 +44,10 @@ class Ring:
     shape : (int, int)
         Rows and columns of a frame.
     dtype : dtype
-        uint8, uint16 or float32.
     slots : int
         Frames that may wait, at least 1.
     name : str
         What messages call the camera.
-
-    Attributes
-    ----------
-    dropped : int
-        Frames lost so far, here or before they came here.
-    error : HardwareError or None
-        What ``fail`` was told.
     """
 
     def __init__(
@@ -75,7 +56,7 @@ class Ring:
         if slots < 1:
             raise ValueError(f"a ring has at least 1 slot, not {slots}")
         self.name = name
-        self.dropped = 0
+        self.dropped = 0  # frames lost so far, here or before they came here
         self.error: HardwareError | None = None
         # Besides: one is being written to; and while one is lent and one copied, one can wait.
         places = max(slots + 2, 4)
@@ -100,17 +81,7 @@ class Ring:
         return place
 
     def put(self, time: float, number: int, lost: int = 0) -> None:
-        """Let readers have what was written to the slot.
-
-        Parameters
-        ----------
-        time : float
-            Seconds, monotonic.
-        number : int
-            The frame's number, above those before.
-        lost : int
-            Frames that are missing between the one before and this.
-        """
+        """Let readers have what is in the slot, which arrived at a time, after so many lost frames."""
         with self._came:
             here = self._writing
             self._time[here], self._number[here], self._lost[here] = time, number, lost

@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.io.types import Floats
 
-REMEDY = "measure it otherwise and write it into the rig file as 'delay' of the camera"
-"""What to do where the delay cannot be found."""
-
+_REMEDY = "measure it otherwise and write it into the rig file as 'delay' of the camera"
 _BLOCKS = 16  # along either side of the picture
 _COMPONENTS = 6  # of the picture's change that count
 _RANGE = (-0.05, 0.6)  # seconds
@@ -29,32 +27,14 @@ _UNSURE = 0.01  # seconds
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """How long after the middle of its exposure a frame arrives.
-
-    Attributes
-    ----------
-    seconds : float
-    error : float
-        Standard deviation that is expected of it, seconds.
-    """
+    """How long after the middle of its exposure a frame arrives."""
 
     seconds: float
-    error: float
+    error: float  # standard deviation that is expected of it, seconds
 
 
 def block_means(frames: NDArray[Any], blocks: int = _BLOCKS) -> Floats:
-    """Return the mean counts of a grid of blocks in each frame.
-
-    Parameters
-    ----------
-    frames : ndarray, (n, H, W), uint8, uint16 or float32
-    blocks : int
-        Along either side, or as many as there are pixels.
-
-    Returns
-    -------
-    ndarray, (n, blocks x blocks), float64
-    """
+    """Return the mean counts of a grid of blocks in each frame, (n, blocks x blocks), float64."""
     rows, columns = (np.linspace(0, size, min(blocks, size) + 1).astype(np.intp) for size in frames.shape[1:])
     sums = np.add.reduceat(frames, columns[:-1], axis=2, dtype=np.float64)
     sums = np.add.reduceat(sums, rows[:-1], axis=1)
@@ -101,7 +81,7 @@ def estimate_delay(
     if not total > 0 or best in (0, _TRIALS - 1) or costs[best] > (1 - _EXPLAINED) * total:
         raise HardwareError(
             f"{name}: its delay cannot be told, as the picture hardly changes with the place: press"
-            f" deeper, or {REMEDY}"
+            f" deeper, or {_REMEDY}"
         )
     around = tuple(trials[[best - 1, best + 1]])
     found = minimize_scalar(left, bounds=around, method="bounded", options={"xatol": 1e-5})
@@ -109,7 +89,7 @@ def estimate_delay(
     if not error < _UNSURE:
         raise HardwareError(
             f"{name}: its delay is {found.x:.3f} s, give or take {error:.3f} s, which is too little to go by:"
-            f" press deeper, or {REMEDY}"
+            f" press deeper, or {_REMEDY}"
         )
     return Delay(float(found.x), error)
 
@@ -151,14 +131,7 @@ def _fit(place: Floats, time: Floats, change: Floats) -> _Fit:
 class _Hats:
     """Least squares of broken lines: by bands, as threads of a matrix library take longer than the work.
 
-    Parameters
-    ----------
-    knot : ndarray, (n,), intp
-        The knot before each frame.
-    share : ndarray, (n,), float64
-        How far the frame is on the way to the next knot, from 0 to 1.
-    count : int
-        Knots.
+    Of each frame, (n,), it is given the knot before it, and its share of the way to the next.
     """
 
     def __init__(self, knot: NDArray[np.intp], share: Floats, count: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +14,7 @@ from mirrorskin.hw.stage import Limits, Position
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats
 
-_RAMP = 0.1
-"""Seconds in which a stage is taken to reach its speed, as long as nothing else is known."""
-
+_RAMP = 0.1  # seconds in which a stage is taken to reach its speed, as long as nothing else is known
 _STEPS_MAX = 10**6
 _TURNS_MAX = 10_000
 _ROUNDING = 1e-9  # of a step
@@ -24,20 +22,10 @@ _ROUNDING = 1e-9  # of a step
 
 @dataclass(frozen=True, slots=True)
 class Trapezoid:
-    """A way that begins and ends at rest: the speed rises evenly, stays, and falls as it rose.
+    """A way that begins and ends at rest: the speed rises evenly, stays, and falls as it rose."""
 
-    Attributes
-    ----------
-    length : float
-        Of the way, mm or radians, above 0.
-    speed : float
-        In the middle, mm/s or rad/s, above 0; not reached on a short way.
-    acceleration : float
-        mm/s^2 or rad/s^2, above 0.
-    """
-
-    length: float
-    speed: float
+    length: float  # mm or radians, above 0
+    speed: float  # in the middle, mm/s or rad/s; not reached on a short way
     acceleration: float
 
     @classmethod
@@ -97,6 +85,7 @@ class VerticalPlan:
     stop: float
     step: float | None = None
     speed: float | None = None
+    motion: ClassVar[Literal["vertical"]] = "vertical"
 
     def __post_init__(self) -> None:
         _check_number(self.start, "start", "mm")
@@ -113,11 +102,6 @@ class VerticalPlan:
     def in_steps(self) -> bool:
         """Whether the body halts for each frame."""
         return self.step is not None
-
-    @property
-    def motion(self) -> Literal["vertical"]:
-        """How the body moves."""
-        return "vertical"
 
     @property
     def first(self) -> Position:
@@ -178,6 +162,7 @@ class AxialPlan:
     turns: float = 1.0
     phase_step: float | None = None
     rate: float | None = None
+    motion: ClassVar[Literal["axial"]] = "axial"
 
     def __post_init__(self) -> None:
         _check_number(self.press, "press", "mm")
@@ -193,11 +178,6 @@ class AxialPlan:
     def in_steps(self) -> bool:
         """Whether the body halts for each frame."""
         return self.phase_step is not None
-
-    @property
-    def motion(self) -> Literal["axial"]:
-        """How the body moves."""
-        return "axial"
 
     @property
     def first(self) -> Position:
@@ -228,17 +208,7 @@ class AxialPlan:
     def frames_a_turn(self, frame_rate: float, each: int = 1) -> float:
         """Return how many frames a turn has, or what there is of the only one.
 
-        Parameters
-        ----------
-        frame_rate : float
-            Of the camera, Hz; in steps, it does not count.
-        each : int
-            Frames at each place, in steps.
-
-        Raises
-        ------
-        InputError
-            Without a halt the frame rate must be known.
+        Without a halt the camera's frame rate, Hz, must be known; in steps, each place has `each` frames.
         """
         if self.phase_step is not None:
             turn = math.tau / self.phase_step * each
@@ -295,14 +265,6 @@ def _check_steps(count: float, least: int) -> None:
 
 def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
     """Refuse a plan that a stage cannot do: places beyond its limits, too fast, too slow, no axes for arcs.
-
-    Parameters
-    ----------
-    plan : VerticalPlan or AxialPlan
-    stage : StageSettings
-        As the rig file says.
-    name : str
-        What to call the stage in messages.
 
     Raises
     ------

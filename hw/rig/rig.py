@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
@@ -17,46 +16,21 @@ from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
-if TYPE_CHECKING:
-    from mirrorskin.hw.grbl.stage import GrblStage
-
-_TICK = 0.02
-"""Seconds from one look of the guard to the next."""
-
-_STALL = 0.1
-_STALL_PERIODS = 3
+_TICK = 0.02  # seconds from one look of the guard to the next
+_STALL, _STALL_PERIODS = 0.1, 3  # seconds, and frame periods, without a frame that a move bears
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
 _JOIN = 5.0
 
 
 class Move:
-    """A move of the stage that is under way; a thread waits for its end.
-
-    Parameters
-    ----------
-    stage : Stage
-        It has taken the move.
-    began : float
-        When it was told to begin, seconds of `time.monotonic`.
-
-    Attributes
-    ----------
-    began : float
-        As given.
-    ended : float
-        When it was known to rest; infinite before.
-    error : Exception or None
-        Why it did not come to its end.
-    rest : Report or None
-        Where it came to rest.
-    """
+    """A move of the stage that is under way, and was told to begin at a time; a thread waits for its end."""
 
     def __init__(self, stage: Stage, began: float) -> None:
         self._stage = stage
-        self.began, self.ended = began, math.inf
-        self.error: Exception | None = None
-        self.rest: Report | None = None
+        self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
+        self.error: Exception | None = None  # why it did not come to its end
+        self.rest: Report | None = None  # where it came to rest
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._wait, name=f"{stage.name}: waits")
         self._thread.start()
@@ -95,15 +69,21 @@ class Rig(Closing):
     Parameters
     ----------
     stage : Stage
+        To move it, use the rig: only then is the move guarded.
     camera : Camera
     settings : RigSettings
 
     Attributes
     ----------
     stage, camera, settings
-        As given. To move the stage, use the rig: only then is the move guarded.
+        As given.
     name : str
         What to call it in messages.
+
+    Examples
+    --------
+    >>> with open_rig(load_rig("rig.toml")) as rig:  # doctest: +SKIP
+    ...     rig.go(Position(travel=1.0))
     """
 
     def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
@@ -135,13 +115,7 @@ class Rig(Closing):
         return self._move is not None and not self._move.over
 
     def check(self) -> None:
-        """Raise what went wrong, if anything did.
-
-        Raises
-        ------
-        HardwareError
-            Stage or camera failed; the stage was stopped.
-        """
+        """Raise what went wrong with stage or camera, if anything did; the stage was stopped then."""
         move = self._move
         if self._fault is None and move is not None and move.error is not None:
             if not isinstance(move.error, HardwareError):
@@ -151,13 +125,7 @@ class Rig(Closing):
             raise self._fault
 
     def begin(self, move: Callable[[], None]) -> Move:
-        """Tell the stage to move, and return while it does.
-
-        Parameters
-        ----------
-        move : callable
-            Calls ``move`` or ``precess`` of the stage.
-        """
+        """Tell the stage to move by calling `move`, and return while it does."""
         self.check()
         if self.camera.latest == -math.inf:
             self.take(1)  # a camera that is still starting is not missed later
@@ -167,12 +135,7 @@ class Rig(Closing):
         return self._move
 
     def end(self, move: Move) -> Report:
-        """Wait until a move is over.
-
-        Returns
-        -------
-        Report
-            Where the body rests.
+        """Wait until a move is over, and return where the body rests.
 
         Raises
         ------
@@ -290,16 +253,12 @@ def open_rig(settings: RigSettings) -> Rig:
         stage = GrblStage(settings.stage)
         opening.callback(stage.close)
         if settings.stage.home:
-            _check_homing(stage)
+            if not stage.homes:  # nobody would know where it is
+                raise InputError(
+                    f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or "
+                    "home = false"
+                )
             if stage.report().state == "alarm":
                 stage.home()
         opening.pop_all()
     return Rig(stage, camera, settings)
-
-
-def _check_homing(stage: GrblStage) -> None:
-    """Refuse a stage that is never where it says, because its homing is switched off."""
-    if not stage.homes:
-        raise InputError(
-            f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or home = false"
-        )

@@ -23,9 +23,7 @@ from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 _DARK_FRAMES = 16
 
-UNKNOWN_DELAY = 0.2
-"""Seconds that a camera's frames are taken to be late at most, where nobody said."""
-
+UNKNOWN_DELAY = 0.2  # seconds that a camera's frames are taken to be late at most, where it is not known
 _UPRIGHT = 1e-4  # rad
 
 
@@ -44,8 +42,8 @@ class Scan(Closing):
 
     Attributes
     ----------
-    rig : Rig
-    plan : VerticalPlan or AxialPlan
+    rig, plan
+        As given.
     name, header, shape, dtype, motion, rewindable
         As of every source; of ``shape``, the first is the number of frames expected.
     count, dropped : int
@@ -205,8 +203,7 @@ def _scalar(value: float | None) -> Floats | None:
     return None if value is None else np.asarray(value, np.float64)
 
 
-_ASTRAY = (0.02, 2e-3)
-"""How far from where it was sent the body may rest, mm and rad."""
+_ASTRAY = (0.02, 2e-3)  # how far from where it was sent the body may rest, mm and rad
 
 
 class StepScan(Scan):

@@ -24,13 +24,7 @@ _NEAR = 9  # frames on either side of a gap
 
 
 class Progress:
-    """Tells how far along a plan's way each report is: mm, or radians without jumps.
-
-    Parameters
-    ----------
-    plan : VerticalPlan or AxialPlan
-        It goes without a halt.
-    """
+    """Returns how far along the way of a plan without halts each report is: mm, or radians without jumps."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -64,14 +58,7 @@ class LiveTrack:
     """Where the body is, as far as it is known while it moves: the planned way, locked to the latest reports.
 
     The reports of the last moments tell by a straight line which of the plan's seconds it is at, and how
-    fast these pass; the plan tells the place. It never runs back.
-
-    Parameters
-    ----------
-    path : Trapezoid
-        The planned way.
-    began : float
-        When the move was told to begin, seconds.
+    fast these pass; the plan tells the place. It never runs back. The move was told to begin at `began`.
     """
 
     def __init__(self, path: Trapezoid, began: float) -> None:
@@ -133,7 +120,6 @@ class Track:
     path : Trapezoid
         The way as it was gone.
     reports : int
-        How many there are.
     spread : float
         Standard deviation of the reports about the result, mm or radians.
     """
@@ -224,19 +210,8 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
     line through those of the frames around, by their numbers. Frames that were lost but not counted are seen
     by the whole periods by which all later ones are late.
 
-    Parameters
-    ----------
-    number : array_like, (n,)
-        Of the frames; those lost are counted, as far as anyone noticed.
-    arrival : array_like, (n,)
-        Seconds.
-    window : int
-        Frames on either side that count.
-
-    Returns
-    -------
-    ndarray, (n,), float64
-        Seconds; never decreasing.
+    Numbers are of the frames, lost ones counted as far as anyone noticed; `window` frames on either side
+    count. The times returned, (n,), seconds, never decrease.
     """
     t = np.asarray(arrival, np.float64)
     if len(t) < 3:

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.hw import video
-from mirrorskin.hw.camera import Tally
+from mirrorskin.hw.camera_thread import FrameCounter
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.hw.video import VideoCamera, to_grey
@@ -147,7 +147,7 @@ def test_a_network_stream_has_the_right_frames_at_the_right_rate_and_comes_back(
         drawn = [read_number(picture) for picture in pixels]
         assert np.all(np.diff(drawn) == np.diff(numbers))
         np.testing.assert_allclose(pixels[50], draw_number(drawn[50]), atol=12)
-        sent = Tally()
+        sent = FrameCounter()
         for number in drawn:
             sent.add(server.sent[number])
         assert opened.counts.rate == pytest.approx(sent.counts().rate, rel=0.02)
@@ -493,7 +493,7 @@ def test_a_picture_that_does_not_say_when_is_due_a_period_later() -> None:
 
 
 def test_the_rate_is_that_of_the_newest_frames_whatever_their_jitter() -> None:
-    tally = Tally()
+    tally = FrameCounter()
     rng = np.random.default_rng(1)
     assert np.isnan(tally.counts().rate)
     times = np.concatenate([np.arange(50) / 10, 5 + np.arange(200) / 80])
@@ -506,7 +506,7 @@ def test_the_rate_is_that_of_the_newest_frames_whatever_their_jitter() -> None:
 
 @pytest.mark.parametrize("after", [1, 20, 64, 110, 200])
 def test_a_pause_does_not_change_the_rate_and_counts_as_one_late_frame(after) -> None:
-    tally = Tally()
+    tally = FrameCounter()
     for at in np.concatenate([np.arange(90) / 50, 30 + np.arange(after) / 50]):
         tally.add(at)
     counts = tally.counts(dropped=3, reconnects=2)
@@ -515,7 +515,7 @@ def test_a_pause_does_not_change_the_rate_and_counts_as_one_late_frame(after) ->
 
 
 def test_frames_in_bursts_have_the_rate_of_all() -> None:
-    tally = Tally()
+    tally = FrameCounter()
     for burst in range(40):
         for frame in range(8):
             tally.add(0.08 * burst + 1e-5 * frame)
@@ -523,14 +523,14 @@ def test_frames_in_bursts_have_the_rate_of_all() -> None:
 
 
 def test_late_is_more_than_one_and_a_half_periods() -> None:
-    tally = Tally()
+    tally = FrameCounter()
     for at in [*np.arange(20) / 10, 1.9 + 0.149, 1.9 + 0.149 + 0.151]:
         tally.add(at)
     assert tally.counts().late == 1
 
 
 def test_frames_at_the_same_instant_have_a_rate() -> None:
-    tally = Tally()
+    tally = FrameCounter()
     for _ in range(40):
         tally.add(1.0)
     assert tally.counts().rate > 0
