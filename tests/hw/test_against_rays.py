@@ -9,7 +9,7 @@ import numpy as np
 import poses
 import pytest
 import rays
-from geometry import pixel_centres, response
+from geometry import pixel_centres
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin import Axial, Camera, Horizontal, Movement, Plane, Twin, Twist
@@ -121,13 +121,6 @@ def test_a_scattering_mirror_shows_the_mean_of_many_rays(
     chamber: str, pattern: str, distance: float, device: Device
 ) -> None:
     compare(dataclasses.replace(CHAMBERS[chamber], scatter=np.radians(3.0)), pattern, distance, device)
-
-
-def test_an_ideal_mirror_under_a_uniform_wall_has_the_response_of_its_zenith() -> None:
-    zenith = np.radians(np.linspace(0, 60, 601))[np.newaxis]
-    light = Ideal(body_of(rays.Chamber(scatter=np.radians(3.0))), Uniform()).light(level_sheet(zenith))
-    assert light.dtype == np.float32
-    np.testing.assert_allclose(light, response(zenith), atol=1e-6)
 
 
 def test_under_a_linear_wall_brightness_is_linear_in_zenith_and_saturates_beyond() -> None:

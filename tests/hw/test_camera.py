@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mirrorskin.hw.twin.camera import Camera, Sensor, frame_dtype
+from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.io import InputError
 from mirrorskin.kernels import exposure
 from mirrorskin.kernels.device import Device
@@ -50,10 +50,6 @@ def test_levels_grow_with_the_bits(dtype: str, bits: int | None, levels: tuple[f
     assert (camera.bits, camera.dark, camera.bright, camera.top) == levels
 
 
-def test_a_camera_is_one_of_eight_bits_unless_told_otherwise() -> None:
-    assert Camera() == Camera(np.dtype(np.uint8), 1.5, 0, bits=8)
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -90,27 +86,6 @@ def test_what_cannot_be_is_refused_in_one_line(values: dict[str, Any], words: st
     with pytest.raises(InputError, match=words) as refused:
         make_camera(**values)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"noise": 0, "seed": 2**64 - 1, "electrons": 0.001},
-        {"electrons": math.inf, "distance": math.inf, "gain_deviation": 0.99},
-        {"frame_rate": 50, "exposure": 1 / 50, "point_spread": 3, "distance": 0.1},
-        {"frame_rate": 30, "exposure": 1 / 30},
-    ],
-)
-def test_what_can_just_be_is_taken(values: dict[str, Any]) -> None:
-    camera = make_camera(**values)
-    assert {name: getattr(camera, name) for name in values} == values
-
-
-def test_a_type_is_known_by_any_of_its_names() -> None:
-    assert frame_dtype("u2") == frame_dtype(np.uint16) == np.uint16
-    for unknown in ("int32", "float64", "no type", "U5"):
-        with pytest.raises(InputError, match="take uint8, uint16, float32"):
-            frame_dtype(unknown)
 
 
 @pytest.mark.parametrize(("dtype", "bits"), [*KINDS, ("float32", None)])
@@ -194,23 +169,6 @@ def test_the_photon_transfer_curve_has_the_slope_of_a_count_and_the_height_of_th
     assert height == pytest.approx(expected[0], rel=0.02)
 
 
-@pytest.mark.parametrize("electrons", [2, 10, 50])
-def test_few_electrons_are_skew_as_poissons(electrons: int) -> None:
-    camera = make_camera(noise=0, electrons=electrons / 208)
-    drawn = (
-        shoot(Sensor(camera, SHAPE), lit(1), range(40)).ravel().astype(np.float64) - 16
-    ) * camera.electrons
-    assert drawn.mean() == pytest.approx(electrons, abs=4 * np.sqrt(electrons / drawn.size))
-    assert drawn.var() == pytest.approx(electrons, rel=0.015)
-    poisson = float(stats.poisson(electrons).stats("s"))
-    assert stats.skew(drawn) == pytest.approx(poisson, abs=0.01 * poisson + 5 * np.sqrt(6 / drawn.size))
-
-
-def test_no_electrons_no_noise_but_that_of_reading() -> None:
-    counts = shoot(Sensor(make_camera(noise=0, electrons=3.0), SHAPE), lit(0), range(2))
-    assert (counts == 16).all()
-
-
 def test_noise_of_a_pixel_depends_on_no_other_pixel_frame_or_seed() -> None:
     def noise(frame: int, seed: int = 0) -> NDArray[np.float64]:
         counts = shoot(Sensor(make_camera(noise=1, seed=seed), (384, 512)), lit(0, (384, 512)), [frame])[0]
@@ -241,37 +199,6 @@ def test_counts_stop_at_both_ends_and_do_not_wrap(dtype: str, bits: int) -> None
         assert (counts == end).mean() == pytest.approx(share, abs=4 * np.sqrt(share / counts.size))
 
 
-@EVERY
-def test_the_same_seed_gives_the_same_counts_whatever_came_between(device: Device, dtype: str) -> None:
-    camera = make_camera(dtype, noise=4, seed=3, electrons=20, gain_deviation=0.01, offset_deviation=1)
-    light = np.random.default_rng(0).random((10, 13), np.float32)
-    first, other = Sensor(camera, (10, 13), device), Sensor(camera, (9, 7), device)
-    forward = shoot(first, light, range(6))
-    shoot(other, lit(1, (9, 7)), range(3))
-    shoot(first, lit(1, (10, 13)), [-2, 2**40])
-    again = shoot(first, light, [5, 3, 1, 0, 2, 4])[[3, 2, 4, 1, 5, 0]]
-    np.testing.assert_array_equal(again, forward)
-    np.testing.assert_array_equal(shoot(Sensor(camera, (10, 13), device), light, range(6)), forward)
-    assert (forward[0] != forward[1]).mean() > 0.5
-
-
-def test_frames_of_64_bits_and_numpys_numbers_are_frames() -> None:
-    sensor = Sensor(make_camera(seed=2**64 - 1), (3, 4))
-    numbers: list[Any] = [0, 1, -1, 2**32, -(2**63), 2**63 - 1]
-    frames = shoot(sensor, lit(0, (3, 4)), numbers)
-    assert len(np.unique(frames.reshape(len(numbers), -1), axis=0)) == len(numbers)
-    np.testing.assert_array_equal(shoot(sensor, lit(0, (3, 4)), [np.int64(-1)])[0], frames[2])  # type: ignore[list-item]
-
-
-def test_a_frame_changes_nothing_but_its_own_place_in_a_stack() -> None:
-    stack = np.full((3, *SHAPE), 77, np.uint8)
-    light = lit(1)
-    Sensor(make_camera("uint8"), SHAPE).expose(light, 0, stack[1])
-    assert (stack[[0, 2]] == 77).all()
-    assert (light == 1).all()
-    assert abs(stack[1].mean() - 224) < 0.1
-
-
 def test_pixels_deviate_as_much_as_told() -> None:
     shape = (300, 400)
     sensor = Sensor(make_camera("uint16", gain_deviation=0.02, offset_deviation=5, seed=1), shape)
@@ -284,12 +211,6 @@ def test_pixels_deviate_as_much_as_told() -> None:
     assert abs(np.corrcoef(gain.ravel(), sensor.offset.ravel())[0, 1]) < 2 * error
     counts = shoot(sensor, lit(0, shape), [0])[0]
     assert abs(np.corrcoef(counts.ravel() - sensor.offset.ravel(), sensor.offset.ravel())[0, 1]) < 2 * error
-
-
-def test_pixels_are_alike_unless_told_otherwise() -> None:
-    sensor = Sensor(make_camera(), SHAPE)
-    assert (sensor.offset == 16).all()
-    assert (sensor.full == 224).all()
 
 
 def test_the_seed_decides_the_pixels_and_one_deviation_does_not_change_the_other() -> None:
@@ -310,11 +231,3 @@ def test_no_pixel_is_blind() -> None:
     gain = (sensor.full - sensor.offset) / 208
     assert gain.min() == pytest.approx(0.05, rel=1e-5)
     assert (gain < 0.051).mean() == pytest.approx(stats.norm.sf(0.95 / 0.9), abs=0.02)
-
-
-def test_the_maps_cannot_be_written() -> None:
-    sensor = Sensor(make_camera(), SHAPE)
-    for values in (sensor.offset, sensor.full):
-        assert (values.shape, values.dtype) == (SHAPE, np.float32)
-        with pytest.raises(ValueError, match="read-only"):
-            values[0, 0] = 0

@@ -98,15 +98,6 @@ def test_a_ball_pushed_back_goes_through_mindlins_loop() -> None:
         assert stick_radius(slips, BALL) == pytest.approx(half.stick_radius, rel=0.01)
 
 
-def test_what_slipped_sticks_when_the_body_turns_back() -> None:
-    contact = Friction(SPACE, BALL, MU)
-    contact.move(push(0.5 * FAR))
-    onwards = contact.move(push(0.502 * FAR))
-    back = contact.move(push(0.5 * FAR))
-    assert onwards.sum() > 0.4 * (BALL > 0).sum()
-    assert back.sum() < 0.02 * (BALL > 0).sum()
-
-
 @pytest.mark.parametrize("share", [0.9, 0.6, 0.3])
 def test_a_twisted_ball_sticks_in_the_disc_of_lubkin(share: float) -> None:
     theory = contact_theory.twisted(HERTZ, MU, MODULUS, share * RADIUS)
@@ -118,25 +109,10 @@ def test_a_twisted_ball_sticks_in_the_disc_of_lubkin(share: float) -> None:
     np.testing.assert_allclose(force(contact), 0, atol=1e-4 * HERTZ.force)
 
 
-def test_a_ball_twisted_on_and_on_comes_to_the_torque_of_sliding() -> None:
-    contact = Friction(SPACE, BALL, MU)
-    stuck = [stick_radius(contact.move(twist(angle)), BALL) for angle in (0.1, 0.3, 0.9, 2.0)]
-    assert stuck == sorted(stuck, reverse=True)
-    assert torque(contact) == pytest.approx(3 * np.pi / 16 * MU * HERTZ.force * RADIUS, rel=0.005)
-
-
 @pytest.fixture
 def glued() -> tuple[Friction, float]:
     disc = np.where(R < RADIUS, 1.0, 0.0)
     return Friction(SPACE, disc, 1e6), float(np.sqrt(disc.sum() / np.pi)) * PIXEL
-
-
-def test_a_glued_disc_is_as_stiff_as_the_books_say(glued: tuple[Friction, float]) -> None:
-    contact, radius = glued
-    slips = contact.move(push(0.3, 0.4))
-    assert not slips.any()
-    expected = contact_theory.disc_push(radius, MODULUS, 0.5)
-    np.testing.assert_allclose(force(contact), [0.6 * expected, 0.8 * expected], rtol=0.01)
 
 
 def test_a_glued_disc_resists_twist_as_reissner_and_sagoci_say(glued: tuple[Friction, float]) -> None:
@@ -173,26 +149,6 @@ def test_each_pixel_obeys_coulomb() -> None:
     assert all(0.02 < share < 0.98 for share in shares)
 
 
-def test_a_turned_contact_slips_as_before() -> None:
-    pressure = np.random.default_rng(2).exponential(1.0, (31, 31))
-    half_space = HalfSpace((31, 31), (0.1, 0.1), MODULUS)
-    moves = [(0.3, 0.1), (0.2, 0.4)]
-    first, turned = Friction(half_space, pressure, MU), Friction(half_space, np.rot90(pressure), MU)
-    for x, y in moves:
-        slips = first.move(push(x, y, (31, 31)))
-        again = turned.move(push(-y, x, (31, 31)))
-        assert 0 < slips.sum() < slips.size
-        assert np.mean(np.rot90(slips) != again) < 0.01
-        quarter = np.rot90(np.stack([-first.traction[1], first.traction[0]]), axes=(1, 2))
-        np.testing.assert_allclose(turned.traction, quarter, rtol=0, atol=0.01 * MU * pressure.max())
-
-
-def test_without_friction_all_slips_and_nothing_pulls() -> None:
-    contact = Friction(SPACE, BALL, 0.0)
-    np.testing.assert_array_equal(contact.move(push(0.1)), BALL > 0)
-    assert not contact.traction.any()
-
-
 def test_a_body_that_stands_still_does_not_slip() -> None:
     contact = Friction(SPACE, BALL, MU)
     assert not contact.move(push(0.0)).any()
@@ -200,32 +156,6 @@ def test_a_body_that_stands_still_does_not_slip() -> None:
     held = contact.traction.copy()
     assert not contact.move(push(0.1)).any()
     np.testing.assert_array_equal(contact.traction, held)
-
-
-def test_rounding_is_no_movement() -> None:
-    contact = Friction(SPACE, BALL, MU)
-    contact.move(push(0.1))
-    assert not contact.move(push(0.1 * (1 + 1e-14))).any()
-    contact.move(push(0.0))
-    assert not contact.move(push(1e-17)).any()
-
-
-def test_without_contact_nothing_slips() -> None:
-    contact = Friction(SPACE, np.zeros((SIDE, SIDE)), MU)
-    assert not contact.move(push(1.0)).any()
-    assert not contact.traction.any()
-
-
-def test_a_single_pixel_sticks_and_then_slips() -> None:
-    pressure = np.zeros((5, 6))
-    pressure[2, 4] = 1.0
-    contact = Friction(HalfSpace((5, 6), (0.1, 0.1), MODULUS), pressure, MU)
-    # Its centre shifts by 3 / (4 pi E) of 1 / r + x^2 / r^3 integrated over it, 6 l ln(1 + sqrt 2).
-    most = MU * 6 * 0.1 * np.log(1 + np.sqrt(2)) * 3 / (4 * np.pi * MODULUS)
-    assert not contact.move(push(0.9 * most, shape=(5, 6))).any()
-    assert contact.traction[0, 2, 4] == pytest.approx(0.9 * MU, rel=0.01)
-    assert np.argwhere(contact.move(push(1.5 * most, shape=(5, 6)))).tolist() == [[2, 4]]
-    assert contact.traction[0, 2, 4] == pytest.approx(MU)
 
 
 def test_a_step_that_does_not_settle_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,13 +66,6 @@ def test_a_file_of_the_truth_is_like_the_object_itself(tmp_path: Path) -> None:
         np.testing.assert_allclose(found[gentle], expected[gentle], atol=3e-3)
 
 
-def test_a_small_map_lies_amid_a_larger_field(tmp_path: Path) -> None:
-    path = write(tmp_path / "bump.npy", hill())
-    height = make_object(str(path), (60, 60), (PIXEL, PIXEL)).height(*geometry.pixel_centres((60, 60), PIXEL))
-    np.testing.assert_allclose(height[10:50, 2:58], hill() - hill().max(), atol=1e-12)
-    assert np.isnan(height).sum() == 60 * 60 - 40 * 56
-
-
 @pytest.mark.parametrize(
     ("name", "values", "words"),
     [
@@ -101,18 +94,6 @@ def test_files_that_are_not_what_they_claim(tmp_path: Path, name: str, content: 
 @pytest.mark.parametrize("name", ["missing.npy", "missing.png"])
 def test_missing_files(tmp_path: Path, name: str) -> None:
     refused(tmp_path / name, "No such file")
-
-
-def test_a_folder_is_no_file(tmp_path: Path) -> None:
-    (tmp_path / "folder.npy").mkdir()
-    refused(tmp_path / "folder.npy", "directory")
-
-
-@pytest.mark.parametrize("scale", [0.0, -0.001, np.nan])
-def test_a_scale_must_be_positive(tmp_path: Path, scale: float) -> None:
-    path = write(tmp_path / "hill.png", np.ones((4, 4), np.uint16))
-    with pytest.raises(InputError, match="scale"):
-        load_height_map(path, (PIXEL, PIXEL), scale=scale)
 
 
 def refused(path: Path, words: str) -> None:

@@ -53,31 +53,6 @@ def test_frames_come_at_the_set_rate_and_are_the_twins() -> None:
     np.testing.assert_array_equal(frames, all_frames())
 
 
-def test_blocks_tell_time_and_travel() -> None:
-    live, clock = make_live()
-    live.read()
-    clock.now += 4.5 / RATE
-    block = live.read(np.empty((10, *live.shape[1:]), live.dtype))
-    assert block is not None
-    assert (block.index, len(block.frames), block.dropped) == (1, 4, 0)
-    assert block.time is not None
-    assert block.travel is not None
-    np.testing.assert_allclose(block.time, np.arange(1, 5) / RATE)
-    np.testing.assert_array_equal(block.travel, TRAVEL[1:5])
-
-
-def test_a_small_buffer_leaves_the_rest_for_the_next_read() -> None:
-    live, clock = make_live()
-    live.read()
-    clock.now += 5 / RATE
-    out = np.empty((3, *live.shape[1:]), live.dtype)
-    first, second = live.read(out), live.read(out)
-    assert first is not None
-    assert second is not None
-    assert (first.index, len(first.frames), second.index, len(second.frames)) == (1, 3, 4, 2)
-    assert clock.slept == [] or max(clock.slept) <= 1 / RATE
-
-
 def test_a_late_reader_loses_the_oldest_frames_and_is_told() -> None:
     live, clock = make_live()
     live.read()
@@ -96,13 +71,6 @@ def test_after_the_last_frame_there_is_none_however_late_it_is() -> None:
     assert block is not None
     assert (block.index, len(block.frames)) == (COUNT - 8, 8)
     assert live.read() is None
-
-
-def test_without_a_rate_the_cameras_own_is_taken() -> None:
-    live, clock = make_live(None)
-    live.read()
-    live.read()
-    assert clock.slept == pytest.approx([1 / 30])
 
 
 def test_time_does_not_run_back() -> None:
@@ -140,28 +108,3 @@ def test_frames_of_other_movements_are_passed_over_too_and_told_apart() -> None:
         indexes.append((block.index, len(block.frames), block.dropped))
     assert indexes == [(0, 1, 0), (7, 8, 6), (15, 1, 0), (16, 3, 0), (32, 8, 13)]
     assert live.read() is None
-
-
-def test_a_twin_read_from_the_middle_begins_anew() -> None:
-    twin = Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=Vertical(TRAVEL))
-    twin.skip(COUNT - 2)
-    clock = Clock()
-    live = Live(twin, RATE, clock=clock, sleep=clock.sleep)
-    for number in range(3):
-        block = live.read()
-        assert block is not None
-        assert (block.index, len(block.frames), block.dropped) == (number, 1, 0)
-        np.testing.assert_array_equal(block.frames[0], all_frames()[number])
-
-
-def test_a_buffer_that_does_not_fit_is_refused() -> None:
-    live, _ = make_live()
-    with pytest.raises(InputError, match="buffer"):
-        live.read(np.empty((1, 2, 3), live.dtype))
-
-
-def test_closing_is_leaving() -> None:
-    live, _ = make_live()
-    with live as entered:
-        assert entered is live
-    live.close()

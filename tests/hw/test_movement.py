@@ -13,7 +13,7 @@ from mirrorskin.hw.twin import Axial, Body, Cylinder, Horizontal, Object, Plane,
 from mirrorskin.hw.twin.movement import Movement
 from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.view import View
-from mirrorskin.io import Block, InputError
+from mirrorskin.io import InputError
 
 POINTS = np.random.default_rng(3).uniform(-8, 8, (50, 3))
 
@@ -63,30 +63,6 @@ def test_turns_by_parts_that_binary_numbers_only_come_close_to_are_the_same_pose
             np.testing.assert_array_equal(seen(movement, frame), seen(movement, frame + 3 * count))
 
 
-def test_places_are_kept_to_rounding() -> None:
-    for movement in (
-        Axial(np.linspace(-20, 20, 77), 0.1, 1.0),
-        Horizontal(np.random.default_rng(1).normal(size=(9, 2)), 1.0),
-        Twist([0.0, 7.0, -9.0], 1.0),
-        Vertical([-0.1, 0.2]),
-    ):
-        reduced = movement.reduced(movement.path)
-        turns = (
-            (movement.path - reduced) / (2 * np.pi)
-            if isinstance(movement, Axial)
-            else reduced - movement.path
-        )
-        np.testing.assert_allclose(turns, np.rint(turns), atol=1e-11)
-        if isinstance(movement, Axial):
-            assert 0 <= reduced.min() < reduced.max() < 2 * np.pi
-
-
-def test_a_phase_that_jumps_back_goes_on_as_a_path() -> None:
-    movement = Axial(np.arange(16) * np.pi / 4 % (2 * np.pi), 0.04, 1.0)
-    np.testing.assert_allclose(np.diff(movement.path), np.pi / 4)
-    assert movement.positions.max() < 2 * np.pi
-
-
 def test_the_object_goes_against_a_sideways_move() -> None:
     movement = Horizontal([[0.0, 0.0], [0.3, -0.2]], 0.5)
     np.testing.assert_allclose(seen(movement, 1), POINTS + np.array([-0.3, 0.2, 0.5]))
@@ -95,19 +71,6 @@ def test_the_object_goes_against_a_sideways_move() -> None:
 def test_the_object_turns_against_a_twist() -> None:
     expected = Rotation.from_euler("z", -0.2).apply(POINTS) + np.array([0, 0, 0.5])
     np.testing.assert_allclose(seen(Twist([0.0, 0.2], 0.5), 1), expected)
-
-
-def test_blocks_and_headers_say_where_the_body_is() -> None:
-    axial = Axial([0.1, 0.2, 0.3], 0.04, 1.0, (0.0, 1.0, 2.0))
-    assert axial.header().pivot == (0.0, 1.0, 2.0)
-    assert (axial.header().tilt, axial.header().press) == (0.04, 1.0)
-    np.testing.assert_array_equal(axial.mark(Block(np.zeros((2, 1, 1)), 1)).phase, [0.2, 0.3])
-    sideways = Horizontal(np.arange(8.0).reshape(4, 2), 0.5)
-    moved = sideways.mark(Block(np.zeros((3, 1, 1)), 0)).displacement
-    np.testing.assert_array_equal(moved, [[0, 1], [2, 3], [4, 5]])
-    assert sideways.header().press == 0.5
-    np.testing.assert_array_equal(Twist([0.1, 0.2], 0.5).mark(Block(np.zeros((1, 1, 1)), 1)).twist, [0.2])
-    assert Vertical([1.0]).header().press is None
 
 
 @pytest.mark.parametrize(
@@ -137,10 +100,6 @@ def test_bad_input_is_refused_in_one_line(make: Any, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_tilt_of_thirty_degrees_is_the_most() -> None:
-    assert Axial([0.0], np.radians(30), 1.0).tilt == np.radians(30)
-
-
 @pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 40.0), (3.0, -2.0, -1.5), (-30.0, 10.0, 0.0)])
 def test_a_rotation_raises_the_rim_of_a_disc_as_far_as_it_says(pivot: tuple[float, float, float]) -> None:
     angles = np.linspace(-np.pi, np.pi, 721)
@@ -162,8 +121,3 @@ def test_nothing_stands_higher_than_its_rise(thing: Object) -> None:
         movement = Axial(rng.uniform(-3, 3, 1), rng.uniform(0.05, 0.5), rng.uniform(1, 4), (x, y, z))
         highest = np.nanmax(meet(thing, movement.pose(movement.path[0]), view).height, initial=0.0)
         assert 0 < highest <= movement.rise(thing.radius)
-
-
-def test_what_stays_upright_rises_as_far_as_the_body_is_lowered() -> None:
-    for movement in (Vertical([0.1, 1.5, 0.7]), Horizontal([[9.0, 0.0]], 1.5), Twist([2.0], 1.5)):
-        assert movement.rise(10.0) == 1.5

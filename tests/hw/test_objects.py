@@ -69,24 +69,6 @@ def test_azimuth_is_counter_clockwise_downhill(slope: tuple[float, float], azimu
     assert np.tan(zenith[0]) == pytest.approx(np.hypot(*slope))
 
 
-def test_a_level_surface_has_no_azimuth() -> None:
-    zenith, azimuth = zenith_azimuth(np.zeros(1), np.zeros(1))
-    assert zenith[0] == 0
-    assert np.isnan(azimuth[0])
-
-
-def test_the_plane_ends_at_the_sheet() -> None:
-    beyond = -6.0 * np.array([np.cos(Plane().azimuth)]), -6.0 * np.array([np.sin(Plane().azimuth)])
-    assert np.isnan(Plane(reach=5).height(*beyond))
-    assert np.isnan(Plane(reach=5).slope(*beyond)).all()
-    assert Plane(reach=7).height(*beyond) == pytest.approx(-np.tan(np.radians(20)))
-
-
-def test_response_is_that_of_the_body() -> None:
-    zenith = np.radians(np.linspace(0, 90, 9001))
-    np.testing.assert_allclose(uniform_response(zenith), geometry.response(zenith), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("degrees", "share"),
     [
@@ -103,10 +85,6 @@ def test_response_is_that_of_the_body() -> None:
 )
 def test_response_in_numbers(degrees: float, share: float) -> None:
     assert uniform_response(np.radians([degrees]))[0] == pytest.approx(share, abs=2e-5)
-
-
-def test_response_keeps_nan() -> None:
-    assert np.isnan(uniform_response(np.array([np.nan]))[0])
 
 
 def test_height_map_gives_its_samples_between_them_the_line_and_outside_nothing() -> None:
@@ -134,26 +112,3 @@ def test_the_radius_of_a_height_map_leaves_out_the_table() -> None:
     assert HeightMap(heights, (0.5, 0.25)).radius == pytest.approx(7.5)
     heights[heights == -2] = np.nan  # no table: one level is the object
     assert HeightMap(heights, (0.5, 0.25)).radius == pytest.approx(7.5)
-
-
-def test_a_height_map_against_one_place_at_a_time() -> None:
-    rng = np.random.default_rng(7)
-    heights = -rng.uniform(0, 3, (9, 12))
-    heights[rng.uniform(size=heights.shape) < 0.1] = np.nan
-    thing = HeightMap(heights, (0.5, 0.25))
-    places = rng.uniform(-3.5, 3.5, (500, 2))
-    places[:100] = np.round(places[:100] * 4) / 4  # on samples and halfway between them
-    for x, y in places:
-        column, row = x / 0.5 + 5.5, 4 - y / 0.25
-        weights = np.outer(
-            np.maximum(1 - np.abs(np.arange(9) - row), 0), np.maximum(1 - np.abs(np.arange(12) - column), 0)
-        )
-        used = weights > 0
-        expected = np.sum(weights[used] * heights[used]) if np.isclose(weights.sum(), 1) else np.nan
-        np.testing.assert_allclose(thing.height(np.array([x]), np.array([y])), [expected], atol=1e-12)
-
-
-def test_a_height_map_of_one_row() -> None:
-    thing = HeightMap(np.array([[0.0, -1.0]]), (0.5, 0.5))
-    found = thing.height(np.array([-0.25, 0.0, 0.25, 0.0]), np.array([0.0, 0.0, 0.0, 0.1]))
-    np.testing.assert_allclose(found, [0.0, -0.5, -1.0, np.nan])

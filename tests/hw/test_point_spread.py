@@ -49,25 +49,3 @@ def test_beyond_the_edge_the_picture_goes_on_as_it_ends(sigma: float) -> None:
     np.testing.assert_allclose(blurred(light, sigma), expected, atol=3e-4)
     even = np.full(SHAPE, 0.37, np.float32)
     np.testing.assert_allclose(blurred(even, sigma), 0.37, atol=1e-6)
-
-
-def test_without_spread_light_stays_where_it_is() -> None:
-    light = np.random.default_rng(5).random(SHAPE).astype(np.float32)
-    np.testing.assert_allclose(blurred(light, 0.0), light, atol=1e-6)
-
-
-def test_noise_is_not_blurred() -> None:
-    sensor = Sensor(Camera(np.dtype(np.float32), 2.0, point_spread=2.0), (200, 200))
-    counts = np.empty((200, 200), np.float32)
-    sensor.expose(np.zeros((200, 200), np.float32), 3, counts)
-    noise = counts - 16
-    assert noise.std() == pytest.approx(2.0, rel=0.03)
-    assert abs(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]) < 0.03
-
-
-def test_references_are_those_of_the_pixels_not_of_the_lens() -> None:
-    sharp, soft = (
-        Sensor(Camera(np.dtype(np.float32), gain_deviation=0.1, point_spread=sigma), SHAPE)
-        for sigma in (0, 2)
-    )
-    np.testing.assert_array_equal(sharp.full, soft.full)

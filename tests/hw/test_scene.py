@@ -91,23 +91,6 @@ def test_places_of_a_rotation_are_worked_out_once_in_the_order_of_their_first_ti
     assert len({float(frame[0, 0]) for frame in light}) == per_turn
 
 
-def test_places_gone_back_to_are_worked_out_once() -> None:
-    movement = Twist([0.0, 0.2, 0.1, 0.2, 0.0, 0.1], 1.0)
-    film, contact = recalling(movement)
-    all_light(film, movement)
-    assert [tell(pose) for pose in contact.poses] == [
-        tell(movement.pose(np.asarray(angle))) for angle in (0.0, 0.2, 0.1)
-    ]
-
-
-def test_nothing_is_worked_out_before_it_is_asked_for() -> None:
-    film, contact = recalling(MOVEMENTS["axial"])
-    assert not contact.poses
-    film.light(0)
-    film.light(0)
-    assert len(contact.poses) == contact.lit == 1
-
-
 @pytest.mark.parametrize(("limit", "count"), [(10 * PLACE_BYTES, 10), (10 * PLACE_BYTES - 1, 30)])
 def test_light_is_kept_as_long_as_there_is_room(limit: int, count: int) -> None:
     film, contact = recalling(MOVEMENTS["axial"], limit=limit)
@@ -115,21 +98,6 @@ def test_light_is_kept_as_long_as_there_is_room(limit: int, count: int) -> None:
     assert len(contact.poses) == count
     all_light(film, MOVEMENTS["axial"])
     assert len(contact.poses) == (count if count == 10 else 2 * count)
-
-
-@pytest.mark.parametrize(("room", "worked_out"), [(1, [0, 1, 2, 1, 0]), (2, [0, 1, 2, 0]), (3, [0, 1, 2])])
-def test_the_light_that_was_worked_out_first_makes_room(room: int, worked_out: list[int]) -> None:
-    angles = np.array([0.0, 0.1, 0.2])
-    movement = Twist(angles[[0, 1, 2, 1, 0]], 1.0)
-    film, contact = recalling(movement, limit=room * PLACE_BYTES)
-    all_light(film, movement)
-    assert [tell(pose) for pose in contact.poses] == [tell(movement.pose(angles[k])) for k in worked_out]
-
-
-def test_a_body_that_waits_is_worked_out_once_however_little_is_kept() -> None:
-    film, contact = recalling(MOVEMENTS["horizontal"], limit=0)
-    all_light(film, MOVEMENTS["horizontal"])
-    assert len(contact.poses) == 4
 
 
 @pytest.mark.parametrize("limit", [0, PLENTY])
@@ -151,18 +119,6 @@ def test_light_is_the_same_whatever_else_was_asked(name: str, share: float, limi
         if frame == 2:
             film.touched_throughout()
         np.testing.assert_array_equal(film.light(frame), whole[frame])
-
-
-@pytest.mark.parametrize("share", [0.0, 0.7])
-@pytest.mark.parametrize("name", ["horizontal", "twist"])
-def test_light_that_made_room_comes_back_the_same(name: str, share: float) -> None:
-    movement = MOVEMENTS[name]
-    whole = all_light(real(movement, share), movement)
-    assert whole.max() > 0.9
-    for limit in (0, 2 * PLACE_BYTES):
-        film = real(movement, share, limit)
-        for _ in range(2):
-            np.testing.assert_array_equal(all_light(film, movement), whole)
 
 
 @pytest.mark.parametrize("limit", [0, PLENTY])
@@ -232,11 +188,6 @@ def test_an_exposure_is_the_mean_over_the_poses_that_the_body_passes(name: str) 
         assert np.abs(found - still).max() > 0.1
 
 
-def test_one_frame_alone_is_exposed_where_the_body_stands() -> None:
-    movement = Horizontal([[0.4, 0.2]], 1.0)
-    np.testing.assert_allclose(real(movement, 0.9).light(0), real(movement).light(0), atol=1e-6)
-
-
 # A press, seen from straight above, is worked out at once.
 
 HEIGHT = np.random.default_rng(8).uniform(-2.2, 0.0, SHAPE)
@@ -280,21 +231,6 @@ def test_a_press_is_exposed_as_a_fine_grid_of_times_says(stroke: str, share: flo
 
 
 @pytest.mark.parametrize("stroke", STROKES)
-def test_a_press_without_exposure_is_in_contact_or_not(stroke: str) -> None:
-    scene = press(STROKES[stroke], 0.0)
-    for frame, depth in enumerate(STROKES[stroke]):
-        expected = np.where(-np.nan_to_num(HEIGHT, nan=-9.0) <= depth, AFTER, BEFORE)
-        np.testing.assert_allclose(scene.light(frame), expected, atol=1e-7)
-
-
-def test_a_press_can_be_asked_in_any_order() -> None:
-    scene, again = press(STROKES["down and up"], 0.5), press(STROKES["down and up"], 0.5)
-    whole = all_light(again, Vertical(STROKES["down and up"]))
-    for frame in (4, 0, 3, 3):
-        np.testing.assert_array_equal(scene.light(frame), whole[frame])
-
-
-@pytest.mark.parametrize("stroke", STROKES)
 def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
     movement = Vertical(STROKES[stroke])
     optics, contact = Ideal(Body(), Uniform()), Conform(BALL, VIEW)
@@ -313,10 +249,3 @@ def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
         # Five poses tell time to a tenth of an exposure's.
         np.testing.assert_allclose(blurred, exact, atol=0.1 + 1e-6)
         np.testing.assert_allclose(blurred.mean(axis=(1, 2)), exact.mean(axis=(1, 2)), atol=0.01)
-
-
-def test_the_way_up_looks_like_the_way_down() -> None:
-    movement = Vertical([0.0, 0.5, 1.0, 1.0, 0.5, 0.0])
-    for share in (0.0, 1.0):
-        light = all_light(real(movement, share), movement)
-        np.testing.assert_allclose(light, light[::-1], atol=1e-6)

@@ -42,33 +42,6 @@ def test_lines_are_refracted_at_the_top_towards_the_pinhole(distance: float, ind
     assert (view.slope_x * view.x + view.slope_y * view.y <= 0).all()
 
 
-def test_light_takes_the_shortest_time() -> None:
-    body, distance = Body(), 90.0
-    view = View(SHAPE, PIXEL, body, distance)
-
-    def time(move_x: float, move_y: float) -> np.ndarray:
-        x, y = at_top(view, body)
-        x, y = x + move_x, y + move_y
-        in_air = np.sqrt(x**2 + y**2 + (distance - body.height) ** 2)
-        return in_air + body.index * np.sqrt((x - view.x) ** 2 + (y - view.y) ** 2 + body.height**2)
-
-    for way in ((1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)):
-        later = time(*way) - time(0.0, 0.0)
-        assert (later > 0).all()
-        assert later.max() < 1e-7
-
-
-def test_without_refraction_lines_are_straight() -> None:
-    view = View(SHAPE, PIXEL, Body(index=1.0), 70.0)
-    np.testing.assert_allclose(view.slope_x, -view.x / 70, atol=1e-14)
-    np.testing.assert_allclose(view.slope_y, -view.y / 70, atol=1e-14)
-
-
-def test_on_the_axis_the_line_is_the_axis() -> None:
-    view = View((1, 1), PIXEL, Body(), 70.0)
-    assert view.slope_x[0, 0] == view.slope_y[0, 0] == 0
-
-
 @pytest.mark.parametrize("distance", [40.0, 39.0, 0.0, -50.0, -np.inf, np.nan])
 def test_a_camera_must_be_above_the_body(distance: float) -> None:
     with pytest.raises(InputError, match=r"put it more than 40\.0 mm above"):

@@ -17,7 +17,6 @@ from mirrorskin.kernels.device import C_TYPES, Device
 PIXELS = [1, 1300]
 PHASES = np.array([0.1, 1.0, 1.7, 2.9, 3.3, 4.4, 5.2, 6.1, 7.0, 8.8, 9.1])
 STEPS = {"uint8": 2**17, "uint16": 2**23}
-SUMS = ("total", "cosine", "sine", "square")
 
 
 def samples(dtype: str, pixels: int, seed: int = 0) -> NDArray[Any]:
@@ -189,25 +188,6 @@ def test_a_ring_is_summed_anew(device: Device, dtype: str, pixels: int) -> None:
     given = [pixels, high[0], *held, fit, *answers]
     again = run(device, "correlation_solve_pairs", pixels, given, int(dtype != "float32"), dtype)[6:]
     close(again, expected, dtype)
-
-
-def test_rounded_instruments_are_exact_for_samples_of_the_model() -> None:
-    made = np.array([[100, 7, -4], [30, 0, 12]])
-    phases = np.pi / 2 * np.array([0, 1, 2, 3, 1])
-    frames = np.stack(
-        [made[:, 0] + c * made[:, 1] + s * made[:, 2] for c, s in [(1, 0), (0, 1), (-1, 0), (0, -1), (0, 1)]]
-    )
-    coarse = np.array([[1, 3, 1], [1, -1, 2], [1, -3, 1], [1, 1, -3], [1, 0, 4]], np.int32)
-    exact = np.stack([np.ones(5), np.cos(phases), np.sin(phases)], axis=1)
-    upper = np.linalg.cholesky(exact.T @ exact).T
-    project = (upper @ np.linalg.inv(coarse.T @ exact)).ravel()
-    high = project.astype(np.float32)
-    fit = np.concatenate([high, project - high, np.linalg.inv(upper).ravel(), [0.5]]).astype(np.float32)
-    sums = np.zeros((4, 2), np.int64)
-    correlation.correlation_add(frames.astype(np.uint8), np.arange(5, dtype=np.int32), coarse, *sums)
-    answers = correlation.correlation_solve_counts(5, *coarse.sum(axis=0)[1:].tolist(), *sums, fit)
-    np.testing.assert_allclose(np.stack(answers[:3], axis=1), made, atol=1e-5)
-    np.testing.assert_allclose(answers[3], 0, atol=1e-4)
 
 
 def test_the_reference_is_least_squares_in_fractions() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from mirrorskin.engine.rotation.edges import LIMITS, find_edges
 from mirrorskin.kernels import edges
-from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, PASSES
+from mirrorskin.kernels.edges import COARSE, FINE, NEAR, PASSES
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (2, 3), (23, 37), (40, 131)]
 
@@ -56,16 +56,6 @@ def test_kernels_and_reference_draw_the_same(device, shape):
     assert min(shape) < 9 or told.sum() > 8
 
 
-def test_pairs_lie_on_their_directions_side():
-    for chosen in PASSES:
-        places, distances = edges.pairs(chosen)
-        assert np.abs(places).max() <= MARGIN - chosen.spacing // 2
-        assert (distances > 0).sum(axis=(1, 2)).min() >= chosen.least
-        np.testing.assert_array_equal(places[0, 0, :, 1], 0)  # first to the right
-        for way in places.reshape(edges.WAYS, -1, 2)[:, :, :]:
-            assert len({tuple(one) for one in way.tolist()}) >= 5
-
-
 def test_flags_that_neighbours_contradict_are_turned_over():
     contact = np.ones((9, 12), np.uint8)
     contact[2, 2] = contact[5, 4] = contact[5, 5] = 0  # one alone, two side by side
@@ -76,12 +66,6 @@ def test_flags_that_neighbours_contradict_are_turned_over():
     np.testing.assert_array_equal(edges.edges_clean(contact), expected)
     assert edges.edges_clean(np.zeros((1, 1), np.uint8))[0, 0] == 0
     assert edges.edges_clean(np.ones((1, 1), np.uint8))[0, 0] == 1
-
-
-def test_corners_of_contact_stay():
-    contact = np.zeros((9, 9), np.uint8)
-    contact[3:, 3:] = 1
-    np.testing.assert_array_equal(edges.edges_clean(contact), contact)
 
 
 @pytest.mark.parametrize("chosen", [NEAR, FINE, COARSE], ids=["near", "fine", "coarse"])
@@ -103,15 +87,6 @@ def test_a_bend_is_no_jump(bend):
         looked = edges.edges_join(cells, np.zeros((25, 25), np.uint8)) if chosen is COARSE else cells
         strength, _ = edges.edges_jumps(looked, chosen, LIMITS, np.ones((25, 25), np.uint8))
         assert not strength.any()
-
-
-def test_where_a_pass_is_quiet_no_other_looks():
-    cells, doubt = level(jump=20.0), np.ones((25, 25), np.uint8)
-    edges.edges_jumps(cells, NEAR, LIMITS, doubt)
-    assert doubt.all()
-    edges.edges_jumps(cells, FINE, LIMITS, doubt)
-    assert not doubt[4:-4, 4:-4].any()
-    assert not edges.edges_jumps(cells, FINE, LIMITS, np.zeros((25, 25), np.uint8))[0].any()
 
 
 def test_contact_ends_at_its_last_pixels_and_the_picture_ends_nothing():

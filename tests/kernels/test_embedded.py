@@ -98,14 +98,6 @@ def test_a_good_answer_is_kept_but_not_for_another_linker(start, tries, tmp_path
     assert len(kept(tmp_path)) == 1
 
 
-@pytest.mark.slow
-def test_without_any_linker(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(embedded, "find_zig", lambda: None)
-    with pytest.raises(DeviceError, match="gcc libc6-dev"):
-        embedded.verify()
-
-
 def test_ziglang_takes_over_from_a_broken_linker(tries, tmp_path, monkeypatch):
     zig = embedded.find_zig()
     working = [str(zig), "ld.lld"] if zig else [str(shutil.which("ld"))]
@@ -119,18 +111,6 @@ def test_ziglang_takes_over_from_a_broken_linker(tries, tmp_path, monkeypatch):
         assert os.environ["PATH"].endswith(os.pathsep + broken)
         assert kept(tmp_path) == ["ziglang"]
         assert len(tries) == 2
-
-
-@pytest.mark.slow
-def test_an_answer_that_cannot_be_kept_is_found_again(start, tries, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(not_a_folder(tmp_path)))
-    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "kernels"))
-    monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
-    embedded.verify()
-    first = len(tries)
-    start()
-    embedded.verify()
-    assert len(tries) == 2 * first
 
 
 def test_a_device_that_never_answers(monkeypatch):
@@ -220,10 +200,6 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
 )
 def test_the_best_name_without_an_instruction_that_is_lacking(flags, name):
     assert embedded.choose_name(flags) == name
-
-
-def test_flags_are_words_of_one_processor():
-    assert "sse2" in embedded._read_flags()
 
 
 @pytest.mark.parametrize("offset", [0, mmap.PAGESIZE - 5], ids=["in a page", "across two pages"])

@@ -15,11 +15,8 @@ from mirrorskin.kernels import exposure
 from mirrorskin.kernels.device import Device
 
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-QUARTERS = [1, 2, 7, 16, 1024, 1025, 4099]
+QUARTERS = [1, 7, 1025]
 LAST = 2**64 - 1
-
-# Pixels, far out in the tails, of pictures of 4096; found by trying all the numbers of 40000 frames.
-FAR = {13019: 4003, 6015: 3886, 36205: 532, 21968: 1461}
 
 
 def expose(device: Device, maps: list[NDArray[np.float32]], dtype: str, **how: float) -> NDArray[Any]:
@@ -78,32 +75,6 @@ def test_random_words_are_those_that_the_generators_authors_published(
     assert found[:, 0].tolist() == words
 
 
-@pytest.mark.parametrize("frame", [0, 1, 2**32 + 5, LAST])
-@pytest.mark.parametrize("seed", [0, 3 * 2**32 + 1, LAST])
-def test_each_half_of_frame_and_seed_counts(frame: int, seed: int) -> None:
-    counter = np.array([[0, 1], [0, 0], [frame % 2**32] * 2, [frame // 2**32] * 2], np.uint32)
-    a, b, c, d = exposure.philox(counter, (seed % 2**32, seed // 2**32))
-    near, far = exposure.radius(a), exposure.radius(c)
-    (x, y), (u, v) = exposure.direction(b), exposure.direction(d)
-    expected = np.concatenate([near * x, near * y, far * u, far * v])
-    np.testing.assert_array_equal(exposure.normals(2, frame, seed), expected)
-
-
-def test_radii_have_rayleighs_distribution_to_beyond_six_deviations() -> None:
-    parts = np.concatenate([np.arange(64), np.geomspace(64, 2**31 - 1, 1000).astype(np.int64)])
-    found = exposure.radius((2 * parts).astype(np.uint32))
-    np.testing.assert_allclose(found, stats.rayleigh.isf((parts + 0.5) / 2**31), rtol=1e-6, atol=1e-4)
-    assert found.max() > 6.6
-
-
-def test_directions_are_spread_evenly_over_the_circle() -> None:
-    words = (np.arange(4096, dtype=np.uint64) * 2**20 + 2**19).astype(np.uint32)
-    x, y = exposure.direction(words)
-    np.testing.assert_allclose(x**2 + y**2, 1, rtol=1e-14)
-    angles = np.sort(np.arctan2(y, x))
-    np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 4096, rtol=1e-9)
-
-
 def test_numbers_are_normal() -> None:
     found = exposure.normals(2**18, 7, 11)
     assert stats.kstest(found, "norm").pvalue > 0.01
@@ -151,15 +122,6 @@ def test_noise_has_the_mean_and_the_variance_of_read_and_shot_noise(
     assert variance == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize(("electrons", "share"), [(1, 0.02), (2, 0.01), (10, 0.002), (1000, 1e-4)])
-def test_shot_noise_has_the_skewness_of_a_poisson_distribution(electrons: float, share: float) -> None:
-    _, variance, third = moments(electrons, 0.0, 1.0)
-    assert third / variance**1.5 == pytest.approx(float(stats.poisson(electrons).stats("s")), rel=share)
-    # Read noise is symmetric: it adds nothing to the third moment.
-    _, _, with_read = moments(electrons, 3.0, 1.0)
-    assert with_read == pytest.approx(electrons, rel=share)
-
-
 def test_counted_electrons_are_distributed_almost_as_poissons() -> None:
     normal = stats.norm.ppf((np.arange(100_000) + 0.5) / 100_000)
     for electrons in (5, 20, 100):
@@ -175,36 +137,23 @@ def test_counted_electrons_are_distributed_almost_as_poissons() -> None:
         assert error < without / 4
 
 
-def test_noise_without_electrons_is_the_read_noise_alone() -> None:
-    normal = np.linspace(-6, 6, 25)
-    np.testing.assert_allclose(exposure.noise(np.full(25, 100.0), normal, 1.5, 0.0), 1.5 * normal, rtol=1e-15)
-
-
-def test_a_signal_below_nothing_has_read_noise_alone() -> None:
-    normal = np.linspace(-6, 6, 25)
-    np.testing.assert_allclose(exposure.noise(np.full(25, -3.0), normal, 1.5, 1.0), 1.5 * normal, rtol=1e-15)
-
-
-@pytest.mark.parametrize(("frame", "seed"), [(0, 0), (1, 0), (0, 1), (2**32 + 5, 2**40 + 3), (LAST, LAST)])
+@pytest.mark.parametrize(("frame", "seed"), [(0, 0), (2**32 + 5, 2**40 + 3), (LAST, LAST)])
 @pytest.mark.parametrize("quarter", QUARTERS)
 def test_the_devices_numbers_are_the_references(device: Device, quarter: int, frame: int, seed: int) -> None:
     found = device_normals(device, quarter, frame=frame, seed=seed)
     np.testing.assert_allclose(found, exposure.normals(quarter, frame, seed), rtol=0, atol=3e-6)
 
 
-@pytest.mark.parametrize("frame", FAR)
-def test_the_devices_tails_are_the_references(device: Device, frame: int) -> None:
-    expected = exposure.normals(1024, frame, 0)
-    found = device_normals(device, 1024, frame=frame, seed=0)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-6)
-    assert np.abs(expected).argmax() == FAR[frame]
-    assert abs(found[FAR[frame]]) > 5.3
-
-
-@pytest.mark.parametrize("grain", [0.0, 0.02, 1.0])
-@pytest.mark.parametrize("read", [0.0, 1.5])
-@pytest.mark.parametrize(("dtype", "bits"), [("uint8", 8), ("uint16", 10), ("uint16", 16), ("float32", 8)])
-@pytest.mark.parametrize("quarter", [1, 7, 4099])
+@pytest.mark.parametrize(
+    ("dtype", "bits", "read", "grain", "quarter"),
+    [
+        ("uint8", 8, 1.5, 0.0, 7),
+        ("uint8", 8, 0.0, 1.0, 4099),
+        ("uint16", 10, 1.5, 0.02, 1),
+        ("uint16", 16, 1.5, 0.02, 4099),
+        ("float32", 8, 1.5, 1.0, 4099),
+    ],
+)
 def test_the_devices_counts_are_the_references_but_for_ties(
     device: Device, quarter: int, dtype: str, bits: int, read: float, grain: float
 ) -> None:
@@ -235,9 +184,3 @@ def test_counts_end_where_the_bits_do(device: Device, dtype: str, bits: int) -> 
     light = np.zeros(len(offset), np.float32)
     found = expose(device, [light, offset, light], dtype, top=top)
     assert found.tolist() == [0, 0, 0, 0, 0, 0, 2, 2, 8, top - 1, *[top] * 6]
-
-
-def test_floats_end_nowhere(device: Device) -> None:
-    offset = np.array([-1e9, -0.25, 70000.5, 1e9], np.float32)
-    light = np.zeros(4, np.float32)
-    np.testing.assert_array_equal(expose(device, [light, offset, light], "float32"), offset)

@@ -146,11 +146,6 @@ def grid(shape):
     return column * SIZE[0], -row * SIZE[1]
 
 
-def flat(shape, **maps):
-    zeros = np.zeros(shape, np.float32)
-    return check_inputs(zeros, zeros, SIZE, **maps)
-
-
 def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
     x, y = grid((9, 9))
     dz_dx, dz_dy = (1 + x - 6 * x**2, 2 - y + 3 * y**2)
@@ -171,14 +166,6 @@ def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
         assert np.abs((step + level - real)[flags & ~inner & bit != 0]).min() > 1e-7  # of two pixels only
 
 
-def test_the_source_of_each_piece_sums_to_nothing():
-    inputs = SCENES["two weights, edges"].inputs((23, 37))
-    flags = told(inputs)
-    source = links.links_join(*arguments(inputs, flags, 1.0))[3]
-    assert source.sum() == pytest.approx(0, abs=1e-12 * np.abs(source).sum())
-    assert np.abs(source).sum() > 1
-
-
 def test_a_pixel_is_told_by_its_maps():
     nan, one = np.nan, 1.0
     dz = np.array([[one, nan, one, one, nan]], np.float32)
@@ -196,15 +183,3 @@ def test_a_pixel_on_an_edge_keeps_its_link_to_the_neighbour_most_like_it():
     flags = told(check_inputs(dz_dx, np.zeros_like(dz_dx), SIZE, edges=marked))
     assert (flags & RIGHT).tolist() == [[1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 1, 0]]
     assert (flags[:-1] & DOWN > 0).tolist() == [[1, 0, 1, 1], [1, 0, 1, 1]]
-
-
-def test_a_pixel_among_others_on_edges_is_alone():
-    inputs = flat((3, 3), edges=np.ones((3, 3)))
-    assert told(inputs).tolist() == [[SLOPE] * 3] * 3
-
-
-def test_known_and_unknown_pixels_are_not_smoothed_together():
-    heights = np.array([[1.0, 1.0, np.nan, np.nan]])
-    flags = told(flat((1, 4), known_heights=heights))
-    smoothed = links.links_smooth(flags, np.array([[1.0, 0.0, 4.0, 0.0]]))
-    np.testing.assert_allclose(smoothed, [[0.8, 0.2, 3.2, 0.8]])

@@ -60,16 +60,6 @@ def off(found, true):
     return np.linalg.norm(found - true, axis=1)
 
 
-@pytest.mark.parametrize("follows", [False, True])
-def test_places_and_lights_are_those_of_plain_rays(follows):
-    scene = Scene(follows=follows)
-    good = scene.within
-    _, _, x, y, z = scene.scale[:, good]
-    for number, phase in enumerate(PHASE):
-        known = scene.response.wall.curve, x, y, z, scene.normals[good].T
-        np.testing.assert_allclose(scene.light[number, good], light_of(*known, phase, follows), atol=2e-9)
-
-
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 @pytest.mark.parametrize("follows", [False, True])
 def test_without_noise_the_normal_is_the_true_one(gamma, follows):
@@ -100,17 +90,6 @@ def test_the_reference_finds_the_likeliest_normal():
         start = math.acos(vector[2]), math.atan2(vector[1], vector[0])
         best = optimize.least_squares(misfit, start, x_scale=(0.01, 0.1), diff_step=1e-5).x
         assert off(found.vectors[[pixel]], facing(*best)[np.newaxis])[0] < 0.02 * found.sigma[pixel]
-
-
-def test_sigma_is_the_bound_and_what_errors_are():
-    scene = Scene((60, 101))
-    noise = 1.5
-    found = scene.answer(scene.frames(noise), noise)
-    good = scene.within & np.isfinite(found.sigma)
-    assert good.sum() > 0.99 * scene.within.sum()
-    square = (off(found.vectors, scene.normals) / found.sigma)[good] ** 2
-    assert np.mean(square) == pytest.approx(1, abs=0.05)
-    assert found.contact[good].mean() > 0.998
 
 
 def test_samples_beyond_the_ends_of_the_wall_tell_nothing_and_do_no_harm():

@@ -71,21 +71,6 @@ def test_the_reference_solves_the_equations(shape, screening):
     np.testing.assert_allclose(height, told, atol=1e-7 * np.ptp(told) + 1e-9)  # rates settle to 2^-26
 
 
-def test_what_a_source_sums_to_is_taken_from_all_pixels_alike():
-    source = random_source((7, 10))
-    np.testing.assert_allclose(refer(source + 5, 0.0), refer(source, 0.0), atol=1e-12)
-
-
-def test_eliminations_that_no_longer_change_are_told_once():
-    reach, fading, _ = find_rates(400, 300, 1.0, 1.0, 0.0)
-    assert reach[0, 1] == 300
-    assert np.all(np.diff(reach[:, 1]) <= 0)
-    assert reach[-1, 1] < 12
-    last = reach[1:].sum(axis=1) - 1
-    bend = 2 * np.arcsinh(np.sin(np.pi * 8 * np.arange(1, len(reach)) / 800))
-    np.testing.assert_allclose(fading[last, 0], 1 - np.exp(-bend), rtol=1e-7)
-
-
 @pytest.mark.parametrize("screening", [0.0, 0.3])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 31), (33, 2), (19, 60), (35, 90), (21, 37), (41, 37)])
 def test_device_and_reference_find_the_same_heights(device, shape, screening):

@@ -9,7 +9,6 @@ import pytest
 from launches import launch
 from numpy.typing import NDArray
 
-from mirrorskin.kernels import registration
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.registration import (
     BORDER,
@@ -19,7 +18,6 @@ from mirrorskin.kernels.registration import (
     weights,
 )
 
-DTYPES = ["uint8", "uint16", "float32"]
 ALIKE = np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32)
 # Pixels to the right and down: a number, and what a column, a row and a millimetre of height add.
 SHIFT = np.array([[1.3, 0.011, -0.017, 2.1], [-0.6, -0.021, 0.013, -1.4]], np.float32)
@@ -124,33 +122,6 @@ def test_a_shift_of_whole_pixels_moves_samples_and_noise_as_they_are() -> None:
     assert np.isfinite(found.registered).sum() == 5 * 5
 
 
-@pytest.mark.parametrize("place", [(0.5, 0.5), (0.25, 0.0), (0.1, 0.8)])
-def test_noise_is_scaled_by_what_single_samples_come_to(place: tuple[float, float]) -> None:
-    shift = np.array([[place[0], 0, 0, 0], [place[1], 0, 0, 0]], np.float32)
-    height = np.zeros((7, 7), np.float32)
-    parts = []
-    for single in np.eye(49, dtype=np.float32).reshape(49, 7, 7):
-        found = numpy_frame(single, height, shift, *ALIKE)
-        parts.append(found.registered[3, 3])
-    assert np.count_nonzero(parts) in (4, 16)
-    assert found.noise[0, 3, 3] == pytest.approx(np.sum(np.square(parts)), rel=1e-6)
-    assert 0.64**2 - 1e-6 <= found.noise[0, 3, 3] < 1
-    assert sum(parts) == pytest.approx(1, rel=1e-6)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_clipped_and_missing_counts_are_not_admitted(dtype: str) -> None:
-    kind = np.dtype(dtype)
-    fine = [1, 2, 254]
-    bad = [np.nan, np.inf, -np.inf] if kind.kind == "f" else [0, np.iinfo(kind).max]
-    frame = np.array([fine + bad]).astype(kind)
-    room = make_room(frame.shape)
-    registration_admit(frame, *ALIKE, room.padded)
-    np.testing.assert_array_equal(room.padded[2, 2:-2], fine + [np.nan] * len(bad))
-    assert np.isnan(room.padded[[0, 1, 3, 4]]).all()
-    assert np.isnan(room.padded[:, [0, 1, -2, -1]]).all()
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 6), (33, 1100)])
 @pytest.mark.parametrize(("dtype", "each"), [("uint8", False), ("uint16", True), ("float32", False)])
 def test_a_device_agrees_with_the_reference(
@@ -177,17 +148,6 @@ def test_what_is_far_outside_the_picture_is_missing(device: Device, far: float, 
     for found in answers:
         assert np.isnan(found.registered).all()
         assert not found.noise.any()
-
-
-def test_noise_is_summed_over_frames(device: Device) -> None:
-    case = random_case("uint8", (9, 20))
-    room = make_room((9, 20))
-    for _ in range(3):
-        registration.registration_admit(case["frame"], *ALIKE, room.padded)
-        registration_resample(room.padded, case["height"], SHIFT, *ALIKE, room.registered, room.noise)
-    once = device_frame(device, **case)
-    np.testing.assert_allclose(room.noise, 3 * once.noise, rtol=1e-5)
-    assert once.noise[1].sum() > 20
 
 
 @pytest.mark.parametrize("count", [1, 3, 200])

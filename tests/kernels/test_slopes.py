@@ -64,11 +64,3 @@ def test_the_typical_weight_is_told_once_and_bounds_the_others(device):
     weights = find_slopes(*given, TILT).weights
     assert maps.typical == pytest.approx(float(np.median(weights[weights > 0])), rel=0.05)
     assert found["weight_x"].max() <= 1e3 * maps.typical * 1.0001
-
-
-def test_without_contact_nothing_is_typical(device):
-    vectors, sigma, contact = normals((5, 6))
-    maps, found = on_device(device, vectors, sigma, np.zeros_like(contact))
-    assert math.isnan(maps.typical)
-    assert not found["weight_x"].any()
-    assert np.isnan(found["dz_dx"]).all()
