@@ -96,7 +96,7 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
     assert part.chi_square == pytest.approx(50 / 4 / 4, rel=1e-5)
 
 
-@pytest.mark.parametrize("error", [2e-5, 1e-3, 1.0, 179.0, 179.999])
+@pytest.mark.parametrize("error", [2e-5, 179.999])
 def test_small_angles_and_large_ones_are_told_alike(error):
     across = np.linspace(0, 360, 24, endpoint=False, dtype=np.float32)[np.newaxis]
     truth = truth_of_normals(np.full_like(across, 0.0), across)
@@ -104,12 +104,6 @@ def test_small_angles_and_large_ones_are_told_alike(error):
     part = engine.score(io.Result(normals=found), truth).normal
     assert part.largest == pytest.approx(error, rel=1e-5)
     assert part.rms == pytest.approx(error, rel=1e-5)
-
-
-def test_a_normal_s_length_does_not_matter():
-    truth = truth_of_normals([[40]], [[10]])
-    found = 7 * normals([[42]], [[10]])
-    assert engine.score(io.Result(normals=found), truth).normal.rms == pytest.approx(2, rel=1e-5)
 
 
 def test_azimuths_alone_are_scored_the_shorter_way_round():
@@ -122,12 +116,6 @@ def test_azimuths_alone_are_scored_the_shorter_way_round():
     assert part.largest == pytest.approx(180, rel=1e-5)
     assert part.rms == pytest.approx(np.sqrt((4 + 180**2) / 2), rel=1e-5)
     assert np.isnan(part.chi_square)
-
-
-def test_of_normals_the_azimuth_is_not_scored_again():
-    truth = truth_of_normals([[30]], [[20]])
-    result = io.Result(normals=normals([[30]], [[20]]), azimuth=np.zeros((1, 1), np.float32))
-    assert engine.score(result, truth).azimuth is None
 
 
 def test_contact_is_scored_where_there_is_an_answer_and_as_a_whole():

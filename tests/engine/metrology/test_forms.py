@@ -47,6 +47,9 @@ def test_a_plane_is_found_exactly():
     assert found.rms.value == pytest.approx(0, abs=1e-9)
     assert max(found.tilt.sigma, found.offset.sigma) < 1e-9
     assert found.outliers == 0
+    height = np.zeros(SHAPE)
+    height[:10] = 1.0
+    assert fit_plane(height, *axes()).outliers == 0  # a quarter of the surface
 
 
 def test_distances_from_a_plane_are_at_right_angles_to_it():
@@ -64,12 +67,11 @@ def test_a_level_plane_falls_nowhere():
     assert found.azimuth.sigma > 100
 
 
-@pytest.mark.parametrize("zenith", [1, 10, 45, 60])
+@pytest.mark.parametrize("zenith", [1, 60])
 @pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize("size", [(1.0, 1.0), (1.3, 0.8)])
-def test_a_sphere_is_found_exactly(zenith, side, size):
+def test_a_sphere_is_found_exactly(zenith, side):
     width = 5 * np.sin(np.radians(zenith))
-    size = tuple(width * one / 20 for one in size)
+    size = tuple(width * one / 20 for one in (1.3, 0.8))
     centre = 0.1 * width, -0.05 * width, 0.25
     height = side * cap(SHAPE, size, 5.0, width, centre)
     found = fit_sphere(height, *axes(SHAPE, size))
@@ -91,15 +93,6 @@ def test_holes_and_heights_without_a_sigma_do_not_count():
     assert np.isnan(found.residual[10, 10:40]).all()
 
 
-def test_a_few_outliers_do_not_count():
-    height = cap(SHAPE, SIZE, 5.0, 2.5) + np.random.default_rng(1).normal(0, 0.001, SHAPE)
-    height[20, 18:30] -= 0.3
-    found = fit_sphere(height, *axes(), np.full(SHAPE, 0.001))
-    assert found.outliers == 12
-    assert abs(found.radius.value - 5) < 3 * found.radius.sigma < 0.01
-    assert found.rms.value > 10  # outliers are part of what was measured
-
-
 def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
     height = cap(SHAPE, SIZE, 5.0, 2.5) + np.random.default_rng(1).normal(0, 0.001, SHAPE)
     rim = np.isfinite(height) & np.isnan(cap(SHAPE, SIZE, 5.0, 2.38))
@@ -109,12 +102,6 @@ def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
     found = fit_sphere(height, *axes(), sigma)
     assert found.outliers == rim.sum()
     assert abs(found.radius.value - 5) < 3 * found.radius.sigma < 0.02
-
-
-def test_what_is_a_quarter_of_the_surface_is_no_outlier():
-    height = np.zeros(SHAPE)
-    height[:10] = 1.0
-    assert fit_plane(height, *axes()).outliers == 0
 
 
 def test_surer_heights_count_more():
@@ -127,7 +114,7 @@ def test_surer_heights_count_more():
 
 @pytest.mark.parametrize(
     "height",
-    [np.zeros((1, 9)), np.zeros((9, 1)), np.zeros((1, 1)), np.eye(5) + np.where(np.eye(5), 0, NAN)],
+    [np.zeros((1, 9)), np.zeros((1, 1)), np.eye(5) + np.where(np.eye(5), 0, NAN)],
 )
 def test_pixels_in_one_line_make_no_form(height):
     at = io.pixel_axes(height.shape, (0.1, 0.1))
@@ -171,7 +158,7 @@ def test_all_heights_may_be_wrong_together():
     assert min(one.sigma for one in (flat.offset, ball.top, ball.z)) >= 0.02
 
 
-@pytest.mark.parametrize("claimed", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("claimed", [0.5, 2.0])
 def test_birges_ratio_is_that_of_errors_to_what_is_claimed(claimed):
     rng = np.random.default_rng(11)
     sigma = np.full(SHAPE, 0.001 * claimed)
@@ -182,22 +169,3 @@ def test_birges_ratio_is_that_of_errors_to_what_is_claimed(claimed):
     ):
         assert found.birge == pytest.approx(1 / claimed, rel=0.05)
     assert np.isnan(fit_plane(leaning() + error, *axes()).birge)
-
-
-def test_errors_that_are_alike_make_a_radius_less_sure():
-    rng = np.random.default_rng(4)
-    ball = cap(SHAPE, SIZE, 5.0, 2.5)
-    sigmas = [
-        np.median(
-            [fit_sphere(ball + 0.001 * noise(SHAPE, kind, rng), *axes()).radius.sigma for _ in range(9)]
-        )
-        for kind in ("white", "alike")
-    ]
-    assert sigmas[1] > 4 * sigmas[0]
-
-
-def test_no_uncertainty_is_told_of_as_many_pixels_as_parameters():
-    height = np.array([[0.0, 0.1], [0.2, NAN]])
-    found = fit_plane(height, *io.pixel_axes((2, 2), (0.1, 0.1)))
-    assert np.isnan(found.tilt.sigma)
-    assert found.tilt.value == pytest.approx(np.degrees(np.arctan(np.hypot(1, 2))))

@@ -7,7 +7,6 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
-from mirrorskin.engine.metrology.forms import fit_plane, fit_sphere
 
 NAN = np.nan
 SHAPE, SIZE = (211, 207), (0.03, 0.03)
@@ -44,7 +43,7 @@ def test_a_cap_has_the_numbers_of_its_closed_form(ball):
     assert told["Sq"] == pytest.approx(0, abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(31, 45), (90, 121)])
+@pytest.mark.parametrize("shape", [(90, 121)])
 def test_a_paraboloid_has_the_volume_of_its_closed_form(shape):
     size = 3.0 / shape[0], 4.0 / shape[1]  # millimetres up and across
     x, y = places(shape, size[::-1])
@@ -104,13 +103,6 @@ def test_the_highest_point_is_not_the_one_with_the_largest_error():
     assert np.mean(np.abs(pulls) < 2) >= 0.95
     assert abs(np.mean(pulls)) < 0.6
     assert np.mean(largest) > 0.015
-
-
-def test_a_single_low_pixel_is_not_the_lowest_point():
-    height = cap((61, 61), (0.05, 0.05), RADIUS, 1.4)
-    before = values(result_of(height), form="none")["lowest point"]
-    height[20, 30] = -4.0
-    assert values(result_of(height), form="none")["lowest point"] == before
 
 
 def test_the_lowest_of_many_noisy_pixels_is_known_to_be_too_low():
@@ -219,22 +211,6 @@ def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
     assert any("taken as exact" in note for note in plain.notes)
 
 
-@pytest.mark.parametrize(("power", "form"), [(2, "sphere"), (-1, "plane")])
-def test_what_a_wrong_pixel_size_does_to_a_form_is_within_its_uncertainty(power, form):
-    shape, off = (31, 41), 1e-3
-    x, _ = places(shape, SIZE)
-    height = cap(shape, SIZE, RADIUS, 2.0) if form == "sphere" else 0.1 * x
-    at = io.pixel_axes(shape, SIZE)
-    right, wrong = (fit(height, *(one * by for one in at), form) for by in (1, 1 + off))
-    assert wrong / right - 1 == pytest.approx(power * off, rel=0.15)
-
-
-def fit(height, x, y, form):
-    if form == "sphere":
-        return fit_sphere(height, x, y).radius.value
-    return fit_plane(height, x, y).tilt.value
-
-
 def test_a_section_compares_no_heights_of_pieces_that_lie_nobody_knows_how_high():
     ends = (-0.7, -0.85), (-0.7, 0.95)
     assert engine.measure(pieces([0, 0]), section=ends).quantities["height difference"].value == -4
@@ -284,23 +260,14 @@ def test_heights_without_a_standard_deviation_are_left_out_and_that_is_told():
     assert "pixels left out, whose height has no standard deviation: 2" in found.notes
 
 
-@pytest.mark.parametrize("shape", [(1, 9), (9, 1), (2, 1), (2, 2), (3, 3)])
-@pytest.mark.parametrize("sigma", [None, 0.01, 0.0])
+@pytest.mark.parametrize("shape", [(1, 9), (2, 2)])
+@pytest.mark.parametrize("sigma", [None, 0.0])
 def test_tiny_pictures_of_all_equal_heights_are_measured(shape, sigma):
     told = engine.measure(result_of(np.full(shape, -0.5), sigma=sigma)).quantities
     assert told["highest point"].value == told["lowest point"].value == told["median height"].value == -0.5
     assert told["Sz"].value == pytest.approx(0, abs=1e-9)
     assert told["measured area"].value == pytest.approx(np.prod(shape) * 0.01)
     assert told["volume below rest plane"].value == pytest.approx(np.prod(shape) * 0.005)
-
-
-def test_one_known_pixel_is_measured():
-    height = np.full((5, 6), NAN)
-    height[2, 3] = -0.25
-    told = engine.measure(result_of(height, sigma=0.01)).quantities
-    assert (told["highest point"].value, told["lowest point"].value) == (-0.25, -0.25)
-    assert told["rim height"].value == -0.25
-    assert told["measured area"].value == pytest.approx(0.01)
 
 
 def test_without_standard_deviations_uncertainties_of_heights_are_unknown(ball):
