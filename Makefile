@@ -51,7 +51,7 @@ bench: $(READY)
 	@$(BIN)/mirrorskin bench
 
 portability: $(READY)
-	@$(BIN)/python tests/support/portability.py
+	@$(BIN)/python tests/portability/portability.py
 
 clean:
 	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache
