@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import typer
 
-from mirrorskin.cli.calibrate import board, check, elastic, references, scale, show, tilt, zenith
+from mirrorskin.cli.calibrate import check, elastic, references, scale, show, tilt, zenith
 from mirrorskin.cli.groups import Group
 
 app = typer.Typer(
@@ -13,5 +15,15 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-for module in (references, board, scale, zenith, tilt, elastic, check, show):
-    app.command(module.__name__.rsplit(".", 1)[-1])(module.command)
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "references": references.command,
+    "board": scale.board_command,
+    "scale": scale.command,
+    "zenith": zenith.command,
+    "tilt": tilt.command,
+    "elastic": elastic.command,
+    "check": check.command,
+    "show": show.command,
+}
+for name, command in _COMMANDS.items():
+    app.command(name)(command)

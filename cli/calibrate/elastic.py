@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +12,10 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
-from mirrorskin.cli.calibrate.inputs import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.calibration.gel import BallOnset, LearnedGel
-    from mirrorskin.io import Calibration, ProcessValue, Source
+    from mirrorskin.engine.calibration.gel import BallOnset, GelFit
+    from mirrorskin.io import Calibration, Source
 
 _STEP, _PRESS = "0.03mm", "1.2mm"
 
@@ -50,46 +48,39 @@ def command(
     from mirrorskin.cli.quantity import length
     from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.calibration.gel import fit_gel
-    from mirrorskin.io.calibration.source import size_facts
 
     paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
-    check_call(paths, rig, press=press, settle=settle)
+    inputs.check_call(paths, rig, press=press, settle=settle)
     if thickness < 0:
         raise io.InputError(f"--sheet {sheet} cannot be: give a thickness of 0 or more")
     io.check_output(output, *paths, rig)
-    known = io.open_calibration(output) if output.exists() else None
+    known = inputs.open_known(output)
     if rig is not None:
-        plans = _places(rig, places, press, travel_start, travel_step)
-        paths, travel_step, travel_start = inputs.take(rig, output, plans, settle), None, None
-    told = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
-    told = with_scale(told, known)
+        from mirrorskin.hw.rig.plans import VerticalPlan
+
+        plan = VerticalPlan(
+            length(travel_start or "0mm", "--travel-start"),
+            length(press or _PRESS, "--press"),
+            step=length(travel_step or _STEP, "--travel-step"),
+        )
+        prompt = "put the ball at place {} of {}, near the middle of the field"
+        paths = inputs.take(rig, output, inputs.at_each("elastic", prompt, places, plan), settle)
+        travel_step = travel_start = None
+    given = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
     with ExitStack() as opening:
-        sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
-        cameras = [camera_of(source) for source in sources]
-        camera = one_camera([source.name for source in sources], cameras, known, output)
-        learned = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
-        size = sources[0].header.pixel_size
-    process = _process(paths, ball, sheet, learned) | ({} if size is None else size_facts(size))
-    io.update_calibration(output, learned.gel, camera, process)
-    _tell(output, learned, as_json)
-
-
-def _places(
-    rig: Path, places: int, press: str | None, start: str | None, step: str | None
-) -> list[inputs.Place]:
-    """Say how the recordings are taken."""
-    from mirrorskin.cli.quantity import length
-    from mirrorskin.hw.rig.plans import VerticalPlan
-
-    plan = VerticalPlan(
-        length(start or "0mm", "--travel-start"),
-        length(press or _PRESS, "--press"),
-        step=length(step or _STEP, "--travel-step"),
-    )
-    return inputs.at_each(
-        "elastic", "put the ball at place {} of {}, near the middle of the field", places, plan
-    )
+        sources = inputs.open_all(opening, paths, inputs.with_scale(given, known))
+        camera = inputs.one_camera(sources, known, output)
+        fit = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
+        process = inputs.process_of(
+            sources[0],
+            sources=inputs.names_of(paths),
+            ball=ball,
+            sheet=sheet,
+            untold=", ".join(fit.undetermined) or "nothing",
+        )
+    io.update_calibration(output, fit.gel, camera, process)
+    _report(output, fit, as_json)
 
 
 def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
@@ -108,24 +99,12 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
     return ball_onset(result, plain, radius)
 
 
-def _process(paths: Sequence[Path], ball: str, sheet: str, learned: LearnedGel) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.provenance import signature
-
-    return {
-        **signature(),
-        "sources": ", ".join(map(str, paths)),
-        "ball": ball,
-        "sheet": sheet,
-        "untold": ", ".join(learned.untold) or "nothing",
-    }
-
-
-def _tell(output: Path, learned: LearnedGel, as_json: bool) -> None:
+def _report(output: Path, fit: GelFit, as_json: bool) -> None:
     from mirrorskin.cli.output import print_json
 
-    gel = learned.gel
+    gel = fit.gel
     if as_json:
-        print_json({"output": str(output), "gel": gel, "balls": learned.places, "untold": learned.untold})
+        print_json({"output": str(output), "gel": gel, "balls": fit.places, "untold": fit.undetermined})
         return
     sigma = gel.sigma
     told = [
@@ -133,14 +112,14 @@ def _tell(output: Path, learned: LearnedGel, as_json: bool) -> None:
         *(
             f"{name} {getattr(gel, name):.3f} +- {sigma[name]:.3f} /mm"
             for name in ("compliance", "curvature")
-            if name not in learned.untold
+            if name not in fit.undetermined
         ),
         f"met at a travel of {gel.travel_zero:.3f} +- {sigma['travel_zero']:.3f} mm",
         f"{gel.error:.3f} mm left",
     ]
     typer.echo(f"{output}: {', '.join(told)}")
-    for name in learned.untold:
+    for name in fit.undetermined:
         typer.echo(
-            f"{name}: the presses do not tell it, 0 is kept; press deeper, at more places or larger balls",
+            f"{name}: not determined by the presses, 0 is kept; press deeper, at more places or larger balls",
             err=True,
         )

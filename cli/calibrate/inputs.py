@@ -1,12 +1,12 @@
-"""What a part of a calibration is found out from: presses that are named, or taken on a rig."""
+"""What a part of a calibration is found from: recordings that are named, or taken on a rig."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -16,72 +16,14 @@ if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
-    from mirrorskin.io import Calibration, CameraId, Source
+    from mirrorskin.io import Calibration, CameraId, ProcessValue, Source
 
-
-def check_call(paths: Sequence[Path], rig: Path | None, **asked: str | None) -> None:
-    """Refuse presses that are neither named nor taken, or both, and what a rig is asked for without one."""
-    from mirrorskin.io import InputError
-
-    if rig is None and not paths:
-        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
-    if rig is not None and paths:
-        raise InputError("recordings and --rig both give the presses: leave one of them out")
-    for name, value in asked.items():
-        if rig is None and value is not None:
-            raise InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
-
-
-def with_scale(told: StackOptions, known: Calibration | None) -> StackOptions:
-    """Return what recordings are opened with, and the pixel size of the calibration's scale, if any."""
-    from mirrorskin.io import InputError
-    from mirrorskin.io.calibration.source import differ
-
-    if known is None or known.lens is None:
-        return told
-    size, given = known.lens.pixel_size, told.get("pixel_size", known.lens.pixel_size)
-    if differ(given, size):
-        raise InputError(
-            f"--pixel-size says {given[0]:.5g} mm, the scale of {known.name} {size[0]:.5g} mm: leave it out"
-        )
-    return told | {"pixel_size": size}
-
-
-def camera_of(source: Source) -> CameraId:
-    """Return the camera that a recording is of."""
-    from mirrorskin.io import CameraId
-
-    _, rows, columns = source.shape
-    return CameraId(source.header.camera, (rows, columns), source.dtype)
-
-
-def one_camera(
-    names_of: Sequence[str], cameras: Sequence[CameraId], known: Calibration | None, output: Path
-) -> CameraId:
-    """Return the camera that all recordings are of, if it is that of the calibration."""
-    from mirrorskin import io
-
-    names = {camera.name for camera in cameras} - {""}
-    if len(names) > 1:
-        raise io.InputError(f"the recordings are of {' and '.join(sorted(names))}: take all with one camera")
-    first = cameras[0]
-    for name, camera in zip(names_of, cameras, strict=True):
-        if (camera.shape, camera.dtype) != (first.shape, first.dtype):
-            raise io.InputError(f"{name} is of {camera}, {names_of[0]} of {first}: take all with one camera")
-    one = io.CameraId("".join(names), first.shape, first.dtype)
-    if known is not None:
-        io.check_camera(known, one, names_of[0], f"name another file than {output} with -o")
-    return one
-
-
-TILT, _STEP = "2.5deg", "45deg"
+TILT, _PHASE_STEP = "2.5deg", "45deg"
 BALL = "put the ball at place {} of {}, all over the field"
-
-_TOGETHER = 16
-"""Frames that are read at a time, at most."""
-
-_STILL = 0.05
-"""How far the body moves in a recording in which it stands still, mm: a press has two steps at least."""
+_BLOCK = 16  # frames that are read at a time, at most
+_STILL = (
+    0.05  # mm that the body moves in a recording in which it stands still: a press has two steps at least
+)
 
 OptionalRig = Annotated[
     Path | None,
@@ -92,20 +34,106 @@ OptionalRig = Annotated[
 Settle = scans.Settle
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+def check_call(paths: Sequence[Path], rig: Path | None, **rig_options: str | None) -> None:
+    """Refuse presses that are neither named nor taken, or both, and options of a rig without one."""
+    from mirrorskin.io import InputError
+
+    if rig is None and not paths:
+        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
+    if rig is not None and paths:
+        raise InputError("recordings and --rig both give the presses: leave one of them out")
+    for name, value in rig_options.items():
+        if rig is None and value is not None:
+            raise InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
+
+
+def open_known(output: Path) -> Calibration | None:
+    """Return the calibration that is to be added to, if there is one."""
+    from mirrorskin import io
+
+    return io.open_calibration(output) if output.exists() else None
+
+
+def open_all(opening: ExitStack, paths: Sequence[Path], options: StackOptions) -> list[Source]:
+    """Open recordings; ``opening`` closes them."""
+    from mirrorskin import io
+
+    return [opening.enter_context(io.open_recording(path, **options)) for path in paths]
+
+
+def with_scale(options: StackOptions, known: Calibration | None) -> StackOptions:
+    """Return what recordings are opened with, and the pixel size of the calibration's scale, if any."""
+    from mirrorskin.io import InputError
+    from mirrorskin.io.calibration.source import differ
+
+    if known is None or known.lens is None:
+        return options
+    size, given = known.lens.pixel_size, options.get("pixel_size", known.lens.pixel_size)
+    if differ(given, size):
+        raise InputError(
+            f"--pixel-size says {given[0]:.5g} mm, the scale of {known.name} {size[0]:.5g} mm: leave it out"
+        )
+    return options | {"pixel_size": size}
+
+
+def camera_name(names: Sequence[str]) -> str:
+    """Return the one camera that recordings are of; empty names are unknown."""
+    from mirrorskin.io import InputError
+
+    known = set(names) - {""}
+    if len(known) > 1:
+        raise InputError(f"the recordings are of {' and '.join(sorted(known))}: take all with one camera")
+    return "".join(known)
+
+
+def one_camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
+    """Return the camera that all recordings are of, if it is that of the calibration in the output file."""
+    from mirrorskin import io
+
+    name = camera_name([source.header.camera for source in sources])
+    first, *others = [io.CameraId(source.header.camera, source.shape[1:], source.dtype) for source in sources]
+    for source, camera in zip(sources[1:], others, strict=True):
+        if (camera.shape, camera.dtype) != (first.shape, first.dtype):
+            raise io.InputError(
+                f"{source.name} is of {camera}, {sources[0].name} of {first}: take all with one camera"
+            )
+    camera = io.CameraId(name, first.shape, first.dtype)
+    if known is not None:
+        io.check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
+    return camera
+
+
+def process_of(source: Source | None = None, **facts: ProcessValue) -> dict[str, ProcessValue]:
+    """Return how a part came about: program, date, facts, and the pixel size of a source."""
+    from mirrorskin.engine.provenance import signature
+    from mirrorskin.io.calibration.source import size_facts
+
+    size = None if source is None else source.header.pixel_size
+    return {**signature(), **facts, **({} if size is None else size_facts(size))}
+
+
+def names_of(paths: Sequence[Path]) -> str:
+    """Return paths as a process keeps them."""
+    return ", ".join(map(str, paths))
+
+
+# --- on a rig -----------------------------------------------------------------------------------------------
+
+
+class Place(NamedTuple):
     """A recording that is to be taken."""
 
-    name: str  # What the recording's file is told apart by: "dark", "ball-1"
-    prompt: str  # What the user is to do before: "put the ball at place 1 of 9"
-    plan: Plan  # What the body does then
-    frames: int = 1  # At each step of a plan in steps
+    name: str  # what its file is told apart by: "dark", "ball-1"
+    prompt: str  # what the user is to do before: "put the ball at place 1 of 9"
+    plan: Plan  # what the body does then
+    frames: int = 1  # at each step of a plan in steps
 
 
 def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str | None = None) -> list[Path]:
-    """Take recordings, and keep them beside the calibration file.
+    """Take recordings, and keep them beside the calibration file: CAL-dark.h5 of CAL.h5 and a place "dark".
 
-    The body is lifted, then the user is asked to make each place ready and to press Enter.
+    The body is lifted, then the user is asked to make each place ready and to press Enter. Plans and files
+    are checked before anything moves.
     """
     from mirrorskin import io
     from mirrorskin.hw.rig.plans import check_plan
@@ -124,7 +152,7 @@ def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str
 
 
 def at_each(part: str, prompt: str, count: int, plan: Plan, frames: int = 1) -> list[Place]:
-    """Say that the same is to be done at several places."""
+    """Return the same plan at several places; the prompt has room for their number and count."""
     numbers = range(1, count + 1)
     return [Place(f"{part}-{n}", prompt.format(n, count), plan, frames) for n in numbers]
 
@@ -142,12 +170,12 @@ def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, examp
     return AxialPlan(
         length(press, "--press"),
         angle(tilt or TILT, "--tilt"),
-        phase_step=angle(phase_step or _STEP, "--phase-step"),
+        phase_step=angle(phase_step or _PHASE_STEP, "--phase-step"),
     )
 
 
 def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
-    """Return a plan in which the body all but stands still: two steps of 0.05 mm."""
+    """Return a plan in which the body all but stands still, lifted or at a travel, mm."""
     from mirrorskin.hw.rig.plans import VerticalPlan
     from mirrorskin.hw.rig_file import load_rig
 
@@ -156,25 +184,19 @@ def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
 
 
 def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
-    """Lift the body, have the user make the place ready, and record it."""
     import numpy as np
 
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
-    frames = place.frames if place.plan.in_steps else None
-    scan = scans.make_scan(rig, place.plan, settle if place.plan.in_steps else None, frames)
+    in_steps = place.plan.in_steps
+    scan = scans.make_scan(rig, place.plan, settle if in_steps else None, place.frames if in_steps else None)
     scan.lift()
-    _wait_for_enter(place.prompt)
+    typer.echo(f"{place.prompt}, then press Enter", err=True)
+    if not sys.stdin.readline():  # nobody is there
+        raise typer.Abort
     recorder = io.StreamRecorder(scan, path)
     with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
-        room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
+        room = np.empty((_BLOCK, *recorder.shape[1:]), recorder.dtype)
         while recorder.read(room) is not None:
             show(recorder.count)
-
-
-def _wait_for_enter(prompt: str) -> None:
-    """Ask the user to make something ready; without anyone to ask, stop as at Ctrl-C."""
-    typer.echo(f"{prompt}, then press Enter", err=True)
-    if not sys.stdin.readline():
-        raise typer.Abort

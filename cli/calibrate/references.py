@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -14,16 +14,12 @@ from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from mirrorskin.engine.calibration.references import LevelReport, Measured
-    from mirrorskin.io import CameraId, ProcessValue, References, Source
+    from mirrorskin.engine.calibration.references import Measured
+    from mirrorskin.io import CameraId, Source
 
 _FRAMES = 64
 _PLACES = 9
-_ROUNDS = 4
-"""How often a rig is asked for what is still missing."""
+_ROUNDS = 4  # of taking what is still missing on a rig
 
 _PROMPTS = {
     "dark": "take everything off the sheet, with the lamps as they are in a press",
@@ -85,8 +81,12 @@ def command(
             (darks if name == "dark" else brights).extend(inputs.take(rig, output, [place]))
         measured, camera = _measure(darks, brights, rolled)
     _missing(measured, noise, True)
-    io.update_calibration(output, measured.references, camera, _process(measured, darks, brights, rolled))
-    _tell(output, measured, as_json)
+    process = inputs.process_of(bright_light="of a ball rolled about" if rolled else "of a flat field")
+    for name, level, paths in (("dark", measured.dark, darks), ("bright", measured.bright, brights)):
+        process[f"{name}_sources"] = inputs.names_of(paths)
+        process |= {f"{name}_{key}": value for key, value in asdict(level).items()}
+    io.update_calibration(output, measured.references, camera, process)
+    _report(output, measured, as_json)
 
 
 def _check_call(
@@ -113,7 +113,7 @@ def _check_call(
 
 
 def _still(name: str, rig: Path, frames: int, number: int = 1) -> inputs.Place:
-    """Say how a level is taken, of half the frames at each of two places that are all but one."""
+    """Say how a level is taken: half of the frames at each of two places that are all but one."""
     file = name if number == 1 else f"{name}-{number}"
     return inputs.Place(file, _PROMPTS[name], inputs.still_plan(rig), max(1, -(-frames // 2)))
 
@@ -122,28 +122,19 @@ def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[input
     from mirrorskin.cli.quantity import length
 
     plan = inputs.still_plan(rig, length(press or "", "--press"))
-    prompt = "put the ball at place {} of {}, all over the field"
-    each = max(1, -(-frames // 2))
-    return [
-        inputs.Place(f"bright-{number}", prompt.format(number, places), plan, each)
-        for number in range(1, places + 1)
-    ]
+    return inputs.at_each("bright", inputs.BALL, places, plan, max(1, -(-frames // 2)))
 
 
 def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tuple[Measured, CameraId]:
-    """Measure references, and tell of which camera."""
+    """Measure references, and find of which camera they are."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.references import measure_references
 
     with ExitStack() as opening:
         low, high = ([opening.enter_context(_open(path)) for path in paths] for paths in (darks, brights))
-        names = {source.header.camera for source in (*low, *high)} - {""}
-        if len(names) > 1:
-            raise io.InputError(
-                f"the recordings are of {' and '.join(sorted(names))}: take all with one camera"
-            )
-        camera = io.CameraId("".join(names), low[0].shape[1:], low[0].dtype)
+        name = inputs.camera_name([source.header.camera for source in (*low, *high)])
+        camera = io.CameraId(name, low[0].shape[1:], low[0].dtype)
         with progress("averaging", sum(source.shape[0] for source in (*low, *high))) as show:
             return measure_references(low, high, rolled=rolled, progress=show), camera
 
@@ -162,11 +153,9 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
     """Count the frames that a stated noise still needs, by level, or refuse to go on with too few."""
     from mirrorskin.io import InputError
 
-    if noise is None:
-        return {}
     missing: dict[str, int] = {}
     for name, level in (("dark", measured.dark), ("bright", measured.bright)):
-        count = level.missing(noise)
+        count = 0 if noise is None else level.missing(noise)
         known = f"{name}: the standard error is {level.sigma:.3g} counts"
         if count is None:
             raise InputError(
@@ -182,32 +171,27 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
     return missing
 
 
-def _process(
-    measured: Measured, darks: Sequence[Path], brights: Sequence[Path], rolled: bool
-) -> Mapping[str, ProcessValue]:
-    from mirrorskin.engine.provenance import signature
+def _report(output: Path, measured: Measured, as_json: bool) -> None:
+    import numpy as np
 
-    told: dict[str, ProcessValue] = {
-        **signature(),
-        "bright_light": "of a ball rolled about" if rolled else "of a flat field",
-    }
-    for name, level, paths in (("dark", measured.dark, darks), ("bright", measured.bright, brights)):
-        told[f"{name}_sources"] = ", ".join(map(str, paths))
-        told |= {f"{name}_{key}": value for key, value in asdict(level).items()}
-    return told
-
-
-def _tell(output: Path, measured: Measured, as_json: bool) -> None:
     from mirrorskin.cli.output import print_json
+    from mirrorskin.io.calibration.types import BITS
 
     references = measured.references
-    defects = _count_defects(references)
+    defects = {name: int(np.count_nonzero(references.defects & bit)) for name, bit in BITS.items()}
     levels = {"dark": measured.dark, "bright": measured.bright}
     if as_json:
         print_json({"output": str(output), **levels, "defects": defects})
     else:
-        told = [_words(name, getattr(references, name), level) for name, level in levels.items()]
-        typer.echo(f"{output}: {'; '.join(told)}; " + ", ".join(f"{n} {what}" for what, n in defects.items()))
+        parts = []
+        for name, level in levels.items():
+            drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
+            parts.append(
+                f"{name} {float(np.nanmedian(getattr(references, name))):.2f} +- {level.sigma:.2g} counts"
+                f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
+            )
+        counts = ", ".join(f"{count} {name}" for name, count in defects.items())
+        typer.echo(f"{output}: {'; '.join(parts)}; {counts}")
     for name, level in levels.items():
         if abs(level.drift) > level.sigma:
             typer.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
@@ -217,22 +201,3 @@ def _tell(output: Path, measured: Measured, as_json: bool) -> None:
                 f" corrected for it; better {_REMEDIES[name]}",
                 err=True,
             )
-
-
-def _words(name: str, values: NDArray[np.float32], level: LevelReport) -> str:
-    import numpy as np
-
-    drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
-    return (
-        f"{name} {float(np.nanmedian(values)):.2f} +- {level.sigma:.2g} counts"
-        f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
-    )
-
-
-def _count_defects(references: References) -> dict[str, int]:
-    import numpy as np
-
-    from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED
-
-    bits = {"hot": HOT, "dead": DEAD, "saturated": SATURATED}
-    return {name: int(np.count_nonzero(references.defects & bit)) for name, bit in bits.items()}

@@ -1,7 +1,8 @@
-"""``mirrorskin calibrate scale``: where on the sheet the pixels look."""
+"""``mirrorskin calibrate board`` and ``scale``: a board to print, and where on the sheet the pixels look."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,19 +11,67 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
-from mirrorskin.cli.calibrate.board import BoardText, board_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mirrorskin.engine.calibration.board import Board
     from mirrorskin.engine.calibration.lens import LensFit
-    from mirrorskin.io import Calibration, CameraId, ProcessValue
-
-    Pictures = list[tuple[str, NDArray[Any]]]
+    from mirrorskin.io import CameraId
 
 _PLACES = 5
 _SHOTS = 8
+
+BoardText = Annotated[
+    str,
+    typer.Option(
+        metavar="BOARD",
+        help="charuco:COLUMNSxROWS:SQUARE:MARKER, as in charuco:7x5:2mm:1.5mm, or"
+        " dots:COLUMNSxROWS:PITCH, as in dots:11x9:1mm.",
+    ),
+]
+
+
+def board_of(text: str) -> Board:
+    """Return the board of ``charuco:COLUMNSxROWS:SQUARE:MARKER`` or ``dots:COLUMNSxROWS:PITCH``."""
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.engine.calibration.board import Charuco, Dots
+    from mirrorskin.io import InputError
+
+    kind, *numbers = text.strip().split(":")
+    size = re.fullmatch("([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", numbers[0].strip()) if numbers else None
+    count = {"charuco": 2, "dots": 1}.get(kind)
+    if size is None or count is None or len(numbers) != 1 + count:
+        raise InputError(f"--board {text}: write e.g. charuco:7x5:2mm:1.5mm, or dots:11x9:1mm")
+    columns, rows = int(size[1]), int(size[2])
+    lengths = [length(one, "--board") for one in numbers[1:]]
+    return Charuco(columns, rows, *lengths) if count == 2 else Dots(columns, rows, *lengths)
+
+
+def board_command(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="BOARD.png", help="Picture to write.")],
+    board: BoardText,
+    dpi: Annotated[float, typer.Option(help="Pixels per inch, to be printed at that.")] = 2540.0,
+) -> None:
+    """Paint a board for printing, in its true size."""
+    from mirrorskin.engine.calibration.board import paint_board
+    from mirrorskin.io import InputError, check_output
+    from mirrorskin.io.pictures import save_print
+
+    kind = board_of(board)
+    if output.suffix.lower() != ".png":
+        raise InputError(f"{output}: a board is written as PNG, which keeps its size: name it board.png")
+    if not 1 <= dpi <= 100_000:
+        raise InputError(f"--dpi {dpi:g}: pixels per inch of a printer are needed, such as 2540")
+    check_output(output)
+    picture = paint_board(kind, dpi)
+    save_print(picture, output, dpi)
+    rows, columns = picture.shape
+    width, height = (side * 25.4 / dpi for side in (columns, rows))
+    typer.echo(
+        f"{output}: {kind}, {columns} x {rows} pixels at {dpi:g} dpi, {width:.2f} x {height:.2f} mm"
+        " with its margin: print it at 100 %, and measure it"
+    )
 
 
 def command(
@@ -45,83 +94,64 @@ def command(
     """
     from mirrorskin import io
     from mirrorskin.engine.calibration.lens import calibrate_lens
-
-    kind, given = board_of(board), list(pictures or [])
-    if not given and rig is None:
-        raise io.InputError("no picture of a board is given: name some, or take them with --rig RIG.toml")
-    io.check_output(output, *given, rig)
-    if rig is not None:
-        given += inputs.take(rig, output, _plan(rig, places))
-    taken, camera = _read(given, output)
-    fit = calibrate_lens(taken, kind)
-    after = io.update_calibration(output, fit.lens, camera, _process(fit, kind, given))
-    _tell(output, fit, given, as_json)
-    _warn(after, fit.lens.pixel_size)
-
-
-def _warn(calibration: Calibration, pixel_size: tuple[float, float]) -> None:
-    """Say which parts the new scale has made useless."""
     from mirrorskin.io.calibration.source import outdated
     from mirrorskin.io.calibration.types import GROUPS
 
-    parts = [GROUPS[part] for part, _ in outdated(calibration, pixel_size)]
-    if parts:
-        typer.echo(f"learn {', '.join(parts)} again: made with another pixel size", err=True)
-
-
-def _plan(rig: Path, places: int) -> list[inputs.Place]:
-    """Say where the board is to lie, with the body lifted."""
-    prompt = (
-        "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the corners"
+    kind, paths = board_of(board), list(pictures or [])
+    if not paths and rig is None:
+        raise io.InputError("no picture of a board is given: name some, or take them with --rig RIG.toml")
+    io.check_output(output, *paths, rig)
+    if rig is not None:
+        prompt = (
+            "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the"
+            " corners"
+        )
+        plan = inputs.still_plan(rig)
+        paths += inputs.take(rig, output, inputs.at_each("board", prompt, places, plan, _SHOTS))
+    read, camera = _read(paths, output)
+    fit = calibrate_lens(read, kind)
+    process = inputs.process_of(
+        board=str(kind),
+        sources=inputs.names_of(paths),
+        marks=sum(fit.marks),
+        worst=fit.worst,
+        corner_sigma=fit.corner_sigma,
     )
-    return inputs.at_each("board", prompt, places, inputs.still_plan(rig), _SHOTS)
+    calibration = io.update_calibration(output, fit.lens, camera, process)
+    _report(output, fit, paths, as_json)
+    old = [GROUPS[part] for part, _ in outdated(calibration, fit.lens.pixel_size)]
+    if old:
+        typer.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
 
 
-def _read(paths: Sequence[Path], output: Path) -> tuple[Pictures, CameraId]:
-    """Read all pictures, and tell of which camera they are."""
-    from mirrorskin import io
-
-    read = [_picture(path) for path in paths]
-    names = {name for _, name, _ in read} - {""}
-    if len(names) > 1:
-        raise io.InputError(f"the recordings are of {' and '.join(sorted(names))}: take all with one camera")
-    # A picture need not be saved in the camera's type of sample: what a recording or the file says holds.
-    told = [dtype for _, _, dtype in read if dtype is not None]
-    if not told and output.exists():
-        told = [io.open_calibration(output).camera.dtype]
-    first = read[0][0]
-    camera = io.CameraId("".join(names), first.shape, (told or [first.dtype])[0])
-    return [(str(path), picture) for path, (picture, _, _) in zip(paths, read, strict=True)], camera
-
-
-def _picture(path: Path) -> tuple[NDArray[Any], str, Any]:
-    """Read a picture, or the mean of a recording and what that says of its camera."""
+def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
+    """Read all pictures, and the means of recordings, and find of which camera they are."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
     from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
 
-    if path.is_dir() or path.suffix.lower() in (".avi", ".mp4"):
-        raise io.InputError(f"{path} is a sequence: name pictures of the board one by one, or a recording")
-    if path.suffix.lower() in PICTURE_SUFFIXES:
-        return read_picture(path), "", None
-    with io.open_recording(path) as recording:
-        return mean_of_still(recording), recording.header.camera, recording.dtype
+    pictures, names, dtypes = [], [], []
+    for path in paths:
+        if path.is_dir() or path.suffix.lower() in (".avi", ".mp4"):
+            raise io.InputError(
+                f"{path} is a sequence: name pictures of the board one by one, or a recording"
+            )
+        if path.suffix.lower() in PICTURE_SUFFIXES:
+            pictures.append(read_picture(path))
+            continue
+        with io.open_recording(path) as recording:
+            pictures.append(mean_of_still(recording))
+            names.append(recording.header.camera)
+            dtypes.append(recording.dtype)
+    # A picture need not be saved in the camera's type of sample: that of a recording or the file is right.
+    if not dtypes and output.exists():
+        dtypes = [io.open_calibration(output).camera.dtype]
+    first = pictures[0]
+    camera = io.CameraId(inputs.camera_name(names), first.shape, (dtypes or [first.dtype])[0])
+    return [(str(path), picture) for path, picture in zip(paths, pictures, strict=True)], camera
 
 
-def _process(fit: LensFit, board: Board, paths: Sequence[Path]) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.provenance import signature
-
-    return {
-        **signature(),
-        "board": str(board),
-        "sources": ", ".join(map(str, paths)),
-        "marks": sum(fit.marks),
-        "worst": fit.worst,
-        "corner_sigma": fit.corner_sigma,
-    }
-
-
-def _tell(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) -> None:
+def _report(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) -> None:
     from mirrorskin.cli.output import print_json
 
     lens, size = fit.lens, fit.lens.pixel_size[0]
@@ -130,9 +160,18 @@ def _tell(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) -> N
             {"source": str(path), "marks": marks, "error": error}
             for path, marks, error in zip(paths, fit.marks, fit.errors, strict=True)
         ]
-        told = {"pixel_size": size, "pixel_size_sigma": size * lens.scale_sigma, "error": lens.error}
-        more = {"worst": fit.worst, "corner_sigma": fit.corner_sigma, "distortion": lens.distortion.tolist()}
-        print_json({"output": str(output), **told, **more, "pictures": each})
+        print_json(
+            {
+                "output": str(output),
+                "pixel_size": size,
+                "pixel_size_sigma": size * lens.scale_sigma,
+                "error": lens.error,
+                "worst": fit.worst,
+                "corner_sigma": fit.corner_sigma,
+                "distortion": lens.distortion.tolist(),
+                "pictures": each,
+            }
+        )
         return
     typer.echo(
         f"{output}: {1000 * size:.4f} +- {1000 * size * lens.scale_sigma:.2g} um a pixel"

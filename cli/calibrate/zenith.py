@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
@@ -12,13 +11,11 @@ import typer
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
-from mirrorskin.cli.calibrate.inputs import camera_of, check_call, one_camera, with_scale
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Calibration, Precession, ProcessValue, Source, WallResponse
+    from mirrorskin.io import Calibration, Precession, Source, WallResponse
 
-_DOUBTFUL = 0.1
-"""Degrees by which zeniths may be off, in the middle of all pixels, before a warning."""
+_DOUBTFUL = 0.1  # degrees by which zeniths of the median pixel may be off without a warning
 
 
 class PatternName(StrEnum):
@@ -61,58 +58,44 @@ def command(
 ) -> None:
     """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
     from mirrorskin import io
+    from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import length
     from mirrorskin.cli.stack import stack_options
+    from mirrorskin.engine.calibration.wall import fit_zenith
 
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    check_call(paths, rig, press=press, settle=settle)
+    inputs.check_call(paths, rig, press=press, settle=settle)
     io.check_output(output, *paths, rig)
-    known = io.open_calibration(output) if output.exists() else None
+    known = inputs.open_known(output)
     if rig is not None:
         plan = inputs.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
         balls = inputs.at_each("zenith", inputs.BALL, places, plan)
         paths, tilt, phase_step = inputs.take(rig, output, balls, settle), None, None
-    told = with_scale(stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size), known)
+    given = stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size)
     with ExitStack() as opening:
-        sources = [opening.enter_context(io.open_recording(path, **told)) for path in paths]
-        cameras = [camera_of(source) for source in sources]
-        camera = one_camera([source.name for source in sources], cameras, known, output)
-        response = _fit(sources, radius, known, pattern.value, body)
-        process = _process(paths, ball, body) | _size(sources[0])
-    io.update_calibration(output, response, camera, process)
-    _tell(output, response, as_json)
-
-
-def _fit(
-    sources: Sequence[Source],
-    radius: float,
-    known: Calibration | None,
-    pattern: str,
-    body: tuple[float, float],
-) -> WallResponse:
-    from mirrorskin.cli.output import progress
-    from mirrorskin.engine.calibration.wall import fit_zenith
-
-    with progress("fitting", len(sources)) as show:
-        return fit_zenith(
-            sources,
-            radius,
-            references=None if known is None else known.references,
-            precession=None if known is None else _precession(known, sources[0]),
-            pattern=pattern,
-            body=body,
-            progress=show,
+        sources = inputs.open_all(opening, paths, inputs.with_scale(given, known))
+        camera = inputs.one_camera(sources, known, output)
+        with progress("fitting", len(sources)) as show:
+            response = fit_zenith(
+                sources,
+                radius,
+                references=None if known is None else known.references,
+                precession=None if known is None else _precession(known, sources[0]),
+                pattern=pattern.value,
+                body=body,
+                progress=show,
+            )
+        process = inputs.process_of(
+            sources[0],
+            sources=inputs.names_of(paths),
+            ball=ball,
+            body_radius=body[0],
+            body_height=body[1],
         )
-
-
-def _size(source: Source) -> dict[str, ProcessValue]:
-    """Return what is kept of the pixel size that the wall was measured with."""
-    from mirrorskin.io.calibration.source import size_facts
-
-    size = source.header.pixel_size
-    return {} if size is None else dict(size_facts(size))
+    io.update_calibration(output, response, camera, process)
+    _report(output, response, as_json)
 
 
 def _precession(known: Calibration, source: Source) -> Precession | None:
@@ -128,20 +111,8 @@ def _precession(known: Calibration, source: Source) -> Precession | None:
     return None
 
 
-def _process(paths: Sequence[Path], ball: str, body: tuple[float, float]) -> dict[str, ProcessValue]:
-    from mirrorskin.engine.provenance import signature
-
-    return {
-        **signature(),
-        "sources": ", ".join(map(str, paths)),
-        "ball": ball,
-        "body_radius": body[0],
-        "body_height": body[1],
-    }
-
-
-def _tell(output: Path, response: WallResponse, as_json: bool) -> None:
-    """Say what was found, with its errors."""
+def _report(output: Path, response: WallResponse, as_json: bool) -> None:
+    """Print what was found, with its errors."""
     import numpy as np
 
     from mirrorskin.cli.output import print_json

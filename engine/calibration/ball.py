@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,51 +15,20 @@ from mirrorskin.io import InputError, pixel_axes
 Doubles = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BallView:
-    """The lines of sight of some pixels: each sees all points ``(x + z vx, y + z vy, z)``.
+class BallSight(NamedTuple):
+    """What n pixels see of a ball in T poses; NaN where they do not see it in contact."""
 
-    Attributes
-    ----------
-    place : ndarray, (4, n), float64
-        x and y where a line meets the rest plane, mm; vx and vy, by how much it moves for each mm of z.
-    """
-
-    place: Doubles
-
-    @classmethod
-    def straight(cls, x: ArrayLike, y: ArrayLike) -> BallView:
-        """Look straight down at places, (n,), mm."""
-        across, up = np.broadcast_arrays(np.asarray(x, np.float64).ravel(), np.asarray(y, np.float64).ravel())
-        return cls(np.stack([across, up, np.zeros_like(across), np.zeros_like(across)]))
-
-    @classmethod
-    def of_picture(cls, shape: tuple[int, int], pixel_size: tuple[float, float]) -> BallView:
-        """Look straight down at every pixel of a picture, row by row."""
-        return cls.straight(*np.meshgrid(*pixel_axes(shape, pixel_size)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """What some pixels see of a ball in T poses; NaN where they do not see it in contact.
-
-    Attributes
-    ----------
-    contact : ndarray, (T, n), bool
-        Whether the sheet lies on the ball there, if it takes the ball's shape (eq. 1 of the paper).
-    z : ndarray, (T, n), float64
-        Height of the point that is seen above the rest plane, mm.
-    normal : ndarray, (T, n, 3), float64
-        Unit normal of the ball there, in the body's frame of that pose.
-    """
-
-    contact: NDArray[np.bool_]
-    z: Doubles
-    normal: Doubles
+    contact: NDArray[np.bool_]  # (T, n): whether the sheet lies on the ball there (eq. 1 of the paper)
+    z: Doubles  # (T, n): height of the point that is seen above the rest plane, mm
+    normal: Doubles  # (T, n, 3): unit normal of the ball there, in the body's frame of that pose
 
 
 def rotations(lean: ArrayLike) -> Doubles:
-    """Return how the body sees the world turned, (T, 3, 3), in poses in which it leans."""
+    """Return how the body sees the world turned, (T, 3, 3), in poses in which it leans by l, (T, 2), radians.
+
+    In a precession of tilt d at the phase a, l = (d cos a, d sin a). The body's axis is
+    ``(-sin|l| l/|l|, cos|l|)``, and a world vector x is seen as ``Rz(a) Ry(|l|) Rz(-a) x``.
+    """
     lean = np.asarray(lean, np.float64)
     angle = np.sqrt(np.sum(lean**2, axis=1))
     cross = np.zeros((len(lean), 3, 3))
@@ -77,14 +45,19 @@ def moved(point: ArrayLike, lean: ArrayLike, pivot: ArrayLike) -> Doubles:
     return np.asarray(np.asarray(pivot, np.float64) + rotations(lean) @ arm)
 
 
-def ball_view(pixels: BallView, centre: ArrayLike, radius: float, lean: ArrayLike, pivot: ArrayLike) -> Seen:
-    """Tell what pixels see of a ball on which the sheet lies.
+def see_ball(
+    sight: Doubles, centre: ArrayLike, radius: float, lean: ArrayLike, pivot: ArrayLike
+) -> BallSight:
+    """Return what pixels see of a ball on which the sheet lies.
+
+    ``sight``, (4, n), are their lines of sight: x and y where a line meets the rest plane, mm, and by how
+    much it moves along both for each mm of z.
 
     The ball's centre C of the mean pose (pressed, upright) is at ``pivot + R (C - pivot)`` in a pose that
     sees the world turned by R. A line of sight meets the upper side of the ball there; the sheet touches
     where that point is above the rest plane, z > 0.
     """
-    x, y, slope_x, slope_y = pixels.place
+    x, y, slope_x, slope_y = sight
     middle = moved(centre, lean, pivot)
     start_x, start_y = x - middle[:, :1], y - middle[:, 1:2]
     start_z = -middle[:, 2:]
@@ -97,7 +70,7 @@ def ball_view(pixels: BallView, centre: ArrayLike, radius: float, lean: ArrayLik
         contact = (z > 0) & (z > middle[:, 2:])
     z = np.where(contact, z, np.nan)
     offset = np.stack([start_x + z * slope_x, start_y + z * slope_y, start_z + z], axis=-1)
-    return Seen(contact, z, offset / radius)
+    return BallSight(contact, z, offset / radius)
 
 
 _COARSE, _LONGEST = 128, 256  # pixels along a side to which pictures are made small, to search and to measure
@@ -111,49 +84,31 @@ _NEAR = 4  # pixels about an outline within which its edge is
 _OUTSIDE = 0.5  # radii of the ball by which its centre may lie outside of the picture
 _RAYS = 90
 _SHARP = 0.5  # pixels by which the places of an edge differ at least
-_SETTLED = 3e-3  # pixels that do not matter
+_CONVERGED = 3e-3  # pixels that do not matter
 _ROUND = 1.5  # pixels by which an outline may miss the circle
 _STRAY = 3.0  # times the median distance from the rest beyond which a frame's ball is a mistake
 _ROUNDS = 8
 
 
-class Found(NamedTuple):
-    """A ball's place in the mean pose."""
-
-    x: float  # Of its centre, millimetres from the picture's centre
-    y: float  # Of its centre, millimetres from the picture's centre
-    depth: float  # By how much its top stands above the rest plane, mm
-
-
-class Followed(NamedTuple):
-    """A ball's place in each frame; NaN where none is seen.
-
-    Attributes
-    ----------
-    centres, sigma : ndarray, (T, 3), float64
-        Of its centre in the body's frame of that pose, and their standard errors as the outline's own
-        unevenness has them; millimetres from the picture's centre and the rest plane.
-    """
+class BallCentres(NamedTuple):
+    """A ball's centre in each frame, (T, 3), mm, in the body's frame of that pose; NaN where none is seen."""
 
     centres: Doubles
-    sigma: Doubles
-
-    def with_sigma(self, sigma: float) -> Followed:
-        """Return the same with one standard error."""
-        return self._replace(sigma=np.full_like(self.sigma, sigma))
+    sigma: Doubles  # standard errors, from the outline's own unevenness
 
 
 def find_ball(
     frames: NDArray[Any], phase: ArrayLike, pixel_size: tuple[float, float], radius: float
-) -> Found:
-    """Find the one ball that is pressed into the sheet during a turn; see `follow_ball`."""
+) -> Doubles:
+    """Return the mean centre, (3,), mm, of the one ball that is pressed into the sheet during a turn.
+
+    For a tilt d that is the centre of the mean pose, but for d^2 / 2 times the distance from the pivot.
+    """
     alpha = check_phases(phase)
-    centres = follow_ball(frames, pixel_size, radius).centres
-    x, y, z = smooth_turn(centres, alpha)[0]
-    return Found(float(x), float(y), float(z) + radius)
+    return np.asarray(smooth_turn(follow_ball(frames, pixel_size, radius).centres, alpha)[0])
 
 
-def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: float) -> Followed:
+def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: float) -> BallCentres:
     """Find a ball's centre in each frame, in the body's frame of that pose.
 
     Where the sheet leaves the ball, and where the ball gets too steep for the wall to be seen, light ends on
@@ -162,7 +117,7 @@ def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: f
     circle is fitted to where its edge is, by rays from its centre.
 
     From a circle of radius a the ball's centre is sqrt(radius^2 - a^2) below the rest plane. Where the light
-    ends before the contact does, it is lower than told.
+    ends before the contact does, it is lower than that.
     """
     centres, sigma = np.full((2, len(frames), 3), np.nan)
     for number, frame in enumerate(frames):
@@ -178,11 +133,11 @@ def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: f
             f"a ball of {2 * radius:g} mm is seen in {seen} of {len(frames)} frames: check its diameter and"
             " the pixel size, and press it until a ring of light shows in all frames"
         )
-    return Followed(centres, sigma)
+    return BallCentres(centres, sigma)
 
 
 def smooth_turn(values: Doubles, phase: Doubles) -> Doubles:
-    """Fit mean, cosine and sine over a turn, whatever a few values say that are wrong."""
+    """Fit mean, cosine and sine, (3, c), to values, (T, c), over a turn, robustly."""
     known = np.isfinite(values).all(axis=1)
     functions, values = basis(phase[known]), values[known]
     weight = np.ones(len(values))
@@ -203,13 +158,13 @@ class _Circle(NamedTuple):
     radius: float
 
 
-class _Picture(NamedTuple):
-    """How the brightness of a picture that was made small and blurred changes."""
+class _Gradients(NamedTuple):
+    """Gradients of a downscaled and blurred picture."""
 
-    slope: Doubles  # (2, h, w): Along x and y, a millimetre
-    steep: Doubles  # (h, w): Their length
+    slope: Doubles  # (2, h, w): along x and y, per mm
+    steep: Doubles  # (h, w): their length
     corner: Doubles  # (2,): x and y of the first pixel, mm
-    step: Doubles  # (2,): What a column adds to x, and a row to y, mm
+    step: Doubles  # (2,): what a column adds to x, and a row to y, mm
 
     def at(self, values: Doubles, places: Doubles) -> Doubles:
         """Read a map, (h, w), between its pixels at places, (2, ...), mm; 0 beyond its edges."""
@@ -222,21 +177,21 @@ def _outline(
     frame: NDArray[Any], pixel_size: tuple[float, float], radius: float
 ) -> tuple[_Circle, Doubles] | None:
     """Return the circle on which the light of a frame ends, if there is one, and its standard errors."""
-    circle = _find_circle(_slopes(*_made_small(frame, pixel_size, _COARSE), _BLUR), radius)
-    small = _made_small(frame, pixel_size, _LONGEST)
+    circle = _find_circle(_gradients(*_downscale(frame, pixel_size, _COARSE), _BLUR), radius)
+    small = _downscale(frame, pixel_size, _LONGEST)
     fitted = None
     for blur in (_BLUR, _FINE):
         if circle is None:
             return None
-        fitted = _fit_circle(_slopes(*small, blur), circle, radius)
+        fitted = _fit_circle(_gradients(*small, blur), circle, radius)
         circle = None if fitted is None else fitted[0]
     return fitted
 
 
-def _made_small(
+def _downscale(
     frame: NDArray[Any], pixel_size: tuple[float, float], longest: int
 ) -> tuple[Doubles, Doubles, Doubles]:
-    """Average blocks of pixels, and take out what stands alone; see `_Picture` for corner and step."""
+    """Average blocks of pixels, and remove single outliers; see `_Gradients` for corner and step."""
     block = -(-max(frame.shape) // longest)
     rows, columns = (size // block for size in frame.shape)
     values = np.asarray(frame[: rows * block, : columns * block], np.float64)
@@ -249,16 +204,16 @@ def _made_small(
     return np.asarray(ndimage.median_filter(small, 3, mode="nearest")), corner, step
 
 
-def _slopes(small: Doubles, corner: Doubles, step: Doubles, blur: float) -> _Picture:
+def _gradients(small: Doubles, corner: Doubles, step: Doubles, blur: float) -> _Gradients:
     """Blur a picture, and take its slopes."""
     orders = zip(((0, 1), (1, 0)), step, strict=True)
     slope = np.stack(
         [ndimage.gaussian_filter(small, blur, order=order, mode="nearest") / way for order, way in orders]
     )
-    return _Picture(slope, np.hypot(*slope), corner, step)
+    return _Gradients(slope, np.hypot(*slope), corner, step)
 
 
-def _find_circle(picture: _Picture, radius: float) -> _Circle | None:
+def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
     """Return the circle on which most of the outline of something bright lies, if there is one."""
     places, inwards = _edges(picture)
     pixel = float(np.max(np.abs(picture.step)))
@@ -276,7 +231,7 @@ def _find_circle(picture: _Picture, radius: float) -> _Circle | None:
     return best
 
 
-def _edges(picture: _Picture) -> tuple[Doubles, Doubles]:
+def _edges(picture: _Gradients) -> tuple[Doubles, Doubles]:
     """Return where the picture is steepest along its own slope, and the ways uphill, (2, n) each."""
     steep = picture.steep
     clear = steep > max(_CLEAR * float(np.median(steep)), _FAINT * float(steep.max()), 1e-12)
@@ -290,7 +245,7 @@ def _edges(picture: _Picture) -> tuple[Doubles, Doubles]:
     return places[:, ridge], uphill[:, ridge]
 
 
-def _vote(picture: _Picture, centres: Doubles, margin: int) -> Doubles:
+def _vote(picture: _Gradients, centres: Doubles, margin: int) -> Doubles:
     """Count the centres, (2, n), near each pixel: one counts less the farther off it is.
 
     Returned is a map as large as the picture with a margin of so many pixels round it.
@@ -305,7 +260,7 @@ def _vote(picture: _Picture, centres: Doubles, margin: int) -> Doubles:
     return np.asarray(near * (2 * np.pi * _BLUR**2))
 
 
-def _fit_circle(picture: _Picture, circle: _Circle, radius: float) -> tuple[_Circle, Doubles] | None:
+def _fit_circle(picture: _Gradients, circle: _Circle, radius: float) -> tuple[_Circle, Doubles] | None:
     """Bring a circle to where the light ends on rays from its centre; None if it ends elsewhere on most.
 
     Also returned are the standard errors of its numbers.
@@ -325,7 +280,7 @@ def _fit_circle(picture: _Picture, circle: _Circle, radius: float) -> tuple[_Cir
         step = np.linalg.lstsq(weighted, away * weight, rcond=None)[0]
         x, y, outline = np.array(circle) + step
         circle = _Circle(float(x), float(y), min(max(float(outline), pixel), radius))
-        if np.max(np.abs(step)) < _SETTLED * pixel:
+        if np.max(np.abs(step)) < _CONVERGED * pixel:
             break
     clear = fall > _FAINT * float(picture.steep.max())
     ends = np.array(circle[:2])[:, np.newaxis] + way * circle.radius
@@ -333,15 +288,15 @@ def _fit_circle(picture: _Picture, circle: _Circle, radius: float) -> tuple[_Cir
     met = clear & (np.abs(away) <= _ROUND * pixel)
     if 2 * np.count_nonzero(met) <= np.count_nonzero(inside):
         return None
-    # Rays that pass less than a blur apart tell the same.
+    # Rays that pass less than a blur apart are not independent.
     shared = max(1.0, _RAYS * 2 * _BLUR * pixel / (2 * np.pi * circle.radius))
     variance = shared * np.sum((weight * (away - functions @ step)) ** 2) / np.sum(weight**2)
     spread = np.linalg.pinv(weighted.T @ weighted)
-    error = np.sqrt(np.maximum(variance, (_SETTLED * pixel) ** 2) * np.diag(spread))
+    error = np.sqrt(np.maximum(variance, (_CONVERGED * pixel) ** 2) * np.diag(spread))
     return circle, np.asarray(error)
 
 
-def _light_ends(picture: _Picture, circle: _Circle, way: Doubles) -> tuple[Doubles, Doubles]:
+def _light_ends(picture: _Gradients, circle: _Circle, way: Doubles) -> tuple[Doubles, Doubles]:
     """Return by how much the light ends beyond a circle along some ways, mm, and how steeply it does."""
     pixel = float(np.max(np.abs(picture.step)))
     reach = np.arange(-_NEAR, _NEAR + 0.25, 0.5) * pixel

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import least_squares
 
-from mirrorskin.engine.calibration.ball import BallView, ball_view
+from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
@@ -288,7 +288,7 @@ def _true_ball(sight: Doubles, centre: Doubles, radius: float, found: Result) ->
     """Return what is true of the ball, where it is in contact in every frame, but for a margin."""
     shape = sight.shape[1:]
     upright, pivot = np.zeros((1, 2)), np.zeros(3)
-    seen = ball_view(BallView(sight.reshape(4, -1)), centre, radius, upright, pivot)
+    seen = see_ball(sight.reshape(4, -1), centre, radius, upright, pivot)
     x, y, z = (part.reshape(shape) for part in np.moveaxis(seen.normal[0], -1, 0))
     assert found.contact is not None
     touched = seen.contact[0].reshape(shape) & (found.contact != 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -301,7 +302,8 @@ _CONVERGED = 1e-3  # standard deviations
 _PLATEAU_BIN, _PLATEAU_BINS = 256, 16
 
 
-class Plateau(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Plateau:
     """The upper plateau of pixels' samples, (P,): NaN where it has fewer than five samples."""
 
     value: Floats

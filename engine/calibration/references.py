@@ -134,9 +134,10 @@ def measure_references(
     defects = find_defects(low, high, int(np.median(unlit.count)) - 1, unlit.integer)
     _check_defects(defects, dark[0].name)
     sound = defects == 0
-    maps = (np.where(sound, one, np.nan).astype(np.float32) for one in (low[0], high[0], low[1], high[1]))
+    maps = low.value, high.value, low.sigma, high.sigma
+    values = [np.where(sound, one, np.nan).astype(np.float32) for one in maps]
     return Measured(
-        References(*maps, defects=defects),
+        References(values[0], values[1], values[2], values[3], defects),
         _report(low, unlit.frames, drift, sound, unlit.integer),
         _report(high, frames, shift, sound, unlit.integer),
     )

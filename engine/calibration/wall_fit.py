@@ -99,13 +99,12 @@ def read_press(
     frames, phase = _read(source)
     lean = _circle(source, phase) if precession is None else precession.lean(phase)
     try:
-        found = find_ball(frames, phase, pixel_size, ball)
+        centre, sigma = find_ball(frames, phase, pixel_size, ball), np.full(3, _PLACE)
     except InputError as error:
         raise InputError(f"{source.name}: {error}") from None
-    centre, sigma = np.array([found.x, found.y, found.depth - ball]), np.full(3, _PLACE)
     outline = math.sqrt(max(ball**2 - centre[2] ** 2, 1e-6))
     press = source.header.press
-    if press is not None and abs(press - found.depth) < _PLACE:
+    if press is not None and abs(press - centre[2] - ball) < _PLACE:
         centre[2], sigma[2] = press - ball, _DEPTH
     reach = min(ball * math.sin(_STEEPEST), _BEYOND * outline)
     places = np.stack([axis.ravel() for axis in np.meshgrid(*pixel_axes(frames.shape[1:], pixel_size))])

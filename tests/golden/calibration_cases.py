@@ -21,12 +21,11 @@ from golden import Answer, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
 from mirrorskin import hw, io
-from mirrorskin.engine.calibration.ball import Followed
 from mirrorskin.engine.calibration.board import Dots
 from mirrorskin.engine.calibration.lens import calibrate_lens
 from mirrorskin.engine.calibration.references import measure_references
-from mirrorskin.engine.calibration.tilt import BallTrack, PlateTrack, study_tracks
-from mirrorskin.engine.calibration.tilt_tracks import Tilts
+from mirrorskin.engine.calibration.tilt import fit_precession
+from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
 from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.live import LivePress, LiveRotation
 from mirrorskin.engine.streaming import push_block
@@ -90,10 +89,10 @@ def fit_a_precession() -> Answer:
     tilt, turned, pivot = 0.0441, 0.05, np.array([0.3, -0.2, 12.0])
     alpha = EIGHTHS + turned
     tracks = [
-        BallTrack(EIGHTHS, followed(place, tilt, alpha, pivot)) for place in ((-2, 1, -1.5), (3, 2, -1.5))
+        BallTrack(EIGHTHS, *followed(place, tilt, alpha, pivot)) for place in ((-2, 1, -1.5), (3, 2, -1.5))
     ]
     zenith = tilt + np.random.default_rng(9).normal(0, 5e-5, 8)
-    found = study_tracks(tracks, [PlateTrack(EIGHTHS, Tilts(zenith, np.full(8, 5e-5)), True)])
+    found = fit_precession(tracks, [PlateTrack(EIGHTHS, zenith, np.full(8, 5e-5), True)])
     known = found.precession
     numbers = [known.tilt, known.phase_offset, known.ellipticity, *known.centre, *known.pivot]
     return {
@@ -104,16 +103,14 @@ def fit_a_precession() -> Answer:
     }
 
 
-def followed(place: Any, tilt: float, alpha: Any, pivot: Any) -> Followed:
+def followed(place: Any, tilt: float, alpha: Any, pivot: Any) -> tuple[Any, Any]:
     """Return where a ball is seen while the body leans about its pivot: rotated by the opposite turn."""
     axis = np.stack([-np.sin(alpha), np.cos(alpha), 0 * alpha], axis=1)
     arm = np.asarray(place, float) - pivot
     along = axis * (axis @ arm)[:, None]
     seen = along + (arm - along) * np.cos(tilt) + np.cross(axis, arm) * np.sin(tilt) + pivot
     sigma = np.broadcast_to([1e-3, 1e-3, 3e-3], seen.shape).copy()
-    return Followed(
-        seen + sigma * np.random.default_rng(int(10 * place[0]) + 50).normal(size=seen.shape), sigma
-    )
+    return seen + sigma * np.random.default_rng(int(10 * place[0]) + 50).normal(size=seen.shape), sigma
 
 
 @dataclass(frozen=True)

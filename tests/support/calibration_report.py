@@ -80,15 +80,14 @@ def calibrate(lab: Lab, apart: float = APART, every: int = 1) -> io.Calibration:
     presses = nine_balls(lab, apart, 1)
     response = wall.fit_zenith(presses, BALL / 2, references=taken)
     pixel = lab.pixel_size, lab.pixel_size
-    light = brightness.WallShown.of_pixels(response, taken.dark, taken.bright, lab.shape, pixel)
-    precession = tilt.fit_precession((_again(press) for press in presses[::every]), light)
+    light = brightness.WallBrightness.of_pixels(response, taken.dark, taken.bright, lab.shape, pixel)
+    tracks = []
+    for press in presses[::every]:
+        press.rewind()
+        tracks.append(tilt_tracks.track_ball(press, BALL / 2, light))
+    precession = tilt.fit_precession(tracks, depth_sigma=light.depth_sigma).precession
     camera = io.CameraId("", lab.shape, np.dtype("uint8"))
     return io.Calibration(camera, taken, None, response, precession)
-
-
-def _again(press: Frames) -> tilt_tracks.BallTurn:
-    press.rewind()
-    return tilt_tracks.read_ball(press, BALL / 2)
 
 
 def as_designed(lab: Lab, calibration: io.Calibration) -> tuple[io.Calibration, dict[str, Any]]:

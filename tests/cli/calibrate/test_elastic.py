@@ -52,7 +52,7 @@ def quick(monkeypatch):
         sigma = {"threshold": 0.003, "compliance": 0.01, "travel_zero": 0.002}
         gel = io.Gel(0.21, 0.02, travel_zero=0.01, error=0.004, sigma=sigma)
         places = (gel_module.BallPlace(0.0, 0.0, 0.01, len(presses[0].travel)),)
-        return gel_module.LearnedGel(gel, places, ("curvature",))
+        return gel_module.GelFit(gel, places, ("curvature",))
 
     monkeypatch.setattr(gel_module, "fit_gel", fit)
 
@@ -62,7 +62,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     assert ended.code == 0, ended.said
     assert ended.out.startswith("cal.h5: light from ")
     assert len(ended.out.splitlines()) == 1
-    assert "curvature: the presses do not tell it" in ended.said
+    assert "curvature: not determined by the presses" in ended.said
     calibration = io.open_calibration("cal.h5")
     assert calibration.gel.threshold == 0.21
     assert calibration.camera.shape == (56, 56)

@@ -13,8 +13,7 @@ from commands import run
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import board, scale
-from mirrorskin.cli.calibrate.board import board_of
+from mirrorskin.cli.calibrate.scale import board_command, board_of, command
 from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
 from mirrorskin.engine.calibration.lens import calibrate_lens
 from mirrorskin.io.calibration.source import size_facts
@@ -119,7 +118,7 @@ def test_what_is_no_picture_of_the_board_is_refused(words, said, tmp_path):
     # The folder that is given must not be that of the file.
     (tmp_path / "to").mkdir()
     with pytest.raises(io.InputError, match=re.escape(said)):
-        scale.command(Path("to/cal.h5"), CHARUCO, [Path(word) for word in words])
+        command(Path("to/cal.h5"), CHARUCO, [Path(word) for word in words])
     assert not (tmp_path / "to" / "cal.h5").exists()
 
 
@@ -183,7 +182,7 @@ def test_a_board_is_painted_in_its_true_size():
 )
 def test_a_board_that_cannot_be_painted_is_refused(path, dpi, said):
     with pytest.raises(io.InputError, match=said):
-        board.command(Path(path), CHARUCO, dpi)
+        board_command(Path(path), CHARUCO, dpi)
     assert not Path(path).exists()
 
 

@@ -13,7 +13,7 @@ from stacks import MadeUp, record
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
-from mirrorskin.cli.calibrate.tilt import _spoils
+from mirrorskin.cli.calibrate.tilt import warnings
 from mirrorskin.hw.rig.plans import AxialPlan
 from mirrorskin.hw.twin import Axial, Body, Twin
 
@@ -132,7 +132,7 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
         (["ball.h5", "--rig", "rig.toml", "--press", "1mm"], "leave one of them out"),
         (["--rig", "rig.toml"], "--press is missing"),
         (["ball.h5", "--flat", "other.h5"], "take all with one camera"),
-        (["bare.h5"], "bare.h5: the recording tells no zenith gain and offset"),
+        (["bare.h5"], "bare.h5: the recording has no zenith gain and offset"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
@@ -200,11 +200,11 @@ def test_a_wall_that_was_measured_with_other_pixels_is_refused():
         ({"ellipticity": 0.02, "sigma": {"ellipticity": 0.1}}, ["azimuths are off by up to 0.57 deg"]),
         ({"ellipticity": 0.002, "sigma": {"ellipticity": 0.0005}}, ["azimuths are off by up to 0.057 deg"]),
         ({"ellipticity": 0.002, "sigma": {"ellipticity": 0.001}}, []),
-        ({"centre": (0.003, 0.004), "sigma": {}}, ["from the mean pose, which leans by 0.29 deg"]),
+        ({"centre": (0.003, 0.004), "sigma": {}}, ["to the mean pose, which leans by 0.29 deg"]),
         ({"centre": (1e-4, 0.0), "sigma": {"centre_x": 1e-4, "centre_y": 1e-4}}, []),
     ],
 )
 def test_an_oval_and_a_mean_lean_are_named_with_what_they_spoil_where_they_matter(known, said):
-    found = list(_spoils(a_precession(**{"ellipticity": 0.0, "centre": (0.0, 0.0)} | known)))
+    found = list(warnings(a_precession(**{"ellipticity": 0.0, "centre": (0.0, 0.0)} | known)))
     assert len(found) == len(said)
     assert all(one in note for one, note in zip(said, found, strict=True))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.calibration.ball import BallView, ball_view
+from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.calibration.wall_fit import Prior, fit_wall, start_curve
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
@@ -76,9 +76,9 @@ def test_the_ball_is_met_where_the_shared_geometry_has_it():
     _, lean = look(samples.place, named)
     pivot = [named[f"pivot_{axis}"] for axis in "xyz"]
     for number in range(200):
-        pixel = BallView(np.concatenate([samples.place[:, number], lean[:, number]])[:, np.newaxis])
+        pixel = np.concatenate([samples.place[:, number], lean[:, number]])[:, np.newaxis]
         pose = samples.pose[number]
-        seen = ball_view(pixel, CENTRES[pose // 8], 2.0, LEAN[pose % 8][np.newaxis], pivot)
+        seen = see_ball(pixel, CENTRES[pose // 8], 2.0, LEAN[pose % 8][np.newaxis], pivot)
         if seen.contact[0, 0]:
             assert met.z[number] == pytest.approx(seen.z[0, 0], abs=1e-12)
             np.testing.assert_allclose(met.normal[:, number], seen.normal[0, 0], atol=1e-12)

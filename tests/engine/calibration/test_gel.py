@@ -10,7 +10,6 @@ from mirrorskin import io
 from mirrorskin.engine.calibration.gel import (
     BallOnset,
     ball_onset,
-    ball_pixels,
     fit_gel,
     sphere_slope,
     sphere_travel,
@@ -138,27 +137,25 @@ def test_numbers_that_a_press_does_not_tell_are_left_at_zero_and_named():
         *(part[narrow] for part in (whole.travel, whole.sigma, whole.x, whole.y)), 2.0, 0.417, 0.005
     )
     found = fit_gel([few], sheet=0.0)
-    assert found.untold
-    for name in found.untold:
+    assert found.undetermined
+    for name in found.undetermined:
         assert getattr(found.gel, name) == 0
         assert name not in found.gel.sigma
     assert found.gel.threshold == pytest.approx(0.21, abs=0.01)
 
 
-def test_presses_that_tell_nothing_are_refused():
+def test_presses_that_say_nothing_are_refused():
     with pytest.raises(InputError, match="at least one press"):
         fit_gel([])
-    dark = np.full((9, 9), np.nan)
-    with pytest.raises(InputError, match="0 pixels turned light"):
-        ball_pixels(dark, dark, np.full((9, 9), 2), 0.1, 2.0)
-    with pytest.raises(InputError, match="radius -1"):
-        ball_pixels(dark, dark, np.full((9, 9), 2), 0.1, -1.0)
-
-
-def test_what_is_no_press_of_known_size_is_refused():
     source = type("Source", (), {"name": "turn.h5", "header": io.Header("axial")})()
+    lit = np.zeros((9, 9), np.float32)
+    press = Result(height=lit, height_sigma=lit, status=np.full((9, 9), 2, np.uint8))
     with pytest.raises(InputError, match=r"turn\.h5 is no press"):
         ball_onset(Result(), source, 2.0)
-    lit = np.zeros((9, 9), np.float32)
     with pytest.raises(InputError, match=r"turn\.h5 has no pixel size"):
-        ball_onset(Result(height=lit, height_sigma=lit, status=np.ones((9, 9), np.uint8)), source, 2.0)
+        ball_onset(press, source, 2.0)
+    source.header = io.Header("vertical", pixel_size=(0.1, 0.1))
+    with pytest.raises(InputError, match=r"turn\.h5: 0 pixels turned light"):
+        ball_onset(press, source, 2.0)
+    with pytest.raises(InputError, match="radius -1"):
+        ball_onset(press, source, -1.0)
