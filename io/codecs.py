@@ -19,13 +19,10 @@ Codec = Callable[[Bytes, Bytes], None]
 """Unpack the first bytes into the whole of the second; ValueError if they do not fit."""
 
 _SHUFFLE, _DEFLATE, _LZF = h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_LZF
-_BLOSC, _LZ4, _BITSHUFFLE, _ZSTD = 32001, 32004, 32008, 32015
+_BLOSC, _BITSHUFFLE = 32001, 32008
 
-_ABSENT = (
-    OSError,
-    AttributeError,
-    LookupError,
-)  # a library is not there or made otherwise, a filter is unknown
+# A library is not there or made otherwise, a filter is unknown.
+_ABSENT = (OSError, AttributeError, LookupError)
 
 _SIZE, _POINTER = ctypes.c_size_t, ctypes.c_void_p
 _WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
@@ -45,9 +42,9 @@ def find_codecs(dataset: h5py.Dataset) -> list[Codec] | str:
     return codecs
 
 
-def decode(codecs: list[Codec], left_out: int, packed: Bytes, out: Bytes) -> None:
+def decode(codecs: list[Codec], filter_mask: int, packed: Bytes, out: Bytes) -> None:
     """Unpack a chunk."""
-    steps = [codec for bit, codec in enumerate(codecs) if not left_out >> bit & 1] or [_copy]
+    steps = [codec for bit, codec in enumerate(codecs) if not filter_mask >> bit & 1] or [_copy]
     for codec in steps[:0:-1]:
         between = np.empty_like(out)
         codec(packed, between)
@@ -158,48 +155,12 @@ def _blosc(_values: tuple[int, ...]) -> Codec:
     return decode
 
 
-def _zstd(_values: tuple[int, ...]) -> Codec:
-    function = _function(_plugin("zstd"), "ZSTD_decompress", _SIZE, _POINTER, _SIZE, _POINTER, _SIZE)
-
-    def decode(packed: Bytes, out: Bytes) -> None:
-        _check(function(out.ctypes.data, out.size, packed.ctypes.data, packed.size), out.size)
-
-    return decode
-
-
-def _lz4(_values: tuple[int, ...]) -> Codec:
-    """LZ4 in HDF5: the unpacked size and that of a block; each block tells its packed size, or is raw."""
-    function = _function(
-        _plugin("lz4"), "LZ4_decompress_safe", ctypes.c_int, _POINTER, _POINTER, ctypes.c_int, ctypes.c_int
-    )
-
-    def decode(packed: Bytes, out: Bytes) -> None:
-        if packed.size < _HEAD.size:
-            raise ValueError("(the chunk is too short)")
-        total, block = _HEAD.unpack_from(packed.data)
-        _check(total, out.size)
-        place, done = _HEAD.size, 0
-        while done < out.size and block and place + _WORD.size <= packed.size:
-            size, part = _WORD.unpack_from(packed.data, place)[0], out[done : done + block]
-            data = packed[place + _WORD.size :][:size]
-            if len(data) == size == part.size:
-                part[...] = data
-            else:
-                _check(function(data.ctypes.data, part.ctypes.data, data.size, part.size), part.size)
-            place, done = place + _WORD.size + size, done + part.size
-        _check(done, out.size)
-
-    return decode
-
-
 _MAKERS: dict[int, Callable[[tuple[int, ...]], Codec]] = {
     _SHUFFLE: _shuffle,
     _DEFLATE: _deflate,
     _LZF: _lzf,
     _BITSHUFFLE: _bitshuffle,
     _BLOSC: _blosc,
-    _ZSTD: _zstd,
-    _LZ4: _lz4,
 }
 
 

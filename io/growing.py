@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import MAKE_ROOM
 from mirrorskin.io.calibration.file import CARRIED, size_of, write_calibration
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.layout import DROPPED, LIVE, SERIES, STATE, UNDER_WAY, USED
-from mirrorskin.io.recorder import POSITIONS, Compression, new_stack, packing, write_header, write_plot
+from mirrorskin.io.layout import DROPPED, LIVE, POSITIONS, SERIES, STATE, UNDER_WAY, USED
+from mirrorskin.io.recorder import Compression, new_stack, packing, write_header, write_plot
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 # Files for HDF5 1.10 and later, the first that could read what is being written.

@@ -36,26 +36,42 @@ USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
 UNDER_WAY, COMPLETE, CUT_SHORT = "under way", "complete", "cut short: "
 
 
+POSITIONS: dict[Motion, str] = {
+    "vertical": "travel",
+    "axial": "phase",
+    "horizontal": "displacement",
+    "twist": "twist",
+}
+"""Which series says where the body was, of each motion."""
+
+_CHECKS = {"travel": check_stroke, "phase": check_phase}
+_REMEDIES = {"travel": "give --travel-step", "phase": "give --phase-step or --phases"}
+
+
 @dataclass(frozen=True, slots=True)
-class Taken:
-    """How a recording was taken."""
+class RecordingState:
+    """How far a recording has come, and what a live run did with its frames.
+
+    While it is written, frames and what is known of each grow one after the other: ``count`` frames are known
+    in full. ``state`` is "under way", "complete", or "cut short: " and why.
+    """
 
     count: int
     state: str = COMPLETE
-    used: NDArray[np.bool_] | None = None
-    dropped: NDArray[np.int32] | None = None
+    used: NDArray[np.bool_] | None = None  # whether a live reconstruction used a frame
+    dropped: NDArray[np.int32] | None = None  # how many frames were lost before a frame
 
-    def of(self, frames: slice | NDArray[np.intp]) -> Taken:
-        """Return what is told of some frames."""
+    def of(self, frames: slice | NDArray[np.intp]) -> RecordingState:
+        """Return what is known of some frames."""
         used = None if self.used is None else self.used[frames]
         return replace(self, used=used, dropped=None if self.dropped is None else self.dropped[frames])
 
 
-def how_taken(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> Taken:
-    """Read how far a recording has come, and what is told of it as a whole."""
+def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> RecordingState:
+    """Read how far a recording has come; stacks of other programs are complete."""
     node = file.find(STATE) if ours else None
     if node is None:
-        return Taken(int(stack.shape[0]))
+        return RecordingState(int(stack.shape[0]))
     state = str(file.value(node))
     if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
         state = f"{CUT_SHORT}its writer was killed"
@@ -67,7 +83,7 @@ def how_taken(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> Taken:
     used, dropped = (
         file.read(grown[place], (count,), rows=count) if place in grown else None for place in (USED, DROPPED)
     )
-    return Taken(count, state, None if used is None else used != 0, dropped)
+    return RecordingState(count, state, None if used is None else used != 0, dropped)
 
 
 def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
@@ -75,13 +91,11 @@ def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
 
 
 class Layout:
-    """What a file says of its stack; of a file that is not ours, nothing."""
+    """What a file says of a part of its stack; of a file that is not ours, nothing."""
 
-    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], cut: Selection) -> None:
-        self._file = file
-        self._ours = ours
+    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], part: Selection) -> None:
+        self._file, self._ours, self._part = file, ours, part
         self._count, self._frame = shape[0], shape[1:]
-        self._cut = cut
 
     def header(
         self, motion: Motion | None, tilt: float | None, pixel_size: tuple[float, float] | None
@@ -111,43 +125,32 @@ class Layout:
         )
 
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
-        """Read where the body was in each frame, and when; travel or phase may be given; check it."""
-        found = {"time": self._cut_series("time", (self._count,))}
-        if motion == "vertical":
-            found["travel"] = self._travel(given)
-        elif motion == "axial":
-            found["phase"] = self._phase(given)
-        elif motion == "horizontal":
-            found["displacement"] = self._cut_series("displacement", (self._count, 2))
+        """Read when each frame was taken, and where the body was; travel or phase may be given; check it."""
+        name, time = POSITIONS[motion], self._cut(self._series("time", (self._count,)))
+        if name not in _CHECKS:
+            width = (2,) if name == "displacement" else ()
+            return {"time": time, name: self._cut(self._series(name, (self._count, *width)))}
+        where = f"{self._file.path}: {SERIES[name][0]}"
+        if given is not None:
+            where = f"{self._file.path}: the {name} given"
         else:
-            found["twist"] = self._cut_series("twist", (self._count,))
-        return found
+            given = self._series(name, (self._count,), _REMEDIES[name])
+        if given is None:
+            remedy = _REMEDIES[name]
+            raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
+        return {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
-        """Read when some frames of the cut were taken, and where a live run thought the body to be then."""
-        name = {"vertical": "travel", "axial": "phase"}.get(motion, "")
+        """Read when some frames of the part were taken, and where a live run thought the body to be then."""
+        name = POSITIONS[motion]
         place, unit = LIVE.get(name, ("", ""))
-        values = self._grown(place, (self._count,), unit) if name else None
+        values = self._cut(self._per_frame(place, (self._count,), unit)) if place else None
         if values is None:
             raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
-        time = self._cut_series("time", (self._count,))
-        check = check_stroke if name == "travel" else check_phase
-        rows = values[slice(*self._cut.frames)][chosen]
+        time = self._cut(self._series("time", (self._count,)))
         where = f"{self._file.path}: {place} of the frames that were used"
-        return {name: check(rows, len(chosen), where), "time": None if time is None else time[chosen]}
-
-    def _travel(self, given: ArrayLike | None) -> Floats:
-        if given is not None:
-            return check_stroke(given, self._count, f"{self._file.path}: the travel given", self._cut.frames)
-        values = self._positions("travel", "give --travel-step")
-        where = f"{self._file.path}: {SERIES['travel'][0]}"
-        return check_stroke(values, self._count, where, self._cut.frames)
-
-    def _phase(self, given: ArrayLike | None) -> Floats:
-        if given is not None:
-            return check_phase(given, self._count, f"{self._file.path}: the phase given", self._cut.frames)
-        values = self._positions("phase", "give --phase-step or --phases")
-        return check_phase(values, self._count, f"{self._file.path}: {SERIES['phase'][0]}", self._cut.frames)
+        used = _CHECKS[name](values[chosen], len(chosen), where)
+        return {name: used, "time": None if time is None else time[chosen]}
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
@@ -160,7 +163,7 @@ class Layout:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
         maps = {
             name: np.ascontiguousarray(
-                self._file.read(node, self._frame, unit=TRUTH_UNITS[name])[self._cut.region.slices]
+                self._file.read(node, self._frame, unit=TRUTH_UNITS[name])[self._part.region.slices]
             )
             for name, node in present.items()
         }
@@ -170,24 +173,17 @@ class Layout:
         slip = maps["slip"].astype(np.uint8, copy=False) if "slip" in maps else None
         return Truth(height, zenith, azimuth, maps["contact"].astype(np.uint8, copy=False), slip)
 
-    def _cut_series(self, name: str, shape: Shape) -> Floats | None:
-        values = self._series(name, shape)
-        return None if values is None else values[slice(*self._cut.frames)]
+    def _cut(self, values: Floats | None) -> Floats | None:
+        return None if values is None else values[slice(*self._part.frames)]
 
     def _series(self, name: str, shape: Shape, remedy: str = "") -> Floats | None:
-        where, unit = SERIES[name]
-        return self._grown(where, shape, unit, remedy)
+        place, unit = SERIES[name]
+        return self._per_frame(place, shape, unit, remedy)
 
-    def _grown(self, name: str, shape: Shape, unit: str, remedy: str = "") -> Floats | None:
+    def _per_frame(self, name: str, shape: Shape, unit: str, remedy: str = "") -> Floats | None:
         """Read what there is one of a frame; while a recording is written, there may be more already."""
         rows = shape[0] if self._find(STATE) is not None else None
         return self._read(name, shape, unit=unit, remedy=remedy, rows=rows)
-
-    def _positions(self, name: str, remedy: str) -> Floats:
-        values = self._series(name, (self._count,), remedy)
-        if values is None:
-            raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
-        return values
 
     def _pixel_size(self) -> tuple[float, float] | None:
         x, y = (self._scalar(f"{DETECTOR}/{axis}_pixel_size", "mm", "give --pixel-size") for axis in "xy")
@@ -207,14 +203,14 @@ class Layout:
     def _reference(self, name: str) -> NDArray[np.float32] | None:
         remedy = f"give --{name}, or take the reference again"
         values = self._numbers(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
-        return None if values is None else np.ascontiguousarray(values[self._cut.region.slices], np.float32)
+        return None if values is None else np.ascontiguousarray(values[self._part.region.slices], np.float32)
 
     def _map(self, name: str, unit: str | None = None) -> Floats | None:
         """Read a map of the picture, or one number for all of it."""
         values = self._read(name, (), self._frame, unit=unit)
         if values is None or not values.ndim:
             return values
-        return np.ascontiguousarray(values[self._cut.region.slices])
+        return np.ascontiguousarray(values[self._part.region.slices])
 
     def _pivot(self, pixel_size: tuple[float, float] | None) -> tuple[float, float, float] | None:
         """Read the pivot, and place it from the centre of the region."""
@@ -222,7 +218,7 @@ class Layout:
         if values is None:
             return None
         x, y, z = values.tolist()
-        right, up = self._cut.region.centre(self._frame, pixel_size) if pixel_size else (0.0, 0.0)
+        right, up = self._part.region.centre(self._frame, pixel_size) if pixel_size else (0.0, 0.0)
         return x - right, y - up, z
 
     def _scalar(self, name: str, unit: str, remedy: str) -> float | None:

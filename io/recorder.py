@@ -16,20 +16,12 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.layout import MARK, SERIES, STACK, TRUTH, TRUTH_UNITS
+from mirrorskin.io.layout import MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
 from mirrorskin.io.os_errors import legible
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
-
-POSITIONS: dict[Motion, str] = {
-    "vertical": "travel",
-    "axial": "phase",
-    "horizontal": "displacement",
-    "twist": "twist",
-}
-"""Which series tells where the body was, of each motion."""
 
 
 def check_compression(compression: str) -> None:

@@ -17,7 +17,7 @@ from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
-from mirrorskin.io.layout import MARK, STACK, Layout, Taken, how_taken
+from mirrorskin.io.layout import MARK, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.result import MARK as RESULT_MARK
@@ -35,7 +35,7 @@ class Steps:
 
     def positions(self, count: int) -> Floats:
         """Return the positions of ``count`` frames."""
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is told by who takes them
+        with np.errstate(invalid="ignore", over="ignore"):  # who takes them refuses what is not finite
             return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
 
@@ -84,7 +84,7 @@ class Recording(Closing):
         header: Header,
         positions: Mapping[str, Floats | None],
         truth: Truth | None,
-        taken: Taken,
+        state: RecordingState,
         live: bool = False,
     ) -> None:
         self.path = file.path
@@ -94,8 +94,8 @@ class Recording(Closing):
         self.motion = header.motion
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.full_shape = (taken.count, *_shape(dataset)[1:])
-        self.state, self.used, self.dropped = taken.state, taken.used, taken.dropped
+        self.full_shape = (state.count, *_shape(dataset)[1:])
+        self.state, self.used, self.dropped = state.state, state.used, state.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
@@ -230,21 +230,21 @@ def open_recording(
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
         file.check_layout(MARK)
-        stack, taken = _find_stack(file, dataset, ours)
-        shape = (taken.count, *_shape(stack)[1:])
+        stack, state = _find_stack(file, dataset, ours)
+        shape = (state.count, *_shape(stack)[1:])
         cut = _cut(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size)
-        told, truth = taken.of(slice(*cut.frames)), layout.truth()
+        state_of_part, truth = state.of(slice(*cut.frames)), layout.truth()
         if live:
-            chosen = _used(str(path), told, travel, phase)
-            told, positions = told.of(chosen), layout.live(header.motion, chosen)
+            chosen = _used(str(path), state_of_part, travel, phase)
+            state_of_part, positions = state_of_part.of(chosen), layout.live(header.motion, chosen)
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, _along(given, shape[0]))
         opened = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
         fetched = FrameSubset(opened, chosen) if live else opened
-        recording = Recording(file, stack, fetched, cut, header, positions, truth, told, live)
+        recording = Recording(file, stack, fetched, cut, header, positions, truth, state_of_part, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
 
@@ -275,14 +275,17 @@ def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
 
 
 def _used(
-    path: str, taken: Taken, travel: ArrayLike | Positions | None, phase: ArrayLike | Positions | None
+    path: str,
+    state: RecordingState,
+    travel: ArrayLike | Positions | None,
+    phase: ArrayLike | Positions | None,
 ) -> NDArray[np.intp]:
     """Return the numbers of the frames that a live run used."""
     if travel is not None or phase is not None:
         raise InputError(f"{path}: a live run has its own positions: leave --live out, or those given")
-    if taken.used is None:
+    if state.used is None:
         raise InputError(f"{path} does not say which frames a live run used: leave --live out")
-    used = np.flatnonzero(taken.used)
+    used = np.flatnonzero(state.used)
     if len(used) < 2:
         raise InputError(
             f"{path}: a live run used {len(used)} frames: at least 2 are needed; leave --live out"
@@ -290,7 +293,7 @@ def _used(
     return used
 
 
-def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.Dataset, Taken]:
+def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.Dataset, RecordingState]:
     """Find the stack that is meant, and how far it has come; refuse what is none or cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
@@ -306,11 +309,11 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
         raise InputError(f"{where} is of type {dtype}: frames are uint8, uint16 or float32; convert it first")
     if 0 in shape[1:]:
         raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it anew")
-    taken = how_taken(file, ours and dataset == STACK, stack)
-    if taken.count < 2:
-        raise InputError(f"{where} holds {taken.count} frames: at least 2 are needed; record more")
-    check_storage(file, stack, frames=taken.count)
-    return stack, taken
+    state = read_state(file, ours and dataset == STACK, stack)
+    if state.count < 2:
+        raise InputError(f"{where} holds {state.count} frames: at least 2 are needed; record more")
+    check_storage(file, stack, frames=state.count)
+    return stack, state
 
 
 def _only_stack(file: Hdf5File) -> str:

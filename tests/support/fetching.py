@@ -26,15 +26,14 @@ PACKINGS = {
     "bitshuffle alone": hdf5plugin.Bitshuffle(cname="none"),
     "blosc": hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE),
     "blosc zstd": hdf5plugin.Blosc(cname="zstd"),
-    "zstd": hdf5plugin.Zstd(),
-    "shuffled zstd": {**hdf5plugin.Zstd(), "shuffle": True},
-    "lz4": hdf5plugin.LZ4(nbytes=512),
 }
 """What is unpacked past HDF5."""
 
 ONLY_HDF5 = {
     "fletcher32": {"fletcher32": True},
     "checked gzip": {"compression": "gzip", "fletcher32": True},
+    "shuffled zstd": {**hdf5plugin.Zstd(), "shuffle": True},
+    "lz4": hdf5plugin.LZ4(nbytes=512),
     "blosc2": hdf5plugin.Blosc2(),
     "bzip2": hdf5plugin.BZip2(),
     "scaleoffset": {"scaleoffset": 0},
