@@ -1,4 +1,4 @@
-"""Room on a device for a picture's maps and some frames: in one piece if it fits, else in bands of rows."""
+"""A picture's maps and some frames on a device: in one piece if they fit, else in bands of rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 MEMORY_LIMIT = 256_000_000
-"""Bytes of host memory for frames on the move, where nothing else is said."""
+"""Bytes of host memory for frames on the move, by default."""
 
 _MOST_PIXELS = 2**30  # kernels number those of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
@@ -23,7 +23,7 @@ _LINE = 64  # bytes of the longest word that a kernel loads at once
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """Several maps in one array, each padded to whole words of the frames' samples."""
+    """Several maps in one array, each padded to full words of the frames' samples."""
 
     count: int
     dtype: DTypeLike
@@ -62,7 +62,7 @@ class Band:
     pixels : int
     stride : int
         Pixels from plane to plane.
-    maps : dict of Array, (rows, W), or (count, stride) where planes were asked for
+    maps : dict of Array, (rows, W), or (count, stride) for `Planes`
     frames : Array, (n, rows, W)
     """
 
@@ -76,27 +76,25 @@ class Band:
         length: int,
         least: int,
     ) -> None:
-        shape = (rows.stop - rows.start, columns)
-        self.rows = rows
-        self.pixels = shape[0] * shape[1]
+        self._shape = shape = (rows.stop - rows.start, columns)
+        self._device, self._kinds = device, maps
+        self.rows, self.pixels = rows, shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride = -(-self.pixels // word) * word
         if self.stride > _MOST_PIXELS:
             raise DeviceMemoryError(
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
-        self._shape = shape
-        self._device, self._kinds = device, maps
         self.maps = {name: self._make(name) for name in maps}
         self.frames = _longest(device, length, least, shape, dtype)
         self._other = _second(device, self.frames)
-        self._lent: BorrowedBuffer | None = None
-        self._alone = True
+        self._borrowed: BorrowedBuffer | None = None
+        self._only = True  # band of the picture
         self._resident = False
 
-    def yield_room(self) -> None:
+    def share_device(self) -> None:
         """Leave the device to other bands whenever this one is not at work."""
-        self._alone = False
+        self._only = False
         self._park()
 
     def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
@@ -129,39 +127,35 @@ class Band:
                 array.upload()
             self._resident = True
         yield
-        if not self._alone:
+        if not self._only:
             self._park()
 
     def stage(self, frames: NDArray[Any], lent: bool = False) -> Iterator[Staged]:
-        """Bring frames to the device, piece by piece; kernels are to be given each before the next.
+        """Bring frames, (n, H, W), to the device, piece by piece; give each to its kernels before the next.
 
-        Nothing is copied where the device shares the host's memory and the frames are lent, or lie in the
-        room already. A device of its own memory takes them beside the kernels on those before. When all are
-        through, the frames' memory may be written anew, unless it is lent.
-
-        Parameters
-        ----------
-        frames : ndarray, (n, H, W)
-        lent : bool
-            Whether nobody writes to them as long as they are referred to; see `mirrorskin.io.Block`.
+        Nothing is copied where the device shares the host's memory and the frames are lent (nobody writes to
+        them as long as they are referred to), or lie in the room already. A device of its own memory takes
+        them beside the kernels on those before. When all are through, the frames' memory may be written anew,
+        unless it is lent.
         """
         if len(frames) == 0:
             return
         frames = frames[:, self.rows]
-        whole, shared = frames.flags.c_contiguous, self._device.info.shares_memory
-        borrowed = self._device.lend("frames", frames) if lent and whole and shared else None
+        contiguous, shared = frames.flags.c_contiguous, self._device.info.shares_memory
+        borrowed = self._device.lend("frames", frames) if lent and contiguous and shared else None
         if borrowed is not None:
             yield from self._borrow(borrowed)
-        elif whole and not shared:
+        elif contiguous and not shared:
             yield from self._bring(frames)
         else:
             yield from self._copy(frames)
 
-    def _borrow(self, lent: BorrowedBuffer) -> Iterator[Staged]:
+    def _borrow(self, borrowed: BorrowedBuffer) -> Iterator[Staged]:
         """Work on frames where they lie."""
-        before, self._lent = self._lent, lent
-        aligned = self._whole_words and lent.host.ctypes.data % (4 * self._device.layout.lanes) == 0
-        yield Staged(lent, slice(0, len(lent.host)), aligned)
+        before, self._borrowed = self._borrowed, borrowed
+        address = borrowed.host.ctypes.data
+        aligned = self._full_words and address % (4 * self._device.layout.lanes) == 0
+        yield Staged(borrowed, slice(0, len(borrowed.host)), aligned)
         # It waits for its kernels: when more frames are read, only these here can still be under way.
         del before
 
@@ -173,7 +167,7 @@ class Band:
                 self.frames, self._other = self._other, self.frames
             part = frames[start : start + step]
             self.frames.bring(part)
-            yield Staged(self.frames, slice(start, start + len(part)), self._whole_words)
+            yield Staged(self.frames, slice(start, start + len(part)), self._full_words)
             self.frames.settle()
 
     def _copy(self, frames: NDArray[Any]) -> Iterator[Staged]:
@@ -186,11 +180,11 @@ class Band:
             if not there:
                 room[: len(part)] = part
             self.frames.upload(len(part))
-            yield Staged(self.frames, slice(start, start + len(part)), self._whole_words)
+            yield Staged(self.frames, slice(start, start + len(part)), self._full_words)
             self.frames.claim()
 
     @property
-    def _whole_words(self) -> bool:
+    def _full_words(self) -> bool:
         """Whether each frame is as long as some words."""
         return bool(self.pixels * self.frames.host.itemsize % (4 * self._device.layout.lanes) == 0)
 
@@ -239,22 +233,21 @@ def cut_into_bands(
         Not even one row fits.
     """
 
-    def cut(rows: slice) -> list[Band]:
+    def cut(start: int, stop: int) -> list[Band]:
         try:
-            return [Band(device, rows, shape[1], dtype, maps, length, least)]
+            return [Band(device, slice(start, stop), shape[1], dtype, maps, length, least)]
         except DeviceMemoryError as error:
-            if rows.stop - rows.start == 1:
+            if stop - start == 1:
                 message = f"one row of {shape[1]} pixels does not fit: {error}; use another device"
                 raise DeviceError(message) from error
-        middle = (rows.start + rows.stop) // 2
-        bands = []
-        for half in (slice(rows.start, middle), slice(middle, rows.stop)):
-            bands += cut(half)
+        middle, bands = (start + stop) // 2, []
+        for half in ((start, middle), (middle, stop)):
+            bands += cut(*half)
             for band in bands:
-                band.yield_room()
+                band.share_device()
         return bands
 
-    return cut(slice(0, shape[0]))
+    return cut(0, shape[0])
 
 
 def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
@@ -281,6 +274,7 @@ def _second(device: Device, first: Array) -> Array | None:
 
 
 def _longest(device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
+    """Make room for as many frames as fit, up to a length."""
     while True:
         try:
             return device.array("frames", (length, *shape), dtype)

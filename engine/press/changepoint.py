@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair, travel_pairs
+from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair
 from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError, check_travel
@@ -275,7 +275,7 @@ class ChangePointSearch:
                 self._items(band),
                 pixels=band.pixels,
                 count=len(self._travel),
-                travel=travel_pairs(self.device, self._travel),
+                travel=self._travel_pairs(),
                 noise=noise,
                 quiet=self._quiet(),
                 level=self._level,
@@ -284,6 +284,14 @@ class ChangePointSearch:
                 moved=sum(array.host.nbytes for array in maps.values()),
             )
             return [maps[name].download().copy() for name in ("height", "sigma", "status", "start")]
+
+    def _travel_pairs(self) -> Array:
+        """Hand the travel to the device as (T, 2) floats, whose sums are as good as float64."""
+        pairs = self.device.array("travel", (len(self._travel), 2), np.float32)
+        pairs.host[:, 0] = self._travel
+        pairs.host[:, 1] = self.travel - pairs.host[:, 0]
+        pairs.upload()
+        return pairs
 
     def _take_levels(self, band: Band, noise: float) -> None:
         """Turn the best splits into levels, where noise alone would not make such a split."""

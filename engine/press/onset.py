@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.autotune import choose_layout
-from mirrorskin.engine.frames import Noise, check_dtype, check_frames, check_threshold, reference_maps
+from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError, check_travel
 from mirrorskin.kernels.array import Operand
@@ -156,6 +156,8 @@ class OnsetSearch:
     ) -> None:
         if not 1 <= hold <= _INT_MAX:
             raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
+        if not 0 <= threshold <= 1:
+            raise InputError(f"threshold {threshold}: a share from 0 (dark) to 1 (bright) is needed")
         self._shape, self._dtype = shape, check_dtype(dtype)
         self._release, self._subframe = check_event(event) == "release", subframe
         self._noise = Noise(noise, self._dtype.kind == "u")
@@ -175,7 +177,7 @@ class OnsetSearch:
             "RELEASE": int(self._release),
         }
         self._noise_of_bounds: float | None = None
-        self._set_levels(*reference_maps(dark, bright, shape, self._dtype), check_threshold(threshold))
+        self._set_levels(*reference_maps(dark, bright, shape, self._dtype), threshold)
         self.reset()
 
     def _planes(self) -> dict[str, Planes]:
