@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.harness import Measured, Work
 from mirrorskin.bench.results import Row
-from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
 _SCALE = 3
@@ -79,12 +78,12 @@ class Limits:
         macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
         kernel = self._device.kernel("limits", f"{limit}_all", **macros)
         count, moved = self._count(limit, shape), self._moved(limit, shape)
-        others: dict[str, list[Array | np.uint32]] = {
-            "read": [self._sums],
-            "copy": [],
-            "triad": [np.uint32(_SCALE)],
+        others: dict[str, dict[str, Any]] = {
+            "read": {"sums": self._sums},
+            "copy": {},
+            "triad": {"scale": _SCALE},
         }
-        kernel(shape.items(count), self._data, np.int32(count), *others[limit], moved=moved)
+        kernel(shape.items(count), words=self._data, count=count, **others[limit], moved=moved)
         self._device.finish()
 
     def _count(self, limit: str, shape: Shape) -> int:
@@ -127,8 +126,8 @@ class Arithmetic:
         macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
         kernel = self._device.kernel("limits", "multiply_all", **macros)
         count = len(self._data.host) // shape.lanes
-        steps, factor, summand = np.int32(self._steps), np.float32(0.5), np.float32(1)
-        kernel(shape.items(count), self._data, np.int32(count), steps, factor, summand, moved=0)
+        numbers: dict[str, Any] = {"steps": self._steps, "factor": 0.5, "summand": 1.0}
+        kernel(shape.items(count), numbers=self._data, count=count, **numbers, moved=0)
         self._device.finish()
 
 

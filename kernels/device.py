@@ -279,7 +279,7 @@ class Kernel:
         self,
         items: int,
         /,
-        *args: Operand | np.generic,
+        *,
         moved: int,
         first_item: int = 0,
         **arguments: Operand | float | np.generic | None,
@@ -303,8 +303,7 @@ class Kernel:
         TypeError
             An argument is missing, unknown, or no number where one is needed.
         """
-        if not args:
-            args = self._in_order(arguments)
+        args = self._in_order(arguments)
         group = self._group
         size = -(-items // group) * group
         values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]

@@ -108,13 +108,13 @@ def _make_bilateral(device: Device, shape: Shape, _kind: str, _: int) -> dict[st
     """Return each pass of a step of the bilateral weights."""
     maps = _graph(shape)
     arrays = {name: device.given(name, values, values.dtype) for name, values in maps.items()}
-    pixels, size = shape[0] * shape[1], (np.float32(PIXEL), np.float32(PIXEL))
+    pixels = shape[0] * shape[1]
     pieces = shape[0] * -(-shape[1] // min(device.layout.tile, _PIECE))
     arrays["sums"] = device.given("sums", np.zeros(pieces))
     jobs = {}
     for name, (wanted, numbers, outputs, each, operations) in _PASSES.items():
         given = [arrays[one] for one in wanted.split()]
-        values = [np.float32(_NUMBERS[one]) if one in _NUMBERS else size[0] for one in numbers.split()]
+        values = [_NUMBERS.get(one, PIXEL) for one in numbers.split()]
         out = [arrays[one] for one in outputs.split()]
         items = -(-pixels // device.layout.tile) if name == "step" else pieces
         launch = _launcher(device, name, shape, items, [*given, *values, *out], each * pixels)
@@ -144,11 +144,11 @@ _PASSES = {  # what goes in, its numbers, what comes out, bytes and operations o
 
 
 def _launcher(
-    device: Device, name: str, shape: Shape, items: int, arguments: list[Array | np.generic], moved: int
+    device: Device, name: str, shape: Shape, items: int, values: list[Array | float], moved: int
 ) -> Callable[[], None]:
     kernel = device.kernel("bilateral", f"bilateral_{name}", KNOWN=0)
-    sizes = [np.int32(size) for size in shape]
-    return lambda: kernel(items, *sizes, *arguments, moved=moved)
+    arguments: dict[str, Any] = dict(zip(kernel.arguments, [*shape, *values], strict=True))
+    return lambda: kernel(items, **arguments, moved=moved)
 
 
 def _checker(

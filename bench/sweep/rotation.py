@@ -253,13 +253,14 @@ def _resample(device: Device, maps: dict[str, Array], frame: NDArray[Any]) -> No
     rows, columns = frame.shape
     top = {"TOP": int(np.iinfo(frame.dtype).max)} if frame.dtype.kind == "u" else {}
     macros: dict[str, str | int] = {"FRAME": C_TYPES[frame.dtype.name], "LEVELS": 0, **top}
-    items, sizes = rows * -(-columns // device.layout.tile), (np.int32(rows), np.int32(columns))
+    items = rows * -(-columns // device.layout.tile)
     for name, wanted, each in (
         ("registration_admit", "frame offset gain padded", frame.itemsize + 4),
         ("registration_resample", "padded height shift offset gain registered noise", 28),
     ):
-        arguments = (maps[one] for one in wanted.split())
-        device.kernel("registration", name, **macros)(items, *sizes, *arguments, moved=each * frame.size)
+        arguments: dict[str, Any] = {one: maps[one] for one in wanted.split()}
+        kernel = device.kernel("registration", name, **macros)
+        kernel(items, rows=rows, columns=columns, **arguments, moved=each * frame.size)
 
 
 def _ridges(shape: Shape, kind: str) -> tuple[NDArray[Any], NDArray[np.float32]]:

@@ -120,15 +120,12 @@ def _pass(device: Device, levels: list[Level], maps: Maps, arrays: dict[str, Arr
     width = WIDTH if device.layout.tile > 1 else 1
     kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=0, PART=part_of(device), WIDTH=width)
     items = coarse.rows if between else -(-fine.nodes // device.layout.tile)
-    values: list[Any] = [
-        *map(np.int32, sizes),
-        *map(np.float32, numbers),
-        *(arrays[key] for key in wanted.split()),
-    ]
+    values = [*sizes, *numbers, *(arrays[key] for key in wanted.split())]
+    arguments: dict[str, Any] = dict(zip(kernel.arguments, values, strict=True))
     moved = each * fine.nodes
 
     def launch() -> None:
-        kernel(items, *values, moved=moved)
+        kernel(items, **arguments, moved=moved)
 
     def check() -> None:
         launch()

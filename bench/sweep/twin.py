@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,8 +38,10 @@ def _make_wall(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Jo
 
     def launch() -> None:
         kernel = device.kernel("wall", "wall_light", TABLE=1, GAP=0, LAMPS=0, OBLIQUE=0)
-        counts, reals = np.array(sizes, np.int32), np.array(numbers, np.float32)
-        kernel(-(-pixels // device.layout.tile), *counts, *arrays, *reals, light, moved=moved)
+        arguments: dict[str, Any] = dict(
+            zip(kernel.arguments, [*sizes, *arrays, *numbers, light], strict=True)
+        )
+        kernel(-(-pixels // device.layout.tile), **arguments, moved=moved)
 
     def check() -> None:
         launch()
@@ -76,9 +80,10 @@ def _make_exposure(device: Device, shape: Shape, kind: str, _: int) -> dict[str,
         kernel = device.kernel(
             "exposure", "expose", FRAME=C_TYPES[kind], WHOLE=int(kind != "float32"), SHOT=1
         )
-        keys = np.int32(quarter), np.uint64(5), np.uint64(9)
-        numbers = (np.float32(one) for one in reals)
-        kernel(-(-quarter // device.layout.tile), *arrays, *keys, *numbers, counts, moved=moved)
+        arguments: dict[str, Any] = dict(
+            zip(kernel.arguments, [*arrays, quarter, 5, 9, *reals, counts], strict=True)
+        )
+        kernel(-(-quarter // device.layout.tile), **arguments, moved=moved)
 
     def check() -> None:
         launch()
