@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.fusion_solver import Joint, Known
+from mirrorskin.engine.fusion_solver import FusionSolver, PressHeights
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import attach_provenance
 from mirrorskin.engine.reconstruction import calibrated, undistorted
+from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, find_slopes
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, estimate_rotation, rotation_maps
@@ -30,40 +32,9 @@ _PASSES = 3  # over the axial frames, at most
 _STILL = 0.02  # of a pixel, by which points may move between passes
 
 
-class Heights(Protocol):
-    """What fusion needs of a press: an `Onset`, or anything else that has these."""
-
-    @property
-    def height(self) -> NDArray[np.float32]:
-        """Millimetres, (H, W); NaN where unknown."""
-
-    @property
-    def sigma(self) -> NDArray[np.float32]:
-        """Standard deviations of the heights, mm."""
-
-
-class Directions(Protocol):
-    """What fusion needs of a rotation: `Normals`, or anything else that has these.
-
-    ``tilt`` and ``turns`` are looked at where they exist; see `find_slopes`.
-    """
-
-    @property
-    def vectors(self) -> NDArray[np.float32]:
-        """Unit normals, (H, W, 3); NaN where unknown."""
-
-    @property
-    def sigma(self) -> NDArray[np.float32]:
-        """Their predicted RMS angular errors, radians."""
-
-    @property
-    def contact(self) -> NDArray[np.uint8]:
-        """0 where they mean nothing."""
-
-
 def fuse(
-    onset: Heights,
-    normals: Directions,
+    onset: Onset,
+    normals: Normals,
     pixel_size: ArrayLike,
     *,
     mask: ArrayLike | None = None,
@@ -72,16 +43,15 @@ def fuse(
 ) -> Surface:
     """Join the heights of a press and the normals of a rotation to one surface in absolute millimetres.
 
-    The surface is the one that fits the slopes of the normals and the known heights best, each weighed by
-    its inverse variance; see ``mirrorskin.engine.integrate``. A height is known to lie in the interval
-    between two frames. That is more than its standard deviation says: once a first surface is there, heights
-    inside their intervals pull no more, and those at the ends do; see `mirrorskin.engine.press.intervals`.
+    The surface is the one that fits the slopes of the normals and the known heights best, weighted by inverse
+    variance; see ``mirrorskin.engine.integrate``. A height lies in the interval between two frames, which is
+    more than its standard deviation says: once a first surface is there, heights inside their intervals pull
+    no more, and those at the ends do; see `mirrorskin.engine.press.intervals`.
 
     Where there is a height but no normal, the height is the press's own; near normals it gets the slope of
-    the smooth surface that fits what is around, if one does. Where there is a normal but no height, slopes
-    lead there. Pieces without any known height are told by ``offset_unknown``. Holes that have neither are
-    filled, and marked so; see `mirrorskin.engine.fill_holes`. Of what was filled there is no standard
-    deviation.
+    the smooth surface that fits the heights around, if one does. Where there is a normal but no height,
+    slopes lead there. Components without any known height are marked in ``offset_unknown``. Holes that have
+    neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no sigma.
 
     Parameters
     ----------
@@ -109,6 +79,15 @@ def fuse(
         Maps of different sizes, no height and no normal at all, or a pixel size that cannot be.
     mirrorskin.engine.NotConverged
         The surface was not found.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace as Maps
+    >>> onset = Maps(height=np.array([[1.0, np.nan]]), sigma=np.array([[0.01, np.nan]]))
+    >>> upright = np.array([[[0.0, 0.0, 1.0]] * 2])
+    >>> normals = Maps(vectors=upright, sigma=np.full((1, 2), 0.01), contact=np.ones((1, 2)))
+    >>> fuse(onset, normals, 0.1).height.tolist()
+    [[1.0, 1.0]]
     """
     wanted = _check_shapes(onset, normals, mask)
     slopes = find_slopes(
@@ -118,11 +97,11 @@ def fuse(
         getattr(normals, "tilt", None),
         getattr(normals, "turns", 1),
     )
-    known = Known.of(onset.height, onset.sigma, wanted)
-    return Joint(known, slopes, pixel_size, robust, open_device(device)).finish()
+    press = PressHeights.of(onset.height, onset.sigma, wanted)
+    return FusionSolver(press, slopes, pixel_size, robust, open_device(device)).surface()
 
 
-def _check_shapes(onset: Heights, normals: Directions, mask: ArrayLike | None) -> Mask:
+def _check_shapes(onset: Onset, normals: Normals, mask: ArrayLike | None) -> Mask:
     """Return where heights are wanted, if all maps are of one size."""
     shapes = {
         "heights": np.shape(onset.height),
@@ -135,8 +114,8 @@ def _check_shapes(onset: Heights, normals: Directions, mask: ArrayLike | None) -
         shapes["the mask"] = np.shape(mask)
     size = shapes["heights"]
     if len(size) != 2 or 0 in size or any(shape != size for shape in shapes.values()):
-        told = ", ".join(f"{name.strip()} {shape}" for name, shape in shapes.items())
-        raise InputError(f"maps of one size (H, W) are needed, there are: {told}")
+        found = ", ".join(f"{name.strip()} {shape}" for name, shape in shapes.items())
+        raise InputError(f"maps of one size (H, W) are needed, there are: {found}")
     return np.ones(size, bool) if mask is None else np.asarray(mask) != 0
 
 
@@ -174,13 +153,12 @@ def fuse_sources(
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
     progress : callable, optional
-        Told the number of frames so far, of ``frames_to_read(vertical, axial, register)``.
+        Called with the number of frames so far, of ``frames_to_read(vertical, axial, register)``.
 
     Returns
     -------
     Result
-        Heights and normals. What the process says of one source alone begins with ``vertical_`` or
-        ``axial_``.
+        Heights and normals. Process values of one source alone begin with ``vertical_`` or ``axial_``.
 
     Raises
     ------
@@ -201,7 +179,7 @@ def fuse_sources(
     assert heights.height_sigma is not None
     if not np.isfinite(heights.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
-    onset, known = Known.of(heights.height, heights.height_sigma), heights.height
+    onset, known = PressHeights.of(heights.height, heights.height_sigma), heights.height
     for number in range(_passes(axial, register)):
         found = estimate_rotation(
             axial,
@@ -210,12 +188,12 @@ def fuse_sources(
             progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
             **common,
         )
-        joint = Joint(onset, _slopes_of(found), pixel_size, robust, opened)
-        before, known = fill_with_nearest(known), joint.heights()
+        solver = FusionSolver(onset, _slopes_of(found), pixel_size, robust, opened)
+        before, known = fill_with_nearest(known), solver.heights()
         moved = _moved(before, known, found.normals.tilt, pixel_size)
         if moved <= _STILL:
             break
-    surface = joint.finish()
+    surface = solver.surface()
     if progress:
         progress(frames_to_read(vertical, axial, register))
     turned = attach_provenance(Result(), axial, opened, found.process)
@@ -314,12 +292,12 @@ def _moved(
 
 
 def _after(progress: Progress | None, done: int) -> Progress | None:
-    """Count on from so many frames."""
+    """Return a progress that counts on from so many frames."""
     return None if progress is None else lambda count: progress(done + count)
 
 
 def _both(vertical: Mapping[str, ProcessValue], axial: Mapping[str, ProcessValue]) -> dict[str, ProcessValue]:
-    """Join what two processes say: once what is the same of both, the rest under the movements' names."""
+    """Join two processes: once what is the same of both, the rest under the movements' names."""
     shared = {name: axial[name] for name in ("program", "version", "date", "device", "driver")}
     made = shared | {"source": f"{vertical['source']}, {axial['source']}", "method": "fusion"}
     for motion, process in ("vertical", vertical), ("axial", axial):

@@ -1,4 +1,4 @@
-"""A surface from absolute heights and slopes, each as sure as it is."""
+"""A surface from the heights of a press and the slopes of a rotation, weighted by inverse variance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import Surface
@@ -21,7 +20,7 @@ from mirrorskin.kernels.device import Device
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_EVEN = np.sqrt(3.0)  # half the width of what is spread evenly, in its standard deviations
+_UNIFORM = np.sqrt(3.0)  # half the width of a uniform distribution, in its standard deviations
 _SHARPEST = 1e-5  # mm: no height is known better than this
 _NARROWEST, _WIDEST = 2.0, 8.0  # standard deviation of a window that slopes are taken from, pixels
 _NEAR = 3.0  # such windows, beyond which pixels are too far from any normal
@@ -29,15 +28,15 @@ _LEVEL = 0.05  # slope below which a surface has no terraces to speak of
 _FIRM = 30.0  # how many times a height with normals around is as sure as one of the press
 _OFF = 4.0  # standard deviations from those around, beyond which a height is a mistake
 _ROUGH = 3.0  # mean squared error in standard deviations of what is no smooth surface
-_CLAIM = 2.0  # how many times less sure than they claim heights may be, and still be believed
+_OVERSTATED = 2.0  # times that heights may be less sure than their sigmas, and still be believed
 _SEVERAL = 6.0  # half intervals that heights go over, for their errors to be spread evenly
-_NEARLY_ALL = 0.9  # of all heights, by which it is told how much of their intervals errors use
+_NEARLY_ALL = 0.9  # of all heights: the quantile that shows how much of their intervals errors use
 _LEAST_USED = 0.5
-_LOOKS = 5  # at where the intervals lift a surface
+_ITERATIONS = 5  # of where the intervals lift a component
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class PressHeights:
     """Heights of a press.
 
     Attributes
@@ -51,25 +50,30 @@ class Known:
 
     @classmethod
     def of(cls, height: NDArray[np.floating], sigma: NDArray[np.floating], mask: Mask | bool = True) -> Self:
-        """Take those of a map that are numbers, where they are wanted."""
+        """Take the finite ones of a map, where they are wanted."""
         height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
         known = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
-        # Where few claim to be far more sure than the others, they are mostly those whose light rose oddly.
+        # The few that claim to be far more sure than the others are mostly those whose light rose oddly.
         least = max(float(np.median(sigma[known])), _SHARPEST) if known.any() else _SHARPEST
         return cls(np.where(known, height, np.nan), np.where(known, np.maximum(sigma, least), np.nan))
 
     @property
-    def there(self) -> Mask:
+    def known(self) -> Mask:
         """Where heights are known, (H, W)."""
         return np.isfinite(self.height)
 
+    @property
+    def weight(self) -> Doubles:
+        """Inverse variances, 0 where unknown."""
+        return np.nan_to_num(1 / self.sigma**2)
 
-class Joint:
-    """Heights and slopes on their way to become one surface.
+
+class FusionSolver:
+    """Integrates heights and slopes in three passes: as given, with the slopes of heights, with intervals.
 
     Parameters
     ----------
-    known : Known
+    press : PressHeights
     slopes : Slopes
         On the same pixels.
     pixel_size : float or (float, float)
@@ -87,32 +91,30 @@ class Joint:
     """
 
     def __init__(
-        self, known: Known, slopes: Slopes, pixel_size: ArrayLike, robust: bool, device: Device
+        self, press: PressHeights, slopes: Slopes, pixel_size: ArrayLike, robust: bool, device: Device
     ) -> None:
-        if not (slopes.known | known.there).any():
+        if not (slopes.known | press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
         self._slopes, self._pixel_size = slopes, check_pixel_size(pixel_size)
         self._robust, self._device = robust, device
-        plain = known.height, np.nan_to_num(1 / known.sigma**2)
-        first = self._solve(*plain, sigma=False)
-        known = _doubt(known, first, slopes)
-        plain = known.height, np.nan_to_num(1 / known.sigma**2)
-        longer = _extend(slopes, first, known, self._pixel_size)
-        if longer is not slopes:
-            self._slopes = longer
-            first = self._solve(*plain, initial_heights=first.height, sigma=False)
+        first = self._solve(press.height, press.weight, sigma=False)
+        press = _correct_overstated(press, first, slopes)
+        extended = _extend(slopes, first, press, self._pixel_size)
+        if extended is not slopes:
+            self._slopes = extended
+            first = self._solve(press.height, press.weight, initial_heights=first.height, sigma=False)
         self._start = first.height
-        self._height, self._weight = _sharpen(first, known, slopes)
+        self._height, self._weight = _use_intervals(first, press, slopes)
 
     def heights(self) -> NDArray[np.float32]:
         """Return the heights alone, which is faster."""
         self._start = self._solve(self._height, self._weight, initial_heights=self._start, sigma=False).height
         return self._start
 
-    def finish(self) -> Surface:
-        """Return the whole surface, its holes filled."""
+    def surface(self) -> Surface:
+        """Return the surface, its holes filled."""
         surface = self._solve(self._height, self._weight, initial_heights=self._start)
-        return _join(_fill(_tell_lone(surface, self._weight), self._pixel_size))
+        return _join(_fill(_set_sigma_of_lone_pixels(surface, self._weight), self._pixel_size))
 
     def _solve(self, height: Doubles, weight: Doubles, **options: Any) -> Surface:
         return integrate(
@@ -129,38 +131,39 @@ class Joint:
         )
 
 
-def _doubt(known: Known, surface: Surface, slopes: Slopes) -> Known:
-    """Return heights as unsure as they are, where slopes tell that most claim to be much more sure."""
-    both = known.there & slopes.known
+def _correct_overstated(press: PressHeights, surface: Surface, slopes: Slopes) -> PressHeights:
+    """Raise sigmas to the size of the errors, where slopes show that most are much too small."""
+    both = press.known & slopes.known
     if not both.any():
-        return known
-    off = known.height[both] - surface.height[both]
-    usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _EVEN  # half are beyond half of an interval
-    if usual < _CLAIM * float(np.median(known.sigma[both])):
-        return known
-    return Known(known.height, np.maximum(known.sigma, usual))
+        return press
+    off = press.height[both] - surface.height[both]
+    # Half are beyond half of an interval.
+    usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _UNIFORM
+    if usual < _OVERSTATED * float(np.median(press.sigma[both])):
+        return press
+    return PressHeights(press.height, np.maximum(press.sigma, usual))
 
 
-def _extend(slopes: Slopes, surface: Surface, known: Known, pixel_size: tuple[float, float]) -> Slopes:
+def _extend(slopes: Slopes, surface: Surface, press: PressHeights, pixel_size: tuple[float, float]) -> Slopes:
     """Give pixels with a height but no normal, near those with one, the slopes of the heights around.
 
-    The window spans a terrace or more. Neighbours share what they tell, so each slope counts only for its
-    part of a window. Where heights do not fit a smooth surface, there are no slopes.
+    The window spans a terrace or more. Neighbours share data, so each slope counts only for its part of a
+    window. Where heights do not fit a smooth surface, there are no slopes.
     """
-    gaps = known.there & ~slopes.known
+    from scipy import ndimage
+
+    gaps = press.known & ~slopes.known
     if not gaps.any() or not slopes.known.any():
         return slopes
-    sigma = float(np.median(known.sigma[known.there]))
+    sigma = float(np.median(press.sigma[press.known]))
     width = _window(slopes, sigma, min(pixel_size))
-    reach = ndimage.uniform_filter(
-        slopes.known.astype(np.float32), 2 * int(_NEAR * width) + 1, mode="constant"
-    )
-    gaps &= reach > 0
-    weight = np.where(slopes.known, (_FIRM / sigma) ** 2, np.where(gaps, 1 / known.sigma**2, 0.0))
+    size = 2 * int(_NEAR * width) + 1
+    gaps &= ndimage.uniform_filter(slopes.known.astype(np.float32), size, mode="constant") > 0
+    weight = np.where(slopes.known, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
     height = surface.height.astype(np.float64)
     trend = find_trend(height, weight, gaps, width)
-    off = np.abs(height[gaps] - trend.height) > _OFF * known.sigma[gaps]
-    if off.any():  # mistakes do not tell a second time
+    off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
+    if off.any():  # mistakes count only once
         weight[gaps] = np.where(off, 0.0, weight[gaps])
         trend = find_trend(height, weight, gaps, width)
     smooth = trend.misfit < _ROUGH
@@ -176,38 +179,40 @@ def _extend(slopes: Slopes, surface: Surface, known: Known, pixel_size: tuple[fl
 def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     """Return the width of windows, in pixels, that span the terraces where slopes are as usual."""
     steepness = np.hypot(slopes.dz_dx[slopes.known], slopes.dz_dy[slopes.known])
-    terrace = 2 * _EVEN * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
+    terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
 
 
-def _sharpen(surface: Surface, known: Known, slopes: Slopes) -> tuple[Doubles, Doubles]:
-    """Return known heights and their weights, by what their intervals say where the surface is about known.
+def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
+    """Return known heights and their weights by their intervals, around a surface that is about right.
 
     Heights far from it are mistakes, and get no weight. Nor do those without a normal of their own, which are
-    at rims and often late, in a piece that has others. A piece of which no height is near an end of its
-    interval lies on one terrace: then all of its heights together say no more than one.
+    at rims and often late, in a component that has others. A component of which no height is near an end of
+    its interval lies on one terrace: then all of its heights together count as one.
     """
-    size = np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
-    joined = known.there & (size[surface.component] > 1)
+    from scipy import ndimage
+
+    size = _sizes(surface)
+    joined = press.known & (size[surface.component] > 1)
     both = joined & slopes.known
-    told = np.bincount(surface.component[both], minlength=size.size) > 0
-    joined &= slopes.known | ~told[surface.component]
-    height, weight = known.height.copy(), np.nan_to_num(1 / known.sigma**2)
+    has_both = np.bincount(surface.component[both], minlength=size.size) > 0
+    joined &= slopes.known | ~has_both[surface.component]
+    height, weight = press.height.copy(), press.weight
     if not joined.any():
         return height, weight
-    piece, half = surface.component[joined], _EVEN * known.sigma[joined]
-    middle, shape = known.height[joined], surface.height[joined].astype(np.float64)
+    piece, half = surface.component[joined], _UNIFORM * press.sigma[joined]
+    middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
     # The mean that a solver finds is moved by mistakes, the median is not.
     lift = np.asarray(ndimage.median(middle - shape, piece, np.arange(size.size)))
     half *= _share_used(middle - shape - lift[piece], half, shape)
-    for _ in range(_LOOKS):
+    for _ in range(_ITERATIONS):
         at = shape + lift[piece]
         spread = find_spread(middle - at, half)
         inside = look_inside(at, middle, half, spread)
         firm = np.bincount(piece, inside.weight, size.size)
         lift += np.bincount(piece, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
-    weight = np.nan_to_num(1 / (known.sigma**2 + spread.blur**2))
-    weight[told[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
+    weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
+    weight[has_both[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
     near = inside.weight > 0
     count = np.maximum(np.bincount(piece, near, size.size), 1)
     plain = np.where(near, weight[joined] / count[piece], 0.0)
@@ -218,10 +223,10 @@ def _sharpen(surface: Surface, known: Known, slopes: Slopes) -> tuple[Doubles, D
 
 
 def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
-    """Return which share of their intervals errors make use of, if heights go over several of them.
+    """Return the share of their intervals that errors use, if heights go over several of them.
 
-    Samples that tell more than an interval alone lie nearer to the truth. Ends that no error reaches leave
-    a surface free to follow the few that are beyond.
+    Samples may place the onset better than within an interval. Ends that no error reaches leave a surface
+    free to follow the few that are beyond.
     """
     if np.ptp(height) < _SEVERAL * float(np.median(half)):
         return 1.0
@@ -229,11 +234,15 @@ def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
     return float(np.clip(used, _LEAST_USED, 1.0))
 
 
-def _tell_lone(surface: Surface, weight: Doubles) -> Surface:
-    """Put in the standard deviations of single pixels, which are known without drawing any."""
+def _sizes(surface: Surface) -> NDArray[np.intp]:
+    """Return how many pixels each component has."""
+    return np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
+
+
+def _set_sigma_of_lone_pixels(surface: Surface, weight: Doubles) -> Surface:
+    """Set the standard deviations of components of one pixel, which are known exactly."""
     assert surface.sigma is not None
-    size = np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
-    lone = (surface.component >= 0) & (weight > 0) & (size[surface.component] == 1)
+    lone = (surface.component >= 0) & (weight > 0) & (_sizes(surface)[surface.component] == 1)
     sigma = surface.sigma.copy()
     sigma[lone] = 1 / np.sqrt(weight[lone])
     return replace(surface, sigma=sigma)
@@ -249,12 +258,14 @@ def _fill(surface: Surface, pixel_size: ArrayLike) -> Surface:
 
 
 def _relative(surface: Surface) -> Mask:
-    """Return where heights are relative: pixels of pieces without a known one."""
+    """Return where heights are relative: pixels of components without a known one."""
     return np.asarray(np.append(surface.offset_unknown, False)[surface.component])
 
 
 def _join(surface: Surface) -> Surface:
-    """Make one piece of neighbours whose heights are all absolute, though no slope leads across."""
+    """Make one component of neighbours whose heights are all absolute, though no slope leads across."""
+    from scipy import ndimage
+
     answered = (surface.component >= 0) | (surface.filled > 0)
     relative = _relative(surface)
     pieces, count = ndimage.label(answered & ~relative)

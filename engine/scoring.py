@@ -18,36 +18,66 @@ _JUMP = np.radians(10.0)  # between neighbours, from which on a change of the no
 
 
 @dataclass(frozen=True, slots=True)
-class HeightScore:
-    """Errors of a height map.
-
-    Of pieces whose heights are relative, the mean difference from the truth is taken off first.
+class AngleScore:
+    """Angular errors of normals, or of azimuths alone, where the sheet was in contact in every frame.
 
     Attributes
     ----------
     answered : int
-        Pixels with a height whose truth is known.
+        Pixels with an answer whose truth is known: of angles those in contact, both in truth and by the
+        result; a level one has no azimuth.
     touched : int
-        Pixels where sheet and object touched.
+        Pixels in contact.
     coverage : float
         Share of the touched pixels that were answered.
-    rms, mean, median, p99, largest : float
-        Of the height error (mean) and its magnitude (the others), mm; NaN without answers.
+    rms, median, p99, largest : float
+        Of the angle between answer and truth, degrees, or of the magnitude of the height error, mm; NaN
+        without answers.
     chi_square : float
         Mean of (error / sigma)^2: 1 where the standard deviations are honest; NaN without them.
-    relative : int
-        Pieces whose mean difference was taken off.
     """
 
     answered: int
     touched: int
     coverage: float
     rms: float
-    mean: float
     median: float
     p99: float
     largest: float
     chi_square: float
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return self._table("deg", "error", {})
+
+    def _table(self, unit: str, error: str, after_rms: dict[str, str]) -> dict[str, str]:
+        return {
+            "answered": f"{self.answered} pixels",
+            "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
+            "RMS error": f"{self.rms:.4f} {unit}",
+            **after_rms,
+            f"median {error}": f"{self.median:.4f} {unit}",
+            f"99 % {error}": f"{self.p99:.4f} {unit}",
+            f"largest {error}": f"{self.largest:.4f} {unit}",
+            "mean (error/sigma)^2": f"{self.chi_square:.3f}",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class HeightScore(AngleScore):
+    """Errors of a height map, as of an `AngleScore`.
+
+    Of components whose heights are relative, the mean difference from the truth is taken off first.
+
+    Attributes
+    ----------
+    mean : float
+        Of the height error, mm.
+    relative : int
+        Components whose mean difference was taken off.
+    """
+
+    mean: float
     relative: int = 0
 
     def table(self) -> dict[str, str]:
@@ -55,57 +85,21 @@ class HeightScore:
         mean = {"mean error": f"{self.mean:+.4f} mm"}
         if self.relative:
             mean["offset"] = f"mean difference taken off; pieces without a known height: {self.relative}"
-        return _table_of_errors(self, "mm", "|error|", mean)
-
-
-@dataclass(frozen=True, slots=True)
-class AngleScore:
-    """Angular errors of normals, or of azimuths alone, where the sheet was in contact in every frame.
-
-    Attributes
-    ----------
-    answered : int
-        Pixels in contact, and told to be, with an answer whose truth is known; a level one has no azimuth.
-    touched : int
-        Pixels in contact.
-    coverage : float
-        Share of the touched pixels that were answered.
-    rms, median, p99, largest : float
-        Of the angle between answer and truth, degrees; NaN without answers.
-    chi_square : float
-        Mean of (error / sigma)^2: 1 where the expected errors are honest; NaN without them.
-    """
-
-    answered: int
-    touched: int
-    coverage: float
-    rms: float
-    median: float
-    p99: float
-    largest: float
-    chi_square: float
-
-    def table(self) -> dict[str, str]:
-        """Return names and values to print."""
-        return _table_of_errors(self, "deg", "error", {})
+        return self._table("mm", "|error|", mean)
 
 
 @dataclass(frozen=True, slots=True)
 class ContactScore:
-    """How well it was told where the sheet was in contact in every frame.
+    """How well contact in every frame was found.
 
     Attributes
     ----------
-    recall : float
-        Share of the pixels in contact that are told to be.
-    precision : float
-        Share of the pixels told to be in contact that are.
+    recall, precision : float
+        Share of the pixels in contact that were found, and of those found that are in contact.
     lost : int
         Pixels with an answer that were out of contact in some frame.
-    lost_flagged : float
-        Share of these that are told to be out of contact.
-    wrongly_flagged : float
-        Share of the pixels with an answer and in contact that are told to be out of it.
+    lost_flagged, wrongly_flagged : float
+        Share of these, and of the pixels with an answer and in contact, that the result has out of contact.
     """
 
     recall: float
@@ -131,11 +125,9 @@ class EdgeScore:
     Attributes
     ----------
     true, found : int
-        Pixels on either side of a true edge, and pixels told to be on one.
-    recall : float
-        Share of the true ones with a found one within a pixel.
-    precision : float
-        Share of the found ones with a true one within a pixel.
+        Pixels on either side of a true edge, and of a found one.
+    recall, precision : float
+        Share of the true ones with a found one within a pixel, and of the found ones with a true one.
     """
 
     true: int
@@ -153,7 +145,7 @@ class EdgeScore:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What can be told of a result's errors; None of a map that it does not have.
+    """A result's errors; None of a map that it does not have.
 
     Attributes
     ----------
@@ -166,8 +158,8 @@ class Score:
         Of a result that has azimuths but no normals.
     contact : ContactScore or None
     edges : EdgeScore or None
-        Neither is told of frames that were registered: what follows the object has another contact than what
-        stays with the picture.
+        None of frames that were registered: what follows the object has another contact than what stays with
+        the picture.
     """
 
     height: HeightScore | None = None
@@ -210,10 +202,19 @@ def score(result: Result, truth: Truth) -> Score:
     ------
     InputError
         There is nothing to compare, the sizes differ, or the result was undistorted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import io
+    >>> flat = np.zeros((1, 2), np.float32)
+    >>> truth = io.Truth(flat, flat, flat, np.ones((1, 2), np.uint8))
+    >>> score(io.Result(height=flat + 0.25), truth).height.rms
+    0.25
     """
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
-        raise InputError(f"the result is undistorted, the truth is told of the camera's pixels: {remedy}")
+        raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
     known = {name: getattr(result, name) for name in ("height", "azimuth", "normals", "contact", "edges")}
     sizes = {
         name: values.shape[:-1] if name == "normals" else values.shape
@@ -241,26 +242,10 @@ def score(result: Result, truth: Truth) -> Score:
     )
 
 
-def _table_of_errors(
-    part: HeightScore | AngleScore, unit: str, error: str, mean: dict[str, str]
-) -> dict[str, str]:
-    """Return names and values to print of what errors of both kinds have; the mean stands after the RMS."""
-    return {
-        "answered": f"{part.answered} pixels",
-        "coverage": f"{100 * part.coverage:.2f} % of the {part.touched} pixels in contact",
-        "RMS error": f"{part.rms:.4f} {unit}",
-        **mean,
-        f"median {error}": f"{part.median:.4f} {unit}",
-        f"99 % {error}": f"{part.p99:.4f} {unit}",
-        f"largest {error}": f"{part.largest:.4f} {unit}",
-        "mean (error/sigma)^2": f"{part.chi_square:.3f}",
-    }
-
-
 def _score_heights(
     result: Result, truth: NDArray[np.float32], touched: Mask
 ) -> tuple[HeightScore | None, HeightScore | None]:
-    """Score what was measured, and what was filled, if anything was."""
+    """Score measured heights, and filled ones, if there are any."""
     if result.height is None:
         return None, None
     error = result.height.astype(np.float64) - truth
@@ -272,15 +257,15 @@ def _score_heights(
 
 
 def _mean_differences(result: Result, error: Doubles) -> tuple[Doubles | float, int]:
-    """Return the mean error of the piece that each pixel belongs to, if it is relative, and how many are."""
+    """Return the mean error of each pixel's component, if that is relative, and how many are."""
     unknown, component = result.offset_unknown, result.component
     if unknown is None or component is None or not unknown.any():
         return 0.0, 0
-    told = np.isfinite(error) & (component >= 0)
-    count = np.bincount(component[told], minlength=unknown.size)
-    total = np.bincount(component[told], error[told], unknown.size)
+    known = np.isfinite(error) & (component >= 0)
+    count = np.bincount(component[known], minlength=unknown.size)
+    total = np.bincount(component[known], error[known], unknown.size)
     mean = np.where(unknown, total / np.maximum(count, 1), 0.0)
-    # The last one is for pixels that are in no piece.
+    # The last one is for pixels that are in no component.
     return np.append(mean, 0.0)[component], int(np.count_nonzero(count[unknown.astype(bool)]))
 
 
@@ -323,17 +308,17 @@ def _score_angles(error: Doubles, sigma: NDArray[np.float32] | None, touched: Ma
 
 def _score_contact(result: Result, touched: Mask) -> ContactScore:
     assert result.contact is not None
-    told = result.contact.astype(bool)
-    touched = np.broadcast_to(touched, told.shape)
+    found = result.contact.astype(bool)
+    touched = np.broadcast_to(touched, found.shape)
     answer = result.zenith if result.normals is None else result.normals[..., 2]
-    answered = np.isfinite(answer) if answer is not None else np.ones_like(told)
+    answered = np.isfinite(answer) if answer is not None else np.ones_like(found)
     lost = answered & ~touched
     return ContactScore(
-        recall=_share(told, touched),
-        precision=_share(touched, told),
+        recall=_share(found, touched),
+        precision=_share(touched, found),
         lost=int(np.count_nonzero(lost)),
-        lost_flagged=_share(~told, lost),
-        wrongly_flagged=_share(~told, answered & touched),
+        lost_flagged=_share(~found, lost),
+        wrongly_flagged=_share(~found, answered & touched),
     )
 
 

@@ -133,9 +133,9 @@ def integrate(
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> surface = engine.integrate(np.full((2, 3), 0.5), np.zeros((2, 3)), 0.1)
+    >>> surface = engine.integrate(np.full((2, 3), 0.5), np.zeros((2, 3)), 1.0)
     >>> surface.height[0].round(3).tolist()
-    [-0.05, 0.0, 0.05]
+    [-0.5, 0.0, 0.5]
     """
     began = time.perf_counter()
     inputs = check_inputs(
@@ -194,11 +194,11 @@ class Integrator:
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> integrator = engine.Integrator((2, 3), 0.1)
-    >>> for slope in (0.4, 0.5):
+    >>> integrator = engine.Integrator((2, 3), 1.0)
+    >>> for slope in (0.25, 0.5):
     ...     integrator.push(np.full((2, 3), slope), np.zeros((2, 3)))
     >>> integrator.result().height[0].round(3).tolist()
-    [-0.05, 0.0, 0.05]
+    [-0.5, 0.0, 0.5]
     """
 
     def __init__(
