@@ -1,6 +1,5 @@
 """Normals from axial rotations, against the statistical limit (tests/support/rotations.py)."""
 
-import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -38,19 +37,10 @@ def answered(request, device):
     return normals, rotations.scores(normals.vectors, normals.sigma, stack), stack
 
 
-def test_the_exact_method_reaches_the_bound_in_every_bin(answered):
-    _, told, _ = answered
-    assert np.all(told.ratio <= 1.05), np.round(told.ratio, 3)
-    assert np.all(told.ratio >= 0.95), "better than can be: the scorer is wrong"
-
-
-def test_sigma_is_honest_in_every_bin(answered):
-    _, told, _ = answered
+def test_the_exact_method_reaches_the_bound_in_every_bin_and_sigma_is_honest(answered):
+    normals, told, stack = answered
+    np.testing.assert_allclose(told.ratio, 1, rtol=0, atol=0.05)
     np.testing.assert_allclose(told.chi_square, 1, rtol=0, atol=0.05)
-
-
-def test_all_that_is_in_contact_is_told_so(answered):
-    normals, _, stack = answered
     assert normals.contact.shape == stack.bound.shape
     assert np.all(np.mean(normals.contact == 0, axis=1) <= 0.01)
 
@@ -74,8 +64,9 @@ def test_frames_without_noise_are_answered_exactly(device, noise):
     np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=-1), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("phase", [rotations.EIGHTHS, UNEVEN], ids=["even", "uneven"])
-@pytest.mark.parametrize("name", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize(
+    ("name", "phase"), [("uint8", rotations.EIGHTHS), ("uint16", UNEVEN), ("float32", UNEVEN)]
+)
 def test_the_paper_method_is_equations_16_to_22(device, name, phase):
     setup = replace(SETUPS[name], phase=phase)
     stack = rotations.draw(setup, 500, seed=3)
@@ -97,9 +88,7 @@ def test_the_paper_method_is_where_the_errata_say_it_fails(device):
 
 
 UNUSUAL = {
-    "uneven phases": (replace(CALM, phase=UNEVEN), None),
     "uneven phases, one frame missing": (replace(CALM, phase=UNEVEN), "weight"),
-    "one frame missing": (CALM, "weight"),
     "one frame left out": (CALM, "left out"),
     "one sample missing, any": (FLOATS, "nan"),
 }
@@ -202,10 +191,3 @@ def test_an_unknown_tilt_is_told_within_its_own_error(device, name, tilt):
 
 def flat(stack):
     return stack._replace(normals=stack.normals.reshape(1, -1, 3), bound=stack.bound.reshape(1, -1))
-
-
-def test_the_bins_cover_what_was_asked_for():
-    edges = sorted(bin_ for bin_ in BINS if bin_[1] > bin_[0])
-    assert edges[0][0] == 0
-    assert edges[-1][1] == 60
-    assert all(low == high for (_, high), (low, _) in itertools.pairwise(edges))

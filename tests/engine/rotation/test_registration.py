@@ -13,7 +13,6 @@ from stacks import MadeUp, assert_same, read_all
 from mirrorskin import hw, io
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.hw.twin import Axial, Body, Camera
-from mirrorskin.kernels.errors import DeviceMemoryError
 
 TILT, PRESS = np.radians(2.5), 1.2
 # Uneven, out of order, and more than a turn.
@@ -69,7 +68,7 @@ def ramp(shape=SHAPE):
     return np.stack([50 + 3 * column + 2 * row + frame for frame in range(len(PHASES))]).astype(np.float32)
 
 
-@pytest.mark.parametrize("pivot", PIVOTS)
+@pytest.mark.parametrize("pivot", ["40 mm up", "off the axis"])
 def test_each_pixel_sees_where_its_point_has_gone(device, pivot):
     header, heights = replace(HEADER, pivot=PIVOTS[pivot]), some_heights()
     found = register(made_up(ramp(), header), heights, device)
@@ -82,8 +81,7 @@ def test_each_pixel_sees_where_its_point_has_gone(device, pivot):
         np.testing.assert_allclose(frame[seen], expected[seen], atol=1e-3)
 
 
-@pytest.mark.parametrize("pivot", PIVOTS)
-@pytest.mark.parametrize("name", ["sphere", "cone"])
+@pytest.mark.parametrize(("name", "pivot"), [("sphere", "40 mm up"), ("cone", "off the axis")])
 def test_equation_10_holds_for_the_normal_of_the_mean_pose(name, pivot):
     # A wall so high that brightness is linear from zenith 0 to 45 degrees.
     twin = hw.Twin(
@@ -173,18 +171,26 @@ def test_a_pixel_without_a_scale_counts_as_those_on_opposite_sides_of_it(device,
     assert lost.sum() == len(places) if mended else lost.sum() > 2 * len(places)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_blocks_make_no_difference(device, dtype, monkeypatch):
-    frames = np.random.default_rng(5).uniform(1, 250, (6, *SHAPE)).astype(dtype)
+def test_blocks_make_no_difference(device, monkeypatch):
+    frames = np.random.default_rng(5).uniform(1, 250, (6, *SHAPE)).astype(np.uint8)
     answers = []
-    for length in (1, 2, 4, 5, 6, 9):
+    for length in (1, 4, 9):
         source = Registered(made_up(frames), some_heights(), device=device)
         read = read_all(source, length)
         np.testing.assert_array_equal(read.phase, PHASES)
         answers.append((read.frames, source.noise_gain))
+    again = made_up(frames)
+    again.rewind = lambda: setattr(again, "frames_read", 0)
+    source = Registered(again, some_heights(), device=device)
+    source.read()
+    source.rewind()
+    assert np.isnan(source.noise_gain).all()
+    answers.append((read_all(source, 2).frames, source.noise_gain))
     monkeypatch.setattr("mirrorskin.engine.rotation.registration._BLOCK", 2 * frames[0].nbytes)
     small = Registered(made_up(frames), some_heights(), device=device)
     assert len(small.read(np.empty((6, *SHAPE), np.float32)).frames) == 2
+    with pytest.raises(ValueError, match="needed is"):
+        small.read(np.empty((2, *SHAPE)))
     for found, gain in answers:
         assert found.tobytes() == answers[0][0].tobytes()
         assert gain.tobytes() == answers[0][1].tobytes()
@@ -211,25 +217,6 @@ def test_the_noise_gain_is_that_of_noise():
     assert gain[some].max() <= 1
 
 
-def test_the_noise_gain_is_of_the_frames_read_so_far():
-    twin = hw.Twin(object="sphere", shape=(15, 17), pixel_size=0.1, movement=Axial(PHASES, TILT, PRESS))
-    source = Registered(twin, np.full((15, 17), -0.5))
-    assert np.isnan(source.noise_gain).all()
-    first = source.read().frames.copy()
-    one = source.noise_gain
-    read_all_left(source)
-    assert not np.array_equal(source.noise_gain, one, equal_nan=True)
-    source.rewind()
-    assert np.isnan(source.noise_gain).all()
-    np.testing.assert_array_equal(source.read().frames, first)
-    np.testing.assert_array_equal(source.noise_gain, one)
-
-
-def read_all_left(source):
-    while source.read() is not None:
-        pass
-
-
 def test_the_wrapper_tells_what_the_source_does():
     twin = hw.Twin(object="sphere", shape=(9, 11), pixel_size=0.1, movement=Axial(PHASES, TILT, PRESS))
     source = Registered(twin, np.zeros((9, 11)))
@@ -252,29 +239,13 @@ def test_the_wrapper_tells_what_the_source_does():
     assert known.left
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 3)])
-def test_a_picture_without_16_samples_has_no_answer(device, shape):
-    frames = np.full((6, *shape), 100, np.uint8)
-    assert np.isnan(register(made_up(frames), np.zeros(shape), device)).all()
-
-
-def test_equal_frames_stay_equal(device):
-    frames = np.full((6, *SHAPE), 137, np.uint8)
-    found = register(made_up(frames), some_heights(), device=device)
-    assert np.isfinite(found).sum() > 0.5 * found.size
-    np.testing.assert_allclose(found[np.isfinite(found)], 137, rtol=1e-6)
-
-
 BAD: dict[str, tuple[dict[str, Any], Any, str]] = {
     "vertical": ({"motion": "vertical"}, None, "of vertical motion: only axial ones"),
     "no pixel size": ({"pixel_size": None}, None, "does not say its pixel size"),
-    "no tilt": ({"tilt": None}, None, "does not say its tilt"),
-    "no press": ({"press": None}, None, "does not say its press"),
     "no pivot": ({"pivot": None}, None, "does not say its pivot"),
     "tilt is NaN": ({"tilt": np.nan}, None, "tilt is nan"),
     "pivot is infinite": ({"pivot": (0.0, np.inf, 0.0)}, None, "pivot is .*inf"),
     "another size": ({}, np.zeros((23, 30)), r"shape \(23, 30\), the frames are 23 x 31"),
-    "one number": ({}, 0.0, r"shape \(\), the frames are 23 x 31"),
     "all unknown": ({}, np.full(SHAPE, np.nan), "no height is a number"),
     "not numbers": ({}, np.full(SHAPE, "high"), "heights are of type <U4"),
 }
@@ -287,26 +258,8 @@ def test_what_cannot_be_registered_is_refused_in_one_line(case):
     with pytest.raises(io.InputError, match=message) as refusal:
         Registered(source, some_heights() if heights is None else heights)
     assert "\n" not in str(refusal.value)
-
-
-def test_frames_need_their_phase():
-    source = Registered(MadeUp(ramp(), HEADER), some_heights())
     with pytest.raises(io.InputError, match="made up: the phase of frames from 0 on is missing"):
-        source.read()
-
-
-@pytest.mark.parametrize(
-    "out", [np.empty((2, *SHAPE)), np.empty((2, 23, 30), "f4"), np.empty((0, *SHAPE), "f4")]
-)
-def test_a_buffer_that_does_not_fit_is_a_defect_of_the_caller(out):
-    with pytest.raises(ValueError, match="needed is"):
-        Registered(made_up(ramp()), some_heights()).read(out)
-
-
-def test_a_device_without_room_says_so(small_device):
-    small_device.max_allocation = 4 * 27 * 35 - 1  # a padded frame takes one byte more
-    with pytest.raises(DeviceMemoryError, match="no room for padded"):
-        Registered(made_up(ramp()), some_heights(), device=small_device)
+        Registered(MadeUp(ramp(), HEADER), some_heights()).read()
 
 
 def test_registered_frames_are_not_lent(tmp_path):

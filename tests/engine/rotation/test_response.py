@@ -133,18 +133,6 @@ def test_what_a_response_cannot_do_is_refused(change, told):
         estimate_normals(frames, **(known | change))
 
 
-def test_neither_a_gain_nor_a_response_is_too_little():
-    with pytest.raises(InputError, match="zenith gain"):
-        estimate_normals(np.full((8, *SHAPE), 100, np.uint8), PHASE, tilt=TILT)
-
-
-def test_a_source_without_a_calibration_has_no_response():
-    class Source:
-        calibration = None
-
-    assert wall_response_of(Source()) is None
-
-
 def known_of(**parts):
     """Return the response for a source whose calibration has a wall and other parts."""
     camera = CameraId("", SHAPE, np.dtype(np.float32))

@@ -21,8 +21,7 @@ def slopes_at(zenith, azimuth, sigma=0.001, contact=1, tilt=None, **options):
     return found.dz_dx[0, 0], found.dz_dy[0, 0], *found.weights[:, 0, 0], found.known[0, 0]
 
 
-@pytest.mark.parametrize("azimuth", [0, 30, 135, -90])
-@pytest.mark.parametrize("zenith", [0, 1, 30, 60])
+@pytest.mark.parametrize(("zenith", "azimuth"), [(0, 0), (1, 30), (30, 135), (60, -90)])
 def test_slopes_are_those_of_the_plane_at_right_angles(zenith, azimuth):
     dz_dx, dz_dy, *_ = slopes_at(zenith, azimuth)
     steepness = np.tan(np.radians(zenith))
@@ -40,7 +39,7 @@ def test_without_a_tilt_errors_go_both_ways_alike():
     assert 1 / weight_x == pytest.approx((1 / along + 1 / across) / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("zenith", [0, 1, 2, 2.5])
+@pytest.mark.parametrize("zenith", [0, 2.5])
 def test_within_the_circle_of_the_axis_both_ways_are_alike_too(zenith):
     *_, one, other, _ = slopes_at(zenith, 0, tilt=TILT)
     assert one == pytest.approx(other * np.cos(np.radians(zenith)) ** 2, rel=1e-3)
@@ -78,8 +77,7 @@ SETUP = Setup(gain=3.0, noise=1.5, offset=12.0)
 STEEP = (10, 30, 50)
 
 
-@pytest.mark.parametrize("azimuth", [0, 20, 45, 130])
-@pytest.mark.parametrize("phase", [EIGHTHS, UNEVEN])
+@pytest.mark.parametrize(("phase", "azimuth"), [(EIGHTHS, 20), (EIGHTHS, 130), (UNEVEN, 45)])
 def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
     setup = replace(SETUP, phase=phase)
     known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}

@@ -1,4 +1,4 @@
-"""Rotations under a wall: the twin's counts, and normals by its true response."""
+"""Rotations under a calibrated wall: the twin's counts, and normals by its true response."""
 
 import math
 from dataclasses import replace
@@ -168,12 +168,6 @@ def test_without_a_pivot_frames_are_not_registered_but_heights_are_found():
     assert np.isfinite(result.zenith).sum() > 700
     assert result.process["registered"] is False
     assert result.process["heights"] == "found in the first turn"
-
-
-def test_turns_may_be_told_alone():
-    result = engine.reconstruct(scene().source(turns=2), per_turn=True)
-    assert result.zenith.shape == (2, *SHAPE)
-    np.testing.assert_array_equal(result.zenith[0], result.zenith[1])
 
 
 def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_told():
