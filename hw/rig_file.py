@@ -26,7 +26,6 @@ _CELL = 65535  # rows or columns
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
 Letter = Literal["X", "Y", "Z", "A", "B", "C"]
-Millimetres = Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
 _Side = Annotated[float, Meta(gt=0)]
 _Pixels = Annotated[int, Meta(ge=1, le=_CELL)]
 _Picture = Annotated[str, Meta(pattern=rf"(?i)^[^\x00-\x1f\x7f]*({'|'.join(map(re.escape, SUFFIXES))})\Z")]
@@ -40,21 +39,6 @@ class Axis(msgspec.Struct, frozen=True, kw_only=True):
     """An axis of the machine, and the motion that it makes; see `TravelAxis` and `TiltAxis`.
 
     The machine's coordinate is ``zero + direction * value``, with the value in the axis's own unit.
-
-    Attributes
-    ----------
-    letter : str
-        The machine's name of it: X, Y, Z, A, B or C.
-    limits : (float, float)
-        Least and greatest value allowed, in ``unit``.
-    speed : float
-        Greatest speed, ``unit`` per second.
-    direction : int
-        1 if the value grows with the machine's coordinate, -1 if it falls.
-    zero : float
-        The machine's coordinate at which the value is 0, in ``unit``.
-    unit : str
-        What the machine counts this axis in: "mm" or "deg".
     """
 
     letter: Annotated[Letter, Meta(description="one of X, Y, Z, A, B, C, in quotes,", examples=["Z"])]
@@ -141,29 +125,7 @@ class TiltAxis(Axis, frozen=True, kw_only=True):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the stage is reached, and what it may do.
-
-    Attributes
-    ----------
-    port : str
-        A serial port or a URL of pyserial.
-    baud : int
-        Bits per second.
-    home : bool
-        Whether the stage has switches to home against.
-    timeout : float
-        Longest wait for an answer, seconds.
-    report_rate : float
-        How often its position is asked for, Hz.
-    press : float
-        Greatest travel allowed, mm.
-    pivot : (float, float, float) or None
-        What the body turns about, mm from the sheet's centre.
-    travel : TravelAxis
-        Along the sheet's normal.
-    pitch, roll : TiltAxis or None
-        The two components of the lean; a stage has both or none.
-    """
+    """How the stage is reached, and what it may do: the table ``[stage]`` of ``docs/rig.md``."""
 
     port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
     baud: Annotated[
@@ -182,7 +144,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     report_rate: Annotated[
         float, Meta(ge=1, le=100, description="a rate from 1 to 100 Hz", examples=[20.0])
     ] = 20.0
-    press: Millimetres
+    press: Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
     pivot: Annotated[
         tuple[float, float, float] | None,
         Meta(description="a list of x, y and z, in mm,", examples=[[0.0, 0.0, 0.0]]),
@@ -227,38 +189,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the camera is opened, and what its counts mean.
-
-    Attributes
-    ----------
-    source : int or str
-        The number of a camera, or the path or URL of a stream.
-    size : (int, int)
-        Columns and rows.
-    name : str
-        What it is called in recordings, and by which calibrations know it; by default the source, without a
-        password.
-    dtype : str
-        Type of a sample: uint8, uint16 or float32.
-    fourcc : str or None
-        The format asked of the camera, four letters; None leaves it.
-    exposure : float or None
-        Seconds; None leaves it.
-    gain : float or None
-        In the camera's own unit; None leaves it.
-    rate : float or None
-        Frames per second; None leaves it.
-    delay : float or None
-        From the middle of the exposure to the frame's arrival, seconds; None if it is not known.
-    pixel_size : float or (float, float) or None
-        Width and height of a pixel at the sheet, mm.
-    dark, bright : float or str or None
-        Counts without light, and off the contact: one number, or a picture's file.
-    zenith_gain : float or None
-        Counts per degree of zenith.
-    zenith_offset : float or None
-        Counts at zenith 0.
-    """
+    """How the camera is opened, and what its counts mean: the table ``[camera]`` of ``docs/rig.md``."""
 
     source: Annotated[
         Annotated[int, Meta(ge=0, lt=1000)] | Text,

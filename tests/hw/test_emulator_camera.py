@@ -21,7 +21,7 @@ from mirrorskin.hw.emulator.camera import TwinCamera
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Body, Camera, Twin, Vertical
-from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_lean, pose_at_press
+from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_lean
 from mirrorskin.io import InputError
 
 SHAPE = (33, 47)
@@ -76,36 +76,6 @@ def test_what_is_seen_at_a_place_is_the_frame_of_a_movement_there(name: str, sce
         np.testing.assert_array_equal(look(twin, number, lambda late, pose=pose: pose), frames[number])
 
 
-@pytest.mark.parametrize("name", ["press", "lean"])
-def test_the_movement_of_the_twin_that_looks_does_not_matter(name: str) -> None:
-    other = make_twin(MOVEMENTS["lean" if name == "press" else "press"])
-    movement = MOVEMENTS[name]
-    for number, frame in enumerate(read_all(make_twin(movement))):
-        pose = movement.pose(movement.path[number])
-        np.testing.assert_array_equal(look(other, number, lambda late, pose=pose: pose), frame)
-
-
-@pytest.mark.parametrize("name", ["press", "lean"])
-def test_an_exposure_is_that_of_a_movement_at_the_same_speed(name: str) -> None:
-    camera = Camera(exposure=0.02, frame_rate=25.0, noise=0.0)
-    even = Vertical(0.1 + 0.12 * np.arange(7)) if name == "press" else Axial(0.4 * np.arange(7), TILT, PRESS)
-    twin = make_twin(even, camera=camera)
-    frames = read_all(make_twin(even, camera=camera))
-    for number in (2, 3, 4):
-        step = even.path[1] - even.path[0]
-
-        def pose_at(late: float, number: int = number, step: float = step) -> Pose:
-            return even.pose(np.asarray(even.path[number] + late * 25.0 * step))
-
-        seen = look(twin, number, pose_at)
-        # Where the body was is rounded differently: a count may fall on either side of a half.
-        assert np.abs(seen.astype(int) - frames[number]).max() <= 1
-        assert np.mean(seen != frames[number]) < 0.001
-        middle = pose_at(0.0)
-        still = look(twin, number, lambda late, middle=middle: middle)
-        assert np.mean(seen != still) > 0.01
-
-
 def test_a_position_is_the_lean_of_the_precession_there() -> None:
     for phase in PHASES:
         place = Position(PRESS, TILT * math.cos(phase), TILT * math.sin(phase))
@@ -113,11 +83,6 @@ def test_a_position_is_the_lean_of_the_precession_there() -> None:
         found = lean_at(place)
         np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-15)
         np.testing.assert_allclose(found.shift, expected.shift, atol=1e-14)
-
-
-def test_a_body_that_does_not_lean_is_upright_at_any_phase() -> None:
-    assert pose_at_lean(0.7, 0.0, 1.3, PIVOT).upright
-    np.testing.assert_array_equal(pose_at_lean(0.7, 0.0, 1.3, PIVOT).shift, pose_at_press(0.7).shift)
 
 
 # As a camera.
@@ -154,13 +119,6 @@ def times_of(taken: list[Frames]) -> tuple[NDArray[np.int64], NDArray[np.float64
     return np.concatenate([f.number for f in taken]), np.concatenate([f.time for f in taken])
 
 
-def test_frames_come_at_the_rate_by_the_cameras_own_clock() -> None:
-    with running(still) as camera:
-        number, arrived = times_of(take(camera, 30))
-        assert (camera.shape, camera.dtype, camera.name) == (SHAPE, np.uint8, "twin: sphere")
-    np.testing.assert_allclose(np.diff(arrived), np.diff(number) / 100.0, atol=1e-9)
-
-
 def test_a_frame_shows_the_body_where_it_was_when_it_was_exposed() -> None:
     began = time.monotonic()
 
@@ -191,19 +149,6 @@ def test_frames_arrive_late_by_delay_and_jitter_and_in_order() -> None:
     late = arrived - (exposed[0] + (number - number[0]) / 200.0)
     assert abs(late.mean() - 0.03) < 0.002
     assert 0.002 < late.std() < 0.005
-
-
-def test_no_frame_arrives_before_its_exposure_ends() -> None:
-    twin = make_twin(MOVEMENTS["press"], camera=Camera(exposure=0.02, frame_rate=40.0))
-    moments: list[float] = []
-
-    def where(at: float) -> Position:
-        moments.append(at)
-        return still(at)
-
-    with running(where, 40.0, twin) as camera:
-        arrived = take(camera, 1)[0].time[0]
-    assert arrived == pytest.approx(moments[1] + 0.01)
 
 
 def test_a_camera_that_cannot_keep_up_loses_frames_and_counts_them() -> None:
@@ -246,26 +191,6 @@ def test_a_lost_camera_tells_readers() -> None:
         assert camera.error is not None
         with pytest.raises(HardwareError, match="lost"):
             list(drain(camera))
-
-
-def test_a_closed_camera_tells_readers_and_closes_twice() -> None:
-    camera = TwinCamera(make_twin(MOVEMENTS["press"]), still, rate=50.0)
-    camera.close()
-    camera.close()
-    with pytest.raises(HardwareError, match="closed"):
-        list(drain(camera))
-
-
-def test_frames_that_wait_can_be_forgotten() -> None:
-    with running(still) as camera:
-        seen = camera.counts.frames
-        while camera.counts.frames < seen + 8:
-            time.sleep(0.005)
-        forgotten = camera.latest
-        camera.flush()
-        frames = camera.take(1, PATIENCE)
-        assert frames.time[0] >= forgotten
-        assert frames.dropped < 8  # not those that were forgotten; a busy machine may lose others
 
 
 @pytest.mark.parametrize(

@@ -142,12 +142,6 @@ def test_viewers_may_come_one_after_another_and_together() -> None:
     assert second[-1] < third[0]
 
 
-def test_the_header_tells_size_and_rate() -> None:
-    with streaming((3, 70)) as (_, server), connect(server) as line:
-        header = b"YUV4MPEG2 W70 H3 F200:1 Ip A1:1 Cmono\n"
-        assert read_exactly(line, len(header)) == header
-
-
 def test_a_slow_viewer_gets_whole_frames_with_some_missing() -> None:
     shape, header = (400, 500), b"YUV4MPEG2 W500 H400 F200:1 Ip A1:1 Cmono\n"
     with streaming(shape, period=0.001) as (_, server), connect(server) as slow:
@@ -191,10 +185,3 @@ def test_what_cannot_be_streamed_is_refused() -> None:
             FrameServer(tape, 30.0)
     finally:
         tape.close()
-
-
-def test_a_port_that_is_taken_is_refused() -> None:
-    with streaming() as (tape, server):
-        taken = int(server.url.rpartition(":")[2])
-        with pytest.raises(InputError, match=f"port {taken}"):
-            FrameServer(tape, 30.0, taken)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import time
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -70,17 +69,6 @@ def test_no_byte_more_than_the_buffer_holds_is_ever_sent(size, events):
         assert not waiting or sum(map(len, buffer)) + len(waiting[0]) > size
     assert [*taken, *buffer] == given_in[: len(taken) + len(buffer)]
     assert window.done == len(taken)
-
-
-def test_a_line_longer_than_the_buffer_is_a_defect():
-    with pytest.raises(ValueError, match="does not fit"):
-        Window(16).add("G1X123456789.123")
-
-
-def test_an_answer_to_nothing_changes_nothing():
-    window = Window()
-    assert window.answer() is None
-    assert (window.done, window.busy) == (0, False)
 
 
 def test_a_reset_forgets_all_lines():

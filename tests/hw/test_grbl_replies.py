@@ -55,11 +55,6 @@ def test_the_banner_tells_the_version(line, version):
     assert banner.version == version
 
 
-def test_six_axes_have_their_letters():
-    status = parse(b"<Idle|MPos:1,2,3,4,5,6>")
-    assert status.machine == dict(zip("XYZABC", range(1, 7), strict=True))
-
-
 @pytest.mark.parametrize(
     "line",
     [

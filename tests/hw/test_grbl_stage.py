@@ -78,15 +78,6 @@ def test_a_precession_ends_where_it_began_and_streams_within_the_buffer(opened):
     assert 0 < port.fill <= 128
 
 
-def test_a_smaller_buffer_is_heeded(opened):
-    stage, port = opened(ScriptedGrbl(size=64))
-    stage.move(Position(1.0, LEAN))
-    stage.wait()
-    stage.precess(LEAN, 2.0, 6.0)
-    stage.wait()
-    assert 0 < port.fill <= 64
-
-
 def test_a_precession_begins_where_the_body_stands(opened):
     stage, port = opened()
     sent = len(port.lines)
@@ -114,24 +105,6 @@ def test_what_is_beyond_the_limits_is_refused_before_anything_is_sent(opened):
     time.sleep(0.05)
     assert port.lines == sent
     assert stage.error is None
-
-
-def test_it_goes_no_faster_than_the_controller_does(opened):
-    stage, _ = opened(ScriptedGrbl(settings={112: 300}))
-    with pytest.raises(InputError, match="at most 5 mm/s"):
-        stage.move(Position(1.0), 5.1)
-
-
-def test_the_history_is_in_order_and_can_be_cut(opened):
-    stage, _ = opened()
-    stage.move(Position(1.0), 10.0)
-    stage.wait()
-    reports = stage.history()
-    times = [report.time for report in reports]
-    assert len(reports) >= 3
-    assert times == sorted(times)
-    assert stage.history(times[1])[: len(times) - 2] == reports[2:]
-    assert stage.history(time.monotonic() + 1) == []
 
 
 def test_reports_tell_of_the_time_when_they_were_so(opened):
@@ -205,18 +178,6 @@ def test_an_axis_that_the_controller_has_not_is_refused():
     with pytest.raises(InputError, match="no axis A"):
         GrblStage(stage_settings(pitch=TiltAxis(letter="A", limits=(-57, 57), speed=57)), port)
     assert port.closed
-
-
-def test_two_threads_may_wait(opened):
-    stage, _ = opened()
-    stage.move(Position(1.0), 10.0)
-    found = []
-    others = [threading.Thread(target=lambda: found.append(stage.wait())) for _ in range(2)]
-    for other in others:
-        other.start()
-    for other in others:
-        other.join(5)
-    assert [report.state for report in found] == ["idle", "idle"]
 
 
 def test_closing_twice_and_stopping_after_is_no_error():

@@ -28,28 +28,11 @@ def test_a_way_is_what_its_speed_adds_up_to(length, speed, acceleration):
     np.testing.assert_allclose(path.place(time), gone, atol=1e-6 * length)
 
 
-@ways
-def test_the_time_of_a_place_is_when_it_is_there(length, speed, acceleration):
-    path = Trapezoid(length, speed, acceleration)
-    time = np.linspace(0, path.duration, 101)
-    np.testing.assert_allclose(path.time(path.place(time)), time, atol=1e-6 * path.duration)
-
-
-def test_a_body_rests_before_and_after_its_way():
-    path = Trapezoid.planned(3.0, 1.0)
-    np.testing.assert_array_equal(path.place([-5, 0, path.duration, 99]), [0, 0, 3, 3])
-    assert path.duration == pytest.approx(3.1)
-
-
 def test_a_press_in_steps_takes_every_place_to_its_end():
     plan = VerticalPlan(0.1, 0.7, step=0.1)
     np.testing.assert_allclose(plan.values, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     assert [place.travel for place in plan.places] == list(plan.values)
     assert plan.first == Position(0.1)
-
-
-def test_a_press_in_steps_never_goes_beyond_its_end():
-    np.testing.assert_allclose(VerticalPlan(0.0, 1.0, step=0.3).values, [0, 0.3, 0.6, 0.9])
 
 
 def test_a_turn_in_steps_does_not_take_its_beginning_twice():
@@ -67,12 +50,6 @@ def test_a_rotation_leans_by_its_tilt_towards_each_phase():
         assert math.cos(place.phase - phase) == pytest.approx(1)
 
 
-def test_a_rotation_without_a_halt_goes_round_at_its_rate():
-    path = AxialPlan(1.0, 0.04, turns=2, rate=0.5).path
-    assert path.length == pytest.approx(4 * math.pi)
-    assert path.speed == pytest.approx(math.pi)
-
-
 @pytest.mark.parametrize(
     ("plan", "limit"),
     [
@@ -87,11 +64,6 @@ def test_a_rotation_without_a_halt_goes_round_at_its_rate():
 def test_a_plan_beyond_the_limits_is_refused(plan, limit):
     with pytest.raises(InputError, match=limit):
         plan.check(LIMITS, "stage")
-
-
-@pytest.mark.parametrize("plan", [VerticalPlan(-5.0, 2.0, speed=1), AxialPlan(2.0, math.radians(5), rate=1)])
-def test_a_plan_up_to_the_limits_is_not(plan):
-    plan.check(LIMITS, "stage")
 
 
 @pytest.mark.parametrize(
@@ -138,13 +110,6 @@ def test_a_rotation_that_cannot_be_is_refused(values):
         AxialPlan(*values)
 
 
-def test_turns_that_would_take_for_ever_are_refused():
-    assert AxialPlan(1.0, 0.04, turns=10_000, rate=1.0).turns == 10_000
-    for turns in (10_001, 1e300):
-        with pytest.raises(InputError, match="10000 times at most"):
-            AxialPlan(1.0, 0.04, turns=turns, rate=1.0)
-
-
 STAGE = settings().stage  # 20 mm/s, 20 rad/s, pitch and roll on X and Y
 
 
@@ -165,19 +130,6 @@ def test_what_the_stage_cannot_do_is_refused(plan, said):
         check_plan(plan, STAGE, "stage")
 
 
-@pytest.mark.parametrize(
-    "plan",
-    [
-        VerticalPlan(0.0, 1.0, speed=20.0),
-        VerticalPlan(0.0, 1.0, speed=0.017),
-        AxialPlan(1.0, 0.04, turns=1e4, rate=79.0),
-        AxialPlan(1.0, 0.04, turns=0.1, rate=2e-3),
-    ],
-)
-def test_what_the_stage_can_just_do_is_not(plan):
-    check_plan(plan, STAGE, "stage")
-
-
 def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
     stage = structs.replace(STAGE, pitch=structs.replace(STAGE.pitch, letter="A"))
     with pytest.raises(InputError, match="no arcs in the axes A and Y"):
@@ -185,22 +137,11 @@ def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
     check_plan(AxialPlan(1.0, 0.04, phase_step=1.0), stage, "stage")
 
 
-@pytest.mark.parametrize("way", [{"rate": 1.0}, {"phase_step": 1.0}])
-def test_a_stage_that_does_not_lean_goes_round_in_no_way(way):
-    with pytest.raises(InputError, match="tilt"):
-        check_plan(AxialPlan(1.0, 0.04, **way), structs.replace(STAGE, pitch=None, roll=None), "stage")
-
-
 @pytest.mark.parametrize("turns", [1.0, 3.0])
 def test_a_turn_in_steps_has_as_many_frames_as_it_has_places(turns):
     plan = AxialPlan(1.0, 0.04, turns=turns, phase_step=math.tau / 8)
     assert plan.frames_a_turn(math.nan) == pytest.approx(len(plan.values) / turns)
     assert plan.frames_a_turn(math.nan, each=3) == pytest.approx(3 * len(plan.values) / turns)
-
-
-@pytest.mark.parametrize(("turns", "frames"), [(2.0, 40.0), (1.0, 40.0), (0.5, 20.0)])
-def test_a_turn_without_a_halt_has_as_many_frames_as_come_in_it(turns, frames):
-    assert AxialPlan(1.0, 0.04, turns=turns, rate=0.5).frames_a_turn(20.0) == pytest.approx(frames)
 
 
 @pytest.mark.parametrize("rate", [0.0, math.nan, math.inf])

@@ -105,14 +105,6 @@ def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):
     assert true[-1] == pytest.approx(1)
 
 
-def test_the_times_of_frames_are_those_of_the_scans_clock(pressed):
-    scan, blocks, _ = pressed
-    time = joined(blocks, "time")
-    assert time[0] >= 0
-    assert np.all(np.diff(time) >= 0)
-    assert time[-1] <= scan.now()
-
-
 def test_a_rotation_without_a_halt_has_no_frames_at_rest():
     plan = AxialPlan(0.5, TILT, turns=1.5, rate=3.0)
     with make_rig(rate=200.0) as rig, SweepScan(rig, plan) as scan:
@@ -210,12 +202,6 @@ def test_a_plan_beyond_the_limits_is_refused_before_anything_moves(plan):
         assert rig.stage.moves == []
 
 
-@pytest.mark.parametrize(("settle", "frames"), [(-0.1, 1), (math.nan, 1), (math.inf, 1), (0.1, 0)])
-def test_settling_and_frames_that_cannot_be_are_refused(settle, frames):
-    with make_rig() as rig, pytest.raises(InputError):
-        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle, frames)
-
-
 def test_a_scan_that_is_done_lifts_the_body():
     with make_rig() as rig:
         with StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan:
@@ -230,21 +216,6 @@ def test_a_leaning_body_is_brought_upright_before_it_is_lifted():
         scan = StepScan(rig, AxialPlan(0.5, TILT, phase_step=2.0))
         scan.lift()
         assert rig.stage.moves[-2:] == [Position(0.5), Position(-5.0)]
-
-
-def test_a_scan_that_is_left_between_two_moves_lifts_the_body():
-    with make_rig() as rig:
-        with StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan:
-            scan.read(ROOM)
-        assert rig.stage.position() == Position(-5.0)
-        assert rig.stage.stops == []
-
-
-def test_a_scan_that_did_nothing_moves_nothing():
-    with make_rig() as rig:
-        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).close()
-        assert rig.stage.moves == []
-        assert rig.stage.stops == []
 
 
 def test_a_scan_that_is_left_in_the_middle_of_a_move_stops_the_stage():
@@ -278,8 +249,3 @@ def test_a_stage_that_rests_elsewhere_is_not_believed(monkeypatch):
         monkeypatch.setattr(rig, "go", lambda place, speed=None: astray)
         with pytest.raises(HardwareError, match="from where it was sent"):
             drain(scan)
-
-
-def test_a_scan_cannot_be_rewound():
-    with make_rig() as rig, pytest.raises(RuntimeError):
-        StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5)).rewind()
