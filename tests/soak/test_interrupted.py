@@ -6,6 +6,8 @@ import pytest
 import soak
 from commands import run
 
+pytestmark = pytest.mark.slow
+
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 

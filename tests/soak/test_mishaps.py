@@ -6,6 +6,8 @@ import mishaps
 import pytest
 import soak
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", soak.seeds())
 @pytest.mark.parametrize("what", mishaps.INSIDE)

@@ -10,6 +10,8 @@ from mirrorskin.engine.batch import cluster
 from mirrorskin.engine.batch.cluster import run_cluster
 from mirrorskin.engine.batch.jobs import Plan, make_jobs
 
+pytestmark = pytest.mark.slow
+
 WORKERS = 2
 
 
@@ -32,7 +34,6 @@ def wait_for(workers):
     workers.wait_for_workers(WORKERS, timeout=60)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", soak.seeds())
 def test_a_job_whose_worker_is_killed_is_done_by_another(
     seed, workers, recordings, undisturbed, tmp_path, caplog

@@ -140,21 +140,22 @@ def test_leaving_early_ends_the_batch(recordings, two_workers, tmp_path, slow_jo
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fit", [True, False])
-def test_a_worker_that_comes_late_takes_part_if_it_can(
-    fit, recordings, tmp_path, monkeypatch, caplog, slow_jobs
-):
+def test_a_worker_that_comes_late_takes_part_if_it_can(fit, recordings, tmp_path, monkeypatch, slow_jobs):
     jobs = make_jobs(recordings, tmp_path) * 100
     with start(1) as running, closing(run_cluster(jobs, PLAN, running.scheduler_address)) as run:
         next(run)
         if not fit:
             monkeypatch.setattr(worker, "version", lambda _: "0.0.9")
         running.scale(2)
-        left_out = "is left out: it has mirrorskin 0.0.9"
-        assert any(len(slow_jobs) == 2 if fit else left_out in caplog.text for _ in run)
+        said = running.scheduler.get_events
+        assert any(len(slow_jobs) == 2 if fit else said("mirrorskin") for _ in run)
+        assert fit or "is left out: it has mirrorskin 0.0.9" in said("mirrorskin")[0][1]
     assert len(slow_jobs) == 1 + fit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("losses", "state"), [(3, "done"), (4, "failed")])
 def test_a_job_may_cost_three_workers_and_no_more(losses, state, recordings, tmp_path, monkeypatch):
     lost = []
@@ -189,6 +190,7 @@ def test_a_job_that_fails_in_an_unforeseen_way_is_told_in_a_line(recordings, add
     assert all("of two lines" in outcome.message for outcome in outcomes)
 
 
+@pytest.mark.slow
 def test_no_scheduler_is_refused(recordings, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "_REACH", 0.3)
     jobs = make_jobs(recordings, tmp_path)
@@ -201,6 +203,7 @@ def test_no_scheduler_is_refused(recordings, tmp_path, monkeypatch):
     assert "no answer within 0.3 s" in message
 
 
+@pytest.mark.slow
 def test_a_scheduler_without_workers_is_refused(recordings, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
     with start(0) as running:
@@ -208,6 +211,7 @@ def test_a_scheduler_without_workers_is_refused(recordings, tmp_path, monkeypatc
     assert f"no workers for 0.3 s: start some with 'dask worker {running.scheduler_address}'" in message
 
 
+@pytest.mark.slow
 def test_a_cluster_that_goes_away_is_told(recordings, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PATIENCE", 1.0)
     with start(1) as running:

@@ -25,6 +25,7 @@ def pages(how):
     return int(run.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only the GNU C library is told so")
 def test_memory_is_kept_for_the_next_file():
     assert pages("kept") < 10
