@@ -115,7 +115,7 @@ class Band:
 
     def hand_over(self, name: str) -> NDArray[Any]:
         """Give away what a map holds, (count, stride) or (rows, W), without a copy, and make a new one."""
-        given = self.maps[name].hand_over()
+        given = self.maps[name].detach()
         self.maps[name] = self._make(name)
         return given
 
@@ -142,7 +142,7 @@ class Band:
             return
         frames = frames[:, self.rows]
         contiguous, shared = frames.flags.c_contiguous, self._device.info.shares_memory
-        borrowed = self._device.lend("frames", frames) if lent and contiguous and shared else None
+        borrowed = self._device.borrow("frames", frames) if lent and contiguous and shared else None
         if borrowed is not None:
             yield from self._borrow(borrowed)
         elif contiguous and not shared:
@@ -166,9 +166,9 @@ class Band:
             if self._other is not None:
                 self.frames, self._other = self._other, self.frames
             part = frames[start : start + step]
-            self.frames.bring(part)
+            self.frames.upload_async(part)
             yield Staged(self.frames, slice(start, start + len(part)), self._full_words)
-            self.frames.settle()
+            self.frames.wait()
 
     def _copy(self, frames: NDArray[Any]) -> Iterator[Staged]:
         """Copy frames to the room, unless they are there."""
@@ -196,10 +196,10 @@ class Band:
 
     def _park(self) -> None:
         for array in self.maps.values():
-            array.park()
+            array.evict()
         for room in (self.frames, self._other):
             if room is not None:
-                room.drop()
+                room.discard()
         self._resident = False
 
 

@@ -1,9 +1,9 @@
-"""Arrays that host and device both see, and memory of others that a device reads in place."""
+"""Memory: arrays that host and device both see, and buffers borrowed from another owner."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from mirrorskin.kernels.errors import DeviceMemoryError
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
 
+_READ_WRITE = cl.map_flags.READ | cl.map_flags.WRITE
 _PAGE = 4096
 _SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
 _NO_ROOM = {
@@ -38,15 +39,15 @@ class Array:
     host : ndarray
     arrived : pyopencl.Event or None
         A copy under way that kernels have to wait for.
-    used : pyopencl.Event or None
-        The last kernel that it was given to.
+    last_use : pyopencl.Event or None
+        The last kernel that took it as an argument.
     """
 
     def __init__(self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         self.name = name
         self.arrived: cl.Event | None = None
-        self.used: cl.Event | None = None
-        self._brought = 0
+        self.last_use: cl.Event | None = None
+        self._arriving = 0  # bytes
         self._device = device
         self._shared = device.info.shares_memory
         self._mapped: cl.MemoryMap | None = None
@@ -70,16 +71,7 @@ class Array:
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
         if self._shared and self._mapped is None:
-            view, _ = cl.enqueue_map_buffer(
-                self._device.queue,
-                self.buffer,
-                cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
-                0,
-                self.host.shape,
-                self.host.dtype,
-                is_blocking=True,
-            )
-            self._mapped = view.base
+            self._mapped = _map(self._device.queue, self.buffer, self.host, _READ_WRITE).base
 
     def upload(self, rows: int | None = None) -> None:
         """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
@@ -90,25 +82,25 @@ class Array:
             event = cl.enqueue_copy(self._device.queue, self.buffer, part)
             self._device.profile.wait("upload", self.name, event, part.nbytes)
 
-    def bring(self, values: NDArray[Any]) -> None:
-        """Begin to copy values from elsewhere on the host; kernels that are given this array wait for it.
+    def upload_async(self, values: NDArray[Any]) -> None:
+        """Begin to copy values from elsewhere on the host; kernels that take this array wait for it.
 
-        The device has memory of its own, and the values stay as they are until ``settle``.
+        The device has memory of its own, and the values stay as they are until ``wait``.
         """
         if self._buffer is None:
             self._allocate()
-        self._brought = values.nbytes
-        after = [] if self.used is None else [self.used]
+        self._arriving = values.nbytes
+        after = [] if self.last_use is None else [self.last_use]
         self._device.queue.flush()  # where that kernel waits
         self.arrived = cl.enqueue_copy(
             self._device.copies, self.buffer, values, is_blocking=False, wait_for=after
         )
         self._device.copies.flush()
 
-    def settle(self) -> None:
-        """Wait until what was brought is there."""
+    def wait(self) -> None:
+        """Wait until a copy under way has arrived."""
         if self.arrived is not None:
-            self._device.profile.wait("upload", self.name, self.arrived, self._brought)
+            self._device.profile.wait("upload", self.name, self.arrived, self._arriving)
             self.arrived = None
 
     def download(self) -> NDArray[Any]:
@@ -120,7 +112,7 @@ class Array:
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
         return self.host
 
-    def see(self, kernel: cl.Event | None) -> NDArray[Any]:
+    def snapshot(self, kernel: cl.Event | None) -> NDArray[Any]:
         """Wait for one kernel, while others that only read may run, and return a copy of what it wrote."""
         queue, after = self._device.copies, [] if kernel is None else [kernel]
         self._device.queue.flush()
@@ -128,22 +120,13 @@ class Array:
             event = cl.enqueue_copy(queue, self.host, self.buffer, wait_for=after)
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
             return self.host.copy()
-        view, _ = cl.enqueue_map_buffer(
-            queue,
-            self.buffer,
-            cl.map_flags.READ,
-            0,
-            self.host.shape,
-            self.host.dtype,
-            wait_for=after,
-            is_blocking=True,
-        )
-        seen: NDArray[Any] = view.copy()
+        view = _map(queue, self.buffer, self.host, cl.map_flags.READ, after)
+        copied: NDArray[Any] = view.copy()
         view.base.release(queue)
-        return seen
+        return copied
 
-    def hand_over(self) -> NDArray[Any]:
-        """Wait for the device and give away what it wrote, without a copy; the array is no more of use."""
+    def detach(self) -> NDArray[Any]:
+        """Wait for the device and return what it wrote, without a copy; the array is no longer of use."""
         host = self.download()
         if self._mapped is not None:
             self._mapped.release()
@@ -154,13 +137,13 @@ class Array:
             self._buffer = None
         return host
 
-    def park(self) -> None:
+    def evict(self) -> None:
         """Make room on the device: keep the content on the host until the next upload."""
         if not self._shared and self._buffer is not None:
             self.download()
-            self.drop()
+            self.discard()
 
-    def drop(self) -> None:
+    def discard(self) -> None:
         """Make room on the device, and forget what the device held."""
         if not self._shared and self._buffer is not None:
             self._buffer.release()
@@ -170,7 +153,7 @@ class Array:
     def buffer(self) -> cl.Buffer:
         """The device's side, for kernels; the host must not write while they run."""
         if self._buffer is None:
-            raise RuntimeError(f"{self.name} is parked: upload it first")
+            raise RuntimeError(f"{self.name} was evicted: upload it first")
         if self._mapped is not None:
             self._mapped.release()
             self._mapped = None
@@ -178,76 +161,73 @@ class Array:
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        with _taking(self._device, self.name, self.host.nbytes):
+        with _naming(self._device, self.name, self.host.nbytes):
             if self._shared:
                 self._buffer = cl.Buffer(
                     self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
                 )
             else:
                 self._buffer = cl.Buffer(self._device.context, flags, size=self._memory.nbytes)
-                # Drivers allocate at first use; asking for it here makes a lack of memory show here.
+                # Drivers allocate at first use; a migration makes a lack of memory show here.
                 undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
                 cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
 
 
 class BorrowedBuffer:
-    """Memory of another owner's that kernels read in place; it stays referred to until they are done.
+    """Another owner's memory, which kernels read in place; it stays alive until they are done.
 
-    Attributes
-    ----------
-    name : str
-    host : ndarray
-    buffer : pyopencl.Buffer
-    arrived, used
-        As of an ``Array``; there is no copy to wait for.
+    ``name``, ``host``, ``buffer``, ``arrived`` and ``last_use`` are as of an `Array`; nothing is ever copied.
     """
 
     arrived = None
 
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
         self.name, self.host = name, values
-        self.used: cl.Event | None = None
+        self.last_use: cl.Event | None = None
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         self.buffer = cl.Buffer(device.context, flags, hostbuf=values)
 
     def __del__(self) -> None:
-        if self.used is not None:
-            self.used.wait()
+        if self.last_use is not None:
+            self.last_use.wait()
 
 
 Operand = Array | BorrowedBuffer
-"""What a kernel can be given besides numbers."""
+"""What a kernel takes besides numbers."""
 
 
 def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Make room on the host from where copies to a device are fastest; see ``Device.pinned``."""
     nbytes = math.prod(shape) * dtype.itemsize
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-    with _taking(device, "frames on the host", nbytes):
+    with _naming(device, "frames on the host", nbytes):
         buffer = cl.Buffer(device.context, flags, size=nbytes)
-        view, _ = cl.enqueue_map_buffer(
-            device.copies,
-            buffer,
-            cl.map_flags.READ | cl.map_flags.WRITE,  # type: ignore[arg-type]  # flags are ints at run time
-            0,
-            shape,
-            dtype,
-            is_blocking=True,
+        room: NDArray[Any] = _map(
+            device.copies, buffer, np.broadcast_to(np.empty((), dtype), shape), _READ_WRITE
         )
-    room: NDArray[Any] = view
     return room
 
 
+def _map(
+    queue: cl.CommandQueue, buffer: cl.Buffer, like: NDArray[Any], flags: Any, after: Sequence[cl.Event] = ()
+) -> Any:
+    """Return a device's buffer as an array of the host's, whose base is the mapping, once it is there."""
+    view, _ = cl.enqueue_map_buffer(
+        queue, buffer, flags, 0, like.shape, like.dtype, wait_for=after, is_blocking=True
+    )
+    return view
+
+
 def _aligned(nbytes: int) -> NDArray[np.uint8]:
-    """Zeros that start on a page, so that a device sharing the memory need not copy them."""
+    """Return zeros that start on a page, so that a device sharing the memory need not copy them."""
     raw = np.zeros(nbytes + _PAGE, np.uint8)
     start = -raw.ctypes.data % _PAGE
     return raw[start : start + nbytes]
 
 
 @contextmanager
-def _taking(device: Device, name: str, nbytes: int) -> Iterator[None]:
-    """Say of what a device has no room, where it says that it has none."""
+def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
+    """Name the array for which a device has no memory."""
     try:
         yield
     except cl.Error as error:

@@ -174,10 +174,10 @@ class Device:
         array.upload()
         return array
 
-    def lend(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
-        """Let kernels read memory of another owner's in place; the device must share the host's memory.
+    def borrow(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
+        """Let kernels read another owner's memory in place; the device must share the host's memory.
 
-        Some devices refuse memory that only may be read, such as a file's. Then it returns None.
+        None where a device refuses memory that may only be read, such as a file's.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class Device:
             What the profile calls it.
         values : ndarray
             In C order, at a multiple of its item size, and followed by 64 bytes that may be read; nobody may
-            write to it as long as it is lent.
+            write to it as long as it is borrowed.
         """
         try:
             return BorrowedBuffer(self, name, values)
@@ -316,7 +316,7 @@ class Kernel:
         except cl.Error as error:
             raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
         for array in arrays:
-            array.used = event
+            array.last_use = event
         self._device.profile.watch("kernel", self.name, event, moved)
 
     def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:

@@ -291,7 +291,7 @@ class Levelling:
         offsets.upload()
         height = self._device.array("levelled", self._graph.shape, np.float32)
         self._add(relief, plane, offsets, height)
-        levelled: Floats = height.hand_over()
+        levelled: Floats = height.detach()
         return levelled
 
     def launch(self, relief: Array, plane: Plane) -> Array:

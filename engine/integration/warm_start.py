@@ -52,7 +52,7 @@ class WarmStartIntegrator:
         maps: dict[str, Any] = {name: array.host for name, array in self.maps.items()}
         inputs = Inputs(**maps, pixel_size=self._pixel_size, typical_weight=typical_weight)
         self._graph.use_device_maps(inputs)
-        self._flagged = self._graph.flags.used
+        self._flagged = self._graph.flags.last_use
         self._links = self._graph.links()
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
@@ -67,7 +67,7 @@ class WarmStartIntegrator:
         return self._height
 
     def _finish(self) -> Floats:
-        components = find_components(self._graph.flags.see(self._flagged), cut=False)
+        components = find_components(self._graph.flags.snapshot(self._flagged), cut=False)
         if components.count == 0:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)

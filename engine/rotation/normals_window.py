@@ -127,7 +127,7 @@ class NormalWindow:
                 ring = band.maps["ring"]
                 samples = Samples(ring, self._sums.oldest, self._window, ring=True)
                 self._kernel.run(band, samples, fit, self._known_model, turns=1, bare=bare)
-                self._estimated = ring.used
+                self._estimated = ring.last_use
 
     def place(self, heights: NDArray[np.floating]) -> None:
         """Set how high the object stands from now on, (H, W), mm above the rest plane; with a response."""
@@ -162,7 +162,7 @@ class NormalWindow:
         if len(self.bands) > 1:
             return self.fetch(name)
         band = self.bands[0]
-        return self._without_padding(band, band.maps[name].see(self._estimated))
+        return self._without_padding(band, band.maps[name].snapshot(self._estimated))
 
     def on_device(self, name: str) -> Array:
         """Return a map of the last estimate as one array of the device; it may have padding."""

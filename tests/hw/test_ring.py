@@ -65,7 +65,7 @@ def test_64_bytes_beyond_the_last_place_can_be_read(device) -> None:
         beyond = np.lib.stride_tricks.as_strided(frames.pixels.ravel(), (65,))
         assert int(beyond.sum()) >= number  # reading it does not end the program
         if device.info.shares_memory:
-            assert device.lend("frames", frames.pixels) is not None
+            assert device.borrow("frames", frames.pixels) is not None
 
 
 @pytest.mark.parametrize("slots", [1, 2, 3, 8])

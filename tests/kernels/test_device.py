@@ -112,7 +112,7 @@ def test_a_parked_array_keeps_its_content(device):
     array = device.array("numbers", (3, 5), np.float32)
     array.host[:] = np.arange(15).reshape(3, 5)
     array.upload()
-    array.park()
+    array.evict()
     array.upload()
     np.testing.assert_array_equal(array.download(), np.arange(15).reshape(3, 5))
 
