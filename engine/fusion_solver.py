@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.holes import fill_holes
-from mirrorskin.engine.press.intervals import find_spread, find_trend, look_inside
+from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
@@ -161,11 +161,11 @@ def _extend(slopes: Slopes, surface: Surface, press: PressHeights, pixel_size: t
     gaps &= ndimage.uniform_filter(slopes.known.astype(np.float32), size, mode="constant") > 0
     weight = np.where(slopes.known, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
     height = surface.height.astype(np.float64)
-    trend = find_trend(height, weight, gaps, width)
+    trend = fit_paraboloids(height, weight, gaps, width)
     off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
     if off.any():  # mistakes count only once
         weight[gaps] = np.where(off, 0.0, weight[gaps])
-        trend = find_trend(height, weight, gaps, width)
+        trend = fit_paraboloids(height, weight, gaps, width)
     smooth = trend.misfit < _ROUGH
     gaps[gaps] = smooth
     along = trend.along[:, smooth] / np.array([[pixel_size[0]], [-pixel_size[1]]])
@@ -207,8 +207,8 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
     half *= _share_used(middle - shape - lift[piece], half, shape)
     for _ in range(_ITERATIONS):
         at = shape + lift[piece]
-        spread = find_spread(middle - at, half)
-        inside = look_inside(at, middle, half, spread)
+        spread = estimate_interval_errors(middle - at, half)
+        inside = interval_evidence(at, middle, half, spread)
         firm = np.bincount(piece, inside.weight, size.size)
         lift += np.bincount(piece, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
     weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
-from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.validation import check_pixel_size
-from mirrorskin.engine.press.halfspace import HalfSpace, Seen, Watched, sweep
+from mirrorskin.engine.press.halfspace import HalfSpace, SlopeFit, Targets, sweep
+from mirrorskin.engine.press.spline import spline_products, spline_values
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 
 Doubles = NDArray[np.float64]
@@ -25,14 +25,10 @@ LEARNED_AT = 0.5
 
 _LIT, _DARK, _HIDDEN = 1, 2, 3  # of an onset's status
 _FEWEST = 12  # cells that must have turned light
-_LOOKED = 250  # cells whose onset is looked at; more tell no more of so few splines
+_SAMPLED = 250  # cells whose onset is looked at; more tell no more of so few splines
 _TRAVELS = 16  # at which the press is gone through
-_BENDING = (
-    0.1,
-    0.1,
-    0.3,
-    1.0,
-)  # third derivatives that surfaces usually have, 1/mm^2; the last from there on
+# Third derivatives that surfaces usually have, 1/mm^2, in the first steps; the last from there on.
+_BENDING = 0.1, 0.1, 0.3, 1.0
 _MOST_ROUNDS = 14
 _DAMPING, _STUCK = 1.0, 1e3  # at first, in units of steps; beyond the second nothing moves any more
 _STEP = 0.3  # mm that the surface may move in a round
@@ -46,11 +42,18 @@ _BEYOND = 0.3  # of the touch that may lie beyond the picture, where the object 
 _SHARE_LEFT = 0.02  # of a change that is left, as the cells are coarse
 _FARTHEST = 0.05  # mm, standard deviation up to which a height goes on beyond the touch
 _RIDGE = 1e-12
+_CELLS = 32  # along a side of what turned light, were it square
+_AROUND = 2  # cells beyond it
+_MARGIN = 6  # cells beyond the picture's border, where the object goes on there
+_SPLINES = 8  # along a side, were it square
+_FEWEST_PIECES = 3
+_SHARE = 0.5  # of a cell's pixels that must have turned light
+_SMALL = 4  # cells of a gap that is no feature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """Heights for a gel that gives way.
+    """Heights corrected for the elastomer.
 
     Attributes
     ----------
@@ -106,7 +109,7 @@ def correct_press(
     threshold: float,
     gel: Gel | None,
 ) -> tuple[Result, str]:
-    """Correct the heights of a press or a release for a gel, where all is known that it takes.
+    """Correct the heights of a press or a release for the elastomer, where all is known that it takes.
 
     Parameters
     ----------
@@ -137,14 +140,8 @@ def correct_press(
     if threshold != LEARNED_AT:
         return result, f"none: the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
     try:
-        corrected = correct_onset(
-            result.height,
-            result.height_sigma,
-            result.status,
-            pixel_size,
-            gel,
-            deepest=deepest,
-        )
+        maps = result.height, result.height_sigma, result.status
+        corrected = correct_onset(*maps, pixel_size, gel, deepest=deepest)
     except NotConverged as error:
         return result, f"none: {error}"
     lost = np.count_nonzero((result.status == _LIT) & np.isnan(corrected.height))
@@ -161,15 +158,15 @@ def correct_onset(
     *,
     deepest: float | None = None,
 ) -> Corrected:
-    """Find the surface whose press would turn each pixel light when it did.
+    """Correct heights by eq. 3 for an elastomer that gives way.
 
-    Eq. 3 takes a pixel's travel at its onset for the object's depth there. A gel gives way around what it
-    touches: a paraboloid touches at twice the depth; and the sheet around the touch is steep enough for
-    light before it touches. So a smooth surface is looked for (cubic splines, no finer than an eighth of
-    what turned light), which pressed into an elastic half-space would have brought the sheet to just the
-    threshold's slope at each pixel's onset: by Gauss and Newton, with third derivatives kept small, at first
-    more than in the end. What it differs by from a surface as smooth through the heights as given is added to
-    these; so what is finer stays as it was.
+    Eq. 3 takes a pixel's travel at its onset for the object's depth there. An elastomer gives way around what
+    it touches: a paraboloid touches at twice the depth; and the sheet around the contact is steep enough for
+    light before it touches. So a smooth surface is fitted (cubic splines, no finer than an eighth of what
+    turned light) whose press into an elastic half-space brings the sheet to the threshold's slope at each
+    pixel's onset. It is found by damped Gauss-Newton steps, with third derivatives kept small, at first more
+    than in the end. Its difference from a surface as smooth through the heights as given is added to these;
+    so finer details stay as they were.
 
     Parameters
     ----------
@@ -195,14 +192,12 @@ def correct_onset(
         Maps or sizes that cannot be used.
     """
     scene = _scene_of(_maps(height, sigma, status), check_pixel_size(pixel_size), gel, deepest)
-    smooth = _through(scene, scene.height)
-    factors, seen, form = _look_for(scene, _start(scene))
-    here, whole = (int(np.sum(part)) for part in (scene.cells.inside(seen.contact), seen.contact))
+    smooth = _interpolate(scene, scene.height)
+    factors, fit, form = _fit_surface(scene, _first_guess(scene))
+    here, whole = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if whole - here > _BEYOND * whole:
         raise NotConverged("much of what touches lies beyond the picture")
-    change, spread, touching = _on_pixels(
-        scene, factors - smooth, _variances(scene, seen, form), seen.contact
-    )
+    change, spread, touching = _on_pixels(scene, factors - smooth, _variances(scene, fit, form), fit.contact)
     maps, own = scene.maps, spread + (_SHARE_LEFT * change) ** 2 + gel.error**2
     known = np.isfinite(maps.height) & (touching | (own <= _FARTHEST**2))
     heights = np.where(known, maps.height + change, np.nan)
@@ -224,7 +219,7 @@ class _Scene(NamedTuple):
     maps: _Maps
     cells: Cells
     height: Doubles  # of cells that turned light
-    looked: Mask  # some of these, all over
+    sampled: Mask  # some of these, all over
     dark: Mask  # cells that never did
     surface: Mask  # cells that there may be something in
     x: Doubles
@@ -258,7 +253,7 @@ def _scene_of(maps: _Maps, size: tuple[float, float], gel: Gel, deepest: float |
     left, top = x[0] - size[0] / 2, y[0] + size[1] / 2
     space, splines = HalfSpace(cells.shape, spacing[::-1]), Splines(cells.shape, spacing)
     row, column = np.indices(cells.shape)
-    looked = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _LOOKED) == 0)
+    looked = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _SAMPLED) == 0)
     return _Scene(
         maps, cells, means, looked, dark, surface, left + columns, top - rows, space, splines, travel, gel
     )
@@ -291,7 +286,7 @@ def _on_pixels(
     return height, spread, touching >= 0.5
 
 
-def _through(scene: _Scene, heights: Doubles) -> Doubles:
+def _interpolate(scene: _Scene, heights: Doubles) -> Doubles:
     """Return the factors of a smooth surface through heights of cells, NaN where it is free."""
     known = np.isfinite(heights).ravel()
     basis = scene.splines.basis[known]
@@ -299,13 +294,13 @@ def _through(scene: _Scene, heights: Doubles) -> Doubles:
     return _solve(form, basis.T @ heights.ravel()[known] / _KNOWN**2)
 
 
-def _start(scene: _Scene) -> Doubles:
+def _first_guess(scene: _Scene) -> Doubles:
     """Return the factors of a surface to begin with: flat tops, and depths nearer to those of the touch."""
     lit = np.isfinite(scene.height)
     row, column = ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
     top = float(scene.height[lit].max())
     known = np.where(lit | scene.surface, scene.height[row, column], np.nan)
-    return _through(scene, top + _DEPTH * (known - top))
+    return _interpolate(scene, top + _DEPTH * (known - top))
 
 
 def _stiffness(scene: _Scene, bending: float) -> Doubles:
@@ -319,117 +314,107 @@ def _solve(form: Doubles, values: Doubles) -> Doubles:
     return np.asarray(splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True}).solve(values))
 
 
-def _look_for(scene: _Scene, factors: Doubles) -> tuple[Doubles, Seen, Doubles]:
+def _fit_surface(scene: _Scene, factors: Doubles) -> tuple[Doubles, SlopeFit, Doubles]:
     """Return the surface's factors, what it would have shown, and the form that they minimise.
 
     Gauss and Newton's steps are damped, more after one that has made things worse (Levenberg).
     """
     lit, damping, accepted = np.isfinite(scene.height), _DAMPING, 0
     still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _STEP**2
-    seen = _watch(scene, factors)
+    fit = _simulate(scene, factors)
     for _ in range(_MOST_ROUNDS):
         stiffness = _stiffness(scene, _BENDING[min(accepted, len(_BENDING) - 1)])
-        form, pull = _normal_form(seen, stiffness, factors)
+        form, pull = _normal_equations(fit, stiffness, factors)
         step = _solve(form + damping * still, pull)
         moved = float(np.abs(scene.splines.surface(step)[lit]).max())
         tried = factors + step * min(1.0, _STEP / max(moved, _STEP))
-        shown, before = _watch(scene, tried), _cost(seen, stiffness, factors)
+        shown, before = _simulate(scene, tried), _cost(fit, stiffness, factors)
         after = _cost(shown, stiffness, tried)
         if after >= before:
             if damping > _STUCK:
                 break
             damping *= 10
             continue
-        factors, seen, accepted, damping = tried, shown, accepted + 1, damping / 3
+        factors, fit, accepted, damping = tried, shown, accepted + 1, damping / 3
         if accepted > len(_BENDING) and after > _SETTLED * before:
             break
-    misfit = float(np.median(np.abs(seen.missing))) if seen.missing.size else math.inf
+    misfit = float(np.median(np.abs(fit.residual))) if fit.residual.size else math.inf
     if misfit > _MISFIT:
         raise NotConverged(f"no surface explains when the pixels turned light: slopes differ by {misfit:.2g}")
-    return factors, seen, _normal_form(seen, _stiffness(scene, _BENDING[-1]), factors)[0]
+    return factors, fit, _normal_equations(fit, _stiffness(scene, _BENDING[-1]), factors)[0]
 
 
-def _normal_form(seen: Seen, stiffness: Doubles, factors: Doubles) -> tuple[Doubles, Doubles]:
+def _normal_equations(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> tuple[Doubles, Doubles]:
     """Return the normal equations of the next step: form and right side."""
-    weights = np.minimum(1.0, _ROBUST * _SLOPE_ERROR / np.maximum(np.abs(seen.missing), _RIDGE))
+    weights = np.minimum(1.0, _ROBUST * _SLOPE_ERROR / np.maximum(np.abs(fit.residual), _RIDGE))
     weights /= _SLOPE_ERROR**2
-    form = np.einsum("ki,k,kj->ij", seen.by_surface, weights, seen.by_surface) + stiffness
+    form = np.einsum("ki,k,kj->ij", fit.jacobian, weights, fit.jacobian) + stiffness
     bend = np.einsum("ij,j->i", stiffness, factors)
-    return form, np.einsum("ki,k->i", seen.by_surface, weights * seen.missing) - bend
+    return form, np.einsum("ki,k->i", fit.jacobian, weights * fit.residual) - bend
 
 
-def _cost(seen: Seen, stiffness: Doubles, factors: Doubles) -> float:
-    """Return what a surface costs: slopes that are missing, by Huber's measure, and bending."""
-    wrong = np.abs(seen.missing) / _SLOPE_ERROR
+def _cost(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> float:
+    """Return what a surface costs: residual slopes, by Huber's measure, and bending."""
+    wrong = np.abs(fit.residual) / _SLOPE_ERROR
     small = np.minimum(wrong, _ROBUST)
     bent = float(np.sum(factors * np.einsum("ij,j->i", stiffness, factors)))
     return float(np.sum(small * (2 * wrong - small))) + bent
 
 
-def _watch(scene: _Scene, factors: Doubles) -> Seen:
+def _simulate(scene: _Scene, factors: Doubles) -> SlopeFit:
     """Press a surface, and look when cells turned light."""
     height = scene.splines.surface(factors)
     down, across = (part @ factors for part in scene.splines.slopes)
     azimuth = np.arctan2(down, -across).reshape(height.shape)
     zenith = threshold_at(scene.gel, scene.x[np.newaxis], scene.y[:, np.newaxis], azimuth)
-    watched = Watched(
-        np.where(scene.looked, -scene.height, np.nan), scene.dark & ~scene.surface, np.tan(zenith)
+    targets = Targets(
+        np.where(scene.sampled, -scene.height, np.nan), scene.dark & ~scene.surface, np.tan(zenith)
     )
     surface = np.where(scene.surface, height, np.nan)
-    seen = sweep(scene.space, surface, scene.splines.basis, scene.travel, watched, scene.gel.compliance)
-    return _with_tops(scene, seen, watched.slope.ravel(), down, across)
+    fit = sweep(scene.space, surface, scene.splines.basis, scene.travel, targets, scene.gel.compliance)
+    return _with_flat_tops(scene, fit, targets.slope.ravel(), down, across)
 
 
-def _with_tops(scene: _Scene, seen: Seen, limit: Doubles, down: Doubles, across: Doubles) -> Seen:
+def _with_flat_tops(scene: _Scene, fit: SlopeFit, limit: Doubles, down: Doubles, across: Doubles) -> SlopeFit:
     """Add the dark cells of the surface that are steeper than what is dark can be."""
     steep = np.hypot(down, across)
     cell = np.flatnonzero((scene.dark & scene.surface).ravel() & (steep > limit))
     along_y, along_x = (sparse.diags_array(part[cell] / steep[cell]) for part in (down, across))
     slopes = along_y @ scene.splines.slopes[0][cell] + along_x @ scene.splines.slopes[1][cell]
     nothing = np.zeros(len(cell))
-    return Seen(
-        np.append(seen.missing, (limit - steep)[cell]),
-        np.concatenate([seen.by_surface, slopes.toarray()]),
-        np.append(seen.by_travel, nothing),
-        np.append(seen.load, nothing),
-        np.append(seen.cell, cell),
-        seen.contact,
+    return SlopeFit(
+        np.append(fit.residual, (limit - steep)[cell]),
+        np.concatenate([fit.jacobian, slopes.toarray()]),
+        np.append(fit.by_travel, nothing),
+        np.append(fit.load, nothing),
+        np.append(fit.cell, cell),
+        fit.contact,
     )
 
 
-def _variances(scene: _Scene, seen: Seen, form: Doubles) -> Doubles:
+def _variances(scene: _Scene, fit: SlopeFit, form: Doubles) -> Doubles:
     """Return the variance of the surface at each cell, mm^2: by the fit, and by what is known of the gel."""
     covariance = _solve(form, np.eye(len(form)))
     basis = scene.splines.basis
-    usual = 1.4826 * float(np.median(np.abs(seen.missing)))
+    usual = 1.4826 * float(np.median(np.abs(fit.residual)))
     worse = max(1.0, (usual / _SLOPE_ERROR) ** 2)
     variance = worse * np.asarray(basis.multiply(basis @ covariance).sum(axis=1)).ravel()
-    for slope in _gel_slopes(scene, seen):
-        pull = np.einsum("ki,k->i", seen.by_surface, slope / _SLOPE_ERROR**2)
+    for slope in _gel_slopes(scene, fit):
+        pull = np.einsum("ki,k->i", fit.jacobian, slope / _SLOPE_ERROR**2)
         moved = basis @ np.einsum("ij,j->i", covariance, pull)
         variance += moved**2
     return variance.reshape(scene.cells.shape)
 
 
-def _gel_slopes(scene: _Scene, seen: Seen) -> list[Doubles]:
+def _gel_slopes(scene: _Scene, fit: SlopeFit) -> list[Doubles]:
     """Return by how much a standard error of each of the gel's numbers changes what slopes are missing."""
     gel, sigma = scene.gel, scene.gel.sigma
     slope = math.tan(gel.threshold)
-    threshold = np.full(seen.missing.shape, (1 + slope**2) * sigma.get("threshold", 0.0))
-    compliance = seen.by_travel * seen.load * sigma.get("compliance", 0.0)
-    r = np.hypot(*np.meshgrid(scene.x - gel.axis[0], scene.y - gel.axis[1])).ravel()[seen.cell]
+    threshold = np.full(fit.residual.shape, (1 + slope**2) * sigma.get("threshold", 0.0))
+    compliance = fit.by_travel * fit.load * sigma.get("compliance", 0.0)
+    r = np.hypot(*np.meshgrid(scene.x - gel.axis[0], scene.y - gel.axis[1])).ravel()[fit.cell]
     curvature = slope * r * sigma.get("curvature", 0.0)
     return [threshold, compliance, curvature]
-
-
-_CELLS = 32  # along a side of what turned light, were it square
-_AROUND = 2  # cells beyond it
-_MARGIN = 6  # cells beyond the picture's border, where the object goes on there
-_SPLINES = 8  # along a side, were it square
-_FEWEST_PIECES = 3
-_DEGREE, _ORDER = 3, 3  # cubic; third derivatives are kept small, so that a cap goes on as a cap
-_SHARE = 0.5  # of a cell's pixels that must have turned light
-_SMALL = 4  # cells of a gap that is no feature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -557,28 +542,19 @@ class Splines:
     """
 
     def __init__(self, shape: tuple[int, int], spacing: tuple[float, float]) -> None:
-        self._shape, self._spacing = shape, spacing
-        spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
-        size = math.sqrt(spans[0] * spans[1]) / _SPLINES
+        self._shape = shape
+        self._spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
+        size = math.sqrt(self._spans[0] * self._spans[1]) / _SPLINES
         self._pieces = [
             max(_FEWEST_PIECES, min(round(span / size), count // 2))
-            for span, count in zip(spans, shape, strict=True)
+            for span, count in zip(self._spans, shape, strict=True)
         ]
-        rows, columns = (np.arange(count, dtype=np.float64) for count in shape)
-        along = [
-            [self._values(places, axis, order) for order in (0, 1)]
-            for axis, places in enumerate((rows, columns))
-        ]
-        self.basis = sparse.csr_matrix(sparse.kron(along[0][0], along[1][0]))
-        self.slopes = (
-            sparse.csr_matrix(sparse.kron(along[0][1], along[1][0])) / spacing[0],
-            sparse.csr_matrix(sparse.kron(along[0][0], along[1][1])) / spacing[1],
+        (y, down), (x, across) = (
+            [self._values(np.arange(float(count)), axis, order) for order in (0, 1)]
+            for axis, count in enumerate(shape)
         )
-
-    @property
-    def count(self) -> int:
-        """Of splines."""
-        return int(self.basis.shape[1])
+        self.basis = sparse.csr_matrix(sparse.kron(y, x))
+        self.slopes = sparse.csr_matrix(sparse.kron(down, x)), sparse.csr_matrix(sparse.kron(y, across))
 
     def surface(self, factors: Doubles) -> Doubles:
         """Return a surface at the cells, (H, W), mm."""
@@ -586,58 +562,31 @@ class Splines:
 
     def at(self, factors: Doubles, rows: Doubles, columns: Doubles) -> Doubles:
         """Return a surface on rows and columns that lie at places between the cells."""
-        grid = factors.reshape(self._pieces[0] + _DEGREE, -1)
+        grid = factors.reshape(self._pieces[0] + 3, -1)
         return np.asarray((self._values(rows, 0) @ grid) @ self._values(columns, 1).T)
 
     def roughness(self) -> Doubles:
         """Return the form of the mean squared third derivatives, in all directions alike, 1/mm^4."""
-        along = [[self._products(axis, order) for order in range(_ORDER + 1)] for axis in (0, 1)]
-        parts = [
-            math.comb(_ORDER, order) * np.kron(along[0][order], along[1][_ORDER - order])
-            for order in range(_ORDER + 1)
+        along = [
+            [spline_products(count, order) * (count / span) ** (2 * order - 1) for order in range(4)]
+            for count, span in zip(self._pieces, self._spans, strict=True)
         ]
-        spans = [(count - 1) * step for count, step in zip(self._shape, self._spacing, strict=True)]
-        return np.asarray(np.sum(parts, axis=0) / (spans[0] * spans[1]))
-
-    def _knots(self, axis: int) -> Doubles:
-        """Return the knots along an axis, in cells."""
-        pieces = self._pieces[axis]
-        return np.asarray(np.arange(-_DEGREE, pieces + _DEGREE + 1) * (self._shape[axis] - 1) / pieces)
+        parts = [math.comb(3, order) * np.kron(along[0][order], along[1][3 - order]) for order in range(4)]
+        return np.asarray(np.sum(parts, axis=0) / (self._spans[0] * self._spans[1]))
 
     def _values(self, places: Doubles, axis: int, order: int = 0) -> sparse.csr_matrix:
-        """Return an axis' splines, or their derivatives by the cell, at places."""
-        inside = np.clip(places, 0, (self._shape[axis] - 1) * (1 - 1e-12))
-        knots = self._knots(axis)
-        splines = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
-        return sparse.csr_matrix(splines(inside, nu=order))
-
-    def _products(self, axis: int, order: int) -> Doubles:
-        """Return the integrals of products of two splines' derivatives along an axis."""
-        step, knots = self._spacing[axis], self._knots(axis)
-        ends = knots[_DEGREE:-_DEGREE]
-        nodes, weights = np.polynomial.legendre.leggauss(_DEGREE + 1)
-        width = ends[1] - ends[0]
-        places = (ends[:-1, np.newaxis] + (nodes + 1) / 2 * width).ravel()
-        splines = BSpline(knots, np.eye(len(ends) - 1 + _DEGREE), _DEGREE)
-        values = splines(places, nu=order) / step**order
-        share = np.tile(weights / 2 * width * step, len(ends) - 1)
-        return np.asarray(np.einsum("ki,k,kj->ij", values, share, values))
+        """Return an axis' splines, or their derivatives, 1/mm, at places in cells."""
+        count, pieces = self._shape[axis], self._pieces[axis]
+        values = spline_values(places * pieces / (count - 1), pieces, order)
+        return sparse.csr_matrix(values * (pieces / self._spans[axis]) ** order)
 
 
 def touched(height: Doubles, dark: Mask, hidden: Mask) -> Mask:
-    """Tell which cells belong to the object's surface, by how the sheet around dark ones lies.
+    """Return which cells belong to the object's surface, by how the sheet around dark ones lies.
 
     Dark cells are part of it if what is around them rises towards them, as to a flat top; if it falls, they
-    are the sheet that nothing touches. Small gaps are part of it.
-
-    Parameters
-    ----------
-    height : ndarray, (H, W), float64
-        Of cells that turned light; NaN elsewhere.
-    dark : ndarray, (H, W), bool
-        Cells that never turned light.
-    hidden : ndarray, (H, W), bool
-        Cells that were light before the first frame: surely part of it.
+    are the sheet that nothing touches. Small gaps are part of it, and cells that were light before the first
+    frame.
     """
     lit = np.isfinite(height)
     surface = lit | hidden

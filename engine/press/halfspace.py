@@ -28,7 +28,7 @@ _STEPS = 300  # of conjugate gradients
 class HalfSpace:
     """How pressure on a grid pushes in the surface of an incompressible half-space.
 
-    Pressure is told as strain: divided by Young's modulus, so that no modulus is needed. A point load F moves
+    Pressure is divided by Young's modulus (strain), so that no modulus is needed. A point load F moves
     the surface by ``3 / (4 pi E) F / r`` (Boussinesq), whose spectrum is ``3 / (2 E q)`` at the wavenumber q.
     Cut off at r = L, beyond which the grid has no points, it is ::
 
@@ -106,8 +106,8 @@ def press(
     """Press a rigid surface into the half-space without friction.
 
     Where they touch the half-space takes the surface's height; elsewhere nothing presses. Which pixels touch
-    is found by an active set: on those that are thought to, the pressure is solved for by conjugate
-    gradients; then those that pull are let go, and those that overlap are added, until none does either.
+    is found by an active set: on those of the set the pressure is solved for by conjugate gradients; then
+    those that pull are removed, and those that overlap are added, until neither happens.
 
     Parameters
     ----------
@@ -242,49 +242,23 @@ _SIZES = 4  # cells by which windows grow
 _TINY = np.float32(1e-30)
 
 
-class Watched(NamedTuple):
-    """Cells that are looked at.
+class Targets(NamedTuple):
+    """Cells whose onsets are to be explained, (H, W)."""
 
-    Attributes
-    ----------
-    onset : ndarray, (H, W), float64
-        Travel at which a cell turned light, mm; NaN where it did not.
-    dark : ndarray, (H, W), bool
-        Cells that never did.
-    slope : ndarray, (H, W), float64
-        Of the sheet, at which a cell turns light.
-    """
-
-    onset: Doubles
-    dark: Mask
-    slope: Doubles
+    onset: Doubles  # travel at which a cell turned light, mm; NaN where it did not
+    dark: Mask  # cells that never did
+    slope: Doubles  # of the sheet, at which a cell turns light
 
 
-class Seen(NamedTuple):
-    """How steep the sheet was where and when cells turned light, beside what turns them light.
+class SlopeFit(NamedTuple):
+    """Slopes that turn n cells light less those of the sheet when they did, for a surface of m splines."""
 
-    Attributes
-    ----------
-    missing : ndarray, (n,), float64
-        Slope that turns the cell light, less the sheet's.
-    by_surface : ndarray, (n, m), float64
-        Derivatives of the sheet's slope by the factors of the surface, 1/mm.
-    by_travel : ndarray, (n,), float64
-        By the travel, 1/mm.
-    load : ndarray, (n,), float64
-        Force over Young's modulus, mm^2: by the compliance the slope falls with load times ``by_travel``.
-    cell : ndarray, (n,), int
-        Which cell, counted row by row.
-    contact : ndarray, (H, W), bool
-        What touches at the greatest travel.
-    """
-
-    missing: Doubles
-    by_surface: Doubles
-    by_travel: Doubles
-    load: Doubles
-    cell: NDArray[np.intp]
-    contact: Mask
+    residual: Doubles  # (n,)
+    jacobian: Doubles  # (n, m): derivatives of the sheet's slope by the splines' factors, 1/mm
+    by_travel: Doubles  # (n,): by the travel, 1/mm
+    load: Doubles  # (n,): force over Young's modulus, mm^2; compliance lowers the slope by load * by_travel
+    cell: NDArray[np.intp]  # (n,): counted row by row
+    contact: Mask  # (H, W): at the greatest travel
 
 
 def sweep(
@@ -292,58 +266,45 @@ def sweep(
     surface: Doubles,
     basis: sparse.csr_matrix,
     travel: Doubles,
-    watched: Watched,
+    targets: Targets,
     compliance: float,
-) -> Seen:
-    """Press a surface, and look at each cell when it turned light in truth.
+) -> SlopeFit:
+    """Press a surface, (H, W), made of splines, (H W, m), and compare slopes when cells turned light.
 
-    Between two travels slopes are taken for linear. A cell that never turned light in truth is looked at at
-    the greatest travel, if it is light then.
-
-    Parameters
-    ----------
-    space : HalfSpace
-    surface : ndarray, (H, W), float64
-        Heights of the object, mm; NaN where there is none.
-    basis : csr_matrix, (H W, m), float64
-        What the surface is made of.
-    travel : ndarray, (T,), float64
-        Rising, from the first onset, or before it, to the deepest.
-    watched : Watched
-    compliance : float
-        1/mm.
+    Travels rise from the first onset, or before it, to the deepest; between two of them slopes are taken for
+    linear. A cell that never turned light is compared at the greatest travel, if it is light then.
     """
     state: Pressed | None = None
     before: tuple[float, Doubles] | None = None
     parts: list[tuple[NDArray[np.generic], ...]] = []
-    interval = np.clip(np.searchsorted(travel, watched.onset), 0, len(travel) - 1)
+    interval = np.clip(np.searchsorted(travel, targets.onset), 0, len(travel) - 1)
     for number, depth in enumerate(travel):
         state = press(space, surface + depth, compliance, state)
         rise = _gradient(space, state.height)
         slope = np.hypot(*rise)
-        looked = np.isfinite(watched.onset) & (interval == number)
+        looked = np.isfinite(targets.onset) & (interval == number)
         if number == len(travel) - 1:
-            looked |= watched.dark & (slope > watched.slope)
+            looked |= targets.dark & (slope > targets.slope)
         firm = state.strain > _FIRM * float(state.strain.max())
         if firm.any() and looked.any():
             weights = _weights(space, firm, rise, looked, compliance)
             last, steep = before or (float(depth) - 1.0, slope - np.inf)
-            early = np.where(np.isfinite(watched.onset), depth - watched.onset, 0.0)[looked]
+            early = np.where(np.isfinite(targets.onset), depth - targets.onset, 0.0)[looked]
             rate = weights.sum(axis=1)
             backwards = (slope - steep)[looked] / (depth - last)
             at = slope[looked] - np.where(np.isfinite(backwards), backwards, rate) * early
             load = np.full(at.shape, state.load)
-            by_surface = np.asarray((basis[firm.ravel()].T @ weights.T).T)
-            parts.append((watched.slope[looked] - at, by_surface, rate, load, np.flatnonzero(looked)))
+            jacobian = np.asarray((basis[firm.ravel()].T @ weights.T).T)
+            parts.append((targets.slope[looked] - at, jacobian, rate, load, np.flatnonzero(looked)))
         before = float(depth), slope
     assert state is not None
     if not parts:
         nothing = np.zeros(0)
-        return Seen(
+        return SlopeFit(
             nothing, np.zeros((0, basis.shape[1])), nothing, nothing, np.zeros(0, np.intp), state.contact
         )
-    missing, by_surface, rate, load, cell = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Seen(missing, by_surface, rate, load, cell, state.contact)
+    residual, jacobian, rate, load, cell = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return SlopeFit(residual, jacobian, rate, load, cell, state.contact)
 
 
 def _gradient(space: HalfSpace, height: Doubles) -> tuple[Doubles, Doubles]:

@@ -36,6 +36,9 @@ _MOST_CUT = 16  # holes at the border that are looked at, the largest ones
 _CUT = 0.2  # of a hole's outline along the picture's border, up to which it is still surrounded
 _EFFORT = 300  # of a smooth surface, in splines
 _WORK = 30_000  # in all: the smallest of very many holes get membranes
+_DIRECT = 10_000  # unknowns that a direct solution is quick for
+_TOLERANCE = 1e-5  # of the right side
+_ITERATIONS = 200
 _EXACT = 0.01  # pixel sizes: half-width of a height that claims to be exact
 
 
@@ -97,7 +100,7 @@ def fill_holes(
 
     Notes
     -----
-    A fill is a guess. No honest standard deviation of it can be told: a ball's cap, a worn cone and a top
+    A fill is a guess. No honest standard deviation of it can be given: a ball's cap, a worn cone and a top
     cut off within the hole give the same light. On balls of 3 to 10 mm radius the apex was right within
     0.005 mm at steps of 0.01 mm, and within 0.020 mm at 0.1 and 0.2 mm. A flat top is right within half a
     step and the fall of its flank over a pixel. The tip of a cone is cut off at its hole. What was light from
@@ -214,7 +217,7 @@ def _find_holes(answered: Mask) -> tuple[NDArray[np.int32], Mask]:
 
 
 def _in_hull(region: Mask, groups: NDArray[np.int32]) -> bool:
-    """Tell whether a region lies in the convex hull of the groups that it touches, all but gaps apart."""
+    """Return whether a region lies in the convex hull of the groups that it touches, gaps included."""
     touched = np.unique(groups[ndimage.binary_dilation(region, _SQUARE, iterations=2)])
     around = np.isin(groups, touched[touched > 0])
     if not around.any():
@@ -325,30 +328,11 @@ def _step(field: _Field, filled: Mask) -> float:
     return float(np.median((field.high - field.low)[rim])) if rim.any() else 0.0
 
 
-_DIRECT = 10_000  # unknowns that a direct solution is quick for
-_TOLERANCE = 1e-5  # of the right side
-_ITERATIONS = 200
-
-
 def stretch(height: Doubles, known: Mask, unknown: Mask, spacing: tuple[float, float]) -> Doubles:
     """Solve Laplace's equation: each unknown pixel is the mean of its four neighbours.
 
-    It repeats planes, and never leaves the range of the known heights.
-
-    Parameters
-    ----------
-    height : ndarray, (H, W), float64
-        Of any unit where known.
-    known, unknown : ndarray, (H, W), bool
-        Pixels to be fixed to, and pixels to be found, of which each group touches a known one. At what is
-        neither the membrane is free.
-    spacing : (float, float)
-        Distance of rows, and of columns, in one unit.
-
-    Returns
-    -------
-    ndarray, (H, W), float64
-        The heights, with the unknown ones found.
+    It reproduces planes, and never leaves the range of the known heights. Each group of unknown pixels
+    touches a known one; at pixels that are neither the membrane is free.
     """
     if not unknown.any():
         return height

@@ -15,11 +15,11 @@ from scipy.special import ndtr
 Doubles = NDArray[np.float64]
 
 _LEAST = 0.02  # of half an interval: what its ends are blurred by at least
-_FAR = 6.0  # blurs beyond an end, from which on an onset is a mistake
-_SPAN = 20.0  # half intervals that mistakes are spread over at least
-_FEWEST, _MOST = 1e-4, 0.5  # share of mistakes
+_FAR = 6.0  # blurs beyond an end, from which on an onset is an outlier
+_SPAN = 20.0  # half intervals that outliers are spread over at least
+_FEWEST, _MOST = 1e-4, 0.5  # share of outliers
 _SAMPLES = 8192  # of errors that tell how they are spread
-_ROUNDS = 12  # until the share of mistakes settles
+_ROUNDS = 12  # until the share of outliers is found
 _FAINT = 1e-4  # of an end's own weight, below which a weight is not taken to be more sure
 
 
@@ -30,26 +30,26 @@ class Evidence(NamedTuple):
     weight: Doubles
 
 
-class Spread(NamedTuple):
+class IntervalErrors(NamedTuple):
     """How errors of known heights are spread.
 
     Attributes
     ----------
     blur : float
         Standard deviation that the ends of intervals are blurred by, mm.
-    mistaken : float
-        Density of the heights that are mistakes, 1/mm, over the share of those that are none.
+    outlier_density : float
+        Density of the heights that are outliers, 1/mm, over the share of those that are none.
     """
 
     blur: float
-    mistaken: float
+    outlier_density: float
 
 
-def find_spread(error: Doubles, half: Doubles) -> Spread:
-    """Tell how sharp the intervals' ends are, and how many heights are mistakes, by the greatest likelihood.
+def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
+    """Estimate how sharp the intervals' ends are, and how many onsets are outliers, by maximum likelihood.
 
-    An error e is from a blurred interval with the chance 1 - m, and a mistake, which may be anything, with
-    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Mistakes are on one side, as late onsets
+    An error e is from a blurred interval with the chance 1 - m, and an outlier, which may be anything, with
+    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Outliers are on one side, as late onsets
     are, and what is within intervals does not hold against them: they must not count as blurred ends.
 
     Parameters
@@ -61,7 +61,7 @@ def find_spread(error: Doubles, half: Doubles) -> Spread:
 
     Returns
     -------
-    Spread
+    IntervalErrors
         Its blur is at least a fiftieth of half an interval.
     """
     thin = slice(None, None, -(-error.size // _SAMPLES))
@@ -77,8 +77,8 @@ def find_spread(error: Doubles, half: Doubles) -> Spread:
 
     def unlikely(size: float) -> float:
         density = _chance(error, half, float(np.exp(size))) / (2 * half)
-        mistakes = share(density)
-        return -float(np.sum(np.log(mistakes / span + (1 - mistakes) * density)))
+        outliers = share(density)
+        return -float(np.sum(np.log(outliers / span + (1 - outliers) * density)))
 
     least = np.log(_LEAST * middle)
     most = np.log(max(float(np.max(np.abs(error))), middle)) + 1.0
@@ -87,17 +87,17 @@ def find_spread(error: Doubles, half: Doubles) -> Spread:
     bounds = sizes[max(best - 1, 0)], sizes[min(best + 1, sizes.size - 1)]
     size = float(minimize_scalar(unlikely, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
     size = min((least, size), key=unlikely)
-    mistakes = share(_chance(error, half, float(np.exp(size))) / (2 * half))
-    return Spread(float(np.exp(size)), mistakes / (1 - mistakes) / span)
+    outliers = share(_chance(error, half, float(np.exp(size))) / (2 * half))
+    return IntervalErrors(float(np.exp(size)), outliers / (1 - outliers) / span)
 
 
-def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread) -> Evidence:
+def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: IntervalErrors) -> Evidence:
     """Tell what intervals say of heights, by one Newton step on their likelihood.
 
     That of a height u is the chance that u and an error of standard deviation ``spread.blur`` lie between the
     interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). Its logarithm has the derivative g
     and the curvature -h at u; the same have a known height u + g / h of the weight h. It counts by the chance
-    that it is no mistake.
+    that it is no outlier.
 
     Parameters
     ----------
@@ -105,14 +105,14 @@ def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread)
         Where it is about, mm.
     middle, half : ndarray, (n,), float64
         Of the intervals, mm.
-    spread : Spread
+    spread : IntervalErrors
 
     Returns
     -------
     Evidence
         Of the weight 0 where the height is far outside.
     """
-    blur, mistaken = spread
+    blur, outlier_density = spread
     below, above = (middle - half - height) / blur, (middle + half - height) / blur
     near = (below < _FAR) & (above > -_FAR)
     below, above = np.where(near, below, -1.0), np.where(near, above, 1.0)
@@ -120,7 +120,7 @@ def look_inside(height: Doubles, middle: Doubles, half: Doubles, spread: Spread)
     left, right = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above))
     pull = left - right
     weight = np.clip(pull**2 - (below * left - above * right), _FAINT, 1.0)
-    sound = chance / (chance + 2 * half * mistaken)
+    sound = chance / (chance + 2 * half * outlier_density)
     return Evidence(height + blur * pull / weight, np.where(near, sound * weight / blur**2, 0.0))
 
 
@@ -134,7 +134,7 @@ _REACH = 3.0  # widths of the window, to either side
 _FLAT = 1e-9  # least share of a fit's information that is worth inverting
 
 
-class Trend(NamedTuple):
+class Paraboloids(NamedTuple):
     """Paraboloids at n pixels, (n,), float64.
 
     Attributes
@@ -148,7 +148,7 @@ class Trend(NamedTuple):
     misfit : ndarray
         Mean squared error in standard deviations; NaN where too little is known for a paraboloid.
     pixels : ndarray
-        How many told.
+        Number of known heights.
     """
 
     height: Doubles
@@ -158,7 +158,7 @@ class Trend(NamedTuple):
     pixels: Doubles
 
 
-def find_trend(height: Doubles, weight: Doubles, places: NDArray[np.bool_], width: float) -> Trend:
+def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_], width: float) -> Paraboloids:
     """Fit paraboloids by least squares in a Gaussian window around pixels.
 
     Parameters
@@ -174,7 +174,7 @@ def find_trend(height: Doubles, weight: Doubles, places: NDArray[np.bool_], widt
 
     Returns
     -------
-    Trend
+    Paraboloids
     """
     known = weight > 0
     datum = float(np.average(height[known], weights=weight[known])) if known.any() else 0.0
@@ -190,13 +190,13 @@ def find_trend(height: Doubles, weight: Doubles, places: NDArray[np.bool_], widt
     pixels = window.sums(known.astype(np.float64), [(0, 0)])[0, 0]
     inverse, sound = _invert(matrix)
     found = np.einsum("nij,nj->ni", inverse, right)
-    left = np.maximum(square - np.sum(found * right, axis=-1), 0)
+    residual = np.maximum(square - np.sum(found * right, axis=-1), 0)
     enough = sound & (pixels > 2 * len(_TERMS))
-    return Trend(
+    return Paraboloids(
         height=found[:, 0] + datum,
         along=found[:, 1:3].T,
         variance=np.stack([inverse[:, 1, 1], inverse[:, 2, 2]]),
-        misfit=np.where(enough, left / np.maximum(pixels - len(_TERMS), 1), np.nan),
+        misfit=np.where(enough, residual / np.maximum(pixels - len(_TERMS), 1), np.nan),
         pixels=pixels,
     )
 

@@ -47,7 +47,10 @@ class Spline:
     def __init__(self, shape: tuple[int, int], spacing: tuple[float, float], cells: tuple[int, int]) -> None:
         self._spans = [(length - 1) * step for length, step in zip(shape, spacing, strict=True)]
         self._cells = cells
-        y, x = (_values(length, count) for length, count in zip(shape, cells, strict=True))
+        y, x = (
+            spline_values(np.linspace(0, count, length), count)
+            for length, count in zip(shape, cells, strict=True)
+        )
         rows, columns = y.shape[1], x.shape[1]
         self._down, self._across = _overlapping(rows), _overlapping(columns)
         first, second = (
@@ -67,7 +70,7 @@ class Spline:
     def roughness(self) -> Doubles:
         """Return the form of the integral of the squared third derivatives, in all directions alike."""
         along = [
-            [_products(count, order) * (count / span) ** (2 * order - 1) for order in range(_ORDER + 1)]
+            [spline_products(count, order) * (count / span) ** (2 * order - 1) for order in range(_ORDER + 1)]
             for count, span in zip(self._cells, self._spans, strict=True)
         ]
         parts = [
@@ -95,16 +98,10 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
     """Fit the smoothest surface that stays within the pixels' intervals.
 
     What leaves an interval costs its square, and beyond another half-width only its size (Huber), so that
-    wrong heights do not bend the surface. In each step it is drawn to the ends that it has passed.
-
-    Parameters
-    ----------
-    spline : Spline
-    low, high : ndarray, (H, W), float64
-        Ends of the intervals, mm; NaN where nothing is known, and the upper one infinite where only the lower
-        one is. At least one pixel has both.
-    stiffness : float
-        Cost of the squared third derivatives beside that of the mean squared excess.
+    wrong heights do not bend the surface: iteratively reweighted least squares, in which the surface is drawn
+    to the ends that it has passed. The intervals' ends, (H, W), mm, are NaN where nothing is known, and the
+    upper one is infinite where only the lower one is; at least one pixel has both. Stiffness is the cost of
+    the squared third derivatives beside that of the mean squared excess.
     """
     known, both = np.isfinite(low), np.isfinite(low) & np.isfinite(high)
     half = np.where(both, (high - low) / 2, np.nan)
@@ -135,29 +132,31 @@ def _misfit(excess: Doubles) -> float:
     return float(np.sqrt(np.mean(np.minimum(excess, _LARGEST) ** 2)))
 
 
-def _values(pixels: int, cells: int) -> Doubles:
-    """Return the splines' values at the pixels, (pixels, cells + 3)."""
-    place = np.linspace(0, cells, pixels)
-    cell = np.minimum(place.astype(np.intp), cells - 1)
-    values = np.zeros((pixels, cells + 3))
-    powers = (place - cell)[:, np.newaxis] ** np.arange(4)
-    values[np.arange(pixels)[:, np.newaxis], cell[:, np.newaxis] + np.arange(4)] = powers @ _PIECES.T
+def spline_values(places: Doubles, pieces: int, order: int = 0) -> Doubles:
+    """Return an axis' splines, or their derivatives, at places from 0 to ``pieces``: (n, pieces + 3)."""
+    places = np.clip(places, 0, pieces)
+    piece = np.minimum(places.astype(np.intp), pieces - 1)
+    powers = np.zeros((len(places), 4))
+    for power in range(order, 4):
+        powers[:, power] = math.perm(power, order) * (places - piece) ** (power - order)
+    values = np.zeros((len(places), pieces + 3))
+    values[np.arange(len(places))[:, np.newaxis], piece[:, np.newaxis] + np.arange(4)] = powers @ _PIECES.T
     return values
+
+
+def spline_products(pieces: int, order: int) -> Doubles:
+    """Return the integrals of products of two splines' derivatives, with pieces of length 1."""
+    powers = np.arange(4 - order)
+    factors = [math.perm(int(power) + order, order) for power in powers]
+    parts = _PIECES[:, order:] * factors
+    one = parts @ (1 / (powers[:, np.newaxis] + powers + 1)) @ parts.T
+    matrix = np.zeros((pieces + 3, pieces + 3))
+    for piece in range(pieces):
+        matrix[piece : piece + 4, piece : piece + 4] += one
+    return matrix
 
 
 def _overlapping(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the pairs of splines, in any order, that share a cell."""
     first, second = np.nonzero(np.triu(np.tri(count, k=3), -3))
     return first, second
-
-
-def _products(cells: int, order: int) -> Doubles:
-    """Return the integrals of products of the splines' derivatives, with cells of length 1."""
-    powers = np.arange(4 - order)
-    factors = [math.perm(int(power) + order, order) for power in powers]
-    pieces = _PIECES[:, order:] * factors
-    one = pieces @ (1 / (powers[:, np.newaxis] + powers + 1)) @ pieces.T
-    matrix = np.zeros((cells + 3, cells + 3))
-    for cell in range(cells):
-        matrix[cell : cell + 4, cell : cell + 4] += one
-    return matrix

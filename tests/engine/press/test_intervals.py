@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mirrorskin.engine.press.intervals import Spread, find_spread, find_trend, look_inside
+from mirrorskin.engine.press.intervals import (
+    IntervalErrors,
+    estimate_interval_errors,
+    fit_paraboloids,
+    interval_evidence,
+)
 
 
 def log_likelihood(height, middle, half, blur):
@@ -16,7 +21,7 @@ def log_likelihood(height, middle, half, blur):
 def test_an_interval_pulls_as_its_likelihood_does(blur):
     middle, half = np.full(41, -0.3), np.full(41, 0.05)
     height = np.linspace(-0.3 - 0.05 - 2 * blur, -0.3 + 0.05 + 2 * blur, 41)
-    found = look_inside(height, middle, half, Spread(blur, 0.0))
+    found = interval_evidence(height, middle, half, IntervalErrors(blur, 0.0))
     step = 1e-4 * blur
     below, here, above = (log_likelihood(height + way * step, middle, half, blur) for way in (-1, 0, 1))
     slope, curvature = (above - below) / (2 * step), -(above - 2 * here + below) / step**2
@@ -28,26 +33,28 @@ def test_an_interval_pulls_as_its_likelihood_does(blur):
 
 def test_sharp_ends_leave_what_is_inside_alone():
     height = np.array([-0.34, -0.3, -0.26])
-    found = look_inside(height, np.full(3, -0.3), np.full(3, 0.05), Spread(1e-3, 0.0))
+    found = interval_evidence(height, np.full(3, -0.3), np.full(3, 0.05), IntervalErrors(1e-3, 0.0))
     assert found.height == pytest.approx(height, abs=1e-9)
     assert (found.weight < 1e-3 * 1e6).all()
 
 
 def test_wide_blurs_make_a_plain_known_height():
-    found = look_inside(np.array([0.7]), np.array([0.2]), np.array([0.3]), Spread(10.0, 0.0))
+    found = interval_evidence(np.array([0.7]), np.array([0.2]), np.array([0.3]), IntervalErrors(10.0, 0.0))
     assert found.height == pytest.approx(0.2, abs=1e-3)
     assert found.weight == pytest.approx(1 / (10.0**2 + 0.3**2 / 3), rel=1e-3)
 
 
 def test_what_is_far_outside_is_a_mistake():
-    far = look_inside(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), Spread(0.01, 0.0))
+    far = interval_evidence(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), IntervalErrors(0.01, 0.0))
     assert (far.weight == 0).all()
     assert np.isfinite(far.height).all()
 
 
 def test_heights_count_by_the_chance_that_they_are_no_mistakes():
     height, middle, half = np.linspace(-0.07, 0.07, 15), np.zeros(15), np.full(15, 0.05)
-    sure, unsure = (look_inside(height, middle, half, Spread(0.01, share)) for share in (0.0, 0.3))
+    sure, unsure = (
+        interval_evidence(height, middle, half, IntervalErrors(0.01, share)) for share in (0.0, 0.3)
+    )
     good = (norm.cdf((0.05 - height) / 0.01) - norm.cdf((-0.05 - height) / 0.01)) / 0.1
     assert unsure.weight == pytest.approx(sure.weight * good / (good + 0.3))
     assert (np.diff(unsure.weight / sure.weight)[8:] < 0).all()
@@ -58,7 +65,7 @@ def test_the_blur_is_found(blur):
     random = np.random.default_rng(3)
     half = np.full(200_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, blur, half.size)
-    assert find_spread(error, half).blur == pytest.approx(blur, rel=0.1)
+    assert estimate_interval_errors(error, half).blur == pytest.approx(blur, rel=0.1)
 
 
 def test_mistakes_on_one_side_do_not_blur():
@@ -66,16 +73,16 @@ def test_mistakes_on_one_side_do_not_blur():
     half = np.full(20_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, 0.005, half.size)
     error[::25] = random.uniform(-1.5, 0, 800)
-    found = find_spread(error, half)
+    found = estimate_interval_errors(error, half)
     assert found.blur == pytest.approx(0.005, rel=0.25)
-    assert found.mistaken == pytest.approx(0.04 / 0.96 / np.ptp(error), rel=0.15)
+    assert found.outlier_density == pytest.approx(0.04 / 0.96 / np.ptp(error), rel=0.15)
 
 
 def test_the_least_blur_is_a_fiftieth_of_half_an_interval():
     half = np.full(100, 0.05)
-    assert find_spread(np.linspace(-0.049, 0.049, 100), half).blur == pytest.approx(0.001)
-    assert find_spread(np.zeros(1), half[:1]).blur == pytest.approx(0.001)
-    assert np.isfinite(find_spread(np.full(100, 9.0), half)).all()
+    assert estimate_interval_errors(np.linspace(-0.049, 0.049, 100), half).blur == pytest.approx(0.001)
+    assert estimate_interval_errors(np.zeros(1), half[:1]).blur == pytest.approx(0.001)
+    assert np.isfinite(estimate_interval_errors(np.full(100, 9.0), half)).all()
 
 
 ROWS, COLUMNS = np.mgrid[:30, :40].astype(float)
@@ -96,7 +103,7 @@ def test_a_paraboloid_is_found_as_it_is_up_to_the_border(width):
     height, weight = paraboloid(ROWS, COLUMNS), np.full(ROWS.shape, 1e4)
     weight[:, 25] = 0
     height[:, 25] = np.nan
-    found = find_trend(height, weight, places, width)
+    found = fit_paraboloids(height, weight, places, width)
     at = ROWS[places], COLUMNS[places]
     assert found.height == pytest.approx(paraboloid(*at), abs=1e-8)
     assert found.along == pytest.approx(slopes(*at), abs=1e-8)
@@ -112,7 +119,7 @@ def test_errors_are_no_larger_than_told_and_misfits_about_one():
     true, square, misfit = slopes(ROWS[places], COLUMNS[places]), 0.0, 0.0
     for _ in range(20):
         noisy = paraboloid(ROWS, COLUMNS) + random.normal(0, 0.02, ROWS.shape)
-        found = find_trend(noisy, np.full(ROWS.shape, 0.02**-2), places, 2.0)
+        found = fit_paraboloids(noisy, np.full(ROWS.shape, 0.02**-2), places, 2.0)
         square += np.mean((found.along - true) ** 2 / found.variance, axis=1) / 20
         misfit += np.mean(found.misfit) / 20
     assert (square < 1).all()
@@ -124,7 +131,7 @@ def test_a_step_is_no_paraboloid():
     height = np.where(COLUMNS < 20, 0.0, -0.5)
     places = np.zeros(ROWS.shape, bool)
     places[15, 18:22] = True
-    assert (find_trend(height, np.full(ROWS.shape, 0.03**-2), places, 3.0).misfit > 3).all()
+    assert (fit_paraboloids(height, np.full(ROWS.shape, 0.03**-2), places, 3.0).misfit > 3).all()
 
 
 @pytest.mark.parametrize("known", [0, 1, 5])
@@ -133,7 +140,7 @@ def test_too_little_tells_nothing(known):
     weight[15, 15 : 15 + known] = 1.0
     places = np.zeros(ROWS.shape, bool)
     places[15, 15] = True
-    found = find_trend(paraboloid(ROWS, COLUMNS), weight, places, 2.0)
+    found = fit_paraboloids(paraboloid(ROWS, COLUMNS), weight, places, 2.0)
     assert np.isnan(found.misfit).all()
     assert np.isfinite(found.along).all()
     assert found.pixels[0] <= known
