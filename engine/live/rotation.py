@@ -233,7 +233,7 @@ class LiveRotation:
             relief = integrate_normals(normals, normals.sigma, self._header.pixel_size, device=self.device)
         maps |= {"height": relief.height, "height_sigma": relief.height_sigma, "component": relief.component}
         maps["offset_unknown"] = relief.offset_unknown
-        return self._signed(replace(result, **maps), process | relief.process)
+        return self._signed(replace(result, **maps), {**process, **relief.process})
 
     def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
         return undistorted(attach_provenance(result, self._source, self.device, process), self._source)

@@ -263,7 +263,8 @@ class _Sums:
         """Return the fit that the sums determine; see `Correlator.result`."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
-        return Correlation(*self._solve(), int(np.count_nonzero(used)))
+        mean, cosine, sine, residual = self._solve()
+        return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
 
     def _solve(self) -> list[NDArray[np.float32]]:
         """Return mean, cosine, sine and residual, (H, W) each."""
@@ -291,11 +292,11 @@ class _Sums:
         """Have a kernel turn the sums of each band, or its ring, into the answers."""
         parts = []
         for band in self.bands:
-            answers = {key: band.maps[answer] for key, answer in _ANSWERS.items()}
+            answers: dict[str, Any] = {key: band.maps[answer] for key, answer in _ANSWERS.items()}
             if name == "correlation_window":
-                known = {"ring": band.maps["ring"], "stride": band.stride, **answers}
+                known: dict[str, Any] = {"ring": band.maps["ring"], "stride": band.stride, **answers}
             else:
-                known = _sums_of(band, reference="pairs" in name)
+                known = _sums_of(band, pairs="pairs" in name)
                 known |= {"cosine_part": answers.pop("cosine"), "sine_part": answers.pop("sine"), **answers}
             with band.resident():
                 self._run(band, name, moved, **arguments, fit=self._fit, **known)
@@ -332,11 +333,11 @@ class TurnSums(_Sums):
         if self._counts is None:
             fractions = np.flatnonzero((weight != 0) & (weight != 1))
             whole = slice(fractions[0] if len(fractions) else len(frames))
-            self._add_counts(frames[whole], phase[whole], weight[whole], lent)
+            self._add(frames[whole], phase[whole], weight[whole], lent)
             frames, phase, weight = (part[whole.stop :] for part in (frames, phase, weight))
         if len(frames) > 0:
             self._convert_to_pairs()
-            self._add_floats(frames, phase, weight, lent)
+            self._add(frames, phase, weight, lent)
 
     def _solve(self) -> list[NDArray[np.float32]]:
         rows = self._rows_in_steps(self._phase, self._weight)
@@ -347,44 +348,24 @@ class TurnSums(_Sums):
         _fill(self._fit, _fit_table(self._phase, rows))
         return self._answer("correlation_solve_pairs", 52)
 
-    def _add_counts(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
-        """Add frames of weight 0 or 1 to integer sums."""
-        rows = self._rows_in_steps(phase, weight)
-        for band, staged, places in self._pieces(frames, weight, lent):
-            _fill(self._steps, rows[staged.frames.start + places])
-            self._add(band, "correlation_add", 64, staged, places, basis=self._steps, **_sums_of(band))
-        self._note(phase, weight)
-
-    def _add_floats(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
-        """Add frames of any weight to sums that are pairs of floats."""
-        rows, fresh = _float_rows(phase, weight), not np.any(self._weight)
-        for band, staged, places in self._pieces(frames, weight, lent):
-            start = staged.frames.start
-            first = fresh and not np.any(weight[: start + places[0]])
-            _fill(self._floats, rows[start + places])
-            known = {"fresh": int(first), "basis": self._floats, **_sums_of(band, reference=True)}
-            self._add(band, "correlation_sum", 72, staged, places, **known)
-        self._note(phase, weight)
-
-    def _add(
-        self, band: Band, name: str, moved: int, staged: Staged, places: NDArray[np.intp], **arguments: Any
-    ) -> None:
-        count = len(places)
-        known = {"frames": staged.array, "count": count, "place": self._place}
-        self._run(band, name, self._size * count + moved, **known, **arguments)
-
-    def _pieces(
-        self, frames: NDArray[Any], weight: Doubles, lent: bool
-    ) -> Iterator[tuple[Band, Staged, NDArray[np.intp]]]:
-        """Yield frames on the device, and the places in them of those that count."""
+    def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
+        """Add frames to integer sums, or to pairs."""
+        counts = self._counts is None
+        rows = self._rows_in_steps(phase, weight) if counts else _float_rows(phase, weight)
+        basis, name = (self._steps, "add") if counts else (self._floats, "sum")
+        fresh = not np.any(self._weight)
         for band, staged in self._stage(frames, lent):
-            used = np.flatnonzero(weight[staged.frames])
+            used = staged.frames.start + np.flatnonzero(weight[staged.frames])
             for piece in range(0, len(used), _PIECE):
                 places = used[piece : piece + _PIECE]
-                _fill(self._place, places)
-                yield band, staged, places
-
-    def _note(self, phase: Doubles, weight: Doubles) -> None:
+                _fill(self._place, places - staged.frames.start)
+                _fill(basis, rows[places])
+                known: dict[str, Any] = _sums_of(band, pairs=not counts)
+                if not counts:
+                    known["fresh"] = fresh and not np.any(weight[: places[0]])
+                known |= {"frames": staged.array, "count": len(places), "place": self._place, "basis": basis}
+                moved = self._size * len(places) + (64 if counts else 72)
+                self._run(band, f"correlation_{name}", moved, **known)
         self._phase = np.concatenate([self._phase, phase])
         self._weight = np.concatenate([self._weight, weight])
 
@@ -397,7 +378,7 @@ class TurnSums(_Sums):
             known = _counted(self._rows_in_steps(self._phase, self._weight))
             for band in self.bands:
                 with band.resident():
-                    sums = _sums_of(band, reference=True)
+                    sums = _sums_of(band, pairs=True)
                     self._run(band, "correlation_convert", 68, unit=1 / self._step, **known, **sums)
 
 
@@ -448,7 +429,7 @@ class WindowSums(_Sums):
         rows = self._rows_in_steps(phase, weight)
         moves = np.hstack([rows[self._window :], rows[: len(frames)]])
         for band, staged in self._stage(frames, lent):
-            known = {
+            known: dict[str, Any] = {
                 "frames": staged.array,
                 "count": staged.count,
                 "stride": band.stride,
@@ -478,10 +459,10 @@ class WindowSums(_Sums):
         return self._answer("correlation_window", self._size * len(used) + 16, **known)
 
 
-def _sums_of(band: Band, reference: bool = False) -> dict[str, Array]:
+def _sums_of(band: Band, pairs: bool = False) -> dict[str, Any]:
     """Return the maps that sums are kept in, by the arguments of kernels."""
     sums = {key: band.maps[name] for key, name in _SUMS.items()}
-    return {"reference": band.maps["reference"], **sums} if reference else sums
+    return {"reference": band.maps["reference"], **sums} if pairs else sums
 
 
 def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:

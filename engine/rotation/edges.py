@@ -126,23 +126,23 @@ class EdgeDrawing:
         """Put the kernels on the queue, the longest in so many parts, and yield after each."""
         maps, fewer = self._maps, -(-parts // _SHORTER)
         rows = self._shape[0] + 2 * MARGIN
-        contact = {name: maps[name] for name in ("contact", "clean")}
-        normals = {name: maps[name] for name in ("vectors", "sigma", "cells")}
+        contact: dict[str, Any] = {name: maps[name] for name in ("contact", "clean")}
+        normals: dict[str, Any] = {name: maps[name] for name in ("vectors", "sigma", "cells")}
         yield from self._run("edges_clean", fewer, self._tiles, **contact)
         yield from self._run("edges_cells", fewer, rows, **contact, **normals)
         yield from self._draw(NEAR, parts, "cells", "lines", "more")
         yield from self._draw(FINE, parts, "cells", "more", "lines")
-        joined = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
+        joined: dict[str, Any] = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
         yield from self._run("edges_join", fewer, rows, **joined)
         yield from self._draw(COARSE, parts, "joined", "lines", "more")
-        drawn = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
+        drawn: dict[str, Any] = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
         yield from self._run("edges_bound", fewer, self._tiles, **drawn)
 
     def lines(self) -> NDArray[np.uint8]:
         """Return the edges, once all steps are done."""
         return self._maps["lines"].download().copy()
 
-    def _place(self, chosen: Pass) -> dict[str, Array]:
+    def _place(self, chosen: Pass) -> dict[str, Any]:
         """Return the pairs of cells that a pass compares."""
         places, distances = pairs(chosen)
         return {
@@ -162,7 +162,7 @@ class EdgeDrawing:
             "LAST": int(chosen is COARSE),
         }
         maps, (rows, columns) = self._maps, self._shape
-        found = {name: maps[name] for name in ("strength", "ways")}
+        found: dict[str, Any] = {name: maps[name] for name in ("strength", "ways")}
         yield from self._run(
             "edges_jumps",
             parts,
@@ -179,7 +179,7 @@ class EdgeDrawing:
             doubt=maps["doubt"],
             **found,
         )
-        lines = {"edges": maps[before], "added": maps[after]}
+        lines: dict[str, Any] = {"edges": maps[before], "added": maps[after]}
         yield from self._run("edges_thin", -(-parts // _SHORTER), self._tiles, macros, **found, **lines)
 
     @property

@@ -254,7 +254,7 @@ class NormalKernel:
             (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             further = {"of_mean": mean, "of_cosine": cosine, "of_both": both, "of_sine": sine}
         planes = 4 * len(self._scale.planes) * per_pixel
-        maps = {name: band.maps[name] for name in MAPS}
+        maps: dict[str, Any] = {name: band.maps[name] for name in MAPS}
         kernel(
             -(-band.pixels // (lanes * layout.words)),
             stack=samples.stack,

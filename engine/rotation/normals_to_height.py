@@ -201,7 +201,7 @@ def integrate_normals(
         slopes = find_slopes(vectors, sigma, contact, normals.tilt, turns, white)
         surfaces.append(_integrate(slopes, pixel_size, robust, device))
     before = np.cumsum([0, *(len(one.offset_unknown) for one in surfaces)])
-    components = [
+    components: list[NDArray[Any] | None] = [
         np.where(one.component >= 0, one.component + np.int32(shift), np.int32(-1))
         for one, shift in zip(surfaces, before, strict=False)
     ]
@@ -290,7 +290,8 @@ class SlopeKernels:
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device, self._shape = device, shape
-        self._squares = {name: device.array(name, shape, np.float32) for name in ("squares_x", "squares_y")}
+        names = "squares_x", "squares_y"
+        self._squares: dict[str, Any] = {name: device.array(name, shape, np.float32) for name in names}
         for array in self._squares.values():
             array.upload()
         self.typical = math.nan

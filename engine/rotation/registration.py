@@ -113,17 +113,37 @@ class Registered:
         check_dtype(source.dtype)
         header = source.header if header is None else header
         self._geometry = _Geometry.of(source, header, sight)
-        heights = check_heights(heights, source.shape[1:])
+        height = check_heights(heights, source.shape[1:])
         self.name, self.header, self.shape = source.name, header, source.shape
         self.motion: Motion = source.motion
         self.rewindable = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
         self.device = open_device(device)
         self._source = source
-        levels = _levels(self.header, source.shape[1:])
-        self._maps = _Maps(self.device, heights, *levels, source.dtype, curved=sight is not None)
-        length = _BLOCK // (math.prod(self.shape[1:]) * source.dtype.itemsize)
-        self._room = np.empty((min(max(1, length), self.shape[0]), *self.shape[1:]), source.dtype)
+        rows, columns = self.shape[1:]
+        offset, gain = _levels(header, (rows, columns))
+        integer = source.dtype.kind == "u"
+        self._macros: dict[str, str | int] = {
+            "FRAME": C_TYPES[source.dtype.name],
+            "LEVELS": int(offset.size > 1),
+            **({"TOP": int(np.iinfo(source.dtype).max)} if integer else {}),
+            **({"CURVED": 1} if sight is not None else {}),
+        }
+        padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
+        self._maps = {
+            "padded": self.device.given("padded", padding),
+            "offset": self.device.given("offset", offset),
+            "gain": self.device.given("gain", gain),
+        }
+        self._height = self.device.given("height", height)
+        places = _mendable(offset, gain)
+        self._places = self.device.given("places", places, np.int32) if len(places) else None
+        self._noise = self.device.given("noise", np.zeros((2, rows, columns), np.float32))
+        self._shift = self.device.array("shift", (2, 4 if sight is None else 7), np.float32)
+        self._frame = self.device.array("frame", (rows, columns), source.dtype)
+        self._registered = self.device.array("registered", (rows, columns), np.float32)
+        length = _BLOCK // (rows * columns * source.dtype.itemsize)
+        self._room = np.empty((min(max(1, length), self.shape[0]), rows, columns), source.dtype)
 
     @property
     def noise_gain(self) -> NDArray[np.float32]:
@@ -132,12 +152,14 @@ class Registered:
         NaN where there was no sample. It is that of noise which is independent from pixel to pixel, and equal
         on their shared scale; that of registered neighbours is not independent.
         """
-        return self._maps.noise_gain()
+        squares, count = self._noise.download()
+        gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
+        return gain
 
     def rewind(self) -> None:
         """Go back to the first frame, and forget the noise."""
         self._source.rewind()
-        self._maps.forget()
+        _fill(self._noise, np.zeros_like(self._noise.host))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the next frames and resample them; see ``Source.read``.
@@ -159,8 +181,35 @@ class Registered:
         count = len(block.frames)
         phases = check_phase(block.phase, count, f"{self.name}: the phase of frames from {block.index} on")
         for frame, phase, registered in zip(block.frames, phases, out, strict=False):
-            self._maps.resample(frame, self._geometry.shift(float(phase)), registered)
+            _fill(self._shift, self._geometry.shift(float(phase)))
+            _fill(self._frame, frame)
+            self._resample()
+            registered[:] = self._registered.download()
         return replace(block, frames=out[:count], lent=False)
+
+    def _resample(self) -> None:
+        """Have the device resample the frame that it holds."""
+        rows, columns = self.shape[1:]
+        tile, size = self.device.layout.tile, self._registered.host.nbytes
+        items = rows * -(-columns // tile)
+        known: dict[str, Any] = {"rows": rows, "columns": columns, **self._maps}
+        admit, mend, resample = (
+            self.device.kernel("registration", f"registration_{name}", **self._macros)
+            for name in ("admit", "mend", "resample")
+        )
+        admit(items, **known, frame=self._frame, moved=self._frame.host.nbytes + size)
+        if self._places is not None:
+            count, padded = len(self._places.host), self._maps["padded"]
+            mend(-(-count // tile), count=count, places=self._places, padded=padded, moved=9 * 4 * count)
+        resample(
+            items,
+            **known,
+            height=self._height,
+            shift=self._shift,
+            registered=self._registered,
+            noise=self._noise,
+            moved=7 * size,
+        )
 
     def __enter__(self) -> Self:
         self._source.__enter__()
@@ -174,24 +223,9 @@ class Registered:
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """How the object's points move when the body tilts.
+    """How the object's points move when the body tilts; lengths in mm, the tilt in radians."""
 
-    Attributes
-    ----------
-    corner : (float, float)
-        x and y of the first pixel, mm.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    tilt : float
-        Radians.
-    press : float
-        Millimetres.
-    pivot : (float, float, float)
-        Millimetres.
-    sight : Sight or None
-    """
-
-    corner: tuple[float, float]
+    corner: tuple[float, float]  # x and y of the first pixel
     pixel_size: tuple[float, float]
     tilt: float
     press: float
@@ -200,7 +234,6 @@ class _Geometry:
 
     @classmethod
     def of(cls, source: Source, header: Header, sight: Sight | None) -> Self:
-        """Take what a header says of a source, or raise InputError."""
         if source.motion != "axial":
             raise InputError(f"{source.name} is of {source.motion} motion: only axial ones can be registered")
         pixel_size, tilt, press, pivot = (
@@ -244,85 +277,6 @@ class _Geometry:
                 [y * number, y * column, y * row - along_y * number, 0, 0, -along_y * column, -along_y * row],
             ]
         )
-
-
-class _Maps:
-    """What the device holds: the maps that do not change, and room for one frame on its way.
-
-    Parameters
-    ----------
-    device : Device
-    height : ndarray, (H, W), float32
-        Millimetres.
-    offset, gain : ndarray, (H, W) or (1, 1), float32
-        See ``registration_admit``.
-    dtype : dtype
-        Of a sample of the source.
-    curved : bool
-        Whether shifts have 7 numbers, not 4.
-    """
-
-    def __init__(
-        self,
-        device: Device,
-        height: NDArray[np.float32],
-        offset: NDArray[np.float32],
-        gain: NDArray[np.float32],
-        dtype: np.dtype[Any],
-        curved: bool,
-    ) -> None:
-        self._rows, self._columns = rows, columns = height.shape
-        self._device = device
-        self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "LEVELS": int(offset.size > 1)}
-        self._macros |= {"TOP": int(np.iinfo(dtype).max)} if dtype.kind == "u" else {}
-        self._macros |= {"CURVED": 1} if curved else {}
-        padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
-        self._padded = device.given("padded", padding)
-        self._height = device.given("height", height)
-        self._levels = {"offset": device.given("offset", offset), "gain": device.given("gain", gain)}
-        places = _mendable(offset, gain)
-        self._places = device.given("places", places, np.int32) if len(places) else None
-        self._noise = device.given("noise", np.zeros((2, rows, columns), np.float32))
-        self._shift = device.array("shift", (2, 7 if curved else 4), np.float32)
-        self._frame = device.array("frame", (rows, columns), dtype)
-        self._registered = device.array("registered", (rows, columns), np.float32)
-
-    def resample(self, frame: NDArray[Any], shift: NDArray[np.float32], out: NDArray[np.float32]) -> None:
-        """Write a frame, (H, W), as it looks from the mean pose."""
-        _fill(self._frame, frame)
-        _fill(self._shift, shift)
-        tile, size = self._device.layout.tile, self._registered.host.nbytes
-        items = self._rows * -(-self._columns // tile)
-        known = {"rows": self._rows, "columns": self._columns, "padded": self._padded, **self._levels}
-        admit, mend, resample = (
-            self._device.kernel("registration", f"registration_{name}", **self._macros)
-            for name in ("admit", "mend", "resample")
-        )
-        admit(items, **known, frame=self._frame, moved=self._frame.host.nbytes + size)
-        if self._places is not None:
-            count = len(self._places.host)
-            places = {"places": self._places, "padded": self._padded}
-            mend(-(-count // tile), count=count, **places, moved=9 * 4 * count)
-        resample(
-            items,
-            **known,
-            height=self._height,
-            shift=self._shift,
-            registered=self._registered,
-            noise=self._noise,
-            moved=7 * size,
-        )
-        out[:] = self._registered.download()
-
-    def noise_gain(self) -> NDArray[np.float32]:
-        """Return the RMS over the frames so far of what scales the noise, (H, W)."""
-        squares, count = self._noise.download()
-        gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
-        return gain
-
-    def forget(self) -> None:
-        """Begin the noise anew."""
-        _fill(self._noise, np.zeros_like(self._noise.host))
 
 
 def _fill(array: Array, values: NDArray[Any]) -> None:

@@ -26,8 +26,8 @@ from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import Block, Header, InputError, ProcessValue, Result, Source, WallResponse, check_phase
-from mirrorskin.io.types import Closing
+from mirrorskin.io import Header, InputError, ProcessValue, Result, Source, WallResponse, check_phase
+from mirrorskin.io.frames import FrameSequence
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
@@ -420,52 +420,22 @@ def _account_for_registration(normals: Normals, noise_gain: NDArray[np.float32] 
     return replace(normals, sigma=sigma, contact=inside)
 
 
-class FirstTurn(Closing):
-    """The frames of a source's first turn, 64 at most, kept in memory, as a source.
-
-    Parameters
-    ----------
-    source : Source
-        Of axial motion, which can be rewound. It is read up to the first frame of the second turn.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        A phase is missing, or the source cannot be read.
-    """
-
-    rewindable = True
+class FirstTurn(FrameSequence):
+    """The frames of a source's first turn, up to the first of the second and 64 at most, kept in memory."""
 
     def __init__(self, source: Source) -> None:
-        self.name, self.header, self.motion = source.name, source.header, source.motion
-        self.dtype = source.dtype
         frames: list[NDArray[Any]] = []
         phase = np.empty(0)
         source.rewind()
         while len(frames) < LONGEST and (block := source.read()) is not None:
-            more = check_phase(block.phase, len(block.frames), f"{self.name}: phase")
+            more = check_phase(block.phase, len(block.frames), f"{source.name}: phase")
             phase = np.concatenate([phase, more])
             if len(cut_into_turns(phase)) > 1:
                 break
             frames.extend(block.frames.copy())
         self._frames = np.stack(frames) if frames else np.empty((0, *source.shape[1:]), source.dtype)
         self.phase = phase[: len(frames)]
-        self.shape = self._frames.shape
-        self._next = 0
+        super().__init__(source.name, source.header, self._frames.shape, source.dtype, phase=self.phase)
 
-    def rewind(self) -> None:
-        """Go back to the first frame."""
-        self._next = 0
-
-    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the next frames; see ``Source.read``."""
-        count = min(1 if out is None else len(out), self.shape[0] - self._next)
-        if count == 0:
-            return None
-        part = slice(self._next, self._next + count)
-        self._next = part.stop
-        frames = self._frames[part]
-        if out is not None:
-            out[:count] = frames
-            frames = out[:count]
-        return Block(frames, part.start, phase=self.phase[part])
+    def _fill(self, start: int, out: NDArray[Any]) -> None:
+        out[:] = self._frames[start : start + len(out)]
