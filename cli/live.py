@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.live import LivePress, LiveRotation, Loop
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig_file import RigSettings
-    from mirrorskin.io import Calibration, LiveSource, Result
+    from mirrorskin.io import Calibration, LiveSource
 
 _ENDING = "SIGINT", "SIGTERM", "SIGHUP"
 _LATENCY = "100ms"
@@ -31,22 +30,6 @@ _REMEDIES = {
     "height": "pixel_size in the rig file",
     "fill": "pixel_size in the rig file",
 }
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Wanted:
-    """What is asked besides the plan."""
-
-    record: Path | None
-    settle: str | None
-    frames: int | None
-    window: int | None
-    latency: float
-    threshold: float | None
-    hold: int | None
-    noise: float | None
-    device: str | None
-    calibration: Calibration | None
 
 
 def command(
@@ -109,76 +92,63 @@ def command(
         if path is not None:
             io.check_output(path, rig_file, calibration, *others)
     known = scans.open_calibration(calibration, settings)
-    asked = _Wanted(
-        record, settle, frames, window, duration(latency, "--latency"), threshold, hold, noise, device, known
-    )
-    _run(settings, plan, asked, output, view)
-
-
-def _run(settings: RigSettings, plan: Plan, asked: _Wanted, output: Path | None, view: str | None) -> None:
-    """Do it, and keep what was found whatever ends it."""
-    from mirrorskin.cli.status import summary
-    from mirrorskin.hw.errors import HardwareError
-    from mirrorskin.io import InputError
-
-    live = _Live()
-    try:
-        live.run(settings, plan, asked, view)
-    except (HardwareError, InputError, KeyboardInterrupt, SystemExit):
-        if live.found:
-            typer.echo(f"{settings.name}: cut short: {summary(live.status)}", err=True)
-            try:
-                _save(live, output, settings, asked)
-            except InputError as lacking:  # why it ended matters more
-                typer.echo(f"no result: {lacking}", err=True)
-        raise
-    typer.echo(f"{settings.name}: {summary(live.status)}")
-    _save(live, output, settings, asked)
+    _Live(settings, plan, {**context.params, "latency": duration(latency, "--latency")}, known).run()
 
 
 class _Live:
-    """A run, of which more is left than what it returns."""
+    """A run, of which what was found is kept whatever ends it; the command's options are `given`."""
 
-    def __init__(self) -> None:
+    def __init__(
+        self, settings: RigSettings, plan: Plan, given: Mapping[str, Any], calibration: Calibration | None
+    ) -> None:
+        self._settings, self._plan, self._given = settings, plan, given
+        self._calibration = calibration
         self._loop: Loop | None = None
         self._estimator: LivePress | LiveRotation | None = None
 
-    @property
-    def found(self) -> bool:
-        """Whether there is anything to be kept."""
-        return self._loop is not None and self._loop.status.used > 0
+    def run(self) -> None:
+        """Reconstruct while the stage moves, and save the result."""
+        from mirrorskin.cli.status import summary
+        from mirrorskin.hw.errors import HardwareError
+        from mirrorskin.io import InputError
 
-    @property
-    def status(self) -> Any:
-        """How well it kept up."""
+        name = self._settings.name
+        try:
+            self._reconstruct()
+        except (HardwareError, InputError, KeyboardInterrupt, SystemExit):
+            if self._loop is not None and self._loop.status.used > 0:
+                typer.echo(f"{name}: cut short: {summary(self._loop.status)}", err=True)
+                try:
+                    self._save()
+                except InputError as lacking:  # why it ended matters more
+                    typer.echo(f"no result: {lacking}", err=True)
+            raise
         assert self._loop is not None
-        return self._loop.status
+        typer.echo(f"{name}: {summary(self._loop.status)}")
+        self._save()
 
-    def result(self) -> Result:
-        """Return the maps of what was pushed."""
-        assert self._estimator is not None
-        return self._estimator.result()
-
-    def run(self, settings: RigSettings, plan: Plan, asked: _Wanted, view: str | None) -> None:
+    def _reconstruct(self) -> None:
         """Open all, begin with the work when it is warm, and leave the stage at rest."""
         from mirrorskin.cli.status import show_status
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
         from mirrorskin.io import Calibrated, StreamRecorder
 
+        given, settings, known = self._given, self._settings, self._calibration
         with ExitStack() as stack:
             rig = stack.enter_context(open_rig(settings))
-            scan = scans.make_scan(rig, plan, asked.settle, asked.frames)
+            scan = scans.make_scan(rig, self._plan, given["settle"], given["frames"])
+            view = given["view"]
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())
-            known = asked.calibration
-            recorder = None if asked.record is None else StreamRecorder(scan, asked.record, calibration=known)
+            record = given["record"]
+            recorder = None if record is None else StreamRecorder(scan, record, calibration=known)
             source: LiveSource = scan if recorder is None else recorder
             if known is not None:
                 source = Calibrated(source, known)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
-            estimator = _estimator(source, plan, rig.rate, asked)
+            self._estimator = estimator = self._make_estimator(source, rig.rate)
             estimator.warm()
 
             def on_update(update: Any, status: Any) -> None:
@@ -187,10 +157,9 @@ class _Live:
                     shown.show(update, status)
 
             mark = None if recorder is None else recorder.mark
-            self._estimator = estimator
             guard = _Guard()
             self._loop = Loop(
-                source, estimator, latency=asked.latency, on_update=on_update, mark=mark, guard=guard
+                source, estimator, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
             )
             gc.freeze()  # a collector that looks through all that was there before would hold up frames
             try:
@@ -198,6 +167,32 @@ class _Live:
                     self._loop.run()
             finally:
                 gc.unfreeze()
+
+    def _make_estimator(self, source: LiveSource, rate: float) -> LivePress | LiveRotation:
+        """Make what estimates the maps; the source has its references."""
+        from mirrorskin.engine.live import LivePress, LiveRotation, choose_window
+        from mirrorskin.hw.rig.plans import VerticalPlan
+
+        given, plan = self._given, self._plan
+        known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
+        if isinstance(plan, VerticalPlan):
+            threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
+            hold = _HOLD if given["hold"] is None else given["hold"]
+            return LivePress(source, threshold=threshold, hold=hold, **known)
+        window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
+        return LiveRotation(source, window=window, every=every, **known)
+
+    def _save(self) -> None:
+        """Write the result, if that is asked for, and say what it lacks."""
+        output = self._given["output"]
+        if output is None:
+            return
+        from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
+
+        assert self._estimator is not None
+        result = self._estimator.result()
+        tell_what_is_missing(self._settings.name, result.process, _REMEDIES)
+        save_and_tell(result, output, self._given["device"], as_json=False)
 
 
 class _Guard:
@@ -254,29 +249,3 @@ def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterat
         viewer.close()
         if viewer.error is not None:
             typer.echo(f"the pictures ended early: {viewer.error}", err=True)
-
-
-def _estimator(source: LiveSource, plan: Plan, rate: float, asked: _Wanted) -> LivePress | LiveRotation:
-    """Make what tells the maps; the source has its references."""
-    from mirrorskin.engine.live import LivePress, LiveRotation, choose_window
-    from mirrorskin.hw.rig.plans import VerticalPlan
-
-    if isinstance(plan, VerticalPlan):
-        known: dict[str, Any] = {"noise": asked.noise, "device": asked.device}
-        threshold = _THRESHOLD if asked.threshold is None else asked.threshold
-        return LivePress(
-            source, threshold=threshold, hold=_HOLD if asked.hold is None else asked.hold, **known
-        )
-    window, every = choose_window(plan.frames_a_turn(rate, asked.frames or 1), asked.window)
-    return LiveRotation(source, window=window, every=every, noise=asked.noise, device=asked.device)
-
-
-def _save(live: _Live, output: Path | None, settings: RigSettings, asked: _Wanted) -> None:
-    """Write the result, if that is asked for, and say what it lacks."""
-    if output is None:
-        return
-    from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
-
-    result = live.result()
-    tell_what_is_missing(settings.name, result.process, _REMEDIES)
-    save_and_tell(result, output, asked.device, as_json=False)

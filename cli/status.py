@@ -7,31 +7,22 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from mirrorskin.engine.live import Status, Update
+    from mirrorskin.view.live import LiveView
 
 _JOIN = 5.0  # seconds for a viewer to show the last picture
 _LOOK = 0.2  # seconds after which a waiting viewer looks whether it is over
 
 
-class Viewer(Protocol):
-    """What shows pictures."""
-
-    def show(self, update: Update, status: Status) -> None:
-        """Show what is known now."""
-
-    def close(self) -> None:
-        """Let go."""
-
-
 class Newest:
     """Hands updates to a viewer in a thread of its own: one that is slow misses some, and holds up nobody."""
 
-    def __init__(self, viewer: Viewer) -> None:
+    def __init__(self, viewer: LiveView) -> None:
         self._viewer = viewer
         self._change = threading.Condition()
         self._next: tuple[Update, Status] | None = None
