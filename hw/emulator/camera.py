@@ -41,8 +41,6 @@ class TwinCamera(ThreadedCamera):
         Sensor and object; its movement only bounds how far the body may go.
     where : callable
         Tells the body's `Position` at a time of `time.monotonic`, which is past.
-    rate : float, optional
-        Frames a second; the twin's camera's own otherwise.
     delay, jitter : float
         Of the arrival after the exposure's middle, mean and standard deviation, seconds.
     seed : int
@@ -50,15 +48,10 @@ class TwinCamera(ThreadedCamera):
     pivot : (float, float, float)
         What the body turns about, from the rest sheet's centre, mm.
 
-    Attributes
-    ----------
-    name, shape, dtype, counts, latest, error
-        As for every camera.
-
     Raises
     ------
     InputError
-        Rate, delay or jitter cannot be.
+        Delay or jitter cannot be.
     """
 
     def __init__(
@@ -66,14 +59,15 @@ class TwinCamera(ThreadedCamera):
         twin: Twin,
         where: Callable[[float], Position],
         *,
-        rate: float | None = None,
         delay: float = 0.0,
         jitter: float = 0.0,
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        rate = twin.frame_rate if rate is None else rate
-        _check(rate, delay, jitter, twin.exposure)
+        rate = twin.frame_rate
+        for name, value in (("delay", delay), ("jitter", jitter)):
+            if not 0 <= value < math.inf:
+                raise InputError(f"{name} {value} of the emulated camera cannot be: give seconds, 0 or more")
         super().__init__(twin.name, twin.shape[1:], twin.dtype, rate)
         self._twin, self._where, self._pivot = twin, where, pivot
         self._rate, self._delay, self._jitter = rate, delay, jitter
@@ -89,12 +83,8 @@ class TwinCamera(ThreadedCamera):
             thread.start()
 
     def stall(self) -> None:
-        """Let no more frames arrive, and say nothing, until it comes back."""
+        """Let no more frames arrive, and say nothing."""
         self._stalled.set()
-
-    def come_back(self) -> None:
-        """End a stall; the frames that did not arrive are lost."""
-        self._stalled.clear()
 
     def lose(self) -> None:
         """Be gone for good: no more frames arrive, and readers are told."""
@@ -170,14 +160,3 @@ class TwinCamera(ThreadedCamera):
     def _wait_until(self, due: float) -> bool:
         """Wait for a time, and return whether the camera was closed meanwhile."""
         return self._ended.wait(max(0.0, due - time.monotonic()))
-
-
-def _check(rate: float, delay: float, jitter: float, exposure: float) -> None:
-    rules = {
-        "rate": (rate, rate > 0 and exposure * rate <= 1, f"frames a second, with {exposure:g} s for each"),
-        "delay": (delay, delay >= 0, "seconds, 0 or more"),
-        "jitter": (jitter, jitter >= 0, "seconds, 0 or more"),
-    }
-    for name, (value, holds, remedy) in rules.items():
-        if not (math.isfinite(value) and holds):
-            raise InputError(f"{name} {value} of the emulated camera cannot be: give {remedy}")

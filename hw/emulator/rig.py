@@ -21,7 +21,7 @@ from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
 from mirrorskin.hw.rig_file import CameraSettings, RigFile, RigSettings, StageSettings, TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import Axial, Body, Camera, ContactName, Object, OpticsName, Twin, Vertical
+from mirrorskin.hw.twin import Axial, Camera, Object, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement
 from mirrorskin.io.types import InputError
 
@@ -55,12 +55,6 @@ class EmulatedRig:
     ----------
     object : Object, str or Path
         What lies under the sensor; see `Twin`.
-    shape : (int, int)
-        Rows and columns.
-    pixel_size : float or (float, float)
-        Millimetres.
-    pattern, contact, optics, body
-        As for `Twin`.
     camera : Camera, optional
         What the twin's frames are like; its frame rate is not used.
     rate : float
@@ -73,8 +67,8 @@ class EmulatedRig:
         What the body turns about, from the rest sheet's centre, mm.
     home : bool
         Whether the machine has switches, and must find them before it moves.
-    device : str or Device, optional
-        What renders.
+    **scene
+        Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
 
     Attributes
     ----------
@@ -82,13 +76,12 @@ class EmulatedRig:
     port : GrblPort
     camera : TwinCamera
         Both from the entering on. Their faults can be asked for.
-    settings : RigSettings
-        What a rig file would say, from the entering on; the bright reference is the nominal one.
 
-    Raises
-    ------
-    InputError
-        A value cannot be.
+    Examples
+    --------
+    >>> with EmulatedRig("coin", rate=60.0) as rig:  # doctest: +SKIP
+    ...     rig.settings.stage.port
+    '/dev/pts/3'
     """
 
     port: GrblPort
@@ -98,12 +91,6 @@ class EmulatedRig:
         self,
         object: Object | str | Path = "sphere",  # noqa: A002 - the word users know it by
         *,
-        shape: tuple[int, int] = (240, 320),
-        pixel_size: float | tuple[float, float] = 0.05,
-        pattern: str | Path = "uniform",
-        contact: ContactName = "conform",
-        optics: OpticsName = "ideal",
-        body: Body | None = None,
         camera: Camera | None = None,
         rate: float = 30.0,
         delay: float = 0.0,
@@ -111,21 +98,11 @@ class EmulatedRig:
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
         home: bool = False,
-        device: str | None = None,
+        **scene: Any,
     ) -> None:
         self._levels = replace(camera or Camera(), frame_rate=rate, seed=seed)
-        self._make = functools.partial(
-            Twin,
-            object=object,
-            shape=shape,
-            pixel_size=pixel_size,
-            pattern=pattern,
-            contact=contact,
-            optics=optics,
-            body=body,
-            camera=self._levels,
-            device=device,
-        )
+        of_twin: dict[str, Any] = {"shape": (240, 320), "pixel_size": 0.05, **scene}
+        self._make = functools.partial(Twin, object=object, camera=self._levels, **of_twin)
         self._pivot, self._home = pivot, home
         farthest = Axial(np.arange(8) * np.pi / 4, math.radians(math.hypot(TILT, TILT)), PRESS, pivot)
         self._seen = self._make(movement=farthest)

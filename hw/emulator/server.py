@@ -27,24 +27,8 @@ class FrameServer(Closing):
     slow viewer the oldest are dropped. When the camera fails the connections end; when it is silent nothing
     is sent. Only programs of this computer can connect.
 
-    Parameters
-    ----------
-    camera : Camera
-        Of uint8 or uint16; the server takes its frames, and does not close it.
-    rate : float
-        Frames a second, as the header tells them.
-    port : int
-        Of TCP; 0 takes a free one.
-
-    Attributes
-    ----------
-    url : str
-        What to open: ``tcp://127.0.0.1:PORT``.
-
-    Raises
-    ------
-    InputError
-        The samples cannot be streamed, or the port is taken.
+    The server takes the camera's frames, and does not close it. The URL to open is ``url``; port 0 takes a
+    free one.
     """
 
     def __init__(self, camera: Camera, rate: float, port: int = 0) -> None:

@@ -41,8 +41,8 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 
 
-def make_twin(movement: Movement, shape: tuple[int, int] = SHAPE, **scene: Any) -> Twin:
-    return Twin(object="sphere", shape=shape, pixel_size=0.2, movement=movement, **scene)
+def make_twin(movement: Movement, **scene: Any) -> Twin:
+    return Twin(object="sphere", shape=SHAPE, pixel_size=0.2, movement=movement, **scene)
 
 
 def read_all(twin: Twin) -> NDArray[Any]:
@@ -89,11 +89,10 @@ def test_a_position_is_the_lean_of_the_precession_there() -> None:
 
 
 @contextmanager
-def running(
-    where: Callable[[float], Position], rate: float = 100.0, twin: Twin | None = None, **timing: Any
-) -> Iterator[TwinCamera]:
+def running(where: Callable[[float], Position], rate: float = 100.0, **timing: Any) -> Iterator[TwinCamera]:
     before = threading.active_count()
-    with TwinCamera(twin or make_twin(MOVEMENTS["press"]), where, rate=rate, **timing) as camera:
+    twin = make_twin(MOVEMENTS["press"], camera=Camera(frame_rate=rate))
+    with TwinCamera(twin, where, **timing) as camera:
         yield camera
     assert threading.active_count() == before
 
@@ -166,22 +165,16 @@ def test_a_camera_that_cannot_keep_up_loses_frames_and_counts_them() -> None:
     np.testing.assert_allclose(np.diff(arrived), np.diff(number) / 200.0, atol=1e-9)
 
 
-def test_a_stalled_camera_says_nothing_and_comes_back() -> None:
+def test_a_stalled_camera_says_nothing() -> None:
     with running(still, delay=0.02) as camera:
-        last = times_of(take(camera, 3))[0][-1]
+        take(camera, 3)
         camera.stall()
         time.sleep(0.05)
         latest = camera.latest
-        waiting = drain(camera, 0.1)
-        left: list[Frames] = []
         with pytest.raises(HardwareError, match="no frame"):
-            left.extend(waiting)
+            list(drain(camera, 0.1))
         assert camera.error is None
         assert camera.latest == latest
-        camera.come_back()
-        again = camera.take(1, PATIENCE)
-        missed = int(again.number[0] - max([last, *(frames.number[-1] for frames in left)]) - 1)
-        assert again.dropped == missed >= 5
 
 
 def test_a_lost_camera_tells_readers() -> None:
@@ -193,17 +186,7 @@ def test_a_lost_camera_tells_readers() -> None:
             list(drain(camera))
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"rate": 0.0}, "rate"),
-        ({"rate": math.inf}, "rate"),
-        ({"rate": 60.0}, "rate 60.0 .* 0.02 s"),
-        ({"delay": -0.1}, "delay"),
-        ({"jitter": math.nan}, "jitter"),
-    ],
-)
-def test_what_cannot_be_is_refused(given: dict[str, float], message: str) -> None:
-    twin = make_twin(MOVEMENTS["press"], camera=Camera(exposure=0.02))
-    with pytest.raises(InputError, match=message):
-        TwinCamera(twin, still, **given)
+@pytest.mark.parametrize("given", [{"delay": -0.1}, {"jitter": math.nan}])
+def test_what_cannot_be_is_refused(given: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"^{next(iter(given))} .* cannot be"):
+        TwinCamera(make_twin(MOVEMENTS["press"]), still, **given)
