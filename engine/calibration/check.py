@@ -1,4 +1,4 @@
-"""What errors a calibration leaves: of a ball that was not used for it."""
+"""What errors a calibration leaves, on a ball that was not used for it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.optimize import least_squares
 
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.provenance import naming
@@ -18,11 +16,8 @@ from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels.device import Device
 
 Doubles = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-CELLS = 8  # a side, by default
-
-_FEWEST = 20  # pixels of a cell that is told of
+_FEWEST = 20  # pixels of a cell with errors
 _LEAST = 100  # pixels of a ball that is judged
 _MARGIN = 2  # pixels inside of where contact ends
 _ROUNDS = 3  # of the search for the ball's centre, which its depth changes a little
@@ -38,27 +33,13 @@ class Summary(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """What is wrong with one map.
+    """What is wrong with one map."""
 
-    Attributes
-    ----------
-    error : ndarray, (H, W), float64
-        Found minus true, in ``unit``; NaN where nothing is judged.
-    whole : Summary
-        Of all pixels.
-    cells : Summary
-        Of equal parts of the picture, (n, n); row 0 is its upper edge.
-    unit : str
-        "deg" or "mm".
-    expected : float
-        RMS of the standard deviations that the result tells, in ``unit``; NaN where it tells none.
-    """
-
-    error: Doubles
-    whole: Summary
-    cells: Summary
-    unit: str
-    expected: float = math.nan
+    error: Doubles  # (H, W): found minus true, in ``unit``; NaN where nothing is judged
+    whole: Summary  # of all pixels
+    cells: Summary  # of equal parts of the picture, (n, n); row 0 is its upper edge
+    unit: str  # "deg" or "mm"
+    expected: float = math.nan  # RMS of the result's standard deviations, in ``unit``; NaN without any
 
     def numbers(self) -> dict[str, Any]:
         """Return what there is to print, and to keep."""
@@ -86,7 +67,7 @@ class Check:
         Millimetres of the pixel centres.
     after, before : mapping of str to Errors
         With the calibration, and with its references and its precession alone: zenith, azimuth, normal (the
-        whole angle) and height of a rotation, height of a press. Before is empty where nothing could be told.
+        whole angle) and height of a rotation, height of a press. Before is empty where it is unknown.
     """
 
     ball: float
@@ -98,11 +79,11 @@ class Check:
 
     def numbers(self) -> dict[str, Any]:
         """Return what there is to print as JSON."""
-        told = {
+        each = {
             when: {name: errors.numbers() for name, errors in parts.items()}
             for when, parts in (("before", self.before), ("after", self.after))
         }
-        return {"ball": self.ball, "place": self.place, **told}
+        return {"ball": self.ball, "place": self.place, **each}
 
     def table(self) -> list[list[str]]:
         """Return rows of words: what, when, RMS, bias, RMS of the worst cell, expected, pixels."""
@@ -114,15 +95,15 @@ class Check:
         return rows
 
     def notes(self) -> list[str]:
-        """Say why the table has no number, where it has none."""
+        """Return why the table has no number, where it has none."""
         parts = {
             name: [when[name] for when in (self.before, self.after) if name in when] for name in self.after
         }
-        untold = [name for name, each in parts.items() if all(math.isnan(one.expected) for one in each)]
+        unknown = [name for name, each in parts.items() if all(math.isnan(one.expected) for one in each)]
         few = [name for name, each in parts.items() if any(np.isnan(one.cells.rms).all() for one in each)]
         notes = []
-        if untold:
-            notes.append(f"expected: a result tells no errors of {' and '.join(untold)} alone")
+        if unknown:
+            notes.append(f"expected: a result tells no errors of {' and '.join(unknown)} alone")
         if few:
             notes.append(
                 f"worst cell's rms: no cell has {_FEWEST} pixels of {' and '.join(few)} that could be judged:"
@@ -136,13 +117,13 @@ def check_ball(
     calibration: Calibration,
     ball: float,
     *,
-    cells: int = CELLS,
+    cells: int = 8,
     device: str | Device | None = None,
 ) -> Check:
     """Compare what a calibrated sensor makes of a ball with the ball.
 
     Where the ball lies is found from the very maps that are judged: its centre from the normals of a rotation
-    (their median), centre and top from the heights of a press. So a shift of all is not told of, but how the
+    (their median), centre and top from the heights of a press. So a common shift is not seen, but how the
     maps differ from a ball of that size. Heights of a rotation are relative: their mean difference is taken
     off. Those of a press have the bias of the top, which is that of the travel's zero as well.
 
@@ -159,52 +140,47 @@ def check_ball(
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
-    Returns
-    -------
-    Check
-
     Raises
     ------
     mirrorskin.io.InputError
         The recording cannot be read twice or shows too little of a ball, or the calibration lacks what is to
         be checked.
     """
-    _check_input(source, calibration, ball, cells)
-    with naming(source):
-        if source.motion == "axial":
-            return _check_rotation(source, calibration, ball, cells, device)
-        return _check_press(source, calibration, ball, cells, device)
-
-
-def _check_input(source: Source, calibration: Calibration, ball: float, cells: int) -> None:
     if source.motion not in ("axial", "vertical"):
         raise InputError(f"{source.name} is of {source.motion} motion: check with a press or a rotation")
-    if source.motion == "axial" and (calibration.zenith is None or calibration.zenith.pattern != "graded"):
-        raise InputError("the calibration has no zenith to check with a rotation: calibrate zenith first")
     if not source.rewindable:
         raise InputError(f"{source.name} cannot be read twice: record it first")
     if not (math.isfinite(ball) and ball > 0):
         raise InputError(f"a ball of {ball} mm cannot be: give its diameter")
     if cells < 1:
         raise InputError(f"{cells} cells a side cannot be: give 1 or more")
+    check = _check_rotation if source.motion == "axial" else _check_press
+    with naming(source):
+        return check(source, calibration, ball, cells, device)
 
 
 def _check_rotation(
     source: Source, calibration: Calibration, ball: float, cells: int, device: str | Device | None
 ) -> Check:
     """Judge zenith, azimuth and relative height of a rotation."""
-    assert calibration.zenith is not None
+    response, references = calibration.zenith, calibration.references
+    if response is None or response.pattern != "graded":
+        raise InputError("the calibration has no zenith to check with a rotation: calibrate zenith first")
     found = reconstruct(source, calibration=calibration, device=device)
-    sight = _sight_of(calibration.zenith, found)
+    sight = _sight_of(response, found)
     centre = _centre_by_normals(found, sight, ball / 2, source.header.press)
     truth = _true_ball(sight, centre, ball / 2, found)
-    plain = replace(calibration, zenith=None, gel=None)
-    scale = _designed_scale(calibration)
     before: dict[str, Errors] = {}
-    if scale is not None:
-        gain, offset = scale
+    if references is not None:
+        # As the wall was designed, all pixels central: counts per radian, and at zenith 0.
+        rim = math.atan2(response.radius, response.rim) / 2
+        offset, bright = (np.asarray(part, np.float64) for part in (references.dark, references.bright))
+        gain = (bright - offset) / (math.pi / 4 - rim)
+        sound = np.isfinite(gain)
+        gain, offset = (np.where(sound, part, np.median(part[sound])) for part in (gain, offset))
+        plain = replace(calibration, zenith=None, gel=None)
         source.rewind()
-        first = reconstruct(source, calibration=plain, gain=gain, offset=offset, device=device)
+        first = reconstruct(source, calibration=plain, gain=gain, offset=offset - rim * gain, device=device)
         before = _normal_errors(first, truth, cells)
     after = _normal_errors(found, truth, cells)
     return Check(ball, (float(centre[0]), float(centre[1])), *_axes(found), after, before)
@@ -215,24 +191,19 @@ def _check_press(
 ) -> Check:
     """Judge the heights of a press."""
     found = reconstruct(source, calibration=calibration, device=device)
-    x, y = _fit_ball_to_heights(found, ball / 2)
+    place = _top_by_heights(found, ball / 2)
     before: dict[str, Errors] = {}
     if calibration.gel is not None:
         source.rewind()
         first = reconstruct(source, calibration=replace(calibration, gel=None), device=device)
-        before = _height_errors(first, (x, y), ball / 2, cells)
-    return Check(ball, (x, y), *_axes(found), _height_errors(found, (x, y), ball / 2, cells), before)
+        before = _height_errors(first, place, ball / 2, cells)
+    return Check(ball, place, *_axes(found), _height_errors(found, place, ball / 2, cells), before)
 
 
 def _axes(found: Result) -> tuple[Doubles, Doubles]:
     if found.x is None or found.y is None:
-        raise InputError("without a pixel size a ball cannot be told: give it, or calibrate scale")
+        raise InputError("without a pixel size a ball has no size: give it, or calibrate scale")
     return found.x, found.y
-
-
-def _places(found: Result) -> tuple[Doubles, Doubles]:
-    x, y = np.meshgrid(*_axes(found))
-    return x, y
 
 
 # --- a rotation ---------------------------------------------------------------------------------------------
@@ -248,7 +219,7 @@ class _Truth(NamedTuple):
 
 def _sight_of(response: WallResponse, found: Result) -> Doubles:
     """Return the lines of sight of all pixels, (4, H, W): x, y, and how they move with z."""
-    x, y = _places(found)
+    x, y = np.meshgrid(*_axes(found))
     across, up = x - response.axis[0], y - response.axis[1]
     towards = -(response.sight[0] + response.sight[1] * (across**2 + up**2))
     return np.stack([x, y, towards * across, towards * up])
@@ -266,33 +237,27 @@ def _centre_by_normals(found: Result, sight: Doubles, radius: float, press: floa
         )
     x, y, slope_x, slope_y = sight[:, known]
     lean_x, lean_y, upright = found.normals[known].astype(np.float64).T
-    depth = press
     centre = np.zeros(3)
     for _ in range(_ROUNDS):
+        depth = press
         if depth is None:
             outline = np.percentile(np.hypot(x - centre[0], y - centre[1]), 99)
             depth = radius - math.sqrt(max(0.0, radius**2 - min(outline, radius) ** 2))
         z = depth - radius + radius * upright
-        centre = np.array(
-            [
-                np.median(x + z * slope_x - radius * lean_x),
-                np.median(y + z * slope_y - radius * lean_y),
-                depth - radius,
-            ]
-        )
-        depth = press
+        across, up = (x + z * slope_x - radius * lean_x, y + z * slope_y - radius * lean_y)
+        centre = np.array([np.median(across), np.median(up), depth - radius])
     return centre
 
 
 def _true_ball(sight: Doubles, centre: Doubles, radius: float, found: Result) -> _Truth:
     """Return what is true of the ball, where it is in contact in every frame, but for a margin."""
+    from scipy.ndimage import binary_erosion
+
     shape = sight.shape[1:]
-    upright, pivot = np.zeros((1, 2)), np.zeros(3)
-    seen = see_ball(sight.reshape(4, -1), centre, radius, upright, pivot)
+    seen = see_ball(sight.reshape(4, -1), centre, radius, np.zeros((1, 2)), np.zeros(3))
     x, y, z = (part.reshape(shape) for part in np.moveaxis(seen.normal[0], -1, 0))
     assert found.contact is not None
-    touched = seen.contact[0].reshape(shape) & (found.contact != 0)
-    inside = ndimage.binary_erosion(touched, iterations=_MARGIN)
+    inside = binary_erosion(seen.contact[0].reshape(shape) & (found.contact != 0), iterations=_MARGIN)
     zenith, azimuth, height = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x), seen.z[0].reshape(shape)
     return _Truth(*(np.where(inside, part, np.nan) for part in (zenith, azimuth, height)))
 
@@ -305,23 +270,20 @@ def _normal_errors(found: Result, truth: _Truth, cells: int) -> dict[str, Errors
     lean, turn = found.zenith - truth.zenith, np.arctan2(np.sin(around), np.cos(around))
     sine = np.sqrt(np.sin(found.zenith) * np.sin(truth.zenith))
     apart = 2 * np.arcsin(np.sqrt(np.sin(lean / 2) ** 2 + (sine * np.sin(turn / 2)) ** 2))  # haversines
-    told = {
-        "zenith": _summed(np.degrees(lean), "deg", cells),
-        "azimuth": _summed(np.degrees(turn), "deg", cells),
-        "normal": _summed(np.degrees(apart), "deg", cells, _degrees(found.normal_sigma)),
+    sigma = None if found.normal_sigma is None else np.degrees(found.normal_sigma)
+    errors = {
+        "zenith": _errors(np.degrees(lean), "deg", cells),
+        "azimuth": _errors(np.degrees(turn), "deg", cells),
+        "normal": _errors(np.degrees(apart), "deg", cells, sigma),
     }
-    _check_enough(told["zenith"])
+    _check_enough(errors["zenith"])
     if found.height is not None and found.component is not None:
         error = found.height - truth.height
         for piece in np.unique(found.component[np.isfinite(error)]):
             here = found.component == piece
             error[here] -= np.nanmean(error[here])
-        told["height"] = _summed(error, "mm", cells, found.height_sigma)
-    return told
-
-
-def _degrees(sigma: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-    return None if sigma is None else np.degrees(sigma)
+        errors["height"] = _errors(error, "mm", cells, found.height_sigma)
+    return errors
 
 
 def _check_enough(errors: Errors) -> None:
@@ -332,38 +294,27 @@ def _check_enough(errors: Errors) -> None:
         )
 
 
-def _designed_scale(calibration: Calibration) -> tuple[Doubles, Doubles] | None:
-    """Return counts per radian and at zenith 0, (H, W), as the wall was designed, all pixels central."""
-    response, references = calibration.zenith, calibration.references
-    if response is None or references is None:
-        return None
-    rim = math.atan2(response.radius, response.rim) / 2
-    dark, bright = (np.asarray(part, np.float64) for part in (references.dark, references.bright))
-    gain, offset = (bright - dark) / (math.pi / 4 - rim), dark
-    sound = np.isfinite(gain)
-    gain, offset = (np.where(sound, part, np.median(part[sound])) for part in (gain, offset))
-    return gain, np.asarray(offset - rim * gain)
-
-
 # --- a press ------------------------------------------------------------------------------------------------
 
 
-def _measured(found: Result) -> Mask:
+def _measured(found: Result) -> NDArray[np.bool_]:
     """Return where a height was measured, not filled in."""
     assert found.height is not None
     measured = np.isfinite(found.height)
     return measured if found.filled is None else measured & (found.filled == 0)
 
 
-def _fit_ball_to_heights(found: Result, radius: float) -> tuple[float, float]:
+def _top_by_heights(found: Result, radius: float) -> tuple[float, float]:
     """Return where the top of a ball of that radius lies that fits measured heights best, mm."""
+    from scipy.optimize import least_squares
+
     here = _measured(found)
     if np.count_nonzero(here) < _LEAST:
         raise InputError(
             f"too little of a ball is seen: {np.count_nonzero(here)} pixels turn light; press deeper"
         )
     assert found.height is not None
-    x, y = (part[here] for part in _places(found))
+    x, y = (part[here] for part in np.meshgrid(*_axes(found)))
     height = found.height[here].astype(np.float64)
 
     def missed(ball: Doubles) -> Doubles:
@@ -378,10 +329,10 @@ def _fit_ball_to_heights(found: Result, radius: float) -> tuple[float, float]:
 def _height_errors(found: Result, place: tuple[float, float], radius: float, cells: int) -> dict[str, Errors]:
     """Compare heights with a ball whose top is touched at travel 0."""
     assert found.height is not None
-    x, y = _places(found)
+    x, y = np.meshgrid(*_axes(found))
     rise = radius**2 - (x - place[0]) ** 2 - (y - place[1]) ** 2
     true = np.sqrt(np.where(_measured(found) & (rise > 0), rise, np.nan)) - radius
-    height = _summed(found.height - true, "mm", cells, found.height_sigma)
+    height = _errors(found.height - true, "mm", cells, found.height_sigma)
     _check_enough(height)
     return {"height": height}
 
@@ -389,23 +340,21 @@ def _height_errors(found: Result, place: tuple[float, float], radius: float, cel
 # --- sums ---------------------------------------------------------------------------------------------------
 
 
-def _summed(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | None = None) -> Errors:
+def _errors(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | None = None) -> Errors:
     """Sum up a map of errors."""
     error = np.asarray(error, np.float64)
     known = np.isfinite(error)
     rows, columns = np.nonzero(known)
     cell = (cells * rows // error.shape[0]) * cells + cells * columns // error.shape[1]
-    values = error[known]
     expected = math.nan
     if sigma is not None and known.any():
         expected = float(np.sqrt(np.nanmean(sigma[known].astype(np.float64) ** 2)))
-    whole = _summary(values, np.zeros(values.size, np.intp), (), 1)
-    parts = _summary(values, cell, (cells, cells), _FEWEST)
-    return Errors(error, whole, parts, unit, expected)
+    whole = _summary(error[known], np.zeros(len(rows), np.intp), (), 1)
+    return Errors(error, whole, _summary(error[known], cell, (cells, cells), _FEWEST), unit, expected)
 
 
 def _summary(values: Doubles, group: NDArray[np.intp], shape: tuple[int, ...], fewest: int) -> Summary:
-    """Sum up values by their group's number; groups are numbered row by row."""
+    """Sum up values by the number of their group, row by row."""
     count = np.bincount(group, minlength=math.prod(shape))
     each = np.where(count >= fewest, count, np.nan)
     bias = np.bincount(group, values, minlength=count.size) / each
@@ -417,5 +366,5 @@ def _words(errors: Errors) -> list[str]:
     worst = errors.cells.rms[np.isfinite(errors.cells.rms)]
     digits = 3 if errors.unit == "deg" else 4
     numbers = [errors.whole.rms, errors.whole.bias, worst.max() if worst.size else math.nan, errors.expected]
-    told = [f"{number:.{digits}f} {errors.unit}" if np.isfinite(number) else "-" for number in numbers]
-    return [*told, str(int(errors.whole.pixels))]
+    words = [f"{number:.{digits}f} {errors.unit}" if np.isfinite(number) else "-" for number in numbers]
+    return [*words, str(int(errors.whole.pixels))]

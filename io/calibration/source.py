@@ -1,4 +1,4 @@
-"""Which pixel size a part of a calibration was made with, and whether it is still that."""
+"""A source as it is with a calibration: whether that is of this camera and scale, and what is left of it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.calibration.types import GROUPS, Calibration, CameraId, Part, Precession, stored
+from mirrorskin.io.calibration.types import GROUPS, Calibration, CameraId, Precession, stored
 from mirrorskin.io.selection import Region
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, Source
+
+Size = tuple[float, float]
 
 SIZED = ("zenith", "precession", "gel")
 """The parts whose lengths come from the size of a pixel."""
 
-_SAME = 1e-3
-"""Share by which pixel sizes may differ: less than a calibration's lengths are known to."""
-
-Size = tuple[float, float]
+_MEASURED: Mapping[str, tuple[str, ...]] = {"axial": ("zenith", "precession"), "vertical": ("gel",)}
+_SAME_SIZE = 1e-3  # share by which pixel sizes may differ: less than a calibration's lengths are known to
+_SAME_TILT = 1.25  # factor by which a rotation's half-angle may differ from the calibrated one
 
 
 def size_facts(pixel_size: Size) -> dict[str, float]:
@@ -30,47 +31,44 @@ def size_facts(pixel_size: Size) -> dict[str, float]:
 
 
 def differ(one: Size, other: Size) -> bool:
-    """Tell whether two pixel sizes differ so much that lengths of both cannot be used together."""
-    return not all(abs(left - right) <= _SAME * right for left, right in zip(one, other, strict=True))
+    """Return whether two pixel sizes differ so much that lengths of both cannot be used together."""
+    return not all(abs(left - right) <= _SAME_SIZE * right for left, right in zip(one, other, strict=True))
 
 
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
-    """Yield the parts that were made with another pixel size, and which; of some that is not known."""
+    """Yield those of the parts that were made with another pixel size, as far as that is known, and it."""
     there = calibration.parts()
     for part in parts:
-        told = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
-        if part not in there or not all(isinstance(one, float | int) for one in told):
-            continue
-        x, y = (float(one) for one in told if one is not None)
-        if differ((x, y), pixel_size):
-            yield part, (x, y)
+        facts = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
+        sizes = [float(fact) for fact in facts if isinstance(fact, float | int)]
+        if part in there and len(sizes) == 2 and differ((sizes[0], sizes[1]), pixel_size):
+            yield part, (sizes[0], sizes[1])
 
 
 def check_sizes(
     calibration: Calibration, pixel_size: Size | None, what: str, parts: Iterable[str] = SIZED
 ) -> None:
-    """Refuse parts that were made with another pixel size than the one that is known now."""
-    if pixel_size is None:
-        return
-    for part, before in outdated(calibration, pixel_size, parts):
+    """Refuse parts that were made with another pixel size than the one that is known now, if it is."""
+    for part, before in outdated(calibration, pixel_size, parts) if pixel_size else ():
         says = f"{what} says" if calibration.lens is None else "the scale now says"
+        sizes = (
+            f"{x:.5g} mm" if f"{x:.5g}" == f"{y:.5g}" else f"{x:.5g} x {y:.5g} mm"
+            for x, y in (before, cast(Size, pixel_size))
+        )
         raise InputError(
             f"{calibration.name or 'the calibration'}: calibrate {GROUPS[part]} again: it was made with"
-            f" pixels of {_words(before)}, {says} {_words(pixel_size)}"
+            f" pixels of {next(sizes)}, {says} {next(sizes)}"
         )
 
 
-def _words(size: Size) -> str:
-    x, y = (f"{one:.5g}" for one in size)
-    return f"{x} mm" if x == y else f"{x} x {y} mm"
-
-
-AGAIN = "calibrate again, or give that camera's"
-
-
-def check_camera(calibration: Calibration, camera: CameraId, what: str, remedy: str = AGAIN) -> None:
+def check_camera(
+    calibration: Calibration,
+    camera: CameraId,
+    what: str,
+    remedy: str = "calibrate again, or give that camera's",
+) -> None:
     """Refuse a calibration of another camera.
 
     Parameters
@@ -88,57 +86,36 @@ def check_camera(calibration: Calibration, camera: CameraId, what: str, remedy: 
     InputError
         Name, size of the picture or type of its samples differ.
     """
-    ways = list(_differences(calibration.camera, camera))
-    if ways:
-        mine = " and ".join(way[0] for way in ways)
-        its = " and ".join(way[1] for way in ways)
-        raise InputError(f"{calibration.name or 'the calibration'} is of {mine}, {what} of {its}: {remedy}")
+    mine, differences = calibration.camera, []
+    if mine.name and camera.name and mine.name != camera.name:
+        differences.append((f"the camera {mine.name!r}", f"{camera.name!r}"))
+    if tuple(mine.shape) != tuple(camera.shape):
+        sizes = (f"{one.shape[1]} x {one.shape[0]}" for one in (mine, camera))
+        differences.append((f"{next(sizes)} pixels", next(sizes)))
+    if np.dtype(mine.dtype) != np.dtype(camera.dtype):
+        differences.append((f"{np.dtype(mine.dtype).name} samples", np.dtype(camera.dtype).name))
+    if differences:
+        ours, its = (" and ".join(each) for each in zip(*differences, strict=True))
+        raise InputError(f"{calibration.name or 'the calibration'} is of {ours}, {what} of {its}: {remedy}")
 
 
-def cropped(calibration: Calibration, region: Region, pixel_size: tuple[float, float] | None) -> Calibration:
-    """Return what is left of a calibration for a part of its camera's picture.
-
-    Maps are cut; places are told from the part's centre.
-    """
+def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -> Calibration:
+    """Return a calibration for a part of its camera's picture: maps cut, places relative to its centre."""
     picture = calibration.camera.shape
     if region == Region.whole(picture):
         return calibration
     right, up = region.centre(picture, pixel_size) if pixel_size else (0.0, 0.0)
-    parts: dict[str, Any] = {
-        name: _cut(part, region, right, up) for name, part in calibration.parts().items()
-    }
+    parts: dict[str, Any] = {}
+    for name, part in calibration.parts().items():
+        changed: dict[str, Any] = {}
+        for field, how in stored(part).items():
+            value = getattr(part, field)
+            if how.kind == "map" and value is not None:
+                changed[field] = np.ascontiguousarray(value[region.slices])
+            elif how.place and value is not None:
+                changed[field] = (value[0] - right, value[1] - up, *value[2:])
+        parts[name] = replace(part, **changed)
     return replace(calibration, camera=replace(calibration.camera, shape=region.shape), **parts)
-
-
-def _differences(mine: CameraId, its: CameraId) -> Iterator[tuple[str, str]]:
-    """Yield what the two say of something in which they differ."""
-    if mine.name and its.name and mine.name != its.name:
-        yield f"the camera {mine.name!r}", f"{its.name!r}"
-    if tuple(mine.shape) != tuple(its.shape):
-        yield f"{mine.shape[1]} x {mine.shape[0]} pixels", f"{its.shape[1]} x {its.shape[0]}"
-    if np.dtype(mine.dtype) != np.dtype(its.dtype):
-        yield f"{np.dtype(mine.dtype).name} samples", np.dtype(its.dtype).name
-
-
-def _cut(part: Part, region: Region, right: float, up: float) -> Part:
-    """Cut a part's maps, and tell its places from a centre that lies so far off."""
-    changed: dict[str, Any] = {}
-    for name, how in stored(part).items():
-        value = getattr(part, name)
-        if value is None:
-            continue
-        if how.is_map:
-            changed[name] = np.ascontiguousarray(value[region.slices])
-        elif how.place:
-            changed[name] = (value[0] - right, value[1] - up, *value[2:])
-    return replace(part, **changed)
-
-
-_SAME_TILT = 1.25
-"""By what factor a rotation's half-angle may differ from the one that was calibrated."""
-
-_MEASURED: Mapping[str, tuple[str, ...]] = {"axial": ("zenith", "precession"), "vertical": ("gel",)}
-"""The parts with lengths that a motion is read with."""
 
 
 class Calibrated:

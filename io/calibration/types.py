@@ -1,14 +1,15 @@
-"""How a field of a part of a calibration is kept in a file: told where the field is, read by the layout.
+"""What a calibration holds: the camera it is of, and its parts, each field with how a file keeps it.
 
-The last functions return the metadata of a dataclass's field, as in ``field(metadata=number("mm"))``. A field
-with a default may be missing from a file.
+Coordinates are those of a result: x to the right and y up, mm from the picture's centre; z up to the camera
+from the sheet's rest plane, in the frame of the body. To add a field, declare it with `kept`, and give it a
+default if older files are to be read still: a field with a default may be missing from a file.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -16,114 +17,50 @@ from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.io.types import Floats, ProcessValue
 
-Kind = Literal["array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
-Size = int | str
-Check = Callable[[Any], bool]
-_STORED = "stored"
-_DOUBLE = np.dtype(np.float64)
+Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
 
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """How one field is kept.
+    """How one field is kept in a file.
 
-    Attributes
-    ----------
-    kind : str
-        "array": a NumPy array; "number", "integer", "text": one; "numbers", "integers": a tuple of them;
-        "names": a tuple of texts; "mapping": numbers by names, in a group of their own.
-    unit : str or None
-        The attribute ``units``; None of values without one, or of several with different ones.
-    shape : tuple of int and str
-        Of an array or tuple. A letter is a size that the fields of one part share; "rows" and "columns" are
-        the camera's.
-    dtype : dtype
-        Of an array.
-    valid : callable or None
-        Tells whether a value can be one.
-    place : bool
-        Whether the first two numbers are a place on the sheet, told from the picture's centre.
+    A "map" has one value a pixel of the camera, and is cut with the picture. "numbers", "integers" and
+    "names" are tuples. A "mapping" is of numbers by names, in a group of its own; each has the unit that
+    `unit_of` gives. Letters in ``shape`` are sizes that the fields of one part share. The first two numbers
+    of a ``place`` are relative to the picture's centre.
     """
 
     kind: Kind
     unit: str | None = None
-    shape: tuple[Size, ...] = ()
-    dtype: np.dtype[Any] = _DOUBLE
-    valid: Check | None = None
+    shape: tuple[int | str, ...] = ()
+    dtype: np.dtype[Any] = np.dtype(np.float64)  # noqa: RUF009
+    valid: Callable[[Any], bool] | None = None
     place: bool = False
 
-    @property
-    def is_map(self) -> bool:
-        """Whether there is one value a pixel of the camera, which is cut with the picture."""
-        return self.shape[:2] == ("rows", "columns")
+
+def kept(
+    kind: Kind,
+    unit: str | None = None,
+    *,
+    shape: tuple[int | str, ...] = (),
+    dtype: DTypeLike = np.float64,
+    valid: Callable[[Any], bool] | None = None,
+    place: bool = False,
+) -> Mapping[str, Stored]:
+    """Return the metadata of a dataclass's field, as in ``field(metadata=kept("number", "mm"))``."""
+    shape = ("rows", "columns") if kind == "map" else shape
+    return {"stored": Stored(kind, unit, shape, np.dtype(dtype), valid, place)}
 
 
 def stored(part: Any) -> dict[str, Stored]:
-    """Return how the fields of a part are kept, by their names; ``part`` is one, or its class."""
-    return {one.name: one.metadata[_STORED] for one in fields(part)}
-
-
-def optional(part: Any) -> set[str]:
-    """Name the fields that a file need not have."""
-    return {
-        one.name for one in fields(part) if one.default is not MISSING or one.default_factory is not MISSING
-    }
+    """Return how the fields of a part, or of its class, are kept, by their names."""
+    return {one.name: one.metadata["stored"] for one in fields(part)}
 
 
 def unit_of(name: str, how: Mapping[str, Stored]) -> str | None:
-    """Return the unit of what is told by a field's name, or by that with ``_x``, ``_y`` or ``_z``."""
+    """Return the unit of a field by its name, or by that with ``_x``, ``_y`` or ``_z``."""
     one = how.get(name) or how.get(name.rpartition("_")[0])
     return None if one is None else one.unit
-
-
-def pixels(dtype: DTypeLike, unit: str | None = None) -> Mapping[str, Stored]:
-    """Declare a map: one value a pixel of the camera."""
-    return {_STORED: Stored("array", unit, ("rows", "columns"), np.dtype(dtype))}
-
-
-def array(*shape: Size, unit: str | None = None) -> Mapping[str, Stored]:
-    """Declare an array of float64 that has nothing to do with the camera's pixels."""
-    return {_STORED: Stored("array", unit, shape)}
-
-
-def number(unit: str | None = None, valid: Check | None = None) -> Mapping[str, Stored]:
-    """Declare one float."""
-    return {_STORED: Stored("number", unit, valid=valid)}
-
-
-def integer(valid: Check | None = None) -> Mapping[str, Stored]:
-    """Declare one int."""
-    return {_STORED: Stored("integer", valid=valid)}
-
-
-def numbers(count: Size, unit: str | None = None, valid: Check | None = None) -> Mapping[str, Stored]:
-    """Declare a tuple of floats."""
-    return {_STORED: Stored("numbers", unit, (count,), valid=valid)}
-
-
-def place(count: int) -> Mapping[str, Stored]:
-    """Declare a tuple of floats, x and y or more, mm from the picture's centre."""
-    return {_STORED: Stored("numbers", "mm", (count,), place=True)}
-
-
-def integers(count: Size, valid: Check | None = None) -> Mapping[str, Stored]:
-    """Declare a tuple of ints."""
-    return {_STORED: Stored("integers", None, (count,), valid=valid)}
-
-
-def text(valid: Check | None = None) -> Mapping[str, Stored]:
-    """Declare a text."""
-    return {_STORED: Stored("text", valid=valid)}
-
-
-def names(count: Size) -> Mapping[str, Stored]:
-    """Declare a tuple of texts."""
-    return {_STORED: Stored("names", None, (count,))}
-
-
-def mapping() -> Mapping[str, Stored]:
-    """Declare floats by names; each has the unit that ``unit_of`` tells."""
-    return {_STORED: Stored("mapping")}
 
 
 HOT, DEAD, SATURATED = 1, 2, 4
@@ -175,11 +112,11 @@ class References:
         0 of a sound pixel, else a sum of 1 hot, 2 dead, 4 saturated.
     """
 
-    dark: NDArray[np.float32] = field(metadata=pixels(np.float32, "counts"))
-    bright: NDArray[np.float32] = field(metadata=pixels(np.float32, "counts"))
-    dark_sigma: NDArray[np.float32] = field(metadata=pixels(np.float32, "counts"))
-    bright_sigma: NDArray[np.float32] = field(metadata=pixels(np.float32, "counts"))
-    defects: NDArray[np.uint8] = field(metadata=pixels(np.uint8))
+    dark: NDArray[np.float32] = field(metadata=kept("map", "counts", dtype=np.float32))
+    bright: NDArray[np.float32] = field(metadata=kept("map", "counts", dtype=np.float32))
+    dark_sigma: NDArray[np.float32] = field(metadata=kept("map", "counts", dtype=np.float32))
+    bright_sigma: NDArray[np.float32] = field(metadata=kept("map", "counts", dtype=np.float32))
+    defects: NDArray[np.uint8] = field(metadata=kept("map", dtype=np.uint8))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,13 +145,29 @@ class Lens:
         Standard error of the pixel size, as a share of it.
     """
 
-    pixel_size: tuple[float, float] = field(metadata=numbers(2, "mm", valid=_above_zero))
-    camera: Floats = field(metadata=array(3, 3))
-    distortion: Floats = field(metadata=array(5))
-    matrix: Floats = field(metadata=array(3, 3))
-    shape: tuple[int, int] = field(metadata=integers(2, valid=_above_zero))
-    error: float = field(metadata=number("pixel"))
-    scale_sigma: float = field(default=math.nan, metadata=number())
+    pixel_size: tuple[float, float] = field(metadata=kept("numbers", "mm", shape=(2,), valid=_above_zero))
+    camera: Floats = field(
+        metadata=kept(
+            "array",
+            shape=(
+                3,
+                3,
+            ),
+        )
+    )
+    distortion: Floats = field(metadata=kept("array", shape=(5,)))
+    matrix: Floats = field(
+        metadata=kept(
+            "array",
+            shape=(
+                3,
+                3,
+            ),
+        )
+    )
+    shape: tuple[int, int] = field(metadata=kept("integers", shape=(2,), valid=_above_zero))
+    error: float = field(metadata=kept("number", "pixel"))
+    scale_sigma: float = field(default=math.nan, metadata=kept("number"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -257,21 +210,29 @@ class WallResponse:
         Upper end, by one standard error, of what is left of the zenith on the balls, radians RMS.
     """
 
-    radius: float = field(metadata=number("mm", valid=lambda value: 0 < value < math.inf))
-    rim: float = field(metadata=number("mm", valid=lambda value: 0 < value < math.inf))
-    axis: tuple[float, float] = field(metadata=place(2))
-    sight: tuple[float, float] = field(metadata=numbers(2))
-    lamps: tuple[float, float] = field(metadata=numbers(2))
-    scatter: float = field(metadata=number("rad"))
-    curve: Floats = field(metadata=array("n"))
-    reach: tuple[float, float] = field(metadata=numbers(2))
-    shade: Floats = field(metadata=array(5))
-    pattern: str = field(metadata=text(valid=lambda value: value in PATTERNS))
-    zenith_sigma: NDArray[np.float32] = field(metadata=pixels(np.float32, "rad"))
-    azimuth_sigma: NDArray[np.float32] = field(metadata=pixels(np.float32, "rad"))
-    parameters: tuple[str, ...] = field(metadata=names("p"))
-    covariance: Floats = field(metadata=array("p", "p"))
-    error: float = field(metadata=number("rad"))
+    radius: float = field(metadata=kept("number", "mm", valid=lambda value: 0 < value < math.inf))
+    rim: float = field(metadata=kept("number", "mm", valid=lambda value: 0 < value < math.inf))
+    axis: tuple[float, float] = field(metadata=kept("numbers", "mm", shape=(2,), place=True))
+    sight: tuple[float, float] = field(metadata=kept("numbers", shape=(2,)))
+    lamps: tuple[float, float] = field(metadata=kept("numbers", shape=(2,)))
+    scatter: float = field(metadata=kept("number", "rad"))
+    curve: Floats = field(metadata=kept("array", shape=("n",)))
+    reach: tuple[float, float] = field(metadata=kept("numbers", shape=(2,)))
+    shade: Floats = field(metadata=kept("array", shape=(5,)))
+    pattern: str = field(metadata=kept("text", valid=lambda value: value in PATTERNS))
+    zenith_sigma: NDArray[np.float32] = field(metadata=kept("map", "rad", dtype=np.float32))
+    azimuth_sigma: NDArray[np.float32] = field(metadata=kept("map", "rad", dtype=np.float32))
+    parameters: tuple[str, ...] = field(metadata=kept("names", shape=("p",)))
+    covariance: Floats = field(
+        metadata=kept(
+            "array",
+            shape=(
+                "p",
+                "p",
+            ),
+        )
+    )
+    error: float = field(metadata=kept("number", "rad"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,14 +259,14 @@ class Precession:
         Standard errors, by the names of the fields; ``centre_x``, ``pivot_z`` and so on of several numbers.
     """
 
-    tilt: float = field(metadata=number("rad", valid=lambda value: value > 0))
-    phase_offset: float = field(metadata=number("rad"))
-    direction: int = field(metadata=integer(valid=lambda value: value in (1, -1)))
-    ellipticity: float = field(metadata=number())
-    major_axis: float = field(metadata=number("rad"))
-    centre: tuple[float, float] = field(metadata=numbers(2, "rad"))
-    pivot: tuple[float, float, float] = field(metadata=place(3))
-    sigma: Mapping[str, float] = field(default_factory=dict, metadata=mapping())
+    tilt: float = field(metadata=kept("number", "rad", valid=lambda value: value > 0))
+    phase_offset: float = field(metadata=kept("number", "rad"))
+    direction: int = field(metadata=kept("integer", valid=lambda value: value in (1, -1)))
+    ellipticity: float = field(metadata=kept("number"))
+    major_axis: float = field(metadata=kept("number", "rad"))
+    centre: tuple[float, float] = field(metadata=kept("numbers", "rad", shape=(2,)))
+    pivot: tuple[float, float, float] = field(metadata=kept("numbers", "mm", shape=(3,), place=True))
+    sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
 
     def lean(self, phase: Floats) -> Floats:
         """Return how the body leans.
@@ -377,13 +338,15 @@ class Gel:
         Standard errors, by the names of the fields.
     """
 
-    threshold: float = field(metadata=number("rad", lambda value: 0 < value < math.pi / 4))
-    compliance: float = field(metadata=number("1/mm", lambda value: value >= 0))
-    curvature: float = field(default=0.0, metadata=number("1/mm", lambda value: value >= 0))
-    axis: tuple[float, float] = field(default=(0.0, 0.0), metadata=place(2))
-    travel_zero: float = field(default=0.0, metadata=number("mm"))
-    error: float = field(default=0.0, metadata=number("mm", lambda value: value >= 0))
-    sigma: Mapping[str, float] = field(default_factory=dict, metadata=mapping())
+    threshold: float = field(metadata=kept("number", "rad", valid=lambda value: 0 < value < math.pi / 4))
+    compliance: float = field(metadata=kept("number", "1/mm", valid=lambda value: value >= 0))
+    curvature: float = field(default=0.0, metadata=kept("number", "1/mm", valid=lambda value: value >= 0))
+    axis: tuple[float, float] = field(
+        default=(0.0, 0.0), metadata=kept("numbers", "mm", shape=(2,), place=True)
+    )
+    travel_zero: float = field(default=0.0, metadata=kept("number", "mm"))
+    error: float = field(default=0.0, metadata=kept("number", "mm", valid=lambda value: value >= 0))
+    sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
 
 
 Part = References | Lens | WallResponse | Precession | Gel
@@ -435,12 +398,8 @@ GROUPS = {
     "precession": "tilt",
     "gel": "elastic",
 }
-"""The parts, and what their groups in a file and the commands that find them out are called."""
+"""The attributes of a calibration, and what their groups in a file and the commands are called."""
 
-KINDS: dict[str, type[Part]] = {
-    "references": References,
-    "lens": Lens,
-    "zenith": WallResponse,
-    "precession": Precession,
-    "gel": Gel,
-}
+KINDS: dict[str, type[Part]] = dict(
+    zip(GROUPS, (References, Lens, WallResponse, Precession, Gel), strict=True)
+)
