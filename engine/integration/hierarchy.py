@@ -165,7 +165,8 @@ class Hierarchy:
     @property
     def anchor(self) -> Array:
         """Weights of known heights."""
-        return self.graph["anchor"]
+        anchor: Array = self.graph["anchor"]
+        return anchor
 
     def _allocate(self) -> None:
         """Make room for whatever each node has, extra ones included."""

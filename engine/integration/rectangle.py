@@ -20,6 +20,13 @@ MOST_RADIX = 31
 HALF = 8
 """Pairs of modes that go together."""
 
+SLOTS = 2 * HALF
+"""Modes of a strip of the spectrum; see ``rectangle.cl``."""
+
+_LANES = 8  # lines side by side in a vector, where an item is a core's loop
+_MOST_ROOM = 4096  # complex numbers in an item's own memory; where a transform has more, none are
+_CONSTANT = 2.0**-26  # relative change of a rate, below which it is taken for constant
+_ASTRIDE = 18.0  # work, as `work_of` counts it, of going over the picture against the order in memory
 _CHIRP_COST = 4.5  # of a transform by convolution, in those of a smooth length
 
 
@@ -144,15 +151,6 @@ def _parts(values: NDArray[np.complex128]) -> Doubles:
     return np.stack([values.real, values.imag], axis=-1)
 
 
-SLOTS = 2 * HALF
-"""Modes of a strip of the spectrum; see ``rectangle.cl``."""
-
-_LANES = 8  # lines side by side in a vector, where an item is a core's loop
-_MOST_ROOM = 4096  # complex numbers in an item's own memory; where a transform has more, none are
-_SETTLED = 2.0**-26  # of itself: what a rate may still change by when it is taken for constant
-_ASTRIDE = 18.0  # work, as `work_of` counts it, of going over the picture against the order in memory
-
-
 class Rectangle:
     """Solver of A u = b for heights u, where all pixels of a picture are there and all links alike.
 
@@ -161,22 +159,8 @@ class Rectangle:
     columns, whichever are the easier, leave a tridiagonal system for each mode across them (Hockney, J. ACM
     12, 1965), which is solved by elimination. It is exact but for rounding, and takes any shape.
 
-    It may only be used by one thread at a time.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    pixel_size : (float, float)
-        Of a pixel along x and y: links along x have the weight scale / x^2, those along y scale / y^2.
-    device : Device
-    scale : float, optional
-        See ``pixel_size``.
-
-    Raises
-    ------
-    mirrorskin.kernels.errors.DeviceMemoryError
-        The device has no room for its maps, two or four of the picture's size.
+    Links along x have the weight scale / width^2, those along y scale / height^2, of pixels of a width and
+    height. It needs two or four maps of the picture's size, and one thread at a time.
     """
 
     def __init__(
@@ -208,20 +192,10 @@ class Rectangle:
         self._screening: float | None = None
 
     def solve(self, source: Array, screening: float = 0.0) -> Array:
-        """Solve for the heights.
+        """Return heights, (H, W), for a right side b and a screening, in an array that the next call reuses.
 
-        Parameters
-        ----------
-        source : Array, (H, W), float32
-            Right side b, on the device. Without screening it must sum to 0; a rest is taken from all pixels
-            alike.
-        screening : float, optional
-            On the diagonal of A, not negative.
-
-        Returns
-        -------
-        Array, (H, W), float32
-            Heights, on the device; the next call writes there again. Without screening their mean is 0.
+        Without screening b must sum to 0 (a rest is taken from all pixels alike), and the mean of the heights
+        is 0.
         """
         if screening != self._screening:
             weights = self._along, self._across, screening
@@ -276,15 +250,7 @@ class Rectangle:
 
 
 def are_rows_easier(shape: tuple[int, int], *, side_by_side: bool) -> bool:
-    """Tell whether cosine modes are to be taken along rows.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    side_by_side : bool
-        Whether work-items are lanes side by side, which read columns together.
-    """
+    """Tell whether cosine modes are to be taken along rows; lanes side by side read columns together."""
     rows, columns = (work_of(length) for length in shape)
     return columns + _ASTRIDE <= rows if side_by_side else columns <= rows + _ASTRIDE
 
@@ -314,7 +280,7 @@ def find_rates(
     weights = 4 * along * np.sin(np.pi * mode / (2 * length)) ** 2 + screening
     bend = 2 * np.arcsinh(np.sqrt(weights / across) / 2)
     with np.errstate(divide="ignore"):
-        settled = -np.log(_SETTLED) / (2 * bend.min(axis=1))
+        settled = -np.log(_CONSTANT) / (2 * bend.min(axis=1))
     depth = np.ceil(np.clip(settled, 1, lines)).astype(int)
     fading = [
         _fading(strip, np.arange(count)[:, np.newaxis]) for strip, count in zip(bend, depth, strict=True)

@@ -35,11 +35,11 @@ class Robust:
     Attributes
     ----------
     relief : Array, (H, W), float32
-        Heights above the plane, mm; of no meaning where there is no pixel.
+        Heights above the plane, mm; meaningless where there is no pixel.
     links : Links
-        The graph that they solve: its weights are those that the heights ask for.
+        The graph that they solve, with the final weights.
     flags : ndarray, (H, W), uint8
-        The given graph's, without links whose weight is 0 now.
+        Those given, without links whose weight is 0 now.
     edges : ndarray, (H, W), uint8
         1 on either side of a discontinuity.
     energies : tuple of float
@@ -47,10 +47,10 @@ class Robust:
     iterations : int
         Steps of all descents.
     residual : float
-        Norm of b - A u, of the links' final weights, over that of b; times the solver's own residual, if it
-        had to come nearer in the end.
+        Norm of b - A u, of the links' final weights, over that of b; times the solver's own residual, if a
+        last solution was needed.
     converged : bool
-        Whether the energy has come to rest, and the residual is as little as was asked for, or as lowers it.
+        Whether the energy is stationary, and the residual within the tolerance or too small to lower it.
     """
 
     relief: Array
@@ -87,25 +87,26 @@ def solve_robust(
     """Find heights that fit slopes and known heights, and the discontinuities between them.
 
     The energy of ``mirrorskin.kernels.bilateral`` is lowered step by step: a step solves the least squares
-    that bound it at the heights so far, loosely, for the change of the heights, and so begins where the last
-    one ended; the change is then taken one and a half times. A step that would raise the energy is done again
-    with care, or not at all. There are many minima, so descents from several starts compete: from plain least
-    squares; where the curl of the slopes is far above its noise, from least squares without the links around
-    it, where a surface must break; and from there by way of an energy in which breaks are cheaper.
+    that bound it at the heights so far, with low accuracy, for the change of the heights; the change is then
+    taken one and a half times. A step that would raise the energy is done again with higher accuracy, or not
+    at all. There are many minima, so descents from several starts compete: from plain least squares; where
+    the curl of the slopes is far above its noise, from least squares without the links around it, where a
+    surface must break; and from there by way of an energy in which breaks are cheaper.
 
-    What slopes determine: a height is told along paths of links that are not cut, and a break must be worth
-    its price, ln 2 / k for each pixel on either side and along it.
+    A height is determined along paths of links that are not cut, and a break must be worth its price, ln 2 /
+    k for each pixel on either side and along it (k the sharpness).
 
-    - A piece that is cut off all round keeps its shape, and has an offset that nothing tells unless a height
-      in it is known: it is a component of its own. As long as no slope contradicts, it is not cut off at all:
-      a ball on a plane stays on it without a step, of whatever height.
+    - What is cut off all round keeps its shape, and is a component with an unknown offset unless a height in
+      it is known. As long as no slope contradicts, it is not cut off at all: a ball on a plane stays on it
+      without a step, of whatever height.
     - Of two ways to cut that explain the slopes, the shorter one is found. A ramp that rises from a plane and
-      ends in a cliff is told from one that begins with the cliff if its foot is the longer side.
-    - Where a break goes is told where its height changes along it; elsewhere it takes the shortest way.
+      ends in a cliff is distinguished from one that begins with the cliff if its foot is the longer side.
+    - The place of a break is determined where its height changes along it; elsewhere it takes the shortest
+      way.
     - A step lower than about two pixels (at k = 2; the square root of 8 / k) is taken for a bend, and bends
       the surface for some pixels around: so at the tip of a tear.
     - A known height that contradicts the slopes around it is worth four cuts at most: if it stands alone, its
-      pixel breaks away. It takes about as many known heights as a break is long to set a piece right.
+      pixel breaks away. It takes about as many known heights as a break is long to move a component.
     - Creases err towards their flatter side by s^3 / (2 (2 + s^2)) pixels, s the slope on the other: 0.07 at
       35 degrees. It is how the energy counts, and 2 % of a step of 7 pixels with two creases.
 
@@ -113,14 +114,14 @@ def solve_robust(
     ----------
     inputs : Inputs
     links : Links
-        Of the plane; only these can be cut.
+        Of heights above the plane; only these can be cut.
     flags : ndarray, (H, W), uint8
         What the pixels are; see ``mirrorskin.kernels.links``.
     plane : (float, float, float)
         What heights are relative to, besides the inputs' datum.
     sharpness : float
-        How misfits are told from noise, 1/pixel^2: a link is cut where it misses the slopes by well above the
-        square root of its inverse, seen across the surface.
+        k, 1/pixel^2: a link is cut where it misses the slopes by well above the square root of 1 / k, seen
+        across the surface.
     start : ndarray, (H, W), optional
         Heights above the plane, mm: the only start then.
     tolerance : float
@@ -264,8 +265,8 @@ class _Bound:
         self._shares = {name: rooms.pop(name) for name in ("share_x", "share_y")}
         self._links = rooms
         rows, columns = self._shape
-        self._pieces = rows * -(-columns // min(self._device.layout.tile, 256))
-        self._sums = self._room("sums", (self._pieces,))
+        self._items = rows * -(-columns // min(self._device.layout.tile, 256))
+        self._sums = self._room("sums", (self._items,))
 
     def given(self, name: str, values: NDArray[np.floating[Any]]) -> Array:
         """Return an array that holds values."""
@@ -325,7 +326,7 @@ class _Bound:
         return array
 
     def _run(self, name: str, **arguments: Any) -> None:
-        items = -(-self.flags.size // self._device.layout.tile) if name == "step" else self._pieces
+        items = -(-self.flags.size // self._device.layout.tile) if name == "step" else self._items
         rows, columns = self._shape
         moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
         kernel = self._device.kernel("bilateral", f"bilateral_{name}", KNOWN=int(bool(self._known)))

@@ -1,4 +1,4 @@
-"""Blocks of two by two whose nodes do not hang together, as on either side of a cut, and their parts.
+"""Blocks of two by two whose nodes are not connected, as on either side of a cut, and their parts.
 
 Such an aggregate becomes a coarse node for each of its parts that strong links connect. The largest part
 takes the block's place in the coarse grid; the others are extra nodes: they and their links are kept in

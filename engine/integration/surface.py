@@ -1,14 +1,42 @@
-"""A surface: heights, how sure they are, and what hangs together."""
+"""A surface, and the choice of the solver that finds it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.integration.graph import (
+    LEVEL,
+    Components,
+    Levelling,
+    Links,
+    PixelGraph,
+    Plane,
+    find_components,
+)
+from mirrorskin.engine.integration.height_variance import find_sigma
+from mirrorskin.engine.integration.rectangle import Rectangle
+from mirrorskin.engine.integration.robust import solve_robust
+from mirrorskin.engine.integration.validation import (
+    Flags,
+    Floats,
+    Inputs,
+)
+from mirrorskin.engine.integration.vcycle import Multigrid
+from mirrorskin.io import InputError
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.links import KNOWN, LOST, SLOPE
+
 IntegrationMethod = Literal["direct", "multigrid", "robust"]
+
+_STIFF = 100.0  # times a link's that known heights weigh, above which the direct solver loses too many digits
+_GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,13 +48,13 @@ class Surface:
     height : ndarray, (H, W), float32
         Millimetres; NaN where there is no answer.
     sigma : ndarray, (H, W), float32, or None
-        Standard deviation to be expected of the height, mm: about the mean of its component where that has no
-        known height. NaN where there is no answer, and where nothing tells how noisy the slopes are.
+        Expected standard deviation of the height, mm: about the mean of its component where that has no known
+        height. NaN where there is no answer, and where the noise of the slopes cannot be estimated.
     component : ndarray, (H, W), int32
-        Which of the connected pieces a pixel belongs to, numbered in reading order of their first pixels;
-        -1 where there is no answer.
+        The connected component of a pixel, numbered in reading order of their first pixels; -1 where there is
+        no answer.
     offset_unknown : ndarray, (components,), bool
-        Whether a piece has no known height: its mean is 0.
+        Whether a component has no known height: its mean is 0.
     filled : ndarray, (H, W), uint8
         1 where a height was not measured but filled in.
     edges : ndarray, (H, W), uint8, or None
@@ -34,14 +62,13 @@ class Surface:
     iterations : int
         Of the solver, in all.
     residual : float
-        How far the heights are from the solution, over the heights themselves, both as the sum that is made
-        least weighs them; 0 of the direct solver, where it is not reckoned.
+        Norm of the error over that of the heights above the mean plane, both by the weights of the sum that
+        is minimised; 0 of the direct solver.
     converged : bool
-        Whether that is as little as was asked for; where nothing was, whether it is below 0.3.
+        Whether the residual is within the tolerance; without one, whether it is below 0.3.
     method : {"direct", "multigrid", "robust"}
-        Which solver it was.
     invalid : int
-        Pixels that were wanted but whose slopes are no numbers.
+        Pixels within the mask whose slopes are no numbers.
     """
 
     height: NDArray[np.float32]
@@ -55,3 +82,215 @@ class Surface:
     converged: bool
     method: IntegrationMethod
     invalid: int
+
+
+@dataclass(frozen=True, slots=True)
+class SolverOptions:
+    """How near a solver comes, and what it tells besides.
+
+    Attributes
+    ----------
+    tolerance : float or None
+        Of the residual; None: as near as two cycles get.
+    deadline : float or None
+        Of ``time.perf_counter``; where there is one, no tolerance must be met.
+    sharpness : float or None
+        Of the bilateral weights that look for discontinuities; None where none are looked for.
+    sigma : bool
+        Whether to estimate the heights' standard deviation.
+    """
+
+    tolerance: float | None = None
+    deadline: float | None = None
+    sharpness: float | None = None
+    sigma: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Relief:
+    """Heights above a plane as a solver leaves them, on the device."""
+
+    height: Array
+    plane: Plane
+    method: IntegrationMethod
+    iterations: int
+    residual: float
+    converged: bool
+    links: Links | None = None
+    flags: Flags | None = None
+    edges: Flags | None = None
+
+
+class SurfaceSolver:
+    """Solvers for pictures of one shape and pixel size; what they allocated and found is used again."""
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        self._device = device
+        self._graph = PixelGraph(device, shape)
+        self._levelling = Levelling(self._graph)
+        self._rectangle: Rectangle | None = None
+        self._multigrid: Multigrid | None = None
+        self._flags = np.zeros(shape, np.uint8)
+        self._key: tuple[object, ...] | None = None
+        self._next_key: tuple[object, ...] | None = None
+        self._components: Components | None = None
+        self._plane: Plane | None = None
+        self._last: Array | None = None
+        self._finishing = 0.0  # seconds that the last picture took after its solution
+
+    def reset(self) -> None:
+        """Forget the last picture and its heights."""
+        self._last = self._plane = self._components = self._key = None
+
+    def solve(
+        self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
+    ) -> Surface:
+        """Return the surface of a picture, from a start, (H, W), mm, or the last heights on."""
+        flags = self._graph.upload(inputs)
+        if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
+            raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
+        same = self._is_same(inputs, flags)
+        relief = self._find(inputs, options, start, same)
+        if not relief.converged and options.deadline is None:
+            raise NotConverged(explain(relief.iterations, relief.residual, options.tolerance))
+        begun = time.perf_counter()
+        surface = self._finish(inputs, options, relief, same)
+        self._finishing = time.perf_counter() - begun
+        return surface
+
+    def _is_same(self, inputs: Inputs, flags: Flags) -> bool:
+        """Tell whether the graph is that of the last multigrid; until there is a new one, it is no one's."""
+        even = inputs.weight_x is None and inputs.known_height_weights is None
+        heights = inputs.known_height_weight, inputs.known_heights is None
+        key = inputs.weight, *heights, inputs.pixel_size
+        same = even and key == self._key and np.array_equal(flags, self._flags)
+        self._key, self._next_key = None, key if even else None
+        if not same:
+            self._flags = flags.copy()
+        return same
+
+    def _find(
+        self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None, same: bool
+    ) -> _Relief:
+        """Choose a solver and run it."""
+        if options.sharpness is None and self._is_full_and_even(inputs):
+            height = self._find_rectangle(inputs).solve(self._graph.source(), self._screening(inputs))
+            return _Relief(height, LEVEL, "direct", 1, 0.0, True)
+        if self._plane is None:
+            self._plane = self._graph.mean_plane()
+        first = None if start is None else self._above_plane(start, inputs, self._plane)
+        links = self._graph.links(self._plane)
+        if options.sharpness is not None:
+            return self._solve_robust(inputs, links, options, options.sharpness, first)
+        begin = self._last if first is None else self._graph.put("start", first)
+        if self._multigrid is None:
+            self._multigrid = Multigrid(links)
+        elif not same:
+            self._multigrid.rebuild(links)
+        self._key = self._next_key
+        goal = options.tolerance if options.deadline is None else options.tolerance or _GOAL
+        deadline = None if options.deadline is None else options.deadline - self._finishing
+        found = self._multigrid.solve(begin, tolerance=goal, deadline=deadline)
+        self._last = found.height
+        numbers = found.iterations, found.residual, found.converged
+        return _Relief(found.height, self._plane, "multigrid", *numbers)
+
+    def _is_full_and_even(self, inputs: Inputs) -> bool:
+        """Tell whether all pixels, links and known heights are alike."""
+        if inputs.weight_x is not None or inputs.edges is not None or inputs.known_height_weights is not None:
+            return False
+        every = SLOPE if inputs.known_heights is None else SLOPE | KNOWN
+        full = bool(np.bitwise_and.reduce(self._flags, axis=None) & every == every)
+        return full and self._screening(inputs) <= _STIFF
+
+    def _find_rectangle(self, inputs: Inputs) -> Rectangle:
+        if self._rectangle is None:
+            scale = self._graph.scale * inputs.weight
+            self._rectangle = Rectangle(self._graph.shape, inputs.pixel_size, self._device, scale)
+        return self._rectangle
+
+    def _screening(self, inputs: Inputs) -> float:
+        return 0.0 if inputs.known_heights is None else self._graph.scale * inputs.known_height_weight
+
+    def _above_plane(self, start: NDArray[np.floating], inputs: Inputs, plane: Plane) -> Floats:
+        """Return heights to begin with above the plane, about 0 where nothing is known of them."""
+        known = np.isfinite(start)
+        along_x, along_y, begin = self._graph.steps(plane)
+        row, column = np.ogrid[: start.shape[0], : start.shape[1]]
+        above = start - (begin + along_x * column + along_y * row)
+        datum = inputs.datum
+        if inputs.known_heights is None:
+            datum = float(np.mean(above, where=known)) if known.any() else 0.0
+        return np.where(known, above - datum, 0.0).astype(np.float32)
+
+    def _solve_robust(
+        self, inputs: Inputs, links: Links, options: SolverOptions, sharpness: float, start: Floats | None
+    ) -> _Relief:
+        assert self._plane is not None
+        tolerance = options.tolerance or _GOAL
+        found = solve_robust(
+            inputs,
+            links,
+            self._flags,
+            self._plane,
+            sharpness,
+            start=start,
+            tolerance=tolerance,
+            deadline=options.deadline,
+        )
+        numbers = found.iterations, found.residual, found.converged or options.tolerance is None
+        return _Relief(found.relief, self._plane, "robust", *numbers, found.links, found.flags, found.edges)
+
+    def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief, same: bool) -> Surface:
+        """Add plane and offsets to relief, and estimate its standard deviation."""
+        components = self._find_components(inputs, relief, same)
+        self._levelling.use(components)
+        height = self._levelling.level(relief.height, relief.plane, inputs.datum)
+        return Surface(
+            height=height,
+            sigma=self._find_sigma(inputs, relief, components) if options.sigma else None,
+            component=components.labels,
+            offset_unknown=components.offset_unknown,
+            filled=np.zeros(height.shape, np.uint8),
+            edges=relief.edges,
+            iterations=relief.iterations,
+            residual=relief.residual,
+            converged=relief.converged,
+            method=relief.method,
+            invalid=int(np.count_nonzero(self._flags & LOST)),
+        )
+
+    def _find_components(self, inputs: Inputs, relief: _Relief, same: bool) -> Components:
+        if relief.method == "direct":
+            labels, unknown = np.zeros(self._graph.shape, np.int32), np.array([inputs.known_heights is None])
+            return Components(labels, unknown)
+        if relief.flags is not None:
+            return find_components(relief.flags, True)
+        if not same or self._components is None:
+            alone = (self._flags & (SLOPE | KNOWN)) == KNOWN
+            cut = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
+            self._components = find_components(self._flags, cut)
+        return self._components
+
+    def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
+        links, graph = relief.links, self._graph
+        solver = (
+            self._multigrid if links is None else Multigrid(replace(links, source=graph.source(links=links)))
+        )
+
+        def solve() -> Array:
+            source = graph.source(links=links)
+            if relief.method == "direct" or solver is None:
+                return self._find_rectangle(inputs).solve(source, self._screening(inputs))
+            return solver.solve(tolerance=None).height
+
+        misfit = None if inputs.weights_given else graph.misfit(relief.height, relief.plane, links)
+        return find_sigma(inputs, graph, self._levelling, components.labels, solve, links, misfit)
+
+
+def explain(iterations: int, residual: float, tolerance: float | None) -> str:
+    """Say that and why there is no surface, in one line."""
+    wanted = "" if tolerance is None else f", more than {tolerance:.2g}"
+    reached = f"{iterations} iterations left a residual of {residual:.2g}{wanted}"
+    remedy = "give engine.integrate a larger tolerance, or None to take it as it is"
+    return f"the surface did not converge: {reached}; {remedy}"

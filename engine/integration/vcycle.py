@@ -51,16 +51,7 @@ class Solution:
 
 
 class Multigrid:
-    """A solver for graphs of pixels: any mask, weights, cuts and known heights.
-
-    Conjugate gradients, whose preconditioner is a cycle of `VCycle`.
-
-    Parameters
-    ----------
-    links : Links
-    plain : bool
-        See `rebuild`.
-    """
+    """Conjugate gradients on graphs of pixels with any mask, weights, cuts and known heights."""
 
     def __init__(self, links: Links, *, plain: bool = False) -> None:
         self._device = links.device
@@ -95,18 +86,10 @@ class Multigrid:
         limit: int = 100,
         deadline: float | None = None,
     ) -> Solution:
-        """Solve for the heights.
+        """Solve for the heights, from a start, (H, W), or from what full multigrid makes.
 
-        Parameters
-        ----------
-        start : Array, (H, W), float32, optional
-            Heights to begin with, on the device; it is not changed. By default full multigrid makes them.
-        tolerance : float or None
-            Of the residual; None: two cycles after the start are enough.
-        limit : int
-            Of the iterations.
-        deadline : float, optional
-            Of ``time.perf_counter``: no further cycle is begun that would end later.
+        It ends when the residual is within the tolerance (None: after two cycles), after ``limit`` cycles, or
+        when the next one would end after ``deadline``, of ``time.perf_counter``.
         """
         h = self._hierarchy
         h.copy_picture("admit", self._cycle.full_b, self._links.source)
@@ -127,18 +110,8 @@ class Multigrid:
 
         The step is the best one in the plane of the preconditioned residual and the step before: conjugate
         gradients, as far as the graph is the same, and heights cannot become worse in any case. All of it is
-        on the device's queue when this returns.
-
-        Parameters
-        ----------
-        links : Links
-        deep : bool
-            Whether to rebuild all levels of the graph, but the coarsest, or the finest alone.
-
-        Returns
-        -------
-        Array, (H, W), float32
-            Heights, until the next solution or step.
+        on the device's queue when this returns; heights are valid until the next solution or step. ``deep``:
+        rebuild all levels of the graph but the coarsest, rather than the finest alone.
         """
         h, cycle = self._hierarchy, self._cycle
         h.follow(links, deep=deep)
@@ -163,18 +136,16 @@ class Multigrid:
         energy = self._energy()
         return math.sqrt(product / energy) if product > 0 and energy > 0 else math.inf
 
-    def _attempt(
-        self, start: Array | None, goal: float, limit: int, deadline: float | None
-    ) -> tuple[int, float]:
+    def _attempt(self, start: Array | None, *until: Any) -> tuple[int, float]:
         """Solve from a start; return how many steps were done, and the residual."""
         if start is not None:
             self._hierarchy.copy_picture("admit", self._x, start)
             given = self._dot(self._cycle.full_b, self._cycle.full_b)
             rest = self._find_residual_square()
             if rest <= given:  # a start that is worse than none, or not finite, is none
-                return self._iterate(rest, goal, limit, deadline)
+                return self._iterate(rest, *until)
         self._cycle.start(self._x)
-        return self._iterate(self._find_residual_square(), goal, limit, deadline)
+        return self._iterate(self._find_residual_square(), *until)
 
     def _find_residual(self) -> None:
         h, cycle = self._hierarchy, self._cycle
@@ -356,7 +327,7 @@ class VCycle:
             self._go(number + 1)
             self._ascend(number)
             return
-        steps = {"omega": _OMEGA, "then": _THEN, "inverse": h.inverse}
+        steps: dict[str, Any] = {"omega": _OMEGA, "then": _THEN, "inverse": h.inverse}
         self._over_links("begin", number, **steps, b=self.b, x=self._t)
         self._find_residual(number, self.b, self._t, self.x, divide=True)
         self._restrict(number, self.x, self.b)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.frames import SAMPLES
-from mirrorskin.engine.integration.integration import explain, integrate
-from mirrorskin.engine.integration.surface import Surface
+from mirrorskin.engine.integration.integration import integrate
+from mirrorskin.engine.integration.surface import Surface, explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
 from mirrorskin.io import ProcessValue, Result
 from mirrorskin.kernels.array import Array
