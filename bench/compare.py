@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from mirrorskin.bench.report import Data, as_machine, as_ms
+from mirrorskin.bench.report import as_machine, as_ms
+from mirrorskin.bench.run import Data
 from mirrorskin.io import InputError
 
 Verdict = Literal["quicker", "slower", "as before", "unknown"]
@@ -46,11 +47,6 @@ class Difference:
     verdict: Verdict
     shares: tuple[float | None, float | None]
 
-    @property
-    def is_limit(self) -> bool:
-        """Whether this is what the machine can do, and not what we or others do with it."""
-        return "limit" in self.name
-
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
@@ -60,12 +56,9 @@ class Comparison:
     ----------
     cases : dict of list of Difference
         By the case's name.
-    warnings : tuple of str
-        Why the two are no fair comparison.
-    targets : tuple of str
-        Which aims were reached in one run and not in the other.
-    apart : tuple of str
-        Works of one run alone, and what is no longer the same work.
+    warnings, targets, apart : tuple of str
+        Why the two are no fair comparison; which aims were reached in one run and not in the other; works of
+        one run alone, and what is no longer the same work.
     """
 
     cases: dict[str, list[Difference]]
@@ -75,9 +68,9 @@ class Comparison:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """How many works changed; limits, which tell of the machine, are told apart."""
+        """How many works changed; limits, which tell of the machine, are counted by themselves."""
         every = [one for rows in self.cases.values() for one in rows]
-        limits, works = ([one for one in every if one.is_limit is kind] for kind in (True, False))
+        limits, works = ([one for one in every if ("limit" in one.name) is kind] for kind in (True, False))
         return tuple(
             f"{what}: {_count(rows)}; B takes {_mean(rows):.2f} times as long as A (geometric mean)"
             for what, rows in (("works", works), ("limits of the machine", limits))
@@ -86,12 +79,7 @@ class Comparison:
 
 
 def compare(before: Data, after: Data) -> Comparison:
-    """Compare two runs, work by work.
-
-    Parameters
-    ----------
-    before, after : mapping
-        Runs as `mirrorskin.bench.runs.open_run` returns them; A and B.
+    """Compare two runs, A and B, work by work.
 
     Raises
     ------
@@ -114,9 +102,9 @@ def compare(before: Data, after: Data) -> Comparison:
 def as_data(comparison: Comparison, before: Data, after: Data) -> dict[str, Any]:
     """Return a comparison as what JSON knows."""
     runs = ({name: run[name] for name in run if name != "cases"} for run in (before, after))
-    cases = [{"name": name, "rows": [_row(one) for one in rows]} for name, rows in comparison.cases.items()]
-    told = {name: list(getattr(comparison, name)) for name in ("warnings", "targets", "apart", "summary")}
-    return {**dict(zip(("before", "after"), runs, strict=True)), "cases": cases, **told}
+    cases = [{"name": name, "rows": [asdict(one) for one in rows]} for name, rows in comparison.cases.items()]
+    found = {name: list(getattr(comparison, name)) for name in ("warnings", "targets", "apart", "summary")}
+    return {**dict(zip(("before", "after"), runs, strict=True)), "cases": cases, **found}
 
 
 def as_rows(differences: Sequence[Difference]) -> list[list[str]]:
@@ -195,8 +183,8 @@ def _targets(before: Data, after: Data) -> Iterator[str]:
         other = others.get(target["what"])
         if other is not None and other["met"] != target["met"]:
             word = "reached" if other["met"] else "missed"
-            told = f"{target['measured']} before, {other['measured']} now ({other['bound']})"
-            yield f"{before['name']}, {target['what']}: {word} now: {told}"
+            values = f"{target['measured']} before, {other['measured']} now ({other['bound']})"
+            yield f"{before['name']}, {target['what']}: {word} now: {values}"
 
 
 def _apart(old: Data, new: Data, cases: dict[str, list[Difference]]) -> Iterator[str]:
@@ -210,13 +198,9 @@ def _apart(old: Data, new: Data, cases: dict[str, list[Difference]]) -> Iterator
             yield f"{name}: not the same work in both, or in one alone: {', '.join(rest)}"
 
 
-def _row(one: Difference) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in Difference.__slots__}
-
-
 def _count(rows: Sequence[Difference]) -> str:
-    told = Counter(one.verdict for one in rows)
-    return ", ".join(f"{told[verdict]} {verdict}" for verdict in get_args(Verdict) if told[verdict])
+    counts = Counter(one.verdict for one in rows)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict) if counts[verdict])
 
 
 def _mean(rows: Sequence[Difference]) -> float:

@@ -1,140 +1,158 @@
-"""Correlation with a rotation's phase: the engine against the limits and against peers, on one stack."""
+"""Correlation with a rotation's phase: the engine, the limits and NumPy, PyTorch and Numba on one stack."""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Work, take_turns
+from mirrorskin.bench.harness import (
+    OURS,
+    ROUNDS,
+    THREADS,
+    Case,
+    Cases,
+    Row,
+    Work,
+    agree,
+    check_memory,
+    missing,
+    take_turns,
+)
 from mirrorskin.bench.limits import Limits
-from mirrorskin.bench.memory import check_memory
-from mirrorskin.bench.ours import OURS, our_works
-from mirrorskin.bench.peers.correlation import Peer, Wave, find_peers
-from mirrorskin.bench.results import Case, Row
-from mirrorskin.bench.same import check_correlation
-from mirrorskin.bench.turns import STEPS, fill, phases
+from mirrorskin.bench.scenes import STEPS, fill_turns, phases
 from mirrorskin.engine import Correlator
-from mirrorskin.engine.rotation.design_matrix import basis
-from mirrorskin.engine.streaming import push_block
-from mirrorskin.io import Block
+from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Counts = NDArray[np.uint8]
+Sums = NDArray[np.int32]
+
+_HD, _WINDOW, _QUICK = (64, 1080, 1920), (64, 480, 640), (16, 48, 64)
 _MAPS = 4 * 4  # bytes of a pixel: mean, cosine, sine and residual
 _ROOM = 128  # bytes of a pixel for what all works keep
 _STATE = 4 * 4  # bytes of a pixel's sums over a window
 _UNITS = 2**17  # of a cosine in a peer's sums
+_TILE = 1024  # pixels of Numba
+_SAMPLES = {"NumPy": 65_536, "PyTorch": 2_097_152}  # of a tile: more leave the cache, fewer pay for calls
 
 
-@dataclass(frozen=True, slots=True)
-class CorrelationCase:
-    """A stack of uint8 frames, several turns long.
+class Wave(NamedTuple):
+    """The least-squares fit of mean, cosine and sine, and what it leaves, (H, W) each."""
 
-    Attributes
-    ----------
-    name : str
-    shape : (int, int, int)
-        Frames, rows and columns.
-    """
-
-    name: str
-    shape: tuple[int, int, int]
-
-    @property
-    def pixels(self) -> int:
-        """Of a frame."""
-        return self.shape[1] * self.shape[2]
-
-    @property
-    def size(self) -> str:
-        """Of the stack, in words."""
-        return f"{' x '.join(map(str, self.shape))} uint8"
+    mean: Floats
+    cosine: Floats
+    sine: Floats
+    residual: Floats
 
 
-def run_correlation(case: CorrelationCase, device: Device, rounds: int) -> Case:
+def run_stack(device: Device, quick: bool) -> Case:
     """Time the fit of a wave to a stack, the limits and the peers; their maps must be the same first.
 
-    Bytes are those of the frames, each once, and of the four maps; of frames alone where those are only
-    pushed.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is not enough memory.
-    DeviceError
-        The device has no room for the stack at once.
-    DisagreementError
-        A peer returned other maps.
+    Bytes are those of the frames, each once, and of the four maps; of a push those of the frames alone.
     """
-    count, pixels = case.shape[0], case.pixels
-    check_memory(case.name, (2 * count + _MAPS + _ROOM) * pixels)
-    correlator = Correlator(case.shape[1:], np.uint8, device=device, memory_limit=2 * count * pixels)
+    shape = _QUICK if quick else _HD
+    count, pixels = shape[0], math.prod(shape[1:])
+    check_memory("correlate-uint8", (2 * count + _MAPS + _ROOM) * pixels)
+    correlator = Correlator(shape[1:], np.uint8, device=device, memory_limit=2 * count * pixels)
     frames = correlator.room[:count]
     if len(frames) < count:
         raise DeviceError(f"{device.info.title} has no room for {count} frames at once: use --quick")
-    fill(frames)
+    fill_turns(frames)
     phase = phases(count)
-    limits = Limits(device, np.resize(frames, (count + _MAPS) * pixels))
-    ours = our_works(correlator, Block(frames, 0, phase=phase))
-    peers, absent = find_peers()
-    theirs: dict[str, Work] = {peer.name: partial(peer.correlate, frames, phase) for peer in peers}
+
+    def push() -> None:
+        correlator.reset()
+        correlator.push(frames, phase=phase)
+        device.finish()
+
+    def find() -> object:
+        correlator.reset()
+        correlator.push(frames, phase=phase)
+        return correlator.result()
+
+    absent = missing("torch", "numba")
+    peers: dict[str, Callable[[Counts, Doubles], Wave]] = {"NumPy": _numpy}
+    peers |= {} if "torch" in absent else {"PyTorch": _torch}
+    peers |= {} if "numba" in absent else {"Numba": _numba}
+    theirs: dict[str, Work] = {name: functools.partial(fit, frames, phase) for name, fit in peers.items()}
 
     def check(results: dict[str, Any]) -> None:
         for name in theirs:
-            check_correlation(name, results[OURS], results[name])
+            _check(name, results[name], results[OURS])
 
-    measured = take_turns({**limits.works(), **ours, **theirs}, rounds, device.profile, check)
-    moved = dict.fromkeys((*ours, *theirs), (count + _MAPS) * pixels)
+    moved = dict.fromkeys((f"{OURS}, push only", OURS, *theirs), (count + _MAPS) * pixels)
     moved[f"{OURS}, push only"] = count * pixels
+    limits = Limits(device, (count + _MAPS) * pixels)
+    works = {**limits.works(), f"{OURS}, push only": push, OURS: find, **theirs}
+    measured = take_turns(works, 1 if quick else ROUNDS, device.profile, check)
     rows = [Row(name, measured[name], size, count) for name, size in moved.items()]
-    title = f"mean, cosine, sine and residual; {case.size}"
-    return Case(case.name, title, limits.rows(measured, first="triad") + rows, absent)
+    title = f"mean, cosine, sine and residual; {' x '.join(map(str, shape))} uint8"
+    return Case("correlate-uint8", title, limits.rows(measured, first="triad") + rows, absent)
 
 
-def run_sliding(case: CorrelationCase, device: Device, rounds: int) -> Case:
+def run_sliding(device: Device, quick: bool) -> Case:
     """Time a window of one turn whose frames are pushed one by one, from memory that is not the engine's.
 
-    A turn is a whole stack, and ends when the device is done. Bytes are, of each frame, its own, those of the
-    frame that leaves, and those of the window's sums, once read and once written. The limits are those of as
-    many bytes as one frame moves.
-
-    Raises
-    ------
-    DisagreementError
-        The wave at the end is not that of a peer's sums.
+    Bytes are, of each frame, its own, those of the frame that leaves, and those of the window's sums, once
+    read and once written. The limits are those of as many bytes as one frame moves.
     """
-    count, pixels = case.shape[0], case.pixels
-    a_frame = (2 + 2 * _STATE) * pixels
-    frames = np.empty(case.shape, np.uint8)
-    fill(frames)
-    phase = phases(count)
-    correlator = Correlator(case.shape[1:], np.uint8, window=STEPS, device=device)
-    peers, absent = find_peers()
-    windows = {peer.name: _Window(peer, frames, phase) for peer in peers}
+    shape = _QUICK if quick else _WINDOW
+    a_frame = (2 + 2 * _STATE) * math.prod(shape[1:])
+    frames = np.empty(shape, np.uint8)
+    fill_turns(frames)
+    phase = phases(len(frames))
+    correlator = Correlator(shape[1:], np.uint8, window=STEPS, device=device)
+
+    def push_all() -> None:
+        for k in range(len(frames)):
+            correlator.push(frames[k : k + 1], phase=phase[k : k + 1])
+        device.finish()
+
+    absent = missing("torch", "numba")
+    peers: dict[str, _Slide] = {"NumPy": _numpy_slide}
+    peers |= {} if "torch" in absent else {"PyTorch": _torch_slide}
+    peers |= {} if "numba" in absent else {"Numba": _numba_slide}
+    windows = {name: _Window(slide, frames, phase) for name, slide in peers.items()}
 
     def check(_: dict[str, Any]) -> None:
         for name, window in windows.items():
-            check_correlation(name, correlator.result(), window.wave())
+            _check(name, window.wave(), correlator.result())
 
-    limits = Limits(device, np.zeros(a_frame, np.uint8))
-    ours = {OURS: _push_all(correlator, frames, phase)}
-    works = {**limits.works(), **ours, **{name: window.push_all for name, window in windows.items()}}
-    measured = take_turns(works, rounds, device.profile, check)
-    rows = [Row(name, measured[name], count * a_frame, count) for name in (*ours, *windows)]
-    title = f"one new frame into a window of {STEPS}; {case.size}"
-    return Case(case.name, title, limits.rows(measured, first="triad") + rows, absent)
+    limits = Limits(device, a_frame)
+    works: dict[str, Work] = {OURS: push_all, **{name: one.push_all for name, one in windows.items()}}
+    measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
+    rows = [Row(name, measured[name], len(frames) * a_frame, len(frames)) for name in works]
+    title = f"one new frame into a window of {STEPS}; {' x '.join(map(str, shape))} uint8"
+    return Case("sliding", title, limits.rows(measured, first="triad") + rows, absent)
+
+
+CASES: Cases = {"correlate-uint8": run_stack, "sliding": run_sliding}
+
+
+def _check(name: str, theirs: Wave, ours: Any) -> None:
+    expected = {word: getattr(ours, word) for word in Wave._fields}
+    agree(name, theirs._asdict(), expected, dict.fromkeys(expected, 1e-5 * np.abs(ours.mean)))
+
+
+_Slide = Callable[[Sums, Counts, Counts, Sums], None]
+"""``(sums, now, gone, rows)``: take a frame into a window's sums, and out the one that it replaces. Sums are
+(4, H, W): of the samples, of their products with cosine and sine and of their squares; ``rows``, (6,), is 1,
+cosine and sine of the new frame and of the old one, in units."""
 
 
 class _Window:
     """A peer's window: the last frames in a ring, and their sums."""
 
-    def __init__(self, peer: Peer, frames: NDArray[np.uint8], phase: NDArray[np.float64]) -> None:
-        self._slide, self._frames = peer.slide, frames
+    def __init__(self, slide: _Slide, frames: Counts, phase: Doubles) -> None:
+        self._slide, self._frames = slide, frames
         self._ring = np.zeros((STEPS, *frames.shape[1:]), np.uint8)
         self._sums = np.zeros((4, *frames.shape[1:]), np.int32)
         self._phase = phase[-STEPS:]
@@ -149,24 +167,177 @@ class _Window:
             gone[:] = frame
 
     def wave(self) -> Wave:
-        """Return the fit that the sums tell."""
+        """Return the fit that the sums give."""
         total, cosine, sine, square = self._sums.astype(np.float64)
         model, rounded = basis(self._phase), self._rows[-STEPS:, :3] / [1, _UNITS, _UNITS]
         sums = np.stack([total, cosine / _UNITS, sine / _UNITS])
         wave = np.tensordot(np.linalg.inv(rounded.T @ model), sums, 1)
-        told = np.sum(wave * np.tensordot(model.T @ model, wave, 1), axis=0)
-        left = np.maximum(square - told, 0)
+        explained = np.sum(wave * np.tensordot(model.T @ model, wave, 1), axis=0)
+        left = np.maximum(square - explained, 0)
         return Wave(*np.stack([*wave, np.sqrt(left / (STEPS - 3))]).astype(np.float32))
 
 
-def _push_all(
-    correlator: Correlator, frames: NDArray[np.uint8], phase: NDArray[np.float64]
-) -> Callable[[], None]:
-    blocks = [Block(frames[k : k + 1], k, phase=phase[k : k + 1]) for k in range(len(frames))]
+def _numpy(frames: Counts, phase: Doubles) -> Wave:
+    """Fit tiles that stay in the cache, in single precision and in place."""
+    maps, raw, size = (
+        np.empty((4, frames[0].size), np.float32),
+        frames.reshape(len(frames), -1),
+        _SAMPLES["NumPy"],
+    )
+    fit, model = fit_matrix(phase).astype(np.float32), basis(phase)
+    gram, size = (model.T @ model).astype(np.float32), size // len(frames)
+    room = np.empty((len(frames), size), np.float32)
+    for first in range(0, raw.shape[1], size):
+        pixels = slice(first, first + size)
+        reference = raw[0, pixels].astype(np.float32)
+        # Small numbers, of whose squares no digit is lost.
+        x = np.subtract(raw[:, pixels], reference, out=room[:, : len(reference)])
+        wave = fit @ x
+        left = np.einsum("kp,kp->p", x, x) - np.einsum("kp,kp->p", wave, gram @ wave)
+        np.add(wave[0], reference, out=maps[0, pixels])
+        maps[1:3, pixels] = wave[1:]
+        np.sqrt(np.maximum(left, 0) / np.float32(len(frames) - 3), out=maps[3, pixels])
+    return Wave(*maps.reshape(4, *frames.shape[1:]))
 
-    def work() -> None:
-        for block in blocks:
-            push_block(correlator, block)
-        correlator.device.finish()
 
-    return work
+def _numpy_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
+    flat, new, old, size = sums.reshape(4, -1), now.reshape(-1), gone.reshape(-1), 16_384
+    room = np.empty((3, size), np.int32)
+    for first in range(0, len(new), size):
+        pixels = slice(first, first + size)
+        come, go, spare = room[:, : len(new[pixels])]
+        np.copyto(come, new[pixels])
+        np.copyto(go, old[pixels])
+        for total, more, less in zip(flat[:3, pixels], rows[:3], rows[3:], strict=True):
+            np.add(total, np.multiply(come, more, out=spare), out=total)
+            np.subtract(total, np.multiply(go, less, out=spare), out=total)
+        np.add(flat[3, pixels], np.multiply(come, come, out=come), out=flat[3, pixels])
+        np.subtract(flat[3, pixels], np.multiply(go, go, out=go), out=flat[3, pixels])
+
+
+def _torch(frames: Counts, phase: Doubles) -> Wave:
+    """Fit large tiles, each operation on all cores, in place."""
+    import torch
+
+    torch.set_num_threads(THREADS)
+    raw, maps = torch.from_numpy(frames.reshape(len(frames), -1)), torch.empty(4, frames[0].size)
+    size = _SAMPLES["PyTorch"] // len(frames)
+    room = torch.empty(len(frames), min(size, raw.shape[1]))
+    fit, model = torch.from_numpy(fit_matrix(phase)).float(), basis(phase)
+    gram = torch.from_numpy(model.T @ model).float()
+    for first in range(0, raw.shape[1], size):
+        pixels = slice(first, first + size)
+        x = room[:, : raw[:, pixels].shape[1]].copy_(raw[:, pixels])
+        reference = x[0].clone()
+        wave = fit @ x.sub_(reference)
+        left = x.square_().sum(0).sub_((gram @ wave).mul_(wave).sum(0)).clamp_(min=0)
+        torch.add(wave[0], reference, out=maps[0, pixels])
+        maps[1:3, pixels] = wave[1:]
+        torch.sqrt(left.div_(len(frames) - 3), out=maps[3, pixels])
+    return Wave(*maps.numpy().reshape(4, *frames.shape[1:]))
+
+
+def _torch_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
+    import torch
+
+    come, go = (torch.from_numpy(frame).int() for frame in (now, gone))
+    *totals, square = torch.from_numpy(sums)
+    for total, more, less in zip(totals, rows[:3].tolist(), rows[3:].tolist(), strict=True):
+        total.add_(come, alpha=more).sub_(go, alpha=less)
+    square.addcmul_(come, come).addcmul_(go, go, value=-1)
+
+
+def _numba(frames: Counts, phase: Doubles) -> Wave:
+    maps = np.empty((4, frames[0].size), np.float32)
+    model = basis(phase)
+    solve = np.linalg.inv(model.T @ model).astype(np.float32)
+    _numba_kernels()[0](frames.reshape(len(frames), -1), model.T.astype(np.float32), solve, maps)
+    return Wave(*maps.reshape(4, *frames.shape[1:]))
+
+
+def _numba_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
+    _numba_kernels()[1](sums.reshape(4, -1), now.reshape(-1), gone.reshape(-1), rows)
+
+
+@functools.cache
+def _numba_kernels() -> tuple[Any, Any]:  # noqa: C901  # functions to compile
+    """Compile both: tiles of pixels on all cores, frame by frame so that the inner loops are vector code.
+
+    What is known of a tile's pixels lies in one array, at distances that are known to the compiler: of many
+    arrays it would not know that they do not overlap, and make scalar code.
+    """
+    import numba
+
+    numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
+    options: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
+    total, along, across, square, first_sample, room = (_TILE * k for k in range(6))
+
+    @numba.njit(**options)
+    def add_four(frames, k, first, end, model, work):  # type: ignore[no-untyped-def]
+        one, two = frames[k, first:end], frames[k + 1, first:end]
+        three, four = frames[k + 2, first:end], frames[k + 3, first:end]
+        c1, c2, c3, c4 = model[1, k], model[1, k + 1], model[1, k + 2], model[1, k + 3]
+        s1, s2, s3, s4 = model[2, k], model[2, k + 1], model[2, k + 2], model[2, k + 3]
+        for p in range(end - first):
+            reference = work[first_sample + p]
+            a, b = np.float32(one[p]) - reference, np.float32(two[p]) - reference
+            c, d = np.float32(three[p]) - reference, np.float32(four[p]) - reference
+            work[total + p] += a + b + c + d
+            work[along + p] += c1 * a + c2 * b + c3 * c + c4 * d
+            work[across + p] += s1 * a + s2 * b + s3 * c + s4 * d
+            work[square + p] += a * a + b * b + c * c + d * d
+
+    @numba.njit(**options)
+    def add_one(frame, cosine, sine, work):  # type: ignore[no-untyped-def]
+        for p in range(len(frame)):
+            x = np.float32(frame[p]) - work[first_sample + p]
+            work[total + p] += x
+            work[along + p] += cosine * x
+            work[across + p] += sine * x
+            work[square + p] += x * x
+
+    @numba.njit(**options)
+    def put(count, first, end, solve, work, maps):  # type: ignore[no-untyped-def]
+        share = np.float32(1 / (count - 3))
+        mean, cosine, sine, residual = maps[0], maps[1], maps[2], maps[3]
+        for p in range(end - first):
+            x, y, z = work[total + p], work[along + p], work[across + p]
+            a = solve[0, 0] * x + solve[0, 1] * y + solve[0, 2] * z
+            b = solve[1, 0] * x + solve[1, 1] * y + solve[1, 2] * z
+            c = solve[2, 0] * x + solve[2, 1] * y + solve[2, 2] * z
+            left = work[square + p] - a * x - b * y - c * z
+            mean[first + p] = work[first_sample + p] + a
+            cosine[first + p], sine[first + p] = b, c
+            residual[first + p] = math.sqrt(max(left, np.float32(0)) * share)
+
+    def correlate(frames, model, solve, maps):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-frames.shape[1] // _TILE)):
+            first, end = tile * _TILE, min(frames.shape[1], (tile + 1) * _TILE)
+            work = np.zeros(room, np.float32)
+            work[first_sample : first_sample + end - first] = frames[0, first:end]
+            whole = len(frames) // 4 * 4
+            for k in range(0, whole, 4):
+                add_four(frames, k, first, end, model, work)
+            for k in range(whole, len(frames)):
+                add_one(frames[k, first:end], model[1, k], model[2, k], work)
+            put(len(frames), first, end, solve, work, maps)
+
+    @numba.njit
+    def move(total, cosine, sine, square, now, gone, rows):  # type: ignore[no-untyped-def]
+        # Two at a time, whose overlap the compiler still checks.
+        for p in range(len(now)):
+            come, go = np.int32(now[p]), np.int32(gone[p])
+            total[p] += np.int32(rows[0] * come - rows[3] * go)
+            square[p] += np.int32(come * come - go * go)
+        for p in range(len(now)):
+            come, go = np.int32(now[p]), np.int32(gone[p])
+            cosine[p] += np.int32(rows[1] * come - rows[4] * go)
+            sine[p] += np.int32(rows[2] * come - rows[5] * go)
+
+    def slide(sums, now, gone, rows):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-len(now) // _TILE)):
+            first, end = tile * _TILE, min(len(now), (tile + 1) * _TILE)
+            mine = sums[0, first:end], sums[1, first:end], sums[2, first:end], sums[3, first:end]
+            move(*mine, now[first:end], gone[first:end], rows)
+
+    return numba.njit(parallel=True, **options)(correlate), numba.njit(parallel=True)(slide)

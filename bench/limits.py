@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Measured, Work
-from mirrorskin.bench.results import Row
+from mirrorskin.bench.harness import Measured, Row, Work
 from mirrorskin.kernels.device import Device
 
-_SCALE = 3
 _RUNS = {"read": 1, "copy": 2, "triad": 3}  # runs of words that a kernel touches
 
 
-@dataclass(frozen=True, slots=True)
-class Shape:
+class Shape(NamedTuple):
     """How a limit's kernel is cut; the macros of ``limits.cl``."""
 
     lanes: int
@@ -31,30 +26,22 @@ class Shape:
         return -(-count // (self.words * self.stride)) * self.stride
 
 
+# Several shapes, because which one a memory likes best differs between machines; the best of a run counts.
 CORES = (Shape(16, 256, 1), Shape(16, 1024, 1), Shape(16, 4096, 1))
 LANES = (Shape(4, 16, 128), Shape(4, 64, 128), Shape(4, 256, 128))
 CHAINS = (Shape(4, 8, 1), Shape(8, 8, 1), Shape(16, 8, 1)), (Shape(2, 8, 128), Shape(4, 8, 128))
 
 
 class Limits:
-    """The limits' kernels, on a copy of a case's frames.
+    """Read, copy and triad on as many bytes as a case moves."""
 
-    Each is run in several shapes, because which one a memory likes best differs between machines; the best
-    of the same run is the limit.
-
-    Parameters
-    ----------
-    device : Device
-    frames : ndarray, any shape and type
-        In C order.
-    """
-
-    def __init__(self, device: Device, frames: NDArray[Any]) -> None:
-        numbers = frames.nbytes // 4
+    def __init__(self, device: Device, size: int) -> None:
+        numbers = max(size // 4, 64 * 3)
         self._device = device
         self._shapes = CORES if device.info.kind == "cpu" else LANES
         self._data = device.array("limits", (numbers,), np.uint32)
-        self._data.host[:] = frames.reshape(-1).view(np.uint8)[: 4 * numbers].view(np.uint32)
+        # Not one page of zeros that the system maps again and again.
+        self._data.host[:] = np.arange(numbers, dtype=np.uint32)
         self._data.upload()
         room = max(shape.lanes * shape.items(numbers // shape.lanes) for shape in self._shapes)
         self._sums = device.array("sums", (room,), np.uint32)
@@ -71,36 +58,27 @@ class Limits:
         rows = []
         for limit in sorted(_RUNS, key=lambda limit: limit != first):
             best = min(self._shapes, key=lambda shape: measured[_name(limit, shape)].wall.median)
-            rows.append(Row(f"{limit} limit", measured[_name(limit, best)], self._moved(limit, best)))
+            moved = 4 * best.lanes * self._count(limit, best) * _RUNS[limit]
+            rows.append(Row(f"{limit} limit", measured[_name(limit, best)], moved))
         return rows
 
     def _run(self, limit: str, shape: Shape) -> None:
         macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
         kernel = self._device.kernel("limits", f"{limit}_all", **macros)
-        count, moved = self._count(limit, shape), self._moved(limit, shape)
-        others: dict[str, dict[str, Any]] = {
-            "read": {"sums": self._sums},
-            "copy": {},
-            "triad": {"scale": _SCALE},
-        }
-        kernel(shape.items(count), words=self._data, count=count, **others[limit], moved=moved)
+        count = self._count(limit, shape)
+        every: dict[str, dict[str, Any]] = {"read": {"sums": self._sums}, "copy": {}, "triad": {"scale": 3}}
+        moved = 4 * shape.lanes * count * _RUNS[limit]
+        kernel(shape.items(count), words=self._data, count=count, **every[limit], moved=moved)
         self._device.finish()
 
     def _count(self, limit: str, shape: Shape) -> int:
         return len(self._data.host) // shape.lanes // _RUNS[limit]
 
-    def _moved(self, limit: str, shape: Shape) -> int:
-        return 4 * shape.lanes * self._count(limit, shape) * _RUNS[limit]
-
 
 class Arithmetic:
     """Multiply-adds that wait for nothing, on numbers that stay in registers; the best of several shapes.
 
-    Parameters
-    ----------
-    device : Device
-    pixels : int
-        Of the case, which takes as long in order of magnitude.
+    They take about as long as a case of so many pixels.
     """
 
     def __init__(self, device: Device, pixels: int) -> None:
@@ -120,14 +98,14 @@ class Arithmetic:
     def row(self, measured: Mapping[str, Measured]) -> Row:
         """Return the limit in the shape that was the quickest."""
         best = min((measured[name] for name in self.works()), key=lambda one: one.wall.median)
-        return Row("multiply-add limit", best, 0, operations=len(self._data.host) * self._steps)
+        return Row("multiply-add limit", best, operations=len(self._data.host) * self._steps)
 
     def _run(self, shape: Shape) -> None:
         macros = {"LANES": shape.lanes, "WORDS": shape.words, "STRIDE": shape.stride}
         kernel = self._device.kernel("limits", "multiply_all", **macros)
         count = len(self._data.host) // shape.lanes
-        numbers: dict[str, Any] = {"steps": self._steps, "factor": 0.5, "summand": 1.0}
-        kernel(shape.items(count), numbers=self._data, count=count, **numbers, moved=0)
+        known: dict[str, Any] = {"count": count, "steps": self._steps, "factor": 0.5, "summand": 1.0}
+        kernel(shape.items(count), numbers=self._data, **known, moved=0)
         self._device.finish()
 
 

@@ -1,139 +1,521 @@
-"""The onset of the light state: the engine against the limits and against peers, on one stack in memory."""
+"""The onset of the light state: the engine, the limits and NumPy, OpenCV, PyTorch and Numba on one stack.
+
+Aim: at least 70 % of the read limit with one threshold, and the full default no slower than the best peer.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+import functools
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Work, take_turns
+from mirrorskin.bench.harness import (
+    OURS,
+    ROUNDS,
+    THREADS,
+    Case,
+    Cases,
+    Row,
+    Work,
+    agree,
+    check_memory,
+    missing,
+    take_turns,
+)
 from mirrorskin.bench.limits import Limits
-from mirrorskin.bench.memory import check_memory
-from mirrorskin.bench.ours import OURS, our_works
-from mirrorskin.bench.peers.onset import Peer, References, find_peers
-from mirrorskin.bench.results import Case, Row
-from mirrorskin.bench.same import check_frames, check_heights
-from mirrorskin.bench.stacks import LEVELS, StackName, fill, noise_of, references
+from mirrorskin.bench.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 from mirrorskin.engine import OnsetSearch
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
-from mirrorskin.io import Block
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.onset import onset_levels
 
+Maps = dict[str, NDArray[Any]]
+Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
+
+_HD, _MEMORY, _VGA, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640), (12, 48, 64)
 _THRESHOLD = 0.5
 _MAPS = 64  # bytes a pixel for all maps
-_LARGE = 10**9  # bytes of frames from which no peer may take as much again
+_PLATEAU, _SURELY = (
+    3.0,
+    6.0,
+)  # sigmas a sample may be off its plateau, and below the level that are surely dark
+_INVALID = -2  # instead of a frame's number: a sample that is no number came before the onset
+_TILE = 131_072  # pixels of a peer's tile: more leave the cache, fewer pay more for each call
+_NUMBA_TILE = 16_384
+_COUNTABLE = 255  # frames that a byte counts
 
 
 @dataclass(frozen=True, slots=True)
 class OnsetCase:
-    """A stack and what is asked of it.
+    """A stack and what is found in it.
 
-    Attributes
-    ----------
-    name : str
-    shape : (int, int, int)
-        Frames, rows and columns.
-    dtype : dtype
-    full : bool
-        The full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
-        compared. Else one threshold for all pixels, and the numbers of the frames (equation 4).
-    hold : int
-    stack : {"press", "random"}
+    `full` is the full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
+    compared. Else there is one threshold for all pixels, and the frames' numbers are compared (equation 4).
     """
 
     name: str
-    shape: tuple[int, int, int]
-    dtype: np.dtype[Any]
-    full: bool
-    hold: int
-    stack: StackName
+    shape: tuple[int, int, int] = _HD
+    dtype: str = "uint8"
+    stack: StackName = "random"
+    full: bool = False
+    hold: int = 1
 
     @property
-    def title(self) -> str:
-        """What is measured, in one line."""
-        what = "full default" if self.full else f"frame of the onset, one threshold, hold {self.hold}"
-        return f"{what}; {' x '.join(map(str, self.shape))} {self.dtype.name}, {self.stack}"
-
-    @property
-    def bytes(self) -> int:
-        """Of the frames."""
-        return int(np.prod(self.shape)) * self.dtype.itemsize
-
     def options(self) -> dict[str, Any]:
-        """Return what `OnsetSearch` is told."""
+        """Keywords of `OnsetSearch`."""
+        dtype = np.dtype(self.dtype)
         if self.full:
-            dark, bright = references(self.shape[1:], self.dtype)
+            dark, bright = references(self.shape[1:], dtype)
             return {"dark": dark, "bright": bright}
-        low, high = LEVELS[self.dtype.name]
-        noise = noise_of(self.dtype)
-        return {"dark": low, "bright": high, "hold": self.hold, "subframe": False, "noise": noise}
+        low, high = LEVELS[self.dtype]
+        return {
+            "dark": low,
+            "bright": high,
+            "hold": self.hold,
+            "subframe": False,
+            "noise": press_noise(dtype),
+        }
 
+    @property
     def known(self) -> References:
-        """Return what peers are told: the same, prepared in the same way."""
+        """What peers know: the same, prepared in the same way."""
         shape = self.shape[1:] if self.full else ()
-        options = self.options()
-        dark, bright = reference_maps(options["dark"], options["bright"], shape, self.dtype)  # type: ignore[arg-type]
-        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, self.dtype)
+        options, dtype = self.options, np.dtype(self.dtype)
+        dark, bright = reference_maps(options["dark"], options["bright"], shape, dtype)  # type: ignore[arg-type]
+        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, dtype)
         return References(np.asarray(level), np.asarray(light), plateau)
 
 
 def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
-    """Time the onset, the limits and the peers on one stack; their maps must be the same first.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is not enough memory.
-    DeviceError
-        The device has no room for the stack at once.
-    DisagreementError
-        A peer returned other maps.
-    """
-    check_memory(case.name, 2 * case.bytes + _MAPS * case.shape[1] * case.shape[2])
-    search = OnsetSearch(
-        case.shape[1:], case.dtype, **case.options(), device=device, memory_limit=2 * case.bytes
-    )
+    """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
+    dtype = np.dtype(case.dtype)
+    size = math.prod(case.shape) * dtype.itemsize
+    check_memory(case.name, 3 * size + _MAPS * math.prod(case.shape[1:]))
+    search = OnsetSearch(case.shape[1:], dtype, **case.options, device=device, memory_limit=2 * size)
     frames = search.room[: case.shape[0]]
     if len(frames) < case.shape[0]:
         raise DeviceError(f"{device.info.title} has no room for {case.shape[0]} frames at once: use --quick")
-    fill(frames, case.stack)
-    travel = np.arange(len(frames), dtype=np.float64) * 0.05
-    limits = Limits(device, frames)
-    ours = our_works(search, Block(frames, 0, travel=travel))
-    theirs, absent = _peer_works(case, frames, travel)
+    fill_press(frames, case.stack)
+    travel = travel_of(len(frames))
+
+    def push() -> None:
+        search.reset()
+        search.push(frames, travel=travel)
+        device.finish()
+
+    def find() -> object:
+        search.reset()
+        search.push(frames, travel=travel)
+        return search.result()
+
+    theirs = _peer_works(case, frames, travel)
 
     def check(results: dict[str, Any]) -> None:
+        words = ("height", "sigma", "status") if case.full else ("frame",)
+        found = {word: getattr(results[OURS], word) for word in words}
         for name in theirs:
-            (check_heights if case.full else check_frames)(name, results[OURS], results[name])
+            if case.full:
+                near = {"height": np.spacing(np.abs(found["height"])), "sigma": 1e-5 * np.abs(found["sigma"])}
+                agree(name, results[name], found, near)
+            else:  # a pixel with invalid input has no onset either
+                agree(name, {"frame": np.maximum(results[name], -1)}, found)
 
-    works = {**limits.works(), **ours, **theirs}
-    measured = take_turns(works, rounds, device.profile, check)
-    rows = [Row(name, measured[name], case.bytes, len(frames)) for name in (*ours, *theirs)]
-    return Case(case.name, case.title, limits.rows(measured) + rows, absent)
+    limits = Limits(device, size)
+    works: dict[str, Work] = {f"{OURS}, push only": push, OURS: find, **theirs}
+    measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
+    rows = [Row(name, measured[name], size, len(frames)) for name in works]
+    what = "full default" if case.full else f"frame of the onset, one threshold, hold {case.hold}"
+    title = f"{what}; {' x '.join(map(str, case.shape))} {case.dtype}, {case.stack}"
+    return Case(case.name, title, limits.rows(measured) + rows, missing("torch", "numba"))
 
 
-def _peer_works(
-    case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]
-) -> tuple[dict[str, Work], dict[str, str]]:
-    peers, absent = find_peers()
-    known = case.known()
+def run_pushed(cases: dict[str, OnsetCase], device: Device, rounds: int) -> Case:
+    """Time whole presses whose frames are pushed one by one, from memory that is not the engine's.
 
-    def heights(peer: Peer) -> object:
-        assert peer.heights is not None
-        noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), case.dtype.kind == "u")
-        return peer.heights(frames, travel, known, noise)
+    A turn begins with a reset and ends when the device is done; the limits are those of one frame.
+    """
+    case = next(iter(cases.values()))
+    frames = np.empty(case.shape, case.dtype)
+    fill_press(frames, case.stack)
+    travel = travel_of(len(frames))
+    searches = {
+        name: OnsetSearch(case.shape[1:], case.dtype, **one.options, device=device)
+        for name, one in cases.items()
+    }
 
+    def press(search: OnsetSearch) -> None:
+        search.reset()
+        for t in range(len(frames)):
+            search.push(frames[t : t + 1], travel=travel[t : t + 1])
+        device.finish()
+
+    limits = Limits(device, frames[0].nbytes)
+    works: dict[str, Work] = {name: functools.partial(press, search) for name, search in searches.items()}
+    measured = take_turns({**limits.works(), **works}, rounds, device.profile)
+    rows = [Row(name, measured[name], frames.nbytes, len(frames)) for name in works]
+    title = f"one frame a push; {' x '.join(map(str, case.shape))} {case.dtype}, {case.stack}"
+    return Case(case.name, title, limits.rows(measured) + rows, {})
+
+
+class References(NamedTuple):
+    """What is known of each pixel before the first frame, () or (H, W).
+
+    `level` is the float32 at which it turns light, NaN for a dead pixel, `light` the smallest sample that is
+    light, `dark` its dark plateau.
+    """
+
+    level: NDArray[np.float32]
+    light: Levels
+    dark: NDArray[np.float32]
+
+    def of(self, rows: slice) -> References:
+        """Return those of some rows; those of all pixels as they are."""
+        return References(*(values[rows] if values.ndim else values for values in self))
+
+
+FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
+"""``(frames, light, hold)`` to the number of each pixel's onset, (H, W): the first frame of the first run of
+`hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one, -2 after an invalid sample."""
+
+
+def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]) -> dict[str, Work]:
+    known, absent = case.known, missing("torch", "numba")
+    peers: dict[str, FirstLight] = {"NumPy": first_light, "OpenCV": _opencv}
+    if "torch" not in absent:
+        peers["PyTorch"] = _torch
+    noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), frames.dtype.kind == "u")
     works: dict[str, Work] = {}
-    for peer in peers:
-        if peer.whole_stack and case.bytes >= _LARGE:
-            absent[peer.name] = "takes as much memory again"
-        elif not case.full:
-            works[peer.name] = partial(peer.first_light, frames, known.light, case.hold)
-        elif peer.heights is not None:
-            works[peer.name] = partial(heights, peer)
-    return works, absent
+    for name, find in peers.items():
+        if case.full:
+            works[name] = functools.partial(_heights, find, frames, travel, known, noise)
+        else:
+            works[name] = functools.partial(_onsets, find, frames, known, case.hold)
+    if "numba" not in absent:
+        works["Numba"] = (
+            functools.partial(_numba_heights, frames, travel, known, noise)
+            if case.full
+            else functools.partial(numba_onsets, frames, known.light, case.hold)
+        )
+    return works
+
+
+def _in_tiles(frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
+    """Fill all rows in tiles, on all cores."""
+    count = max(1, min(_TILE // frames.shape[2], -(-frames.shape[1] // THREADS)))
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(fill, (slice(row, row + count) for row in range(0, frames.shape[1], count))))
+
+
+def _onsets(find: FirstLight, frames: NDArray[Any], known: References, hold: int) -> NDArray[np.int32]:
+    onset = np.empty(frames.shape[1:], np.int32)
+
+    def fill(rows: slice) -> None:
+        onset[rows] = find(frames[:, rows], known.of(rows).light, hold)
+
+    _in_tiles(frames, fill)
+    return onset
+
+
+def _heights(
+    find: FirstLight, frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
+) -> Maps:
+    height, sigma = (np.full(frames.shape[1:], np.nan, np.float32) for _ in range(2))
+    status = np.empty(height.shape, np.uint8)
+
+    def fill(rows: slice) -> None:
+        part, mine = frames[:, rows], known.of(rows)
+        onset = find(part, mine.light, 2)
+        height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
+
+    _in_tiles(frames, fill)
+    return {"height": height, "sigma": sigma, "status": status}
+
+
+def first_light(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Count with NumPy the frames that leave a pixel undecided; see `FirstLight`."""
+    shape = frames.shape[1:]
+    undecided, few, onset = np.ones(shape, bool), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
+    for number, dark in enumerate(_dark_frames(frames, hold, lambda f, out: np.less(f, light, out=out)), 1):
+        np.logical_and(undecided, dark, out=undecided)
+        np.add(few, undecided.view(np.uint8), out=few)
+        if number % _COUNTABLE == 0 or number == len(frames):
+            onset += few
+            few[:] = 0
+    onset[undecided] = -1
+    return _without_gaps(frames, light, hold, onset)
+
+
+def _opencv(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Do the same with OpenCV."""
+    import cv2
+
+    shape = frames.shape[1:]
+    level: Any = light if light.ndim else float(light)
+    undecided, few = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
+    onset = np.zeros(shape, np.int32)
+    ones = np.ones(shape, np.uint8)
+
+    def less(frame: NDArray[Any], out: NDArray[Any]) -> None:
+        cv2.compare(frame, level, cv2.CMP_LT, dst=out.view(np.uint8))
+
+    for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
+        cv2.bitwise_and(undecided, dark.view(np.uint8), dst=undecided)
+        cv2.add(few, cv2.bitwise_and(undecided, ones), dst=few)
+        if number % _COUNTABLE == 0 or number == len(frames):
+            onset += few
+            few[:] = 0
+    onset[undecided != 0] = -1
+    return _without_gaps(frames, light, hold, onset)
+
+
+def _torch(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Do the same with PyTorch on the host; uint16 samples must be below 32768."""
+    import torch
+
+    def tensor(values: NDArray[Any]) -> Any:
+        return torch.from_numpy(values.view(np.int16) if values.dtype == np.uint16 else values)
+
+    level = tensor(light) if light.ndim else light.item()
+    shape = frames.shape[1:]
+    undecided, few, onset = np.ones(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
+
+    def less(frame: NDArray[Any], out: NDArray[Any]) -> None:
+        torch.lt(tensor(frame), level, out=torch.from_numpy(out.view(np.uint8)))
+
+    for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
+        torch.from_numpy(undecided).bitwise_and_(torch.from_numpy(dark.view(np.uint8)))
+        torch.from_numpy(few).add_(torch.from_numpy(undecided))
+        if number % _COUNTABLE == 0 or number == len(frames):
+            onset += few
+            few[:] = 0
+    onset[undecided != 0] = -1
+    return _without_gaps(frames, light, hold, onset)
+
+
+def _dark_frames(
+    frames: NDArray[Any], hold: int, less: Callable[[NDArray[Any], NDArray[Any]], object]
+) -> Iterator[NDArray[np.bool_]]:
+    """Yield for each frame where no run of `hold` light frames begins, in a mask that is used again."""
+    dark, after = np.empty(frames.shape[1:], bool), np.empty(frames.shape[1:], bool)
+    less(frames[0], dark)
+    for frame in frames[1:]:
+        less(frame, after)
+        if hold == 2:
+            np.bitwise_or(dark.view(np.uint8), after.view(np.uint8), out=dark.view(np.uint8))
+        yield dark
+        dark, after = after, dark
+    yield dark
+
+
+def _without_gaps(
+    frames: NDArray[Any], light: Levels, hold: int, onset: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Correct the onsets of the few pixels of float frames that have a sample which is no number."""
+    if frames.dtype.kind != "f":
+        return onset
+    with np.errstate(invalid="ignore", over="ignore"):
+        gaps = ~np.isfinite(frames.sum(axis=0, dtype=np.float32))
+    samples = frames[:, gaps]
+    broken = ~np.isfinite(samples)
+    is_light = samples >= (light[gaps] if light.ndim else light)
+    if hold == 2:
+        is_light[:-1] &= is_light[1:]
+    found = is_light.any(axis=0)
+    first = np.where(found, is_light.argmax(axis=0), len(frames))
+    spoiled = broken.any(axis=0) & (broken.argmax(axis=0) < first + hold)
+    onset[gaps] = np.where(spoiled, _INVALID, np.where(found, first, -1))
+    return onset
+
+
+def _answer(
+    frames: NDArray[Any],
+    onset: NDArray[np.int32],
+    travel: NDArray[np.float64],
+    known: References,
+    noise: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Return height, sigma and status of onsets in NumPy: the full default, decision 2."""
+    dead = np.isnan(known.level) | (onset == _INVALID)
+    status = np.select([dead, onset == -1, onset == 0], [0, 2, 3], 1).astype(np.uint8)
+    height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
+    row, column = found = np.nonzero(status == 1)
+    start = onset[found].astype(np.intp)
+    level, light = known.level[found], known.light[found]
+
+    surely = level - np.float32(_SURELY * noise)
+    below, todo = start - 1, np.arange(len(start))  # back to the last frame that was surely dark
+    while len(todo := todo[below[todo] > 0]):
+        sample = frames[below[todo], row[todo], column[todo]]
+        todo = todo[~((sample < light[todo]) & (sample <= surely[todo]))]
+        below[todo] -= 1
+
+    low, high = (frames[start - 1 + k, row, column].astype(np.float64) for k in (0, 1))
+    last = len(frames) - 1
+    after = np.fmin(*(frames[np.minimum(start + k, last), row, column] for k in (1, 2)))
+    sudden_step = _PLATEAU * noise * np.sqrt(2)
+    step = high - low
+    share = (np.minimum(level, high) - low) / step
+    width = travel[start] - travel[start - 1]
+    from_dark, to_light = low <= known.dark[found] + _PLATEAU * noise, high >= after - sudden_step
+    hovers = (step <= sudden_step) | ((start - 2 - below) * step > 2.5 * sudden_step)
+    interval = np.where(hovers, travel[start] - travel[below], width) / np.sqrt(12)
+    line = width * noise * np.hypot(share, 1 - share) / step
+
+    either, both = from_dark | to_light, from_dark & to_light
+    height[found] = -(travel[start - 1] + width * np.where(both, 0.5, share))
+    sigma[found] = np.where(both | hovers, interval, np.where(either, np.hypot(line, interval), line))
+    return height, sigma, status
+
+
+def numba_onsets(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Find onsets with Numba: tiles on all cores, frame by frame, so that the inner loop is vector code."""
+    onset = np.empty(frames.shape[1:], np.int32)
+    each = light.ndim > 0
+    scan = _numba_scan(each, hold, frames.dtype.kind == "f", whole=False)
+    scan(frames.reshape(len(frames), -1), light.reshape(-1) if each else light[()], onset.reshape(-1))
+    return onset
+
+
+def _numba_heights(
+    frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
+) -> Maps:
+    shape = frames.shape[1:]
+    maps = {"height": np.empty(shape, np.float32), "sigma": np.empty(shape, np.float32)}
+    maps |= {"status": np.empty(shape, np.uint8)}
+    run = _numba_scan(True, 2, frames.dtype.kind == "f", whole=True)
+    flat = (values.reshape(-1) for values in (*known, *maps.values()))
+    run(frames.reshape(len(frames), -1), travel, *flat, noise)
+    return maps
+
+
+@functools.cache
+def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # noqa: C901  # to compile
+    """Compile the search for onsets, with a level of each pixel or one for all, and heights if `whole`."""
+    import numba
+
+    numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
+
+    @numba.njit
+    def settle(series, light):  # type: ignore[no-untyped-def]
+        run = 0
+        for t in range(len(series)):
+            if not np.isfinite(series[t]):
+                return _INVALID
+            run = run + 1 if series[t] >= light else 0
+            if run == hold:
+                return t + 1 - hold
+        return len(series) - run if run else -1
+
+    @numba.njit
+    def search(frames, first, end, light, onset):  # type: ignore[no-untyped-def]
+        count, pixels = len(frames), end - first
+        undecided, few = np.ones(pixels, np.uint8), np.zeros(pixels, np.uint8)
+        sums = np.zeros(pixels if floats else 0, np.float32)
+        onset[:] = 0
+        for t in range(count):
+            # Cut from a whole row: of a part of all rows, Numba does not know that samples lie side by side.
+            now, then = frames[t, first:end], frames[min(t + hold, count) - 1, first:end]
+            for p in range(pixels):
+                sample = now[p] if hold == 1 else min(now[p], then[p])
+                open_ = undecided[p] & np.uint8(sample < (light[p] if each else light))
+                undecided[p] = open_
+                few[p] += open_
+            if floats:
+                for p in range(pixels):
+                    sums[p] += now[p]
+            if (t + 1) % _COUNTABLE == 0 or t + 1 == count:
+                for p in range(pixels):
+                    onset[p] += few[p]
+                    few[p] = 0
+        for p in range(pixels):
+            if undecided[p]:
+                onset[p] = -1
+            if floats and not np.isfinite(sums[p]):
+                onset[p] = settle(frames[:, first + p], light[p] if each else light)
+
+    @numba.njit(error_model="numpy")
+    def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
+        surely = level - np.float32(_SURELY * noise)
+        below = start - 1
+        while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > surely):
+            below -= 1
+        low, high = np.float64(frames[start - 1, pixel]), np.float64(frames[start, pixel])
+        last = len(frames) - 1
+        after = np.fmin(frames[min(start + 1, last), pixel], frames[min(start + 2, last), pixel])
+        sudden_step = _PLATEAU * noise * math.sqrt(2)
+        from_dark, to_light = low <= dark + _PLATEAU * noise, high >= after - sudden_step
+        step = high - low
+        share = (min(np.float64(level), high) - low) / step
+        width = travel[start] - travel[start - 1]
+        line = width * noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        hovers = step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step
+        interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
+        sudden = from_dark and to_light
+        spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line
+        height = -(travel[start - 1] + width * (0.5 if sudden else share))
+        return height, interval if sudden or hovers else spread
+
+    def onsets(frames, light, onset):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-len(onset) // _NUMBA_TILE)):
+            first, end = tile * _NUMBA_TILE, min(len(onset), (tile + 1) * _NUMBA_TILE)
+            search(frames, first, end, light[first:end] if each else light, onset[first:end])
+
+    def heights(frames, travel, level, light, dark, height, sigma, status, noise):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-len(status) // _NUMBA_TILE)):
+            first, end = tile * _NUMBA_TILE, min(len(status), (tile + 1) * _NUMBA_TILE)
+            onset = np.empty(end - first, np.int32)
+            search(frames, first, end, light[first:end], onset)
+            for p in range(first, end):
+                start = onset[p - first]
+                dead = np.isnan(level[p]) or start == _INVALID
+                status[p] = 0 if dead else 2 if start == -1 else 3 if start == 0 else 1
+                if status[p] == 1:
+                    height[p], sigma[p] = answer(frames, p, start, travel, level[p], light[p], dark[p], noise)
+                else:
+                    height[p], sigma[p] = np.nan, np.nan
+
+    return numba.njit(parallel=True, error_model="numpy")(heights if whole else onsets)
+
+
+_ONSET = (
+    OnsetCase("equation4-uint8"),
+    OnsetCase("equation4-uint16", dtype="uint16"),
+    OnsetCase("equation4-float32", dtype="float32"),
+    OnsetCase("equation4-memory", _MEMORY),
+    OnsetCase("hold2-uint8", hold=2),
+    OnsetCase("full-uint8", full=True, stack="press"),
+    OnsetCase("full-uint16", dtype="uint16", full=True, stack="press"),
+    OnsetCase("full-float32", dtype="float32", full=True, stack="press"),
+    OnsetCase("full-memory", _MEMORY, full=True, stack="press"),
+    OnsetCase("full-random", full=True),
+)
+
+
+def _sized(case: OnsetCase, quick: bool) -> OnsetCase:
+    return replace(case, shape=_QUICK) if quick else case
+
+
+def _onset(case: OnsetCase) -> Callable[[Device, bool], Case]:
+    return lambda device, quick: run_onset(_sized(case, quick), device, 1 if quick else ROUNDS)
+
+
+def _pushed(name: str, stack: StackName) -> Callable[[Device, bool], Case]:
+    def run(device: Device, quick: bool) -> Case:
+        plain = _sized(OnsetCase(name, _VGA, stack=stack), quick)
+        cases = {f"{OURS}, equation 4": plain, f"{OURS}, full default": replace(plain, full=True)}
+        return run_pushed(cases, device, 1 if quick else ROUNDS)
+
+    return run
+
+
+CASES: Cases = {case.name: _onset(case) for case in _ONSET} | {
+    "live": _pushed("live", "press"),
+    "live-random": _pushed("live-random", "random"),
+}

@@ -1,32 +1,74 @@
-"""What a benchmark found, as plain data, and that as tables."""
+"""A run as tables: of each case, and on a page of one or several runs."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from mirrorskin.bench.environment import describe_environment
-from mirrorskin.bench.results import Case, Row
-from mirrorskin.kernels.device import Device
-
-Data = Mapping[str, Any]
+from mirrorskin.bench.harness import OURS
+from mirrorskin.bench.run import Data, Run
+from mirrorskin.io import InputError, check_output
 
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
 TARGET_HEAD = ("aim", "bound", "measured", "reached")
+PICTURE = Path("images") / "roofline.png"
+"""Where the page's picture lies, seen from the page."""
+
 LEGEND = (
     "ms: median by the host's clock, from the call to its return; kernels and copies: the device's own "
     "account of that time. of limit: bandwidth as a share of the first row's, by the clock; then the same "
-    "of kernels alone. Bytes are those of the frames, each once, of axial rotation those of the maps too, "
-    "and of integration those of what is given and of the heights, each once."
+    "of kernels alone. Bytes are those of what goes in and of what comes out, each once."
 )
 
+_ABOUT = (
+    "What `mirrorskin bench` measured. `mirrorskin bench report` made this page of the runs named below: "
+    "make it anew rather than change it."
+)
+_COMMANDS = """```sh
+pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, besides NumPy, SciPy, OpenCV
+mirrorskin bench --list                           # the cases
+mirrorskin bench --case 'call-*' -o mine.json     # some of them; the tables of all works go to mine.md
+mirrorskin bench compare before.json mine.json    # what is quicker or slower by more than its turns vary
+mirrorskin bench report mine.json -o page.md      # a page like this one
+```"""
+_METHOD = (
+    "The works of a case take turns in one process: the engine, the limits of memory (read, copy, triad) "
+    "on as many bytes, and peers, each as one who knows the library well would use it. All must return "
+    "the same maps before anything is timed. A time is the median of up to 15 rounds by the host's clock, "
+    "from the call until the device is done. A limit is what the same device did in the same rounds with "
+    "nothing else to do. Compare within a run rather than between runs, or let `bench compare` judge by "
+    "the quartiles."
+)
+_AIMS = "What was aimed at, and what came of it."
+_CALLS = (
+    "Calls as users make them, NumPy arrays in and maps out, and the share of the time that their kernels "
+    "take."
+)
+_BESIDE = (
+    "Each work of ours beside the quickest of the peers that do the same. of limit: bandwidth as a share "
+    "of the limit of memory; what is far below is bound by arithmetic or by calls."
+)
+_SIZES = (
+    "GB/s by the host's clock, and the share of the limit of memory that took turns with it: by size of "
+    "picture and type of frames, number of frames, or cores."
+)
+_ROOF = (
+    "Each number is a kernel on its largest pictures, its dots are other sizes and types: how many "
+    "multiply-adds it does with a byte that must move, and how many in a second, by the device's own "
+    "account. Below a slope memory binds, below the level line arithmetic does; what is above a slope has "
+    "its bytes in a cache."
+)
+_STARTS = "Milliseconds of the steps of a process, with an empty cache of kernels and with a full one."
+_ACCURACY = "Answers on this device against truths that are known, each a number and its bound."
 
-def as_data(device: Device, cases: Sequence[Case], quick: bool) -> dict[str, Any]:
-    """Return everything about a run as what JSON knows; a number that there is not is None."""
-    data = {**describe_environment(device), "quick": quick, "cases": [_case(case) for case in cases]}
-    return {**data, "device": asdict(device.info)}
+
+@dataclass(slots=True)
+class Machine:
+    """The cases of all runs of one device, by name; of a case that several runs have, the last one counts."""
+
+    title: str
+    cases: dict[str, Data] = field(default_factory=dict)
 
 
 def as_rows(case: Data) -> list[list[str]]:
@@ -56,80 +98,256 @@ def is_limit(row: Data) -> bool:
     return "limit" in row["name"]
 
 
-def as_title(data: Data) -> str:
+def as_title(run: Data) -> str:
     """Return device, processor, commit and date in one line."""
-    code = data["commit"] or data["versions"].get("mirrorskin")
-    return f"{as_machine(data)}; mirrorskin {code}; {data['date']}"
+    code = run["commit"] or run["versions"].get("mirrorskin")
+    return f"{as_machine(run)}; mirrorskin {code}; {run['date']}"
 
 
-def as_machine(data: Data) -> str:
+def as_machine(run: Data) -> str:
     """Return device and processor in one line."""
-    device = data["device"]
-    where = f"{device['platform']}: {device['name']} (driver {device['driver']}), {data['threads']} threads"
-    return f"{where}; {data['processor']}"
+    device = run["device"]
+    where = f"{device['platform']}: {device['name']} (driver {device['driver']}), {run['threads']} threads"
+    return f"{where}; {run['processor']}"
 
 
-def as_versions(data: Data) -> str:
+def as_versions(run: Data) -> str:
     """Return the versions of what a run used, in one line."""
-    return ", ".join(f"{name} {version or 'not installed'}" for name, version in data["versions"].items())
+    return ", ".join(f"{name} {version or 'not installed'}" for name, version in run["versions"].items())
 
 
-def as_markdown(data: Data) -> str:
-    """Return a run as a page."""
-    parts = [f"# {as_title(data)}", as_versions(data), LEGEND]
-    parts += [as_section(case, "##") for case in data["cases"]]
-    return "\n\n".join(parts) + "\n"
-
-
-def as_section(case: Data, level: str) -> str:
-    """Return a case with all its tables and notes as a part of a page.
-
-    Parameters
-    ----------
-    case : mapping
-    level : str
-        Hashes of its heading.
-    """
-    parts = [f"{level} {case['name']}: {case['title']}"]
-    for head, rows, numbers in ((HEAD, as_rows(case), True), (TARGET_HEAD, as_targets(case), False)):
-        parts += [as_table(head, rows, numbers=numbers)] if rows else []
-    return "\n\n".join([*parts, *as_notes(case)])
+def as_ms(seconds: float) -> str:
+    """Return a time as milliseconds, of three digits or so."""
+    milliseconds = 1e3 * seconds
+    return f"{milliseconds:.{2 if milliseconds < 10 else 1 if milliseconds < 1000 else 0}f}"
 
 
 def as_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: bool = True) -> str:
-    """Return a table of a page.
-
-    Parameters
-    ----------
-    head : sequence of str
-    rows : sequence of sequences of str
-        Cells under the head.
-    numbers : bool
-        Columns after the first are set to the right.
-    """
+    """Return a table of a page; columns of numbers, those after the first, are set to the right."""
     lines = [head, ["---"] + ["---:" if numbers else "---"] * (len(head) - 1), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
 
 
-def _case(case: Case) -> dict[str, Any]:
-    rows = [_row(case, row) for row in case.rows]
-    # Numbers of NumPy were compared, and JSON does not know its bool.
-    targets = [{**asdict(target), "met": bool(target.met)} for target in case.targets]
-    told = {"absent": case.absent, "notes": list(case.notes), "targets": targets}
-    return {"name": case.name, "title": case.title, "rows": rows, **told}
+def as_markdown(run: Data) -> str:
+    """Return a run with all its tables and notes as a page."""
+    parts = [f"# {as_title(run)}", as_versions(run), LEGEND]
+    for case in run["cases"]:
+        parts.append(f"## {case['name']}: {case['title']}")
+        for head, rows, numbers in ((HEAD, as_rows(case), True), (TARGET_HEAD, as_targets(case), False)):
+            parts += [as_table(head, rows, numbers=numbers)] if rows else []
+        parts += as_notes(case)
+    return "\n\n".join(parts) + "\n"
 
 
-def _row(case: Case, row: Row) -> dict[str, Any]:
-    return {
-        "name": row.name,
-        "bytes": row.bytes,
-        "frames": row.frames,
-        "operations": row.operations,
-        **asdict(row.measured),
-        "bandwidth": row.bandwidth,
-        "share": _number(case.share(row)),
-        "kernel_share": _number(case.kernel_share(row)),
-    }
+def write_page(runs: Mapping[Path, Run], page: Path) -> None:
+    """Write a page of runs by their files, and to `PICTURE` beside it its picture, if there is one.
+
+    Raises
+    ------
+    InputError
+        Page or picture cannot be written, or there is no Matplotlib.
+    """
+    from mirrorskin.bench.roofline import draw_rooflines, roofline_of
+
+    machines = gather(runs.values())
+    rooflines = {one.title: roof for one in machines if (roof := roofline_of(one.cases.values()))}
+    if rooflines:
+        picture = page.parent / PICTURE
+        try:
+            picture.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            where = "choose another place with -o"
+            raise InputError(f"{picture.parent} cannot be made: {error.strerror}; {where}") from error
+        check_output(picture, *runs)
+        draw_rooflines(rooflines, picture)
+    write_text(page, as_page(runs, pictured=bool(rooflines)))
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a text file, or raise InputError."""
+    try:
+        path.write_text(content, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path} could not be written: {error.strerror}; make room") from error
+
+
+def gather(runs: Iterable[Run]) -> list[Machine]:
+    """Return the cases of some runs by the machine that they ran on."""
+    machines: dict[str, Machine] = {}
+    for run in runs:
+        machine = machines.setdefault(as_machine(run), Machine(as_machine(run)))
+        machine.cases.update({case["name"]: case for case in run["cases"]})
+    return list(machines.values())
+
+
+def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
+    """Return the page of some runs; `pictured` says whether there is a picture."""
+    machines = gather(runs.values())
+    parts = ["# Benchmarks", _ABOUT, "## How to measure", _COMMANDS, _METHOD]
+    parts += ["## Machine and runs", _runs(runs)]
+    for title, about, tell in (
+        ("Aims", _AIMS, _aims),
+        ("Calls", _CALLS, _calls),
+        ("Kernels and paths beside peers", _BESIDE, _beside_peers),
+        ("Sizes, types and cores", _SIZES, _sizes),
+    ):
+        parts += _topic(title, about, machines, tell)
+    if pictured:
+        parts += ["## Roofline", f"![Roofline]({PICTURE.as_posix()})", _ROOF]
+    parts += _topic("Cold and warm", _STARTS, machines, _starts)
+    parts += _topic("Accuracy", _ACCURACY, machines, _accuracy)
+    return "\n\n".join(parts) + "\n"
+
+
+def _runs(runs: Mapping[Path, Run]) -> str:
+    """List the machines, and what each run was made with."""
+    lines = []
+    for machine in dict.fromkeys(as_machine(run) for run in runs.values()):
+        lines.append(f"- {machine}:")
+        for path, run in runs.items():
+            if as_machine(run) == machine:
+                quick = "; made with `--quick`: the times mean nothing" if run["quick"] else ""
+                code = (run["commit"] or str(run["versions"].get("mirrorskin")))[:12]
+                lines.append(f"    - {path.name}: {run['date'][:10]}, mirrorskin {code}{quick}")
+    versions = dict.fromkeys(as_versions(run) for run in list(runs.values())[-1:])
+    return "\n".join([*lines, f"- The last of them with {next(iter(versions), '')}."])
+
+
+def _topic(
+    title: str, about: str, machines: Sequence[Machine], tell: Callable[[Machine], list[str]]
+) -> list[str]:
+    """Return a heading and what there is to say of each machine; nothing where there is nothing."""
+    parts = []
+    for machine in machines:
+        if mine := tell(machine):
+            parts += [*([f"**{machine.title}**"] if len(machines) > 1 else []), *mine]
+    return [f"## {title}", about, *parts] if parts else []
+
+
+def _aims(machine: Machine) -> list[str]:
+    cases = [case for case in machine.cases.values() if not _is(case, "accuracy-")]
+    cells = [[case["name"], *row] for case in cases for row in as_targets(case)]
+    return [as_table(("case", *TARGET_HEAD), cells, numbers=False)] if cells else []
+
+
+def _calls(machine: Machine) -> list[str]:
+    """Return the calls with the share that their kernels take."""
+    cells = []
+    for case in machine.cases.values():
+        if _is(case, "call-"):
+            for row in (row for row in case["rows"] if not is_limit(row)):
+                wall, kernel = row["wall"]["median"], row["device"].get("kernel", {}).get("median")
+                share = "" if kernel is None else f"{100 * kernel / wall:.0f} %"
+                cells.append([case["title"], row["name"], as_ms(wall), share])
+    return [as_table(("call", "work", "ms", "in kernels"), cells)] if cells else []
+
+
+def _beside_peers(machine: Machine) -> list[str]:
+    """Return each work of ours that a peer does too, or that an aim is about, beside the quickest peer."""
+    cells = []
+    for case in machine.cases.values():
+        if _is(case, "sweep-", "scaling-", "accuracy-", "call-", "cold-"):
+            continue
+        works = [row for row in case["rows"] if not is_limit(row)]
+        ours, others = ([row for row in works if is_ours(row) is kind] for kind in (True, False))
+        rivals = {row["name"]: _quickest(row, others) for row in ours}
+        wanted = {target["what"] for target in case["targets"]} | {name for name in rivals if rivals[name]}
+        alone = not any(rivals.values())
+        cells += [
+            [case["name"], *_beside(row, rivals[row["name"]])]
+            for row in ours
+            if alone or row["name"] in wanted
+        ]
+    head = ("case", "work", "ms", "GB/s", "of limit", "quickest peer", "ms", "times as fast")
+    return [as_table(head, cells)] if cells else []
+
+
+def is_ours(row: Data) -> bool:
+    """Return whether a row is the engine's: by its name, or because it used the device."""
+    return OURS in row["name"] or "kernel" in row["device"]
+
+
+def _is(case: Data, *starts: str) -> bool:
+    return str(case["name"]).startswith(starts)
+
+
+def _quickest(row: Data, others: Sequence[Data]) -> Data | None:
+    """Return the quickest of the others that do the same: what stands behind the comma of their names."""
+    same = [other for other in others if _part(other) == _part(row)]
+    return min(same, key=lambda other: float(other["wall"]["median"]), default=None)
+
+
+def _beside(row: Data, rival: Data | None) -> list[str]:
+    mine, counted = row["wall"]["median"], bool(row["bytes"])
+    share = row["share"] if counted else None
+    cells = [
+        row["name"],
+        as_ms(mine),
+        f"{row['bandwidth'] / 1e9:.2f}" if counted else "",
+        "" if share is None else f"{100 * share:.0f} %",
+    ]
+    if rival is None:
+        return [*cells, "", "", ""]
+    theirs = rival["wall"]["median"]
+    return [*cells, _head(rival), as_ms(theirs), f"{theirs / mine:.1f}"]
+
+
+def _sizes(machine: Machine) -> list[str]:
+    """Return a table for each set of sizes and types, with a line for each work of ours."""
+    tables: dict[tuple[str, ...], list[list[str]]] = {}
+    for case in machine.cases.values():
+        labels, rows = as_sweep(case)
+        if rows:
+            tables.setdefault(labels, []).extend(rows)
+    return [as_table(("case", "work", *labels), rows) for labels, rows in tables.items()]
+
+
+def as_sweep(case: Data) -> tuple[tuple[str, ...], list[list[str]]]:
+    """Return what a sweep goes through, sizes, types or cores, and its works: names, and cells under those.
+
+    Both are empty where a case is no sweep.
+    """
+    rows = [
+        row for row in case["rows"] if _is(case, "sweep-", "scaling-") and not is_limit(row) and row["bytes"]
+    ]
+    labels = tuple(dict.fromkeys(_part(row) for row in rows))
+    lines: dict[str, dict[str, str]] = {}
+    for row in rows:
+        share = "" if row["share"] is None else f" ({100 * row['share']:.0f} %)"
+        rate = row["bandwidth"] / 1e9
+        lines.setdefault(_head(row), {})[_part(row)] = f"{rate:.{1 if rate >= 1 else 2}f}{share}"
+    cells = ([name, *(found.get(label, "") for label in labels)] for name, found in lines.items())
+    return labels, [[case["name"], *line] for line in cells]
+
+
+def _starts(machine: Machine) -> list[str]:
+    steps: dict[str, dict[str, str]] = {}
+    for case in machine.cases.values():
+        for row in case["rows"]:
+            if _head(row) in ("cold", "warm"):
+                steps.setdefault(_part(row), {})[_head(row)] = as_ms(row["wall"]["median"])
+    cells = [[step, *(found.get(kind, "") for kind in ("cold", "warm"))] for step, found in steps.items()]
+    return [as_table(("step", "cold, ms", "warm, ms"), cells)] if cells else []
+
+
+def _accuracy(machine: Machine) -> list[str]:
+    """Return how many bounds each case of accuracy keeps, and which it does not."""
+    cells = []
+    for case in machine.cases.values():
+        if _is(case, "accuracy-"):
+            missed = [f"{one['what']}: {one['measured']}" for one in case["targets"] if not one["met"]]
+            kept = f"{len(case['targets']) - len(missed)} of {len(case['targets'])}"
+            cells.append([case["name"], case["title"], kept, "; ".join(missed) or "none"])
+    head = ("case", "about", "bounds that are kept", "missed")
+    return [as_table(head, cells, numbers=False)] if cells else []
+
+
+def _head(row: Data) -> str:
+    return str(row["name"]).partition(", ")[0]
+
+
+def _part(row: Data) -> str:
+    return str(row["name"]).partition(", ")[2]
 
 
 def _cells(row: Data) -> list[str]:
@@ -147,13 +365,3 @@ def _cells(row: Data) -> list[str]:
         f"{row['frames'] / wall['median']:.0f}" if row["frames"] else "",
         *("" if share is None else f"{100 * share:.0f} %" for share in shares),
     ]
-
-
-def as_ms(seconds: float) -> str:
-    """Return a time as milliseconds, of three digits or so."""
-    milliseconds = 1e3 * seconds
-    return f"{milliseconds:.{2 if milliseconds < 10 else 1 if milliseconds < 1000 else 0}f}"
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.report import Data, is_limit
+from mirrorskin.bench.report import is_limit
+from mirrorskin.bench.run import Data
 from mirrorskin.view.canvas import new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -33,17 +34,7 @@ _NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "wh
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A kernel on one size and type.
-
-    Attributes
-    ----------
-    bytes, operations : float
-        Of a turn.
-    seconds : float
-        In kernels, by the device's account.
-    share : float or None
-        Of the bandwidth of the limit that took turns with it.
-    """
+    """A kernel on one size and type: bytes, operations and seconds of a turn, and the share of its limit."""
 
     bytes: float
     operations: float
@@ -63,13 +54,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """A kernel in all sizes and types.
-
-    Attributes
-    ----------
-    name, case : str
-    points : tuple of Point
-    """
+    """A kernel in all sizes and types."""
 
     name: str
     case: str
@@ -84,17 +69,7 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True)
 class Roofline:
-    """What a device can do, and what kernels reach of it.
-
-    Attributes
-    ----------
-    bandwidths : dict of float
-        Bytes per second that are read, or combined as a triad, from memory that no cache holds.
-    peak : float
-        Multiply-adds per second; infinite where no run measured them.
-    kernels : tuple of Kernel
-        By the operations with each byte.
-    """
+    """What a device can do, bytes and multiply-adds a second, and its kernels."""
 
     bandwidths: dict[str, float]
     peak: float
@@ -112,13 +87,7 @@ class Roofline:
 
 
 def roofline_of(cases: Iterable[Data]) -> Roofline | None:
-    """Return the roofline of the cases of one machine; None where they tell no limit or no operations.
-
-    Parameters
-    ----------
-    cases : iterable of mapping
-        As `mirrorskin.bench.runs.open_run` returns them.
-    """
+    """Return the roofline of the cases of one machine; None where they have no limit or no operations."""
     rows = [(case["name"], row) for case in cases for row in case["rows"] if _ran_kernels(row)]
     limits = [row for _, row in rows if is_limit(row)]
     points: dict[tuple[str, str], list[Point]] = {}
@@ -135,19 +104,9 @@ def roofline_of(cases: Iterable[Data]) -> Roofline | None:
 
 
 def draw_rooflines(rooflines: Mapping[str, Roofline], path: Path) -> None:
-    """Draw the rooflines of machines, one below the other, into a PNG.
+    """Draw the rooflines of machines, by their titles and one below the other, into a PNG.
 
-    Parameters
-    ----------
-    rooflines : mapping
-        By the machine's title.
-    path : Path
-        PNG to write.
-
-    Raises
-    ------
-    InputError
-        Matplotlib is not installed, or the file cannot be written.
+    Raises InputError where Matplotlib is not installed, or the file cannot be written.
     """
     figure = new_figure(_WIDTH, _HEIGHT * len(rooflines))
     every = figure.subplots(len(rooflines), 2, squeeze=False, width_ratios=[_SHARE, 1 - _SHARE])

@@ -18,7 +18,7 @@ from mirrorskin.cli.groups import Group
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mirrorskin.bench.results import Case
+    from mirrorskin.bench.harness import Case
 
 _RUN = "RUN.json"
 _WIDTH = 100  # a pipe has 80, which would cut the names
@@ -27,7 +27,7 @@ app = typer.Typer(cls=Group, invoke_without_command=True)
 
 
 @app.callback()
-def suite(
+def measure(
     context: typer.Context,
     case: Annotated[
         list[str] | None,
@@ -49,14 +49,14 @@ def suite(
     list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
 ) -> None:
     """Time the kernels and whole paths against the limits and against others; check their accuracy."""
-    from mirrorskin import bench
+    from mirrorskin.bench import run, suite
     from mirrorskin.cli.output import progress
     from mirrorskin.kernels.device import open_device
 
     if context.invoked_subcommand is not None:
         _refuse_options(context)
         return
-    names = bench.choose(case or bench.NAMES)
+    names = suite.choose(case or suite.NAMES)
     if list_:
         typer.echo(json.dumps(names, indent=2) if as_json else "\n".join(names))
         return
@@ -70,31 +70,31 @@ def suite(
                 cases.append(one)
                 show(len(cases))
 
-            bench.run_suite(opened, names, quick, done)
+            suite.run_suite(opened, names, quick, done)
     finally:
         # Also before an error or Ctrl-C: what is done took minutes.
         if cases:
-            _tell(bench.as_data(opened, cases, quick), output, page, as_json)
-    bench.check_accuracy(cases)
+            _tell(run.as_data(opened, cases, quick), output, page, as_json)
+    suite.check_accuracy(cases)
 
 
-@app.command()
-def compare(
+@app.command("compare")
+def compare_runs(
     before: Annotated[Path, typer.Argument(metavar="A.json", help="A run that 'mirrorskin bench -o' wrote.")],
     after: Annotated[Path, typer.Argument(metavar="B.json", help="Another, later one.")],
     as_json: options.Json = False,
 ) -> None:
     """Compare two runs, work by work: what changed by more than its turns vary."""
-    from mirrorskin import bench
     from mirrorskin.bench import compare as comparing
+    from mirrorskin.bench import report, run
 
-    runs = bench.open_run(before), bench.open_run(after)
+    runs = run.open_run(before), run.open_run(after)
     found = comparing.compare(*runs)
     if as_json:
         typer.echo(json.dumps(comparing.as_data(found, *runs), indent=2))
         return
     console = _console()
-    titles = (f"{word}: {bench.as_title(run)}" for word, run in zip("AB", runs, strict=True))
+    titles = (f"{word}: {report.as_title(one)}" for word, one in zip("AB", runs, strict=True))
     console.print(*titles, *(f"warning: {line}" for line in found.warnings), sep="\n", markup=False)
     for name, rows in found.cases.items():
         console.print(f"\n{name}", markup=False)
@@ -102,8 +102,8 @@ def compare(
     console.print("", *found.targets, *found.apart, *found.summary, sep="\n", markup=False)
 
 
-@app.command()
-def report(
+@app.command("report")
+def make_report(
     runs: Annotated[list[Path], typer.Argument(metavar=_RUN, help="Runs that 'mirrorskin bench -o' wrote.")],
     output: Annotated[
         Path,
@@ -111,13 +111,15 @@ def report(
     ],
 ) -> None:
     """Make a page of runs: aims, a summary, a roofline, and every case. Needs no device."""
-    from mirrorskin import bench, io, view
+    from mirrorskin import io, view
+    from mirrorskin.bench.report import write_page
+    from mirrorskin.bench.run import open_run
 
     if output.suffix != ".md":
         raise io.InputError(f"{output}: name a page that ends in .md")
     view.check_drawing()
     io.check_output(output, *runs)
-    bench.write_page({path: bench.open_run(path) for path in runs}, output)
+    write_page({path: open_run(path) for path in runs}, output)
     typer.echo(f"written to {output}", err=True)
 
 
@@ -170,29 +172,29 @@ def _check(output: Path | None) -> Path | None:
 
 
 def _tell(data: Mapping[str, Any], output: Path | None, page: Path | None, as_json: bool) -> None:
-    from mirrorskin import bench
+    from mirrorskin.bench.report import as_markdown, write_text
 
     text = json.dumps(data, indent=2)
     if as_json:
         typer.echo(text)
     else:
         _print(data)
-    for path, content in ((output, text + "\n"), (page, bench.as_markdown(data))):
+    for path, content in ((output, text + "\n"), (page, as_markdown(data))):
         if path is not None:
-            bench.write_text(path, content)
+            write_text(path, content)
             typer.echo(f"written to {path}", err=True)
 
 
 def _print(data: Mapping[str, Any]) -> None:
-    from mirrorskin import bench
+    from mirrorskin.bench import report
 
     console = _console()
-    console.print(bench.as_title(data), bench.LEGEND, sep="\n", markup=False)
+    console.print(report.as_title(data), report.LEGEND, sep="\n", markup=False)
     for case in data["cases"]:
         console.print(f"\n{case['name']}: {case['title']}", markup=False)
-        _print_table(console, bench.HEAD, bench.as_rows(case))
-        _print_table(console, bench.TARGET_HEAD, bench.as_targets(case), numbers=False)
-        for note in bench.as_notes(case):
+        _print_table(console, report.HEAD, report.as_rows(case))
+        _print_table(console, report.TARGET_HEAD, report.as_targets(case), numbers=False)
+        for note in report.as_notes(case):
             console.print(note, markup=False)
 
 

@@ -83,7 +83,7 @@ def test_the_devices_account_is_told_by_kind_and_by_kernel(clock):
     assert one.kernels == pytest.approx({"scan": 0.3, "heights": 0.6})
     assert set(one.device) == {"upload", "kernel"}
     assert one.kernel == pytest.approx(0.9)
-    assert one.transfer == pytest.approx(0.03)
+    assert one.device["upload"].median == pytest.approx(0.03)
     assert one.wall.median == 3
 
 
@@ -91,4 +91,3 @@ def test_a_work_without_a_device_has_no_account_of_it(clock):
     one = take_turns({"a": lambda: clock.move(1)}, 3, Profile())["a"]
     assert one.device == {}
     assert np.isnan(one.kernel)
-    assert one.transfer == 0

@@ -1,65 +1,102 @@
-"""What a case tells as data and tables, whatever it has: no works, no limit, aims alone."""
+"""Runs as tables and as a page; the page of the committed runs is the one in the docs."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_runs import case, row, run, target
 
-from mirrorskin.bench.harness import Measured, Timing
-from mirrorskin.bench.report import TARGET_HEAD, as_data, as_markdown, as_notes, as_rows, as_targets
-from mirrorskin.bench.results import Case, Row, Target
+from mirrorskin.bench.harness import Case, Measured, Row, Target, Timing
+from mirrorskin.bench.report import as_markdown, as_page, as_rows, as_sweep, as_targets, write_page
+from mirrorskin.bench.run import as_data, open_run
+from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
 
+ROOT = Path(__file__).parents[2]
+COMMITTED = sorted((ROOT / "bench" / "results").glob("*.json"))
+LIMIT = row("read limit", 0.1, moved=10**9, kernel=0.08, share=1.0)
+OURS = row("mirrorskin", 0.2, moved=10**9, kernel=0.2, share=0.5)
 SECOND = Timing(1.0, 0.9, 1.1, 3)
-AIMS = (Target("height", "at most 0.1 um", "0.05 um", True), Target("sigma", "0.9 to 1.1", "nan", np.False_))
 
 
-def measured(**device):
-    return Measured(SECOND, device, dict.fromkeys(device, 1.0), 2.0, 0.5)
+def page_of(*runs):
+    return as_page({Path(f"run{n}.json"): one for n, one in enumerate(runs)}, pictured=False)
 
 
-def told(*cases):
-    return as_data(open_device(), cases, quick=False)
+def test_the_page_in_the_docs_is_that_of_the_committed_runs():
+    page = as_page({path: open_run(path) for path in COMMITTED}, pictured=True)
+    made = "make it with: mirrorskin bench report bench/results/*.json -o docs/benchmarks.md"
+    assert (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8") == page, made
 
 
-def test_a_case_of_aims_alone_is_told():
-    data = told(Case("accuracy", "near the truth", [], {}, ("a note",), AIMS))
-    (case,) = data["cases"]
-    assert json.loads(json.dumps(case, allow_nan=False)) == case
-    assert as_rows(case) == []
-    assert as_notes(case) == ["a note"]
-    assert as_targets(case) == [
-        ["height", "at most 0.1 um", "0.05 um", "yes"],
-        ["sigma", "0.9 to 1.1", "nan", "no"],
-    ]
+def test_each_run_has_its_tables_beside_it():
+    for path in COMMITTED:
+        assert path.with_suffix(".md").read_text(encoding="utf-8").count("\n## ") == len(
+            open_run(path)["cases"]
+        )
+
+
+def test_cases_become_json_and_tables_whatever_they_have():
+    aims = (
+        Target("height", "at most 0.1 um", "0.05 um", True),
+        Target("sigma", "0.9 to 1.1", "nan", np.False_),
+    )
+    measured = Measured(SECOND, {"kernel": Timing(0.0, 0.0, 0.1, 3)}, {"scan": 1.0}, {"scan": 8.0}, 2.0, 0.5)
+    rows = [Row("mirrorskin", measured, 0), Row("other", measured, 100)]
+    cases = [Case("accuracy", "near", [], {}, ("a note",), aims), Case("plain", "no limit", rows, {})]
+    data = as_data(open_device(), cases, quick=False)
+    assert json.loads(json.dumps(data, allow_nan=False)) == data
+    near, plain = data["cases"]
+    assert as_targets(near)[1] == ["sigma", "0.9 to 1.1", "nan", "no"]
+    assert [one["kernel_share"] for one in plain["rows"]] == [None, None]
+    assert [cells[-2:] for cells in as_rows(plain)] == [["", ""], ["", ""]]
     page = as_markdown(data)
-    assert f"| {' | '.join(TARGET_HEAD)} |" in page
     assert "| height | at most 0.1 um | 0.05 um | yes |" in page
-    assert "| work |" not in page
+    assert "first call: mirrorskin 2.00 s, other 2.00 s; 1.00 s in all went into building" in page
 
 
-def test_a_case_without_a_limit_has_no_shares():
-    rows = [Row("mirrorskin", measured(kernel=SECOND), 0), Row("other", measured(), 100)]
-    case = Case("plain", "no limit", rows, {})
-    assert np.isnan(case.share(rows[1]))
-    (data,) = told(case)["cases"]
-    assert [row["share"] for row in data["rows"]] == [None, None]
-    assert [cells[-2:] for cells in as_rows(data)] == [["", ""], ["", ""]]
+def test_a_page_has_runs_aims_calls_and_the_quickest_peer():
+    slow, quick = row("NumPy, slow", 0.9), row("Numba, quick", 0.1)
+    works = row("mirrorskin, quick", 0.2, moved=10**9, kernel=0.1, share=0.5), slow, quick
+    aims = target("whole path", True), target("memory | peak", False, "12 MB")
+    found = page_of(
+        run(case("press", LIMIT, OURS, targets=aims), case("call-onset", LIMIT, OURS)),
+        run(case("turn", LIMIT, *works), case("accuracy-all", targets=aims), quick=True),
+    )
+    assert (
+        "run1.json: 2026-11-21, mirrorskin 0123456789ab; made with `--quick`: the times mean nothing" in found
+    )
+    assert "| press | whole path | at most 1.25 times | 1.3 times | yes |" in found
+    assert r"| press | memory \| peak | at most 1.25 times | 12 MB | no |" in found
+    assert "| all about call-onset | mirrorskin | 200.0 | 100 % |" in found
+    assert "| turn | mirrorskin, quick | 200.0 | 5.00 | 50 % | Numba | 100.0 | 0.5 |" in found
+    assert "| accuracy-all | all about accuracy-all | 1 of 2 | memory \\| peak: 12 MB |" in found
+    assert "![" not in found
 
 
-def test_a_kernel_that_took_no_time_in_most_turns_has_no_bandwidth():
-    row = Row("mirrorskin", measured(kernel=Timing(0.0, 0.0, 0.1, 3)), 100)
-    assert np.isnan(row.kernel_bandwidth)
-    (data,) = told(Case("plain", "title", [row], {}))["cases"]
-    assert data["rows"][0]["kernel_share"] is None
+def test_without_aims_or_sweeps_a_page_has_no_such_part():
+    found = page_of(run(case("press", LIMIT, OURS)))
+    assert "## Kernels" in found
+    assert not any(f"## {title}" in found for title in ("Aims", "Sizes", "Cold", "Accuracy", "Calls"))
 
 
-def test_rows_and_aims_of_a_case_are_told_together():
-    rows = [Row("read limit", measured(kernel=SECOND), 100), Row("mirrorskin", measured(kernel=SECOND), 50)]
-    (data,) = told(Case("both", "title", rows, {"torch": "not installed"}, (), AIMS))["cases"]
-    assert data["rows"][1]["share"] == pytest.approx(0.5)
-    assert data["targets"][1] == {"what": "sigma", "bound": "0.9 to 1.1", "measured": "nan", "met": False}
-    assert as_notes(data) == [
-        "first call: mirrorskin 2.00 s; 1.00 s in all went into building OpenCL kernels",
-        "torch: not installed",
+def test_a_sweep_is_a_table_of_sizes():
+    works = [row(f"scan, {size}", 0.5, moved=10**9, share=0.25) for size in ("VGA", "1080p")]
+    labels, lines = as_sweep(case("sweep-onset", LIMIT, *works, row("other, VGA", 1.0, moved=10**7)))
+    assert labels == ("VGA", "1080p")
+    assert lines == [
+        ["sweep-onset", "scan", "2.0 (25 %)", "2.0 (25 %)"],
+        ["sweep-onset", "other", "0.01", ""],
     ]
+    assert as_sweep(case("press", *works)) == ((), [])
+
+
+def test_cold_and_warm_starts_are_a_table():
+    found = page_of(run(case("cold-start", LIMIT, row("cold, import", 0.5), row("warm, import", 0.25))))
+    assert "| import | 500.0 | 250.0 |" in found
+
+
+def test_a_page_that_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"page\.md could not be written"):
+        write_page({Path("a.json"): run(case("press", LIMIT, OURS))}, tmp_path / "none" / "page.md")

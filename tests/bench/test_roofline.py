@@ -1,7 +1,6 @@
 """The roofline holds what a run measured, and becomes a picture."""
 
 import cv2
-import numpy as np
 import pytest
 from bench_runs import case, row, run
 
@@ -69,12 +68,6 @@ def test_the_share_is_of_the_limit_that_binds():
     assert [found.share(one.best) for one in found.kernels] == pytest.approx([0.9, 30 / 40])
 
 
-def test_of_limits_that_are_as_large_the_best_counts():
-    found = roofline(kernel("scan", 15.0), above=[*limits(), *limits(read=12.0, triad=7.0, peak=50.0)])
-    assert found.bandwidths == pytest.approx({"read": 12 * GIGA, "triad": 8 * GIGA})
-    assert found.peak == pytest.approx(50 * GIGA)
-
-
 def test_sizes_and_types_are_one_kernel_and_kernels_are_in_the_order_of_their_intensity():
     found = roofline(
         kernel("late, VGA", 30.0, 50),
@@ -85,12 +78,6 @@ def test_sizes_and_types_are_one_kernel_and_kernels_are_in_the_order_of_their_in
     assert [one.name for one in found.kernels] == ["slow", "scan", "late"]
     assert len(found.kernels[1].points) == 2
     assert found.kernels[1].best.rate == pytest.approx(11 * GIGA)
-
-
-def test_without_a_peak_memory_is_the_only_roof():
-    found = roofline(kernel("scan", 15.0), above=limits()[:3])
-    assert found.peak == np.inf
-    assert found.allowed(1000.0) == pytest.approx(10_000 * GIGA)
 
 
 @pytest.mark.parametrize(

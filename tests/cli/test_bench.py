@@ -8,9 +8,9 @@ import pytest
 from bench_runs import case, row, run, save
 from commands import run as mirrorskin
 
-from mirrorskin.bench import NAMES, suite
-from mirrorskin.bench.harness import Measured, Timing
-from mirrorskin.bench.results import Case, Row, Target
+from mirrorskin.bench import suite
+from mirrorskin.bench.harness import Case, Measured, Row, Target, Timing
+from mirrorskin.bench.suite import NAMES
 from mirrorskin.io import InputError
 
 SECOND = Timing(1.0, 0.9, 1.1, 3)
@@ -25,7 +25,7 @@ def ran(command, *words):
 
 def made_up(name, *targets):
     """Return what runs a case that takes no time."""
-    rows = [Row(work, Measured(SECOND, {}, {}, 1.0, 0.0), 100) for work in ("read limit", "mirrorskin")]
+    rows = [Row(work, Measured(SECOND, {}, {}, {}, 1.0, 0.0), 100) for work in ("read limit", "mirrorskin")]
     return lambda device, quick: Case(name, f"quick: {quick}", rows, {}, (), targets)
 
 
@@ -53,11 +53,11 @@ def names_of(told):
 
 
 def test_a_run_agrees_with_its_peers_and_writes_json_and_a_page(tmp_path):
-    words = ["--case", "equation4-uint8", "--case", "normals-*", "-o", tmp_path / "run.json"]
+    words = ["--case", "equation4-uint8", "--case", "hold2-uint8", "-o", tmp_path / "run.json"]
     told = json.loads(ran(["--quick", "--json"], *words))
     assert told == json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
     assert {"date", "commit", "device", "processor", "threads", "versions"} <= set(told)
-    assert len(told["cases"]) == 4
+    assert len(told["cases"]) == 2
     for one in told["cases"]:
         assert all(work["wall"]["median"] > 0 for work in one["rows"])
         assert one["rows"][0]["share"] == 1
@@ -65,11 +65,11 @@ def test_a_run_agrees_with_its_peers_and_writes_json_and_a_page(tmp_path):
 
 
 def test_the_table_fits_a_hundred_columns():
-    names = ["--case", "full-float32", "--case", "live", "--case", "twin"]
+    names = ["--case", "full-float32", "--case", "live"]
     table = ran(["--quick"], *names).splitlines()
     assert max(map(len, table)) <= 100
     works = [line.split("  ")[0] for line in table]
-    assert works.count("read limit") == 3
+    assert works.count("read limit") == 2
     assert {"mirrorskin", "NumPy", "OpenCV", "mirrorskin, full default"} <= set(works)
 
 
@@ -168,7 +168,7 @@ def test_two_runs_are_compared(runs):
 def test_a_page_is_made_of_runs_without_a_device(runs, tmp_path, monkeypatch):
     monkeypatch.setattr("mirrorskin.kernels.device.open_device", None)
     assert ran(["report"], *runs, "-o", tmp_path / "page.md") == ""
-    assert "| 400.0 |" in (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "Some GPU" in (tmp_path / "page.md").read_text(encoding="utf-8")
     assert (tmp_path / "images" / "roofline.png").stat().st_size > 10_000
 
 

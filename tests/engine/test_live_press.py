@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from live_frames import PIXEL, Clock, paced, press_frames, press_header, turn_header
 
-from mirrorskin.bench.stacks import references
+from mirrorskin.bench.scenes import references
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.live import LivePress, run
 from mirrorskin.io import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, turn_header
 
-from mirrorskin.bench.turns import SCALES, TILT
+from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
 from mirrorskin.engine.live import LiveRotation, choose_window, run
 from mirrorskin.engine.rotation.normals_to_height import find_slopes

@@ -39,6 +39,7 @@ def row(
         "wall": timing(seconds, spread, rounds),
         "device": {} if kernel is None else {"kernel": timing(kernel, spread, rounds)},
         "kernels": {} if kernel is None else {"some_kernel": kernel},
+        "moved": {} if kernel is None else {"some_kernel": moved},
         "first": seconds,
         "compile": 0,
         "bandwidth": moved / seconds,

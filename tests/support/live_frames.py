@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench import stacks, turns
-from mirrorskin.bench.live.paced import Paced
+from mirrorskin.bench import scenes
+from mirrorskin.bench.live import Paced
 from mirrorskin.io import Block, Header
 
 PIXEL = 0.05
@@ -30,19 +30,19 @@ class Clock:
 
 def press_frames(shape: tuple[int, int, int], dtype: str = "uint8") -> NDArray[Any]:
     frames = np.empty(shape, dtype)
-    stacks.fill(frames, "press")
+    scenes.fill_press(frames)
     return frames
 
 
 def turn_frames(shape: tuple[int, int, int], dtype: str = "uint8") -> NDArray[Any]:
     frames = np.empty(shape, dtype)
-    turns.fill(frames)
+    scenes.fill_turns(frames)
     return frames
 
 
 def phases(count: int, seed: int = 0) -> NDArray[np.float64]:
     """Phases of eight frames a turn, as uneven as live ones are."""
-    even = np.arange(count) * (2 * np.pi / turns.STEPS)
+    even = np.arange(count) * (2 * np.pi / scenes.STEPS)
     return even + np.random.default_rng(seed).normal(0, 0.02, count)
 
 
@@ -51,8 +51,8 @@ def press_header(**other: Any) -> Header:
 
 
 def turn_header(dtype: str = "uint8", **other: Any) -> Header:
-    offset, gain, _ = turns.SCALES[dtype]
-    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "tilt": turns.TILT}
+    offset, gain, _ = scenes.SCALES[dtype]
+    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "tilt": scenes.TILT}
     return Header("axial", **{"pixel_size": (PIXEL, PIXEL), **known, **other})
 
 

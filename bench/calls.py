@@ -1,0 +1,221 @@
+"""Whole calls as users make them: arrays in and maps out; commands and imports in processes of their own.
+
+Each row has the seconds of its kernels beside those of the call: the rest is copies and host work.
+Sizes: ``call-NAME`` is that of the paper's cameras, ``call-NAME-small`` 480 x 640 or less.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mirrorskin import engine
+from mirrorskin.bench.files import make_press, make_turns, new_folder, record
+from mirrorskin.bench.harness import OURS, Case, Cases, Measured, Row, Timing, Work, check_memory, take_turns
+from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.scenes import (
+    PIXEL,
+    SCALES,
+    TILT,
+    Shape,
+    blob_mask,
+    fill_press,
+    fill_turns,
+    noisy_slopes,
+    phases,
+    references,
+    travel_of,
+    turn_noise,
+)
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.errors import DeviceError
+
+_HD, _VGA, _TINY = (1080, 1920), (480, 640), (48, 64)
+_ROUNDS = 7
+_ROOM = 200  # bytes of a pixel for maps and what is kept
+_BYTE = np.dtype(np.uint8)
+
+
+def run_onset(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+    """Time `find_onset` with references of each pixel."""
+    frames = np.empty((count, *shape), np.uint8)
+    fill_press(frames)
+    dark, bright = references(shape, _BYTE)
+    travel = travel_of(count)
+    call = partial(engine.find_onset, frames, travel, dark=dark, bright=bright, device=device)
+    works = {"find_onset": call}
+    return _run(name, f"onset of {_size(frames.shape)}, references", works, frames.nbytes, device, quick)
+
+
+def run_normals(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+    """Time `estimate_normals` of one turn."""
+    frames = np.empty((count, *shape), np.uint8)
+    fill_turns(frames)
+    offset, gain, _ = SCALES["uint8"]
+    known: dict[str, Any] = {"tilt": TILT, "gain": gain, "offset": offset, "noise": turn_noise(_BYTE)}
+    call = partial(engine.estimate_normals, frames, phases(count), device=device, **known)
+    works = {"estimate_normals": call}
+    return _run(name, f"normals of {_size(frames.shape)}", works, frames.nbytes, device, quick)
+
+
+def run_correlate(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+    """Time `correlate`."""
+    frames = np.empty((count, *shape), np.uint8)
+    fill_turns(frames)
+    works = {"correlate": partial(engine.correlate, frames, phases(count), device=device)}
+    return _run(name, f"wave of {_size(frames.shape)}", works, frames.nbytes, device, quick)
+
+
+def run_integrate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
+    """Time `integrate` of a full picture and within a mask, with standard deviations and without."""
+    dz_dx, dz_dy = noisy_slopes(shape)
+    mask = blob_mask(shape)
+    call = partial(engine.integrate, dz_dx, dz_dy, PIXEL, device=device)
+    works = {
+        "integrate": partial(call, sigma=False),
+        "integrate, sigma": partial(call, sigma=True),
+        "integrate within a mask": partial(call, mask=mask, sigma=False),
+        "integrate within a mask, sigma": partial(call, mask=mask, sigma=True),
+    }
+    title = f"heights of slopes of {shape[0]} x {shape[1]}"
+    return _run(name, title, works, 3 * dz_dx.nbytes, device, quick)
+
+
+def _run(
+    name: str, title: str, works: Mapping[str, Callable[[], object]], moved: int, device: Device, quick: bool
+) -> Case:
+    limits = Limits(device, moved)
+    timed: dict[str, Work] = {**limits.works(), **works}
+    measured = take_turns(timed, 1 if quick else _ROUNDS, device.profile)
+    rows = [Row(f"{OURS}, {work}", measured[work], moved) for work in works]
+    return Case(name, title, [*limits.rows(measured), *rows], {}, tuple(map(_parts, rows)))
+
+
+def run_reconstruct(name: str, counts: tuple[int, int], shape: Shape, device: Device, quick: bool) -> Case:
+    """Time the command ``mirrorskin reconstruct`` of a press and of a turn, from process start to end."""
+    offset, gain, _ = SCALES["uint8"]
+    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "pixel_size": (0.03, 0.03)}
+    sources = {
+        f"press of {counts[0]}": make_press((counts[0], *shape), pixels=True),
+        f"turn of {counts[1]}": make_turns((counts[1], *shape), **known),
+    }
+    rows = []
+    with new_folder(name, 4 * sum(counts) * math.prod(shape)) as folder:
+        for number, (what, source) in enumerate(sources.items()):
+            path = folder / f"{number}.h5"
+            record(source, path)
+            words = ["reconstruct", str(path), "-o", str(folder / f"{number}-result.h5"), "--json"]
+            words += ["--device", device.info.title]
+            command = [sys.executable, "-m", "mirrorskin.cli.main", *words]
+            measured = _time_process(command, 1 if quick else _ROUNDS, Path(words[3]))
+            rows.append(
+                Row(f"{OURS}, reconstruct, {what}", measured, math.prod(source.shape), source.shape[0])
+            )
+    title = f"the command reconstruct on {shape[0]} x {shape[1]} uint8, caches of kernels full"
+    return Case(name, title, rows, {}, tuple(map(_parts, rows)))
+
+
+def run_import(_: Device, quick: bool) -> Case:
+    """Time processes that import the engine, and NumPy alone."""
+    rows = []
+    for what in ("mirrorskin.engine", "numpy"):
+        command = [sys.executable, "-c", f"import {what}"]
+        rows.append(Row(f"import {what}", _time_process(command, 1 if quick else _ROUNDS)))
+    return Case("call-import", "a process that imports, from start to end", rows, {})
+
+
+def _time_process(command: list[str], rounds: int, made: Path | None = None) -> Measured:
+    """Time a process, the first of which does not count; its device's account is the profile in its JSON.
+
+    What it `made` is removed before each, since to replace a file takes longer.
+    """
+    seconds: list[float] = []
+    profiles: list[list[dict[str, Any]]] = []
+    for _ in range(rounds + 1):
+        if made is not None:
+            made.unlink(missing_ok=True)
+        begun = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True)
+        seconds.append(time.perf_counter() - begun)
+        if done.returncode:
+            last = (done.stderr.strip() or "it said nothing").splitlines()[-1]
+            raise DeviceError(f"{' '.join(command[1:4])} ended with {done.returncode}: {last}")
+        profiles.append(json.loads(done.stdout)["profile"] if done.stdout else [])
+
+    def total(profile: list[dict[str, Any]], kind: str) -> float:
+        return float(sum(record["seconds"] for record in profile if record["kind"] == kind))
+
+    kinds: tuple[Any, ...] = ("upload", "kernel", "download")
+    device = {kind: [total(profile, kind) for profile in profiles[1:]] for kind in kinds}
+    last_records = [record for record in profiles[-1] if record["kind"] == "kernel"]
+    return Measured(
+        Timing.of(seconds[1:]),
+        {kind: Timing.of(values) for kind, values in device.items() if any(values)},
+        {record["name"]: record["seconds"] for record in last_records},
+        {record["name"]: record["bytes"] for record in last_records},
+        seconds[0],
+        total(profiles[0], "compile"),
+    )
+
+
+def _parts(row: Row) -> str:
+    """Say which share of a call is in kernels, and which in copies."""
+    wall, device = row.measured.wall.median, row.measured.device
+    copies = sum(device[kind].median for kind in device if kind != "kernel")
+    kernel = device["kernel"].median if "kernel" in device else 0.0
+    shares = f"{100 * kernel / wall:.0f} % in kernels, {100 * copies / wall:.0f} % in copies"
+    return f"{row.name}: {1e3 * wall:.1f} ms, {shares}"
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{' x '.join(map(str, shape))} uint8"
+
+
+def _stack(
+    name: str, run: Callable[[str, int, Shape, Device, bool], Case], count: int, small: int
+) -> dict[str, Callable[[Device, bool], Case]]:
+    """Return a call on frames of both sizes."""
+
+    def sized(title: str, frames: int, shape: Shape, device: Device, quick: bool) -> Case:
+        shape, frames = (_TINY, 8) if quick else (shape, frames)
+        check_memory(title, (4 * frames + _ROOM) * math.prod(shape))
+        return run(title, frames, shape, device, quick)
+
+    both = {name: (count, _HD), f"{name}-small": (small, _VGA)}
+    return {title: partial(sized, title, frames, shape) for title, (frames, shape) in both.items()}
+
+
+def _map(
+    name: str, run: Callable[[str, Shape, Device, bool], Case], shape: Shape, small: Shape
+) -> dict[str, Callable[[Device, bool], Case]]:
+    both = {name: shape, f"{name}-small": small}
+    return {
+        title: lambda device, quick, title=title, size=size: run(  # type: ignore[misc]
+            title, _TINY if quick else size, device, quick
+        )
+        for title, size in both.items()
+    }
+
+
+def _commands(name: str, shape: Shape, device: Device, quick: bool) -> Case:
+    return run_reconstruct(name, (30, 8), shape, device, quick)
+
+
+CASES: Cases = {
+    **_stack("call-onset", run_onset, 64, 16),
+    **_stack("call-normals", run_normals, 8, 8),
+    **_stack("call-correlate-8", run_correlate, 8, 8),
+    **_stack("call-correlate-64", run_correlate, 64, 64),
+    **_map("call-integrate", run_integrate, (1024, 1024), (256, 256)),
+    **_map("call-reconstruct", _commands, (480, 480), (120, 120)),
+    "call-import": run_import,
+}

@@ -1,0 +1,117 @@
+"""Each case runs at a tiny size, its works agree, and it returns what reports are made of."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mirrorskin.bench import integration, suite
+from mirrorskin.bench.harness import (
+    Case,
+    DisagreementError,
+    InaccurateError,
+    Measured,
+    Row,
+    Target,
+    Timing,
+    agree,
+)
+from mirrorskin.bench.run import as_data
+from mirrorskin.bench.scenes import blob_mask, noisy_slopes, random_cuts
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import open_device
+
+QUICK = (
+    "equation4-uint8",
+    "full-float32",
+    "live",
+    "correlate-uint8",
+    "sliding",
+    "normals-uint8",
+    "call-onset",
+    "call-correlate-8-small",
+    "integrate-live",
+    "sweep-onset",
+    "file-press",
+    "file-lab",
+    "live-vertical-vga",
+    "accuracy-edges",
+)
+
+
+def check_case(name):
+    device = open_device()
+    (case,) = suite.run_suite(device, [name], quick=True)
+    assert case.name == name
+    (data,) = as_data(device, [case], quick=True)["cases"]
+    assert json.loads(json.dumps(data, allow_nan=False)) == data
+    works = [row for row in case.rows if "limit" not in row.name]
+    assert all(row.measured.wall.median > 0 for row in works)
+    assert name.startswith("accuracy-") == bool(case.targets)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_case_runs_at_a_tiny_size(name):
+    check_case(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in suite.NAMES if name not in QUICK])
+def test_every_other_case_runs_at_a_tiny_size(name):
+    check_case(name)
+
+
+def test_a_call_says_which_share_its_kernels_take():
+    (case,) = suite.run_suite(open_device(), ["call-correlate-8"], quick=True)
+    (work,) = [row for row in case.rows if "limit" not in row.name]
+    assert set(work.measured.kernels) == set(work.measured.moved) != set()
+    assert "% in kernels" in case.notes[0]
+
+
+def test_patterns_choose_cases_in_their_order():
+    assert suite.choose(["full-*", "equation4-uint8"])[:2] == ("equation4-uint8", "full-uint8")
+    with pytest.raises(InputError, match=r"case 'onset': no such case; the nearest are .*; --list names all"):
+        suite.choose(["onset"])
+
+
+def test_an_inaccurate_device_fails():
+    cases = [Case("accuracy-press", "", [], {}, (), (Target("height", "at most 1", "3", False),))]
+    with pytest.raises(InaccurateError, match="accuracy-press, height: 3, must be at most 1"):
+        suite.check_accuracy(cases)
+    suite.check_accuracy([Case("file-press", "", [], {}, (), cases[0].targets)])
+
+
+def test_maps_that_differ_are_named_with_a_pixel():
+    ours = {"height": np.array([[1.0, np.nan], [2.0, 3.0]])}
+    agree("peer", {"height": ours["height"] + 0.1}, ours, {"height": 0.2})
+    agree("peer", {"height": ours["height"].copy()}, ours)
+    other = {"height": np.array([[1.0, np.nan], [2.0, 4.0]])}
+    agree("peer", other, ours, spared=1)
+    with pytest.raises(
+        DisagreementError, match=r"peer differs from mirrorskin in the height of 1 of 4 .*\(1, 1\)"
+    ):
+        agree("peer", other, ours)
+    with pytest.raises(DisagreementError, match="there is no height"):
+        agree("peer", {}, ours)
+
+
+def test_shares_are_of_the_limit_above_or_of_the_case():
+    def row(name, seconds, limit=None):
+        timing = Timing(seconds, seconds, seconds, 3)
+        return Row(name, Measured(timing, {"kernel": timing}, {}, {}, 1.0, 0.0), 100, limit=limit)
+
+    first, second = row("read limit, small", 1.0), row("read limit, large", 2.0)
+    works = row("scan, small", 4.0, first), row("scan, large", 4.0, second), row("scan", 4.0)
+    case = Case("sweep", "", [first, second, *works], {})
+    assert [case.share(work) for work in works] == [0.25, 0.5, 0.25]
+    assert case.kernel_share(works[1]) == 0.5
+
+
+def test_a_direct_solution_solves_its_own_equations():
+    shape = (40, 50)
+    slopes, mask, edges = noisy_slopes(shape), blob_mask(shape), random_cuts(shape, 5)
+    truth = integration.find_truth(slopes, mask, edges)
+    left = truth.system.matrix @ truth.values - truth.system.source
+    assert np.abs(left).max() < 1e-12
+    assert truth.error(truth.values) < 1e-15
+    assert truth.error(truth.map) < 1e-6
