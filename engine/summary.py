@@ -12,12 +12,12 @@ from mirrorskin.io import Result
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """How much of a result was answered.
+    """How much of a result was answered; ``str()`` of it is one line.
 
     Attributes
     ----------
     what : {"height", "normals", "azimuth"}
-        What was asked for.
+        The maps that count.
     pixels, answered : int
         All, and those with an answer; in each turn, where each has maps of its own.
     quantity, unit : str
@@ -25,11 +25,11 @@ class Summary:
     lowest, highest : float
         NaN without an answer.
     in_contact : int or None
-        Pixels told to be in contact in every frame, if that was asked.
+        Pixels in contact in every frame, if that was estimated.
     turns : int or None
         How many have maps of their own.
     filled : int or None
-        Of the pixels with a height, those that were filled, if any were looked for.
+        Of the pixels with a height, those that were filled, if holes were looked for.
     relief : (float, float) or None
         Lowest and highest of the heights that go with normals and are relative, mm.
     """
@@ -59,57 +59,42 @@ class Summary:
         if self.in_contact is not None:
             parts.append(f"in contact at {self.in_contact}")
         if self.relief is not None:
-            lowest, highest = self.relief
-            parts.append(f"relative height from {lowest:.3f} to {highest:.3f} mm")
+            parts.append("relative height from {:.3f} to {:.3f} mm".format(*self.relief))
         return ", ".join(parts)
 
 
 def summarise(result: Result) -> Summary:
-    """Count the pixels of a result that have an answer, and tell how far the answers reach.
+    """Count the pixels of a result that have an answer, and find the range of the answers.
 
-    Of a result without zeniths that has azimuths, the modulation is told. Of one with normals, whose heights
-    are all relative, the normals are.
+    They are heights; normals where there are some and all heights are relative; else azimuths, whose
+    modulation is given.
     """
-    if result.zenith is not None and (result.height is None or _relative(result)):
-        return _summary(result, "normals", result.zenith, "zenith", np.degrees(result.zenith), "deg")
-    if result.height is None and result.azimuth is not None and result.modulation is not None:
-        return _summary(result, "azimuth", result.azimuth, "modulation", result.modulation, "counts")
     height = np.empty(0, np.float32) if result.height is None else result.height
-    return _summary(result, "height", height, "height", height, "mm")
-
-
-def _summary(
-    result: Result,
-    what: str,
-    answers: NDArray[np.float32],
-    quantity: str,
-    values: NDArray[np.float32],
-    unit: str,
-) -> Summary:
+    relative = result.offset_unknown is not None and bool(np.all(result.offset_unknown))
+    answers, values, names = height, height, ("height", "height", "mm")
+    if result.zenith is not None and (result.height is None or relative):
+        answers, values, names = result.zenith, np.degrees(result.zenith), ("normals", "zenith", "deg")
+    elif result.height is None and result.azimuth is not None and result.modulation is not None:
+        answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")
+    what, quantity, unit = names
     answered = np.isfinite(answers)
-    known = values[answered & np.isfinite(values)]
+    lowest, highest = _range(values[answered]) or (np.nan, np.nan)
     return Summary(
         what,
         answers.size,
         int(np.count_nonzero(answered)),
         quantity,
         unit,
-        lowest=float(np.min(known)) if known.size else np.nan,
-        highest=float(np.max(known)) if known.size else np.nan,
+        lowest,
+        highest,
         in_contact=None if result.contact is None else int(np.count_nonzero(result.contact)),
         turns=len(answers) if answers.ndim == 3 else None,
         filled=None if result.filled is None else int(np.count_nonzero(result.filled)),
-        relief=_relief(result),
+        relief=_range(height) if relative else None,
     )
 
 
-def _relative(result: Result) -> bool:
-    """Tell whether no absolute height is known."""
-    return result.offset_unknown is not None and bool(np.all(result.offset_unknown))
-
-
-def _relief(result: Result) -> tuple[float, float] | None:
-    """Return how far heights reach that are relative, if there are any."""
-    if result.height is None or not _relative(result) or not np.isfinite(result.height).any():
-        return None
-    return float(np.nanmin(result.height)), float(np.nanmax(result.height))
+def _range(values: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Return the lowest and the highest finite value, if there is any."""
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else None

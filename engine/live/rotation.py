@@ -1,4 +1,4 @@
-"""A rotation while it goes on: normals of the turn that has just been, edges, and heights that follow."""
+"""A rotation while it goes on: normals of the last turn, edges, and heights that follow."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live.press import area_of
@@ -32,12 +31,12 @@ from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
 from mirrorskin.kernels.device import Device
 
 _FEWEST = 3  # frames that determine a wave
-_PLACED = 8  # updates after which it is told anew how high the object stands
+_PLACED = 8  # updates after which it is estimated anew how high the object stands
 _WARMING = 10  # updates after which every kernel has run
 _PARTS = 24  # of the longest kernel
-_HUNGRY = 0.1  # seconds after which a part is done whether or not there is time
+_OVERDUE = 0.1  # seconds after which a part is done whether or not there is time
 _GUESS = 0.005  # seconds that a part may take, where none was done yet
-_CALM = 0.7  # share of the longest part's time that is kept from part to part
+_DECAY = 0.7  # of the longest part's time, from part to part
 _NO_GAIN = "none: the source has no zenith gain"
 _NO_PIXEL_SIZE = "none: the source has no pixel size"
 
@@ -54,7 +53,7 @@ def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int,
     Raises
     ------
     mirrorskin.io.InputError
-        A turn has fewer than three, from which no wave can be told, or fewer than are wanted.
+        A turn has fewer than three, which determine no wave, or fewer than are wanted.
     """
     if not _FEWEST <= frames_a_turn < math.inf:
         raise InputError(f"{frames_a_turn:g} frames a turn: at least 3 are needed; turn more slowly")
@@ -117,22 +116,17 @@ class LiveRotation:
         self._source, self.every, self._size = source, every, window
         header, shape = source.header, source.shape[1:]
         self._method, self._header = method, header
-        self._wave: Correlator | None = None
-        self._normals: NormalWindow | None = None
         wall = wall_response_of(source)
         self._response = None if wall is None else initial_response(wall, source, header)
-        if header.zenith_gain is None and wall is None:
-            self._wave = Correlator(shape, source.dtype, window=window, device=device)
-            self.device = self._wave.device
+        known = header.zenith_gain is not None or wall is not None
+        self._window: NormalWindow | Correlator
+        if known:
+            options = options_from(header, method, noise, self._response, device)
+            self._window = NormalWindow(shape, source.dtype, window=window, **options)
         else:
-            self._normals = NormalWindow(
-                shape,
-                source.dtype,
-                window=window,
-                **options_from(header, method, noise, self._response, device),
-            )
-            self.device = self._normals.device
-        known = self._normals is not None
+            self._window = Correlator(shape, source.dtype, window=window, device=device)
+        self._normals = self._window if isinstance(self._window, NormalWindow) else None
+        self.device = self._window.device
         self._edges = SpareEdges(self.device, shape) if edges and known else None
         self._slopes = self._heights = None
         if integrate and known and header.pixel_size is not None:
@@ -143,11 +137,11 @@ class LiveRotation:
     @property
     def room(self) -> NDArray[Any]:
         """Where a source may write the next frames, (n, H, W)."""
-        return self._frames_to.room
+        return self._window.room
 
     def warm(self) -> None:
         """Rotate a slanted plane for a while, and forget it."""
-        with suppress(InputError):  # what a plane does not tell
+        with suppress(InputError):  # such as noise or tilt, which a plane does not determine
             for number in range(self._size + _WARMING):
                 phase = 2 * np.pi * number / self._size
                 self.push(self._plane(phase), phase=np.array([phase]))
@@ -160,7 +154,7 @@ class LiveRotation:
     def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`."""
         with naming(self._source):
-            self._frames_to.push(frames, phase=phase, lent=lent)
+            self._window.push(frames, phase=phase, lent=lent)
 
     def maps(self) -> Maps:
         """Return the maps of the last window; none until one is full."""
@@ -169,7 +163,7 @@ class LiveRotation:
             return {}
         with naming(self._source):
             normals.estimate()
-        self._follow(normals)
+        self._start_heights(normals)
         self._has_estimate = True
         vectors, contact = (normals.fetch_early(name) for name in ("vectors", "contact"))
         height = None if self._heights is None else self._heights.result()  # found meanwhile
@@ -200,10 +194,9 @@ class LiveRotation:
     def correlation(self) -> Correlation:
         """Return the fit of the frames in the last window; see ``Correlator.result``."""
         with naming(self._source):
-            if self._normals is not None:
-                return self._normals.correlation()
-            assert self._wave is not None
-            return self._wave.result()
+            if isinstance(self._window, NormalWindow):
+                return self._window.correlation()
+            return self._window.result()
 
     def result(self) -> Result:
         """Return the maps of the last window, heights as near to their normals as ``integrate`` brings them.
@@ -221,11 +214,11 @@ class LiveRotation:
         if self._normals is None:
             process |= {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
             return self._signed(Result(azimuth=wave.azimuth, **maps), process)
-        normals = self._settled()
+        normals = self._normals_in_place()
         edges = find_edges(normals.vectors, normals.sigma, normals.contact, device=self.device)
         systematic = None if self._response is None else self._response.sigma
         result = rotation_maps(Rotation(normals, normals.sigma, edges, self.device, {}, systematic))
-        process |= self._tell(normals)
+        process |= self._provenance(normals)
         if self._header.pixel_size is None:
             process["height"] = _NO_PIXEL_SIZE
             return self._signed(replace(result, **maps), process)
@@ -238,15 +231,10 @@ class LiveRotation:
     def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
         return undistorted(attach_provenance(result, self._source, self.device, process), self._source)
 
-    @property
-    def _frames_to(self) -> NormalWindow | Correlator:
-        """What frames are pushed into."""
-        found = self._normals if self._normals is not None else self._wave
-        assert found is not None
-        return found
-
     def _place(self, height: NDArray[np.float32]) -> None:
-        """Tell the window where the object is, if that counts: its pieces' tops as high as the press."""
+        """Set where the object is, if that matters: its pieces' tops are as high as the press is deep."""
+        from scipy import ndimage
+
         response, normals, press = self._response, self._normals, self._header.press
         if response is None or normals is None or press is None:
             return
@@ -256,8 +244,8 @@ class LiveRotation:
             np.where(piece > 0, np.clip(press + height - tops[piece], 0, press), response.planes[4])
         )
 
-    def _settled(self) -> Normals:
-        """Return the normals of the last window, the object placed as well as they tell."""
+    def _normals_in_place(self) -> Normals:
+        """Return the normals of the last window, with the object placed by a first estimate of them."""
         normals, response, header = self.normals(), self._response, self._header
         if response is None or header.pixel_size is None or header.press is None:
             return normals
@@ -266,7 +254,7 @@ class LiveRotation:
         self._normals.place(coarse_heights(*maps, header.pixel_size, header.press, self.device))
         return self.normals()
 
-    def _follow(self, normals: NormalWindow) -> None:
+    def _start_heights(self, normals: NormalWindow) -> None:
         """Begin a step towards the heights of the normals that are being estimated."""
         if self._slopes is None or self._heights is None:
             return
@@ -286,8 +274,8 @@ class LiveRotation:
         frame = np.clip(level + swing * math.cos(phase), 0, most)
         return np.broadcast_to(np.nan_to_num(frame), (1, rows, columns)).astype(dtype)
 
-    def _tell(self, normals: Normals) -> dict[str, ProcessValue]:
-        """Say what the normals were made with."""
+    def _provenance(self, normals: Normals) -> dict[str, ProcessValue]:
+        """Return what the normals were made with, for the process."""
         header = self._header
         scale: dict[str, ProcessValue] = {
             "zenith_gain": parameter_origin(None, header.zenith_gain, "none"),
@@ -310,7 +298,7 @@ class LiveRotation:
 
     def reset(self) -> None:
         """Forget the frames so far."""
-        self._frames_to.reset()
+        self._window.reset()
         self._has_estimate, self._updates = False, 0
         if self._response is not None and self._normals is not None:
             self._normals.place(self._response.planes[4])
@@ -322,19 +310,7 @@ class LiveRotation:
 
 
 class SpareEdges:
-    """Edges of the last normals for which there was time.
-
-    Parameters
-    ----------
-    device : Device
-    shape : (int, int)
-        Rows and columns.
-
-    Attributes
-    ----------
-    lines : ndarray, (H, W), uint8, or None
-        See ``find_edges``; None until the first are drawn.
-    """
+    """Edges of the last normals for which there was time: ``lines``, (H, W), None until they are drawn."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device = device
@@ -348,19 +324,12 @@ class SpareEdges:
         self._cost, self._last = _GUESS, -math.inf
 
     def work(self, window: NormalWindow, seconds: float) -> None:
-        """Go on with the drawing for as long as there is time, at least a little now and then.
-
-        Parameters
-        ----------
-        window : NormalWindow
-            Whose last estimate is drawn next.
-        seconds : float
-        """
+        """Go on drawing a window's last estimate for some seconds, a little now and then anyway."""
         begun = now = time.perf_counter()
-        while begun + seconds - now > self._cost or now - self._last > _HUNGRY:
+        while begun + seconds - now > self._cost or now - self._last > _OVERDUE:
             self._part(window)
             self._last = time.perf_counter()
-            self._cost = max(self._last - now, _CALM * self._cost)
+            self._cost = max(self._last - now, _DECAY * self._cost)
             now = self._last
 
     def finish(self, window: NormalWindow) -> None:
