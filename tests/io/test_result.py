@@ -14,38 +14,25 @@ from mirrorskin import io
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 
 
-def a_result(**changes):
+PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
+FLOATS = ("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual")
+
+
+def a_press(**changes):
     height = np.linspace(-1, 0, 35, dtype=np.float32).reshape(5, 7)
     height[1, 2] = np.nan
-    x, y = io.pixel_axes((5, 7), (0.5, 0.6))
-    status = np.ones((5, 7), np.uint8)
-    maps = {
-        "height": height,
-        "height_sigma": height / 10,
-        "status": status,
-        "x": x,
-        "y": y,
-        "process": PROCESS,
-    }
-    return io.Result(**maps | changes)
+    maps = {"height": height, "height_sigma": height / 10, "status": np.ones((5, 7), np.uint8)}
+    return io.Result(**maps | PLACES | {"process": PROCESS} | changes)
 
 
-def a_turn(*size, only=None, **changes):
-    """Return a result with every map of a rotation, of so many turns, rows and columns, or with some maps."""
+def a_rotation(*size, **changes):
+    """Return a result with every map of a rotation, of so many turns, rows and columns."""
     rng = np.random.default_rng(5)
-    floats = ("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual")
-    maps = {name: rng.normal(size=size).astype(np.float32) for name in floats}
+    maps = {name: rng.normal(size=size).astype(np.float32) for name in FLOATS}
     maps["normals"] = rng.normal(size=(*size, 3)).astype(np.float32)
     maps["normals"][..., 1, 2, :] = np.nan
     maps |= {name: rng.integers(0, 2, size).astype(np.uint8) for name in ("edges", "contact")}
-    return io.Result(**{name: maps[name] for name in only or maps} | {"process": PROCESS} | changes)
-
-
-PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
-PLOTTED = [
-    *("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual"),
-    *("edges", "contact"),
-]
+    return io.Result(**maps | {"process": PROCESS} | changes)
 
 
 @pytest.fixture
@@ -54,7 +41,7 @@ def path(tmp_path):
 
 
 def test_a_result_has_the_layout_of_the_design(path):
-    io.save_result(a_result(), path)
+    io.save_result(a_press(), path)
     with h5py.File(path) as file:
         assert dict(file.attrs) == {"NX_class": "NXroot", "default": "entry"}
         assert dict(file["entry"].attrs) == {
@@ -86,23 +73,19 @@ def test_a_result_has_the_layout_of_the_design(path):
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"height_sigma": None},
-        {"x": None, "y": None},
-        {"process": {}},
-        {"height_sigma": None, "status": None},
-    ],
+    "changes", [{}, {"height_sigma": None, "status": None}, {"x": None, "y": None}, {"process": {}}]
 )
 def test_a_result_comes_back_as_it_was(path, changes):
-    result = a_result(**changes)
+    result = a_press(**changes)
     io.save_result(result, path)
-    assert_same(io.open_result(path), result)
+    found = io.open_result(path)
+    assert_same(found, result)
+    assert {name: type(value) for name, value in found.process.items()} == {
+        name: type(value) for name, value in result.process.items()
+    }
     group, signal, axes = plot_of(path)
-    assert axes == ([] if result.x is None else ["y", "x"])
+    assert (group.name, axes) == ("/entry/result", [] if result.x is None else ["y", "x"])
     np.testing.assert_array_equal(signal, result.height)
-    assert group.name == "/entry/result"
 
 
 @pytest.mark.parametrize(
@@ -112,24 +95,21 @@ def test_a_result_comes_back_as_it_was(path, changes):
         ((), PLACES, ["y", "x"]),
         ((3,), {}, ["turn", ".", "."]),
         ((3,), PLACES, ["turn", "y", "x"]),
-        ((1,), PLACES, ["turn", "y", "x"]),
     ],
 )
 def test_a_rotation_s_result_comes_back_and_its_zenith_is_plotted(path, turns, places, axes):
-    result = a_turn(*turns, 5, 7, **places)
+    result = a_rotation(*turns, 5, 7, **places)
     io.save_result(result, path)
     assert_same(io.open_result(path), result)
     group, signal, plotted_along = plot_of(path)
-    assert plotted_along == axes
-    assert signal.name == "/entry/result/zenith"
-    assert list(group.attrs["auxiliary_signals"]) == PLOTTED[1:]
-    np.testing.assert_array_equal(signal, result.zenith)
+    assert (signal.name, plotted_along) == ("/entry/result/zenith", axes)
+    assert list(group.attrs["auxiliary_signals"]) == [*FLOATS[1:], "edges", "contact"]
     if turns:
         np.testing.assert_array_equal(group["turn"], range(turns[0]))
 
 
 def pieces(*size):
-    """Return what tells of two pieces, of which one is relative, and of filled pixels."""
+    """Return two pieces, of which one is relative, and a filled pixel."""
     component = np.full(size, -1, np.int32)
     component[..., :2, :], component[..., 3:, :] = 0, 1
     filled = np.zeros(size, np.uint8)
@@ -139,92 +119,36 @@ def pieces(*size):
 
 @pytest.mark.parametrize("turns", [(), (3,)])
 def test_pieces_of_a_surface_come_back(path, turns):
-    result = a_turn(*turns, 5, 7, height=np.zeros((*turns, 5, 7), np.float32), **pieces(*turns, 5, 7))
+    result = a_rotation(*turns, 5, 7, height=np.zeros((*turns, 5, 7), np.float32), **pieces(*turns, 5, 7))
     io.save_result(result, path)
     assert_same(io.open_result(path), result)
-    with h5py.File(path) as file:
-        maps = file["entry/result"]
-        assert (maps["component"].dtype.str[1:], maps["component"].shape) == ("i4", (*turns, 5, 7))
-        assert (maps["filled"].dtype.str[1:], maps["filled"].attrs["interpretation"]) == ("u1", "image")
-        assert (maps["offset_unknown"].dtype.str[1:], maps["offset_unknown"].shape) == ("u1", (2,))
-        assert "interpretation" not in maps["offset_unknown"].attrs
-        assert not {"units"} & {
-            *maps["component"].attrs,
-            *maps["filled"].attrs,
-            *maps["offset_unknown"].attrs,
-        }
-        assert {"component", "filled"} < set(maps.attrs["auxiliary_signals"])
-        assert "offset_unknown" not in maps.attrs["auxiliary_signals"]
-    assert plot_of(path)[1].name == "/entry/result/height"
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "line"),
-    [
-        (
-            "offset_unknown",
-            np.zeros(3),
-            r"offset_unknown has shape \(3,\) where \(2,\) is needed: reconstruct",
-        ),
-        ("offset_unknown", np.zeros((5, 7)), r"offset_unknown has shape \(5, 7\) where \(2,\) is needed"),
-        ("offset_unknown", np.zeros(2, "S2"), "offset_unknown holds no numbers: reconstruct"),
-        ("component", np.zeros(2), r"component has shape \(2,\) where \(5, 7\) is needed"),
-        ("filled", np.zeros((7, 5)), r"filled has shape \(7, 5\) where \(5, 7\) is needed"),
-    ],
-)
-def test_damaged_pieces_are_one_line(path, name, value, line):
-    io.save_result(a_turn(5, 7, **pieces(5, 7)), path)
-    with h5py.File(path, "r+") as file:
-        del file[f"entry/result/{name}"]
-        file[f"entry/result/{name}"] = value
-    for read in (io.open_result, io.describe):
-        with pytest.raises(io.InputError, match=line) as caught:
-            read(path)
-        assert "\n" not in str(caught.value)
-
-
-def test_parameters_keep_their_types(path):
-    io.save_result(a_result(), path)
-    found = io.open_result(path).process
-    assert {name: (type(value), value) for name, value in found.items()} == {
-        name: (type(value), value) for name, value in PROCESS.items()
-    }
-
-
-def test_a_result_is_described(path):
-    io.save_result(a_result(), path)
+    group, signal, _ = plot_of(path)
+    assert signal.name == "/entry/result/height"
+    assert {"component", "filled"} < set(group.attrs["auxiliary_signals"])
+    assert "offset_unknown" not in group.attrs["auxiliary_signals"]
     facts = io.describe(path)
-    assert facts["kind"] == "result"
-    assert facts["map height"] == "5 x 7 float32"
-    assert facts["threshold"] == "0.5"
+    assert (facts["kind"], facts["components"]) == ("result", "2, of which 1 have an unknown offset")
 
 
 def test_a_result_of_another_program_s_types_is_read(path):
-    io.save_result(a_result(), path)
+    io.save_result(a_press(), path)
     with h5py.File(path, "r+") as file:
         height = file["entry/result/height"][()]
         del file["entry/result/height"]
         file["entry/result/height"] = height.astype(">f8")
-    assert_same(io.open_result(path), a_result())
+    assert_same(io.open_result(path), a_press())
 
 
 def test_a_failure_leaves_the_older_result(path, monkeypatch):
-    io.save_result(a_result(), path)
+    io.save_result(a_press(), path)
     before = path.read_bytes()
-    bad = a_result(process={"program": object()})
+    bad = a_press(process={"program": object()})
     with pytest.raises(TypeError):
         io.save_result(bad, path)
     monkeypatch.setattr("pathlib.Path.replace", lambda *names: (_ for _ in ()).throw(OSError(28, "full")))
     with pytest.raises(io.InputError, match=r"result\.h5 could not be written: No space left on device"):
-        io.save_result(a_result(), path)
+        io.save_result(a_press(), path)
     assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_an_older_result_is_replaced(path):
-    path.write_text("something else")
-    io.save_result(a_result(), path)
-    assert_same(io.open_result(path), a_result())
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -232,14 +156,10 @@ def test_an_older_result_is_replaced(path):
     ("name", "line"),
     [
         ("missing/r.h5", "there is no folder .*missing: make it first"),
-        ("file/r.h5", "there is no folder .*file: make it first"),
         ("folder", "is a folder: name a file in it"),
         ("pipe", "is no regular file: choose another place with -o"),
         ("x" * 300, "cannot be written: File name too long; choose another place with -o"),
-        (
-            "/proc/r.h5",
-            "/proc/r.h5 cannot be written: No such file or directory; choose another",
-        ),
+        ("/proc/r.h5", "/proc/r.h5 cannot be written: No such file or directory; choose another"),
     ],
 )
 def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
@@ -247,7 +167,7 @@ def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     before = sorted(tmp_path.iterdir())
-    for refuse in (io.check_output, lambda path: io.save_result(a_result(), path)):
+    for refuse in (io.check_output, lambda path: io.save_result(a_press(), path)):
         with pytest.raises(io.InputError, match=line) as caught:
             refuse(tmp_path / name)
         assert "\n" not in str(caught.value)
@@ -270,36 +190,18 @@ def test_what_is_no_result_is_refused(tmp_path, path):
     ("name", "value", "line"),
     [
         ("result", None, "/entry/result holds no maps: reconstruct it again"),
-        ("result/height", np.zeros(3), "/entry/result holds no maps"),
-        (
-            "result/status",
-            np.ones((7, 5)),
-            r"/entry/result/status has shape \(7, 5\) where \(5, 7\) is needed: ",
-        ),
-        (
-            "result/x",
-            np.zeros(5),
-            r"/entry/result/x has shape \(5,\) where \(7,\) is needed: recon",
-        ),
+        ("result/status", np.ones((7, 5)), r"status has shape \(7, 5\) where \(5, 7\) is needed: "),
         ("result/x", np.zeros(7), "/entry/result/x does not run as pixels do: recon"),
-        ("result/y", np.arange(5.0), "/entry/result/y does not run as pixels do: recon"),
-        (
-            "result/height_sigma",
-            np.zeros((5, 7), "S2"),
-            "/entry/result/height_sigma holds no numbers: rec",
-        ),
-        (
-            "result/height_sigma",
-            h5py.SoftLink("gone"),
-            "the link height_sigma leads to gone, which is",
-        ),
+        ("result/height_sigma", np.zeros((5, 7), "S2"), "height_sigma holds no numbers: rec"),
+        ("result/height_sigma", h5py.SoftLink("gone"), "the link height_sigma leads to gone, which is"),
         ("result/status", h5py.ExternalLink("../x.h5", "/x"), "leads out of its folder"),
+        ("result/offset_unknown", np.zeros(3), r"has shape \(3,\) where \(2,\) is needed: reconstruct"),
+        ("result/component", np.zeros(2), r"component has shape \(2,\) where \(5, 7\) is needed"),
         ("process/hold", [1, 2], "/entry/process/hold does not hold one value"),
-        ("process/hold", h5py.SoftLink("gone"), "the link hold leads to gone, which is not there"),
     ],
 )
 def test_a_damaged_result_is_one_line(path, name, value, line):
-    io.save_result(a_result(), path)
+    io.save_result(a_press(**pieces(5, 7)), path)
     with h5py.File(path, "r+") as file:
         del file[f"entry/{name}"]
         if value is not None:
@@ -308,3 +210,4 @@ def test_a_damaged_result_is_one_line(path, name, value, line):
         with pytest.raises(io.InputError, match=line) as caught:
             read(path)
         assert str(caught.value).startswith(str(path))
+        assert "\n" not in str(caught.value)
