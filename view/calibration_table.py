@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Calibration
 from mirrorskin.io.calibration.types import (
-    DEAD,
+    BITS,
     GROUPS,
-    HOT,
-    SATURATED,
     Gel,
     Lens,
     Precession,
@@ -61,17 +59,17 @@ def calibration_table(calibration: Calibration) -> list[Row]:
     return rows
 
 
-_Told = Iterator[tuple[Any, ...]]
+_Numbers = Iterator[tuple[Any, ...]]
 
 
-def _references(part: References) -> _Told:
+def _references(part: References) -> _Numbers:
     yield "dark", _median(part.dark), _median(part.dark_sigma), "counts"
     yield "bright", _median(part.bright), _median(part.bright_sigma), "counts"
-    for name, bit in (("hot", HOT), ("dead", DEAD), ("saturated", SATURATED)):
+    for name, bit in BITS.items():
         yield name, int(np.count_nonzero(part.defects & bit)), math.nan, "pixels"
 
 
-def _lens(part: Lens) -> _Told:
+def _lens(part: Lens) -> _Numbers:
     for name, size in zip("xy", part.pixel_size, strict=True):
         yield f"pixel size along {name}", 1000 * size, 1000 * size * part.scale_sigma, "um"
     for name, value in zip(("k1", "k2", "p1", "p2", "k3"), part.distortion, strict=True):
@@ -79,7 +77,7 @@ def _lens(part: Lens) -> _Told:
     yield "left on the board", part.error, math.nan, "px"
 
 
-def _zenith(part: WallResponse) -> _Told:
+def _zenith(part: WallResponse) -> _Numbers:
     low, high = sorted(math.degrees(math.pi / 4 - math.atan(q)) for q in part.reach)
     yield "pattern", part.pattern
     yield "known on the axis from", low, math.nan, "deg"
@@ -97,7 +95,7 @@ def _zenith(part: WallResponse) -> _Told:
     yield "left on the balls at most", part.error * _DEGREE, math.nan, "deg"
 
 
-def _precession(part: Precession) -> _Told:
+def _precession(part: Precession) -> _Numbers:
     def angle(what: str, value: float, field: str) -> tuple[Any, ...]:
         return what, value * _DEGREE, part.sigma.get(field, math.nan) * _DEGREE, "deg"
 
@@ -112,7 +110,7 @@ def _precession(part: Precession) -> _Told:
         yield f"pivot {name}", value, part.sigma.get(f"pivot_{name}", math.nan), "mm"
 
 
-def _gel(part: Gel) -> _Told:
+def _gel(part: Gel) -> _Numbers:
     sigma = part.sigma
     threshold = part.threshold * _DEGREE, sigma.get("threshold", math.nan) * _DEGREE
     yield "threshold zenith", *threshold, "deg"
@@ -126,7 +124,7 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(known)) if known.size else math.nan
 
 
-_TABLES: Mapping[str, Callable[[Any], _Told]] = {
+_TABLES: Mapping[str, Callable[[Any], _Numbers]] = {
     "references": _references,
     "lens": _lens,
     "zenith": _zenith,

@@ -1,0 +1,257 @@
+"""Figures of a wall's response and of a gel: what they show, from where, and how well they are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from mirrorskin.engine.calibration.wall_response import threshold_zenith
+from mirrorskin.engine.press.elastic import threshold_at
+from mirrorskin.io import Gel, WallResponse
+from mirrorskin.io.types import Floats
+from mirrorskin.view.calibration import draw_pixels, new_sheet
+from mirrorskin.view.canvas import explain_colours
+from mirrorskin.view.colours import MISSING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.projections.polar import PolarAxes
+
+AZIMUTHS = np.linspace(0, math.tau, 181)
+"""Of the normal, radians."""
+
+
+def draw_azimuths(axes: PolarAxes, zeniths: Mapping[str, Floats], title: str) -> None:
+    """Draw zeniths over all azimuths of the normal."""
+    for name, values in zeniths.items():
+        axes.plot(AZIMUTHS, np.degrees(values), lw=1.8, label=name)
+    axes.set_rmin(0)
+    axes.set_yticks([tick for tick in axes.get_yticks() if tick > 0][1::2])
+    axes.set_rlabel_position(22)
+    axes.yaxis.set_major_formatter("{x:g}°")
+    axes.set_title(title)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), frameon=False, ncols=2)
+
+
+def places_about(reach: float) -> dict[str, tuple[float, float]]:
+    """Return the axis and places so far from it, x and y in mm, by their names."""
+    return {
+        "on the axis": (0.0, 0.0),
+        f"{reach:.2g} mm to the right": (reach, 0.0),
+        f"{reach:.2g} mm up": (0.0, reach),
+        f"{reach:.2g} mm to the left": (-reach, 0.0),
+    }
+
+
+_FINE = 300
+_NAMED = 30  # parameters that have room for their names
+_HALF = 0.5  # of full light
+_OFF_AXIS = 0.3  # of the radius: how far off the axis more places are shown
+
+
+def draw_response(response: WallResponse) -> Figure:
+    """Draw what a wall's response says, and its errors.
+
+    Above, the curve of a graded wall or the section of a uniform one, the zenith at which half of the light
+    is reached by azimuth, the shading; below, the errors of zenith and azimuth, and how those of the
+    parameters depend on each other.
+    """
+    figure = new_sheet(17, 10)
+    grid = figure.add_gridspec(2, 3)
+    (_draw_curve if response.pattern == "graded" else _draw_section)(figure.add_subplot(grid[0, 0]), response)
+    _draw_half_light(cast("PolarAxes", figure.add_subplot(grid[0, 1], projection="polar")), response)
+    _draw_shade(figure.add_subplot(grid[0, 2]), response)
+    zenith, azimuth = (figure.add_subplot(grid[1, column]) for column in range(2))
+    draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", "magma")
+    title = "standard error of azimuth times sin(zenith)"
+    draw_pixels(azimuth, np.degrees(response.azimuth_sigma), title, "deg", "magma")
+    _draw_correlation(figure.add_subplot(grid[1, 2]), response)
+    return figure
+
+
+def _central_zenith(q: Floats | float) -> Floats:
+    """Return the zenith of a mirror on the axis that shows the wall at q, degrees."""
+    return np.asarray(np.degrees(math.pi / 4 - np.arctan(q)))
+
+
+def _draw_curve(axes: Axes, response: WallResponse) -> None:
+    """Draw light, and what a degree changes of it, against the zenith of a mirror on the axis."""
+    q = np.linspace(*response.reach, _FINE)
+    zenith, light = _central_zenith(q), np.polynomial.polynomial.polyval(q, response.curve)
+    axes.plot(zenith, light, color="tab:blue", lw=2)
+    axes.set(
+        xlabel="zenith of a mirror on the axis (deg)",
+        title=f"response, known from {zenith.min():.1f}° to {zenith.max():.1f}°",
+        xlim=(0, 50),
+    )
+    axes.set_ylabel("light (share of full light)", color="tab:blue")
+    axes.axvspan(0, zenith.min(), color=MISSING, alpha=0.5, lw=0)
+    axes.axvspan(zenith.max(), 50, color=MISSING, alpha=0.5, lw=0)
+    axes.grid(alpha=0.3)
+    slope = axes.twinx()
+    steep = 100 * np.gradient(light, zenith)
+    slope.plot(zenith, steep, color="tab:orange", lw=1.5, ls="--")
+    slope.set_ylim(1.15 * min(0.0, float(steep.min())), 1.15 * max(0.01, float(steep.max())))
+    slope.set_ylabel("slope (% of full light per deg)", color="tab:orange")
+
+
+def _draw_section(axes: Axes, response: WallResponse) -> None:
+    """Draw the body cut through its axis, and the rays to the ends of what is known."""
+    radius, rim = response.radius, response.rim
+    for side in (-1, 1):
+        axes.plot([side * radius] * 2, [0, rim], color="black", lw=4, solid_capstyle="butt")
+        for q in response.reach:
+            height = radius * math.tan(2 * math.atan(q))
+            axes.plot([0, side * radius], [0, height], color="tab:orange", lw=1.2)
+            align, name = "left" if side > 0 else "right", f"{float(_central_zenith(q)):.1f}°"
+            axes.text(1.06 * side * radius, height, name, ha=align, va="center", color="tab:orange")
+    axes.plot([-radius, radius], [0, 0], color="tab:blue", lw=3)
+    axes.text(0, -0.03 * rim, "sheet", ha="center", va="top", color="tab:blue")
+    axes.axvline(0, color="0.6", lw=0.8, ls=":")
+    axes.set(
+        xlim=(-1.5 * radius, 1.5 * radius),
+        ylim=(-0.12 * rim, 1.08 * rim),
+        aspect="equal",
+        xlabel="from the axis (mm)",
+        ylabel="height (mm)",
+        title=f"wall: radius {radius:.2f} mm, height {rim:.2f} mm\n"
+        "angles: zenith of a mirror on the axis that shows this",
+    )
+
+
+def _draw_half_light(axes: PolarAxes, response: WallResponse) -> None:
+    """Draw by azimuth the zenith at which half of the light is reached, on the axis and off it."""
+    x0, y0 = response.axis
+    full = 1.0 if response.pattern == "graded" else float(response.curve[0])
+    zeniths = {
+        name: threshold_zenith(response, x0 + x, y0 + y, AZIMUTHS, _HALF * full)
+        for name, (x, y) in places_about(_OFF_AXIS * response.radius).items()
+    }
+    draw_azimuths(axes, zeniths, "zenith of half light, by azimuth")
+
+
+def _draw_shade(axes: Axes, response: WallResponse) -> None:
+    """Draw by how much the picture is brighter or darker than its references say, and where the lamps are."""
+    radius = response.radius
+    across = np.linspace(-1, 1, _FINE)
+    x, y = np.meshgrid(across, across[::-1])
+    shade = 100 * np.tensordot(response.shade, np.stack([x, y, x * x, x * y, y * y]), 1)
+    shade[np.hypot(x, y) > 1] = np.nan
+    reach = max(float(np.nanmax(np.abs(shade))), 0.01)
+    picture = axes.imshow(
+        shade,
+        cmap="RdBu_r",
+        vmin=-reach,
+        vmax=reach,
+        extent=(-radius, radius, -radius, radius),
+        interpolation="nearest",
+    )
+    explain_colours(axes, picture, "shading (%)")
+    lamps = np.asarray(response.lamps)
+    strength = float(np.hypot(*lamps))
+    if strength > 0:
+        x1, y1 = 0.6 * radius * lamps / strength
+        axes.annotate("", (x1, y1), (0, 0), arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 2})
+    axes.set(
+        xlim=(-radius, radius),
+        ylim=(-radius, radius),
+        xlabel="x from the axis (mm)",
+        ylabel="y from the axis (mm)",
+        title=f"shading beyond the references\narrow: lamps are {100 * strength:.1f} % brighter there",
+    )
+
+
+def _draw_correlation(axes: Axes, response: WallResponse) -> None:
+    """Draw how the errors of the parameters that were not fixed depend on each other."""
+    free = np.flatnonzero(np.diag(response.covariance) > 0)
+    if not free.size:
+        axes.set_axis_off()
+        return
+    covariance = response.covariance[np.ix_(free, free)]
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigma, sigma)
+    picture = axes.imshow(correlation, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
+    explain_colours(axes, picture, "correlation")
+    left = math.degrees(response.error)
+    axes.set_title(f"errors of the {len(sigma)} parameters\nleft on the balls: {left:.3f}° RMS")
+    names = [response.parameters[number] for number in free] if len(free) <= _NAMED else []
+    size = 7 if len(names) > 12 else 9
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=size)
+    axes.set_yticks(range(len(names)), names, fontsize=size)
+
+
+_BALL = 2.0  # radius of the ball in the figure, mm
+_RADII = 2.0, 3.0, 5.0  # of the balls pressed into the gel, mm
+_DEEPEST = 1.0  # mm
+_NEAR = 3.0  # the same where the wall is infinitely far, mm
+
+
+def draw_gel(gel: Gel) -> Figure:
+    """Draw where on a ball light begins, that by place and azimuth, and how far the stage gives way."""
+    figure = new_sheet(17, 5.2)
+    grid = figure.add_gridspec(1, 3)
+    _draw_threshold(figure.add_subplot(grid[0]), gel)
+    polar = cast("PolarAxes", figure.add_subplot(grid[1], projection="polar"))
+    x0, y0 = gel.axis
+    zeniths = {
+        name: threshold_at(gel, x0 + x, y0 + y, AZIMUTHS)
+        for name, (x, y) in places_about(_OFF_AXIS / gel.curvature if gel.curvature else _NEAR).items()
+    }
+    draw_azimuths(polar, zeniths, "zenith at which light begins, by azimuth")
+    _draw_give(figure.add_subplot(grid[2]), gel)
+    return figure
+
+
+def _draw_threshold(axes: Axes, gel: Gel) -> None:
+    """Draw the upper side of a ball: dark where it is too flat to show light."""
+    angle = np.linspace(-math.radians(60), math.radians(60), _FINE)
+    lit = np.abs(angle) >= gel.threshold
+    x, z = _BALL * np.sin(angle), _BALL * (np.cos(angle) - 1)
+    axes.plot(x, np.where(lit, z, np.nan), color="tab:orange", lw=4, label="light")
+    axes.plot(x, np.where(lit, np.nan, z), color="0.25", lw=4, label="too flat: dark")
+    for side in (-1, 1):
+        across, up = side * math.sin(gel.threshold), math.cos(gel.threshold)
+        foot = _BALL * across, _BALL * (up - 1)
+        tip = foot[0] + 0.5 * across, foot[1] + 0.5 * up
+        axes.annotate("", tip, foot, arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 1.5})
+        axes.plot([foot[0]] * 2, [foot[1], foot[1] + 0.5], color="0.6", lw=1, ls=":")
+    words = _with_error(math.degrees(gel.threshold), math.degrees(gel.sigma.get("threshold", math.nan)), "°")
+    axes.set(
+        xlabel="x (mm)",
+        ylabel="height above the top (mm)",
+        aspect="equal",
+        ylim=(-1.15, 0.75),
+        title=f"a ball of {2 * _BALL:g} mm, on the wall's axis:\nlight begins at a zenith of {words}",
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower center", frameon=False)
+
+
+def _draw_give(axes: Axes, gel: Gel) -> None:
+    """Draw how far the stage gives way under balls (Hertz, of a gel that keeps its volume)."""
+    depth = np.linspace(0, _DEEPEST, _FINE)
+    for radius in _RADII:
+        force = 16 / 9 * math.sqrt(radius) * depth**1.5  # over Young's modulus, mm^2
+        axes.plot(depth, 1000 * gel.compliance * force, lw=2, label=f"ball of {2 * radius:g} mm")
+    words = _with_error(gel.compliance, gel.sigma.get("compliance", math.nan), " per mm")
+    axes.set(
+        xlabel="depth in the gel (mm)",
+        ylabel="the stage gives way by (µm)",
+        xlim=(0, _DEEPEST),
+        title=f"flexure times modulus {words}\nleft on the ball: {1000 * gel.error:.3g} µm RMS",
+    )
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", frameon=False)
+
+
+def _with_error(value: float, sigma: float, unit: str) -> str:
+    """Write a value with its standard error, where that is known."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f"{value:.4g}{unit}"
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}{unit}"
