@@ -101,7 +101,7 @@ def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path, name):
 
 @pytest.mark.parametrize(
     ("told", "shape"),
-    [("3,1,4x3", (3, 4)), ("2,2,4x3", (3, 4)), ("2,1,4x2", (2, 4)), (None, (3, 4)), (None, (6, 7))],
+    [("3,1,4x3", (3, 4)), ("2,1,4x2", (2, 4)), (None, (6, 7))],
 )
 def test_heights_of_other_pixels_are_refused(tmp_path, told, shape):
     with pytest.raises(io.InputError, match=r"h\.h5 holds the heights of rows .* and columns .*, where "):

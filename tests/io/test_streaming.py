@@ -16,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from growing import SHAPE, Feed, frames_of, stream
+from growing import Feed, frames_of, stream
 from stacks import plot_of, read_all
 
 from mirrorskin import io
@@ -91,20 +91,6 @@ def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
     assert {series for series in held(tmp_path / "a.h5") if series.endswith("_live")} == live
 
 
-def test_blocks_go_by_as_they_came_and_the_recorder_is_a_live_source(tmp_path):
-    source = Feed(6, (4,))
-    with io.StreamRecorder(source, tmp_path / "a.h5") as recorder:
-        assert (recorder.name, recorder.motion, recorder.shape) == ("feed", "vertical", (6, *SHAPE))
-        assert recorder.header is source.header
-        assert recorder.dtype == np.uint8
-        block = recorder.read()
-        assert block.lent
-        assert (recorder.count, recorder.now()) == (4, 4.0)
-        np.testing.assert_array_equal(recorder.positions()["travel"], source.positions()["travel"])
-        with pytest.raises(RuntimeError, match="cannot be rewound"):
-            recorder.rewind()
-
-
 def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
     with io.StreamRecorder(Feed(10), tmp_path / "a.h5", period=60) as recorder:
         lent = [weakref.ref(recorder.read().frames) for _ in range(2)]
@@ -152,16 +138,6 @@ def test_an_older_file_is_replaced_when_the_first_frame_has_come(tmp_path):
         stream(Feed(fails=(1, KeyboardInterrupt())), path)
     assert len(held(path)["data"]) == 1
     assert [one.name for one in tmp_path.iterdir()] == ["a.h5"]
-
-
-def test_a_source_that_cannot_be_entered_leaves_nothing(tmp_path):
-    class Broken(Feed):
-        def __enter__(self):
-            raise io.InputError("no such port")
-
-    with pytest.raises(io.InputError, match="no such port"):
-        stream(Broken(), tmp_path / "a.h5")
-    assert not list(tmp_path.iterdir())
 
 
 # What is left when something fails.

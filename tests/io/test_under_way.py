@@ -129,22 +129,6 @@ def test_what_is_short_of_something_is_left_out(tmp_path, shorter):
         io.open_recording(path, frames=(2, 7))
 
 
-def test_info_tells_how_it_was_taken(tmp_path):
-    with io.StreamRecorder(Feed(9), tmp_path / "a.h5") as recorder:
-        for _ in range(9):
-            recorder.read()
-        recorder.mark(2, np.zeros(3, bool))
-    facts = io.describe(tmp_path / "a.h5")
-    assert {name: facts[name] for name in ("state", "used", "dropped", "frames")} == {
-        "state": "complete",
-        "used": "6 of 9 frames",
-        "dropped": "9 frames",
-        "frames": "9 of 7 x 5, uint8",
-    }
-    told = run("info", tmp_path / "a.h5").out
-    assert re.search(r"used +6 of 9 frames", told)
-
-
 # What a live run used, where it thought the body was.
 
 USED = np.array([1, 1, 0, 1, 0, 0, 1, 1, 1, 1, 0, 1], bool)
