@@ -30,7 +30,7 @@ READ_TIMEOUT = 2.0  # seconds without a picture after which a stream or camera c
 
 # OpenCV takes these from the environment only: no messages of FFmpeg's, and whole seconds for a camera.
 _ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
-_RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if told to
+_RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if asked to
 _GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # what FFmpeg calls the grey ones
 _MANUAL = 1.0  # V4L2's "manual exposure"
 _EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
@@ -58,7 +58,7 @@ class VideoCamera(ThreadedCamera):
 
     A camera or stream that is lost is opened again, for at most 10 s; it is logged that it is lost, and
     that it is back. Numbers then go on after as many as the time away had room for. ``error`` stays None
-    meanwhile; ``latest`` tells at once that nothing comes.
+    meanwhile; ``latest`` shows at once that nothing comes.
 
     Parameters
     ----------
@@ -167,8 +167,8 @@ class VideoCamera(ThreadedCamera):
         now = clock.monotonic()
         if self._lost is None:
             self._lost = now
-            told = "%s: it was lost after %d frames, and is tried again for %.3g s"
-            _log.warning(told, why, self._number, PATIENCE)
+            message = "%s: it was lost after %d frames, and is tried again for %.3g s"
+            _log.warning(message, why, self._number, PATIENCE)
         left = self._lost + PATIENCE - now
         if left <= 0:
             self._fail(f"{why}: it was lost, and not back within {PATIENCE:.3g} s; see its cable and power")
@@ -178,7 +178,7 @@ class VideoCamera(ThreadedCamera):
         return min(OPEN_TIMEOUT, max(left, 0.1))
 
     def _came_back(self, time: float) -> int:
-        """Tell that the camera is back, and return how many frames it would have given meanwhile."""
+        """Log that the camera is back, and return how many frames it would have given meanwhile."""
         away = time - self.latest
         rate = self._counter.counts().rate
         missing = max(1, round(away * rate) - 1) if math.isfinite(rate) else 1
@@ -231,7 +231,7 @@ class Capture:
             return None
         now = clock.monotonic()
         if self._trusts:
-            # V4L2 tells when the driver had it, on this clock if the driver is a good one.
+            # V4L2 says when the driver had it, on this clock if the driver is a good one.
             stamp = float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
             self._trusts = now - _STALEST <= stamp <= now and stamp > self._last
             now = stamp if self._trusts else now
@@ -300,7 +300,7 @@ def _open(source: VideoSource, timeout: float) -> Any:
 
 
 def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> bool:
-    """Set what is asked for, tell what was not taken, and return whether pictures come as they are stored."""
+    """Set what is asked for, log what was not taken, and return whether pictures come as they are stored."""
     if source.kind == "device":
         _set_up(video, source, settings)
         raw = _letters(video.get(cv2.CAP_PROP_FOURCC)).strip() in _RAW

@@ -1,4 +1,4 @@
-"""A GRBL 1.1 controller: what it does on lines, realtime bytes and alarms, by a time that it is told.
+"""A GRBL 1.1 controller: what it does on lines, realtime bytes and alarms, by a clock that is handed to it.
 
 It obeys and answers as the firmware does: lines wait in a receive buffer of 128 bytes, beyond which bytes
 are lost; moves wait in a planner of 15, and the answer to a line comes once its move has found room there;
@@ -27,7 +27,7 @@ HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
 
 _RESET, _ASK, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
 _LONGEST = 79  # characters of a line, without spaces
-_OFFSET_EVERY = 10  # reports, of which one tells the work offset
+_OFFSET_EVERY = 10  # reports, of which one has the work offset
 _SEARCH = 1.5  # travels within which a homing switch must be found
 _FIRST_AXIS = 2  # the firmware homes Z before the others
 
@@ -96,7 +96,7 @@ class Controller:
 
     @property
     def state(self) -> str:
-        """The state as a report tells it."""
+        """The state as a report has it."""
         for name, holds in (
             ("Home", self._homing),
             ("Alarm", self._locked),

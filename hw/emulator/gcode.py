@@ -127,7 +127,7 @@ class Interpreter:
         return Drive(Line(self.place, end), math.inf if motion == "G0" else feed / 60)
 
     def _arc(self, plane: tuple[int, int], values: dict[str, float], end: Place, clockwise: bool) -> Arc:
-        """Return the arc about the centre that I, J and K tell, as seen from its begin."""
+        """Return the arc about the centre that I, J and K give, as seen from its begin."""
         offsets = [values.get("IJK"[axis]) for axis in plane]
         if offsets == [None, None]:
             raise GrblError(35)

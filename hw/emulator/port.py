@@ -100,7 +100,7 @@ class GrblMachine:
 
     @property
     def state(self) -> str:
-        """The state as a report tells it: Idle, Run, Hold:0, Hold:1, Alarm or Home."""
+        """The state as a report has it: Idle, Run, Hold:0, Hold:1, Alarm or Home."""
         with self._lock:
             return self._catch_up().state
 
@@ -156,7 +156,7 @@ class GrblPort(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Take the port away; the machine goes on with what it has been told."""
+        """Take the port away; the machine goes on with its commands."""
         self._closing = True
         self._wake()
         self._thread.join()

@@ -33,7 +33,7 @@ TILT = 9.0
 
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
-# What GRBL is told of homing, in units a minute, ms and units; and of its axes X, Y, Z, which are pitch, roll
+# GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, which are pitch, roll
 # (these count degrees) and travel: greatest speeds in units a minute, accelerations, lengths.
 _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
 _SPEED, _ACCELERATION, _LENGTH = (1200.0, 1200.0, 600.0), (800.0, 800.0, 400.0), (20.0, 20.0, 10.0)
@@ -129,7 +129,7 @@ class EmulatedRig:
         self._leaving.close()
 
     def where(self, at: float) -> Position:
-        """Tell where the body truly is at a time of `time.monotonic`."""
+        """Return where the body truly is at a time of `time.monotonic`."""
         at_machine = self.machine.position(at)
         return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
 

@@ -17,7 +17,7 @@ from mirrorskin.io.types import Closing, InputError
 _COLOURS = {np.dtype(np.uint8): "mono", np.dtype(np.uint16): "mono16"}
 _QUEUE = 4  # frames that wait for a slow viewer
 _LOOK = 0.1  # seconds from one look at whether to end to the next
-_FRACTION = 1001  # greatest denominator of the rate told
+_FRACTION = 1001  # greatest denominator of the rate in the header
 
 
 class FrameServer(Closing):

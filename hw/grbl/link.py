@@ -92,22 +92,22 @@ class Stopping:
 
     @property
     def begun(self) -> bool:
-        """Whether the machine was told to hold."""
+        """Whether the machine was commanded to hold."""
         return self._began < math.inf
 
     @property
     def resetting(self) -> bool:
-        """Whether it was told to reset."""
+        """Whether it was commanded to reset."""
         return self._reset < math.inf
 
     def begin(self, now: float) -> None:
-        """Note that the machine was told to hold."""
+        """Note that the machine was commanded to hold."""
         self._began = min(self._began, now)
 
     def reset(self, now: float, rested: float, gone: bool) -> bool:
         """Return whether to reset now: the machine rests, the line is gone, or the time is up.
 
-        `rested` is when the newest report was asked for, if it tells of rest.
+        `rested` is when the newest report was asked for, if that was of rest.
         """
         if self.resetting or not (gone or rested > self._began or now - self._began > HOLDING):
             return False
@@ -134,7 +134,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class TimedStatus:
     """A report: what it says, when it was asked for, and when it was so."""
 
     status: Status
@@ -143,7 +143,7 @@ class Seen:
 
 
 class Link:
-    """Sends lines and realtime bytes, hears replies, and tells what is wrong.
+    """Sends lines and realtime bytes, hears replies, and notices what is wrong.
 
     At first it only listens: noise, silence and alarms are no errors until `begin`.
 
@@ -156,15 +156,15 @@ class Link:
         name: str,
         timeout: float,
         period: float,
-        on_report: Callable[[Seen], None],
+        on_report: Callable[[TimedStatus], None],
     ) -> None:
         self.error: HardwareError | None = None  # what went wrong, first of all
         self.lock = threading.Condition()
         self.window = Window()
         self.noise = Noise()
-        self.seen: Seen | None = None  # the newest report
+        self.seen: TimedStatus | None = None  # the newest report
         self.rests = 0  # reports of rest in a row, all asked for after the last line was taken
-        self.banner: Banner | None = None  # what it said when it started, since it was last told to
+        self.banner: Banner | None = None  # what it said when it started, since the last reset
         self.gone = False  # whether the port is lost
         self.locked = False  # whether an alarm is no error, because the stage is to be homed first
         self.patience: float | None = None  # seconds that it may be silent while it homes
@@ -172,19 +172,19 @@ class Link:
         self._name = name
         self._timeout = timeout
         self._period = period
-        self._tell = on_report
+        self._on_report = on_report
         self._times = ReportTimes(period)
         self._splitter = Splitter()
-        self._said: list[Reply] = []
+        self._replies: list[Reply] = []
         self._refused: Refusal | None = None
         self._active = False
         self._moved = -math.inf  # when a line was last sent or answered
         self._stopping = Stopping()
-        self._deaf = False  # what comes is noise, and was told as such
+        self._deaf = False  # what comes is noise, and was reported as such
         self._closing = False
         self._threads = [
             threading.Thread(target=work, name=f"{name} {work.__name__.strip('_')}")
-            for work in (self._read, self._keep)
+            for work in (self._read, self._poll)
         ]
         for thread in self._threads:
             thread.start()
@@ -215,13 +215,13 @@ class Link:
     def ask(self, line: str, timeout: float) -> list[Reply]:
         """Send a line, wait until it is answered, and return what was said in between."""
         with self.lock:
-            self._said = []
+            self._replies = []
             number = self.enqueue(line)
         self.until(lambda: self.window.done >= number or None, timeout, f"take {line}")
         with self.lock:
             if self._refused is not None:
                 raise HardwareError(f"{self._name}: it refuses {line}: {self._refused}")
-            return self._said
+            return self._replies
 
     def until(self, ready: Callable[[], T | None], timeout: float, what: str) -> T:
         """Wait until `ready` gives something; HardwareError if something goes wrong, or it takes too long."""
@@ -260,7 +260,7 @@ class Link:
         """Send a realtime byte past all lines; whether it gets there shows in the reports."""
         try:
             self._port.write(byte)
-        except Exception:  # pyserial raises many kinds on a port that is gone; the reader tells of it
+        except Exception:  # pyserial raises many kinds on a port that is gone; the reader reports it
             return
 
     def close(self) -> None:
@@ -312,14 +312,14 @@ class Link:
                 if reply is None:
                     reply, noise = salvage(line)
                 if reply is not None:
-                    self._take(reply, began)
+                    self._handle(reply, began)
                 if noise and self.noise.add(noise, now) and self._active:
                     self._deaf = True
                     self.halt("what it says is garbled; look at the cable, its shield and the baud rate")
                     break
             self.lock.notify_all()
 
-    def _take(self, reply: Reply, began: float) -> None:
+    def _handle(self, reply: Reply, began: float) -> None:
         match reply:
             case Status():
                 self._report(reply, began)
@@ -333,16 +333,16 @@ class Link:
                     self.halt(f"{reply}")
             case Banner():
                 if self._active and not self._stopping.begun:
-                    self.halt("the controller was reset; it has lost what it was told")
+                    self.halt("the controller was reset; it has lost its commands")
                 self.banner = reply
             case Setting() | Message():
-                self._said.append(reply)
+                self._replies.append(reply)
 
     def _report(self, status: Status, began: float) -> None:
         homed = not self.locked and self.patience is None
         working = self._active and homed and not self._stopping.begun
-        self.seen = Seen(status, self._times.answer(began), working)
-        self._tell(self.seen)
+        self.seen = TimedStatus(status, self._times.answer(began), working)
+        self._on_report(self.seen)
         if status.state != "idle":
             self.rests = 0
         elif self.seen.answer.asked > self._moved:
@@ -373,12 +373,12 @@ class Link:
             except Exception as error:  # as in send
                 self._unplugged(error)
 
-    def _keep(self) -> None:
+    def _poll(self) -> None:
         while not self._closing:
             time.sleep(_TICK)
             now = time.monotonic()
             with self.lock:
-                self._look(now)
+                self._check_answers(now)
                 if self._stopping.begun:
                     self._end(now)
                 self._times.period = self._pace()
@@ -394,8 +394,8 @@ class Link:
                     self.halt("the program ended")
                 self._closing = self._stopping.over
 
-    def _look(self, now: float) -> None:
-        """Tell when it has been silent for too long, or lost an answer."""
+    def _check_answers(self, now: float) -> None:
+        """Stop it when it has been silent for too long, or lost an answer."""
         if not self._active or self._stopping.begun:
             return
         if self._times.silence(now) > self._limit() and not self._waiting():

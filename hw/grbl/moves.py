@@ -11,7 +11,7 @@ from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
 SLOWEST = 1.0
-"""Machine units a minute: GRBL goes no slower, whatever it is told."""
+"""Machine units a minute: GRBL goes no slower, whatever the feed."""
 
 _STRAIGHT = "G53G1"  # in the machine's coordinates
 _PLANES = {("X", "Y"): "G17", ("Z", "X"): "G18", ("Y", "Z"): "G19"}
@@ -57,7 +57,7 @@ class Axes:
         """Lower the greatest speed of a motion to what the controller allows, machine units a second."""
         self.speeds[motion] = min(self.speeds[motion], rate / self._axes[motion].scale)
 
-    def apart(self, one: Position, other: Position) -> float:
+    def distance(self, one: Position, other: Position) -> float:
         """Return by how much two places differ in the axis where they differ most, machine units."""
         a, b = self.machine(one), self.machine(other)
         return max(abs(a[letter] - b[letter]) for letter in a)

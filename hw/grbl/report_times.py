@@ -1,4 +1,4 @@
-"""When to ask for a report, what time an answer tells of, and when there was none for too long."""
+"""When to ask for a report, what time an answer is of, and when there was none for too long."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ReportTimes:
         return statistics.median(self._trips) if self._trips else math.nan
 
     def listened(self, began: float, now: float) -> None:
-        """Note that somebody listened for `SLICE` seconds at most; an answer that came is told afterwards."""
+        """Note that somebody listened for `SLICE` seconds at most; an answer is noted afterwards."""
         if self._open:
             delayed = now - began > _DELAYED
             self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._open[0]))

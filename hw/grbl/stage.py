@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.link import RESET, Link, Seen, open_port
+from mirrorskin.hw.grbl.link import RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.replies import Message, Setting, Status
 from mirrorskin.hw.rig_file import StageSettings
@@ -30,7 +30,7 @@ _KEPT = 1 << 17  # reports: an hour of motion
 _THERE = 0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
 _RESTS = 3  # reports of rest elsewhere, until that is where it stays
 _MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
-_HOMING = 60.0  # seconds, where the settings do not tell how long it takes
+_HOMING = 60.0  # seconds, where the settings do not say how long it takes
 _LETTERS = "XYZABC"
 
 
@@ -85,7 +85,7 @@ class GrblStage(Closing):
         self._due = 0.0
         self._ramp = 0.0  # seconds that a move takes longer because it speeds up and slows down
         opened = open_port(settings.port, settings.baud, self.name) if port is None else port
-        self._link = Link(opened, self.name, settings.timeout, 1 / settings.report_rate, self._hear)
+        self._link = Link(opened, self.name, settings.timeout, 1 / settings.report_rate, self._on_report)
         try:
             self._controller = self._open()
         except BaseException:
@@ -129,7 +129,7 @@ class GrblStage(Closing):
             self._link.ask("$H", timeout)
             with self._link.lock:
                 self._excess = math.inf  # the switches may be beyond the limits
-                self._link.patience = None  # not after a failure: what stops homing is told by it
+                self._link.patience = None  # not after a failure: a stop of homing depends on it
                 self._link.locked = False
             self._link.ask(_PREPARE, self._settings.timeout)
             self._target = None
@@ -138,7 +138,7 @@ class GrblStage(Closing):
     def move(self, place: Position, speed: float | None = None) -> None:
         """Begin to go to `place` in a straight line; see `Stage.move`."""
         self.limits.check(place, self.name)
-        command = self._axes.straight(self._stand(), place, speed)
+        command = self._axes.straight(self._destination(), place, speed)
         if command is None:
             self._target = place
         else:
@@ -146,12 +146,12 @@ class GrblStage(Closing):
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
         """Begin to go round; see `Stage.precess`."""
-        before = self._stand()
+        before = self._destination()
         self.limits.check_precession(before.travel, tilt, self.name)
         assert self._offset is not None  # it is open only when this is known
         commands = self._axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
-        if self._axes.apart(before, begin) > _THERE:
+        if self._axes.distance(before, begin) > _THERE:
             raise InputError(
                 f"{self.name}: a precession begins where the body leans by {math.degrees(tilt):.4g} degrees "
                 f"at the phase {math.degrees(start):.4g} degrees; move there first"
@@ -160,7 +160,7 @@ class GrblStage(Closing):
 
     def wait(self, timeout: float | None = None) -> Report:
         """Wait until the body rests and every command is done; see `Stage.wait`."""
-        self._stand()
+        self._destination()
         if timeout is None:
             timeout = 1.25 * max(0.0, self._due - time.monotonic()) + self._settings.timeout
         with self._guarded():
@@ -213,10 +213,10 @@ class GrblStage(Closing):
         return self._link.seen is not None and self._link.seen.status.state == state
 
     def _await_offset(self) -> None:
-        """Wait until a report has told where the work coordinates begin."""
+        """Wait until a report has the offset at which the work coordinates begin."""
         try:
             self._link.until(
-                lambda: self._offset, max(self._settings.timeout, _REFRESH), "tell its work offset"
+                lambda: self._offset, max(self._settings.timeout, _REFRESH), "report its work offset"
             )
         except HardwareError as error:
             raise InputError(
@@ -225,9 +225,9 @@ class GrblStage(Closing):
 
     def _check(self, controller: Controller) -> None:
         """Refuse a controller that lacks an axis; go no faster than it does, and learn how soon."""
-        told = (self._link.seen.status.machine or self._link.seen.status.work) if self._link.seen else None
+        known = (self._link.seen.status.machine or self._link.seen.status.work) if self._link.seen else None
         for motion, letter in self._axes.letters.items():
-            if told is not None and letter not in told:
+            if known is not None and letter not in known:
                 raise InputError(f"{self.name}: the controller has no axis {letter}; correct the rig file")
             steps, rate, acceleration = (
                 controller.settings.get(number + _LETTERS.index(letter), 0.0) for number in (100, 110, 120)
@@ -240,14 +240,14 @@ class GrblStage(Closing):
             if acceleration > 0:
                 self._ramp = max(self._ramp, rate / acceleration)
 
-    def _hear(self, seen: Seen) -> None:
+    def _on_report(self, seen: TimedStatus) -> None:
         """Take a report; the link's lock is held."""
         if seen.status.offset is not None:
             self._take_offset(seen.status.offset, seen.working)
         place = self._place(seen.status)
         if place is None:
             return
-        self._look(place, seen.working)
+        self._check_limits(place, seen.working)
         self._latest = Report(seen.answer.time, place, seen.status.state)
         if seen.answer.sure:
             self._reports.append(self._latest)
@@ -265,10 +265,10 @@ class GrblStage(Closing):
             machine = {letter: value + self._offset[letter] for letter, value in status.work.items()}
         try:
             return None if machine is None else self._axes.place(machine)
-        except KeyError:  # fewer axes than asked for; told when the stage is opened
+        except KeyError:  # fewer axes than asked for; refused when the stage is opened
             return None
 
-    def _look(self, place: Position, working: bool) -> None:
+    def _check_limits(self, place: Position, working: bool) -> None:
         """Stop it beyond its limits; one that begins there may come back, and go no farther."""
         excess = self.limits.excess(place)
         self._excess = min(self._excess, excess) if working else excess
@@ -278,7 +278,7 @@ class GrblStage(Closing):
                 "look at its cable and its switches, and home it"
             )
 
-    def _stand(self) -> Position:
+    def _destination(self) -> Position:
         """Return where the body is once all that was asked is done."""
         if self._link.error is not None:
             raise self._link.error.with_traceback(None)
@@ -302,13 +302,13 @@ class GrblStage(Closing):
             )
 
     def _arrived(self) -> Report | None:
-        """Return the report that tells of rest, at the target if there is one; the link's lock is held."""
+        """Return the report of rest, at the target if there is one; the link's lock is held."""
         link, latest = self._link, self._latest
         if link.window.busy or not link.rests or latest is None:
             return None
         if self._target is None:
             return latest if link.rests > 1 else None
-        off = self._axes.apart(latest.position, self._target)
+        off = self._axes.distance(latest.position, self._target)
         if off <= _THERE + self._rounding:
             return latest
         if link.rests >= _RESTS:
@@ -344,7 +344,7 @@ def _greet(link: Link, name: str, timeout: float) -> Controller:
     return controller
 
 
-def _first(link: Link, name: str, timeout: float) -> Seen:
+def _first(link: Link, name: str, timeout: float) -> TimedStatus:
     """Wait for the first report; a controller that is locked hard answers only after a reset."""
     try:
         try:
@@ -365,13 +365,13 @@ def _first(link: Link, name: str, timeout: float) -> Seen:
 
 
 def _identity(link: Link, name: str, timeout: float) -> Controller:
-    told = {m.text.partition(":")[0]: m.text for m in link.ask("$I", timeout) if isinstance(m, Message)}
-    version = told.get("VER", "").removeprefix("VER:").strip(":")
+    answers = {m.text.partition(":")[0]: m.text for m in link.ask("$I", timeout) if isinstance(m, Message)}
+    version = answers.get("VER", "").removeprefix("VER:").strip(":")
     match = re.match(r"(\d+)\.(\d+)", version)
     number = (int(match[1]), int(match[2])) if match else link.banner.version if link.banner else (0, 0)
     if number < _OLDEST:
         raise InputError(f"{name}: it says that it is version {version or '?'}; GRBL 1.1 or later is needed")
-    size = re.match(r"OPT:[^,]*,\d+,(\d+)", told.get("OPT", ""))
+    size = re.match(r"OPT:[^,]*,\d+,(\d+)", answers.get("OPT", ""))
     if size:
         link.window.size = int(size[1])
     settings = {}

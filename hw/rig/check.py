@@ -140,13 +140,13 @@ def check_stage(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
         The stage was lost meanwhile.
     """
     yield Finding("stage", "firmware", stage.firmware)
-    report, told = stage.report(), stage.parameters
+    report, parameters = stage.report(), stage.parameters
     yield _state(report, settings)
     yield _position(report, stage, settings)
-    yield _homing(told, settings)
+    yield _homing(parameters, settings)
     for name, axis in settings.axes.items():
-        yield _length(name, axis, told)
-        yield _speed(name, axis, told)
+        yield _length(name, axis, parameters)
+        yield _speed(name, axis, parameters)
     if settings.pitch and settings.roll:
         yield _arcs(settings.pitch, settings.roll)
     yield from _reports(stage, settings)
@@ -185,27 +185,29 @@ def _position(report: Report, stage: Stage, settings: StageSettings) -> Finding:
     return Finding("stage", "position", found)
 
 
-def _homing(told: Mapping[int, float], settings: StageSettings) -> Finding:
-    on = bool(int(told.get(_HOMING, 0)) & 1)
-    found = ("on" if on else "off") if _HOMING in told else "not told"
+def _homing(parameters: Mapping[int, float], settings: StageSettings) -> Finding:
+    on = bool(int(parameters.get(_HOMING, 0)) & 1)
+    found = ("on" if on else "off") if _HOMING in parameters else "not told"
     wrong = settings.home and not on
     remedy = "the file asks for homing; set stage.home = false, or switch it on ($22=1)" if wrong else ""
     return _rated("stage", "homing ($22)", found, remedy, "failed")
 
 
-def _length(name: str, axis: Axis, told: Mapping[int, float]) -> Finding:
+def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     """Compare how far an axis goes: homed, GRBL counts down from 0, or up if it was built so."""
     unit, (low, high) = axis.unit, axis.limits
     number = _LENGTHS + _LETTERS.index(axis.letter)
-    length = told.get(number)
-    what, found = f"{name}: limits against ${number}", f"{low:g} to {high:g} {unit}, of {_told(length, unit)}"
+    length = parameters.get(number)
+    what = f"{name}: limits against ${number}"
+    found = f"{low:g} to {high:g} {unit}, of {_of_controller(length, unit)}"
     if length is None:
         return Finding("stage", what, found)
     ends = sorted(axis.zero + axis.direction * value for value in (low, high))
     most, remedy = length * (1 + _ALIKE), ""
+    within = -most <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= most
     if high - low > most:
         remedy = f"they are {high - low:g} {unit} apart, and the axis is shorter; correct stage.{name}.limits"
-    elif told.get(_SOFT_LIMITS) and not (-most <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= most):
+    elif parameters.get(_SOFT_LIMITS) and not within:
         remedy = (
             f"they are {ends[0]:g} to {ends[1]:g} in the machine's coordinates; its soft limits ($20) "
             f"refuse a part; correct stage.{name}.limits or its zero"
@@ -213,23 +215,23 @@ def _length(name: str, axis: Axis, told: Mapping[int, float]) -> Finding:
     return _rated("stage", what, found, remedy)
 
 
-def _speed(name: str, axis: Axis, told: Mapping[int, float]) -> Finding:
+def _speed(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     """Compare how fast an axis is; GRBL counts by the minute."""
     unit, number = axis.unit, _RATES + _LETTERS.index(axis.letter)
-    theirs = told[number] / 60 if number in told else None
-    found = f"{axis.speed:g} {unit}/s, of {_told(theirs, f'{unit}/s')}"
+    theirs = parameters[number] / 60 if number in parameters else None
+    found = f"{axis.speed:g} {unit}/s, of {_of_controller(theirs, f'{unit}/s')}"
     remedy = ""
     if theirs is not None and axis.speed > theirs * (1 + _ALIKE):
         remedy = f"the controller moves more slowly than the file says; set stage.{name}.speed = {theirs:g}"
     return _rated("stage", f"{name}: speed against ${number}", found, remedy)
 
 
-def _told(value: float | None, unit: str) -> str:
+def _of_controller(value: float | None, unit: str) -> str:
     return "what the controller does not tell" if value is None else f"{value:g} {unit} of the controller"
 
 
 def _arcs(pitch: Axis, roll: Axis) -> Finding:
-    """Tell whether the axes span a plane that GRBL knows arcs in."""
+    """Return whether the axes span a plane that GRBL knows arcs in."""
     remedy = ""
     if not {pitch.letter, roll.letter} <= set("XYZ"):
         remedy = "GRBL has none there, so rotations go in steps only; put pitch and roll on two of X, Y and Z"

@@ -48,7 +48,7 @@ def estimate_delay(
 
     The function is a broken line through some twenty places, fitted together with a steady drift to the
     principal components of the picture's change; the delay leaves the least sum of squares. Its standard
-    error follows from what is left in each frame, told as an error in time.
+    error follows from the residual of each frame as an error in time.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def estimate_delay(
     Raises
     ------
     HardwareError
-        The picture changes too little to tell.
+        The picture changes too little.
     """
     from scipy.optimize import minimize_scalar
 
@@ -72,19 +72,19 @@ def estimate_delay(
     change = _components(np.asarray(pictures, np.float64))
     total = float(np.sum(change**2))
 
-    def left(delay: float) -> float:
-        return float(np.sum(_fit(place(time - delay), time, change).left ** 2))
+    def cost(delay: float) -> float:
+        return float(np.sum(_fit(place(time - delay), time, change).residual ** 2))
 
     trials = np.linspace(*_RANGE, _TRIALS)
-    costs = [left(float(delay)) for delay in trials]
+    costs = [cost(float(delay)) for delay in trials]
     best = int(np.argmin(costs))
     if not total > 0 or best in (0, _TRIALS - 1) or costs[best] > (1 - _EXPLAINED) * total:
         raise HardwareError(
-            f"{name}: its delay cannot be told, as the picture hardly changes with the place: press"
+            f"{name}: its delay cannot be found, as the picture hardly changes with the place: press"
             f" deeper, or {_REMEDY}"
         )
     around = tuple(trials[[best - 1, best + 1]])
-    found = minimize_scalar(left, bounds=around, method="bounded", options={"xatol": 1e-5})
+    found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-5})
     error = _error(float(found.x), time, change, place)
     if not error < _UNSURE:
         raise HardwareError(
@@ -96,9 +96,9 @@ def estimate_delay(
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """A broken line through the picture's components: what it leaves, and its slope at each frame, (n, c)."""
+    """A broken line through the picture's components: its residual and its slope at each frame, (n, c)."""
 
-    left: Floats
+    residual: Floats
     slope: Floats
     freedom: int
 
@@ -117,7 +117,7 @@ def _fit(place: Floats, time: Floats, change: Floats) -> _Fit:
     width = (high - low) / (count - 1) or 1.0
     along = np.clip((place - low) / width, 0, count - 1)
     knot = np.minimum(along.astype(np.intp), count - 2)
-    hats = _Hats(knot, along - knot, count)
+    hats = _BrokenLines(knot, along - knot, count)
 
     since = (time - time.mean())[:, None]
     of_change, of_since = hats.fit(change), hats.fit(since)
@@ -128,7 +128,7 @@ def _fit(place: Floats, time: Floats, change: Floats) -> _Fit:
     return _Fit(change - hats.at(line) - since * drift, slope, count + 1)
 
 
-class _Hats:
+class _BrokenLines:
     """Least squares of broken lines: by bands, as threads of a matrix library take longer than the work.
 
     Of each frame, (n,), it is given the knot before it, and its share of the way to the next.
@@ -159,12 +159,12 @@ class _Hats:
 
 
 def _error(delay: float, time: Floats, change: Floats, place: Callable[[Floats], Floats]) -> float:
-    """Return the standard error of a delay: a frame counts by what its picture tells of time."""
+    """Return the standard error of a delay: a frame counts by how its picture depends on time."""
     step = 1e-3
     fit = _fit(place(time - delay), time, change)
     speed = (place(time - delay + step) - place(time - delay - step)) / (2 * step)
     pace = fit.slope * speed[:, None]
     weight = np.sum(pace**2, axis=1)
-    late = np.sum(pace * fit.left, axis=1)  # the frame's error in time, times its weight
+    late = np.sum(pace * fit.residual, axis=1)  # the frame's error in time, times its weight
     free = max(1, len(time) - fit.freedom) / len(time)
     return math.sqrt(float(np.sum(late**2)) / free) / max(float(weight.sum()), 1e-300)

@@ -24,7 +24,7 @@ _JOIN = 5.0
 
 
 class Move:
-    """A move of the stage that is under way, and was told to begin at a time; a thread waits for its end."""
+    """A move of the stage that is under way, begun at a time; a thread waits for its end."""
 
     def __init__(self, stage: Stage, began: float) -> None:
         self._stage = stage
@@ -63,8 +63,8 @@ class Rig(Closing):
 
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
-    the rig for anything is told why. Frames are missed after 0.1 s or three periods, whichever is longer; a
-    computer that is too busy to look that often gives the camera more time.
+    the rig for anything gets the reason. Frames are missed after 0.1 s or three periods, whichever is longer;
+    a computer that is too busy to look that often gives the camera more time.
 
     Parameters
     ----------

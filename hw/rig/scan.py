@@ -183,7 +183,7 @@ class Scan(Closing):
         self.rig.go(self.plan.first)
 
     def _known(self) -> Header:
-        """Say what is known before anything moves."""
+        """Return what is known before anything moves."""
         stage, camera = self.rig.settings.stage, self.rig.settings.camera
         header = Header(
             self.motion,
@@ -203,7 +203,7 @@ def _scalar(value: float | None) -> Floats | None:
     return None if value is None else np.asarray(value, np.float64)
 
 
-_ASTRAY = (0.02, 2e-3)  # how far from where it was sent the body may rest, mm and rad
+_OFF_TARGET = (0.02, 2e-3)  # how far from where it was sent the body may rest, mm and rad
 
 
 class StepScan(Scan):
@@ -251,7 +251,7 @@ class StepScan(Scan):
         return self._block(frames, arrival, place, dropped, origin)
 
     def _go_on(self) -> None:
-        """Move to the next place, and tell from when on frames show the body settled there."""
+        """Move to the next place, and find from when on frames show the body settled there."""
         self._step += 1
         place = self._places[self._step]
         rest = self.rig.go(place)
@@ -275,7 +275,7 @@ class StepScan(Scan):
 
 def _check_there(rest: Report, place: Position, name: str) -> None:
     """Refuse a stage that rests elsewhere than it was sent."""
-    travel, lean = _ASTRAY
+    travel, lean = _OFF_TARGET
     off = abs(rest.position.travel - place.travel)
     leans = max(abs(rest.position.pitch - place.pitch), abs(rest.position.roll - place.roll))
     if off > travel or leans > lean:

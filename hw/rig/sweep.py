@@ -27,7 +27,7 @@ class SweepScan(Scan):
     """Records while the body moves on; see ``Scan``.
 
     The live position of a frame is that of the planned way, locked to the latest reports, at the frame's
-    arrival less the camera's delay. Afterwards ``positions`` tells it better: from all reports, and from
+    arrival less the camera's delay. Afterwards ``positions`` has it better: from all reports, and from
     the even times at which a camera exposes. A delay that the rig file does not give is measured first, by a
     short move there and back.
 
@@ -101,7 +101,7 @@ class SweepScan(Scan):
                 return self._give(taken, rest, np.zeros(rest.stop - rest.start), origin)
         while True:
             taken = self.rig.take(most)
-            self._follow()
+            self._add_reports()
             exposed = taken.time - self.delay.seconds
             way = self._live_track.at(exposed)
             part = self._thinned(taken, self._part(exposed, way))
@@ -139,9 +139,9 @@ class SweepScan(Scan):
         """Wait for the end of the move, and for the last reports."""
         if self._move is not None:
             self.rig.end(self._move)
-        self._follow()
+        self._add_reports()
 
-    def _follow(self) -> None:
+    def _add_reports(self) -> None:
         """Take in the reports that came since."""
         if self._move is None:
             return
@@ -151,7 +151,7 @@ class SweepScan(Scan):
             self._live_track.add(report.time, way)
 
     def _part(self, exposed: Floats, way: Floats) -> slice:
-        """Tell which of some frames belong to the scan.
+        """Return which of some frames belong to the scan.
 
         A press has frames at rest on either side. A rotation has none: they would count one phase too often.
         """

@@ -11,11 +11,11 @@ from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid, VerticalPlan
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io.types import Floats
 
-_LOCK = 8  # of the latest reports, that tell how far the way has come
+_LOCK = 8  # of the latest reports, that show how far the way has come
 _SLOPES = (0.2, 2.0)  # of a planned second, that may pass in one
 _AT_REST = 1e-3  # of the way's length, that the body may seem to have moved
 _RAMPS = (0.004, 2.0)  # seconds in which a stage reaches its speed
-_LEAST = 4  # reports under way, to tell more than when the move began
+_LEAST = 4  # reports under way, to find more than when the move began
 _SPREAD = 1.4826  # standard deviations in a median magnitude, of a normal distribution
 _ORDER = 1.5  # by which the plan's deviations exceed chance
 _SMOOTH = 5  # reports on either side
@@ -57,8 +57,8 @@ class Progress:
 class LiveTrack:
     """Where the body is, as far as it is known while it moves: the planned way, locked to the latest reports.
 
-    The reports of the last moments tell by a straight line which of the plan's seconds it is at, and how
-    fast these pass; the plan tells the place. It never runs back. The move was told to begin at `began`.
+    The reports of the last moments show by a straight line which of the plan's seconds it is at, and how
+    fast these pass; the plan gives the place. It never runs back. The move was commanded at `began`.
     """
 
     def __init__(self, path: Trapezoid, began: float) -> None:
@@ -127,11 +127,11 @@ class Track:
     def __init__(self, times: ArrayLike, ways: ArrayLike, path: Trapezoid) -> None:
         time, way = np.asarray(times, np.float64), np.asarray(ways, np.float64)
         self.began, self.path = _fit(time, way, path)
-        left = way - self.path.place(time - self.began)
-        self._extra = _agreed(left)
+        residual = way - self.path.place(time - self.began)
+        self._extra = _common_deviation(residual)
         self._time = time
         self.reports = len(time)
-        self.spread = _deviation(left - self._extra)
+        self.spread = _deviation(residual - self._extra)
 
     @property
     def ended(self) -> float:
@@ -188,13 +188,13 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
     return gone(best.x)
 
 
-def _agreed(left: Floats) -> Floats:
-    """Return what neighbouring reports agree on of what is left; nothing where it looks like chance."""
-    chance = _deviation(np.diff(left)) / math.sqrt(2)
-    if len(left) <= 2 * _SMOOTH or _deviation(left) <= _ORDER * chance:
-        return np.zeros_like(left)
+def _common_deviation(residual: Floats) -> Floats:
+    """Return what neighbouring reports agree on of what is residual; nothing where it looks like chance."""
+    chance = _deviation(np.diff(residual)) / math.sqrt(2)
+    if len(residual) <= 2 * _SMOOTH or _deviation(residual) <= _ORDER * chance:
+        return np.zeros_like(residual)
     weights = (1 - (np.abs(np.arange(-_SMOOTH, _SMOOTH + 1)) / (_SMOOTH + 1)) ** 3) ** 3
-    edges = np.pad(left, _SMOOTH, mode="edge")
+    edges = np.pad(residual, _SMOOTH, mode="edge")
     return np.asarray(np.convolve(edges, weights / weights.sum(), mode="valid"))
 
 
@@ -216,7 +216,7 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
     t = np.asarray(arrival, np.float64)
     if len(t) < 3:
         return t
-    n = _mended(np.asarray(number, np.float64), t)
+    n = _with_lost_frames(np.asarray(number, np.float64), t)
     frame = np.arange(len(n))
     first, end = np.maximum(frame - window, 0), np.minimum(frame + window + 1, len(n))
 
@@ -233,12 +233,12 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
     return np.maximum.accumulate(t[0] + pace * n + mean_late + slope * (n - mean_n))
 
 
-def _mended(number: Floats, arrival: Floats) -> Floats:
+def _with_lost_frames(number: Floats, arrival: Floats) -> Floats:
     """Count frames that nobody noticed were lost: from a gap on, all frames are whole periods late."""
     period = float(np.median(np.diff(arrival) / np.diff(number)))
     late = arrival - period * (number - number[0])
-    mended = number.copy()
+    counted = number.copy()
     for gap in np.flatnonzero(np.diff(late) > _GAP * period) + 1:
         before, after = late[max(0, gap - _NEAR) : gap], late[gap : gap + _NEAR]
-        mended[gap:] += max(0, round((np.median(after) - np.median(before)) / period))
-    return mended
+        counted[gap:] += max(0, round((np.median(after) - np.median(before)) / period))
+    return counted
