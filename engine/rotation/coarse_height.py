@@ -33,26 +33,7 @@ def coarse_heights(
     Slopes are integrated; the highest point of each piece is taken to be as high as the body was pressed.
     Where no normal is known, the nearest slope is taken, as over a crease; where that is because the surface
     is too level to be seen, it becomes less towards the middle, as on a ball. Beyond the pieces, the nearest
-    height is taken.
-
-    Parameters
-    ----------
-    vectors : ndarray, (H, W, 3), float32
-        Unit normals.
-    contact : ndarray, (H, W), uint8
-        0 where they mean nothing.
-    too_level : ndarray, (H, W), bool
-        Where the surface is too level to be seen.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    press : float
-        Millimetres.
-    device : Device
-
-    Returns
-    -------
-    ndarray, (H, W), float64
-        Millimetres, finite, from 0 to the press; the press where there is no contact at all.
+    height is taken. Heights are finite, from 0 to the press, mm; the press where there is no contact at all.
     """
     from scipy import ndimage
 

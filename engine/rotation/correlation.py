@@ -8,8 +8,9 @@ floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -288,25 +289,22 @@ class _Sums:
         items = -(-band.pixels // self._device.layout.tile)
         kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
 
-    def _answer(self, name: str, moved: int, **arguments: Any) -> list[NDArray[np.float32]]:
-        """Have a kernel turn the sums of each band, or its ring, into the answers."""
+    def _answer(
+        self, name: str, moved: int, known: Callable[[Band], dict[str, Any]], **arguments: Any
+    ) -> list[NDArray[np.float32]]:
+        """Have a kernel turn what is known of each band into the answers."""
         parts = []
         for band in self.bands:
-            answers: dict[str, Any] = {key: band.maps[answer] for key, answer in _ANSWERS.items()}
-            if name == "correlation_window":
-                known: dict[str, Any] = {"ring": band.maps["ring"], "stride": band.stride, **answers}
-            else:
-                known = _sums_of(band, pairs="pairs" in name)
-                known |= {"cosine_part": answers.pop("cosine"), "sine_part": answers.pop("sine"), **answers}
             with band.resident():
-                self._run(band, name, moved, **arguments, fit=self._fit, **known)
+                self._run(band, name, moved, **arguments, fit=self._fit, **known(band))
                 parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
         return [np.concatenate(part) for part in zip(*parts, strict=True)]  # copies
 
     def _answer_counts(self, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
         """Return the answers of integer sums of ``size`` bytes."""
         _fill(self._fit, _fit_table(self._phase, rows))
-        return self._answer("correlation_solve_counts", 4 * (size + 4), **_counted(rows))
+        known = _counted(rows)
+        return self._answer("correlation_solve_counts", 4 * (size + 4), _sums_and_answers, **known)
 
 
 class TurnSums(_Sums):
@@ -346,7 +344,7 @@ class TurnSums(_Sums):
         rows /= [1, self._step, self._step]
         rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
         _fill(self._fit, _fit_table(self._phase, rows))
-        return self._answer("correlation_solve_pairs", 52)
+        return self._answer("correlation_solve_pairs", 52, partial(_sums_and_answers, pairs=True))
 
     def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
@@ -456,13 +454,24 @@ class WindowSums(_Sums):
         _fill(self._place, (self.oldest + used) % self._window)
         _fill(self._floats, rows[used])
         known = {"count": len(used), "place": self._place, "basis": self._floats}
-        return self._answer("correlation_window", self._size * len(used) + 16, **known)
+        return self._answer("correlation_window", self._size * len(used) + 16, _ring_and_answers, **known)
 
 
 def _sums_of(band: Band, pairs: bool = False) -> dict[str, Any]:
     """Return the maps that sums are kept in, by the arguments of kernels."""
     sums = {key: band.maps[name] for key, name in _SUMS.items()}
     return {"reference": band.maps["reference"], **sums} if pairs else sums
+
+
+def _sums_and_answers(band: Band, pairs: bool = False) -> dict[str, Any]:
+    answers = {key: band.maps[name] for key, name in _ANSWERS.items()}
+    parts = {"cosine_part": answers.pop("cosine"), "sine_part": answers.pop("sine")}
+    return {**_sums_of(band, pairs), **parts, **answers}
+
+
+def _ring_and_answers(band: Band) -> dict[str, Any]:
+    answers = {key: band.maps[name] for key, name in _ANSWERS.items()}
+    return {"ring": band.maps["ring"], "stride": band.stride, **answers}
 
 
 def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:

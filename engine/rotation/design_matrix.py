@@ -107,31 +107,15 @@ def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doub
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnFit:
-    """How a turn of N frames is fitted; two are the same if they are one object.
+    """How a turn of N frames is fitted; two are the same if they are one object."""
 
-    Attributes
-    ----------
-    phase, weights : ndarray, (N,), float64
-        Radians from 0 to a turn, and weights above 0.
-    matrix : ndarray, (3, N), float64
-        See `fit_matrix`.
-    table : ndarray, (6, N), float32
-        Cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine.
-    covariance : ndarray, (3, 3), float64
-        Of mean, cosine and sine, where samples of weight 1 have variance 1.
-    weighted : bool
-        Whether a frame has another weight than 1.
-    goes_round : bool
-        See `goes_round`.
-    """
-
-    phase: Doubles
-    weights: Doubles
-    matrix: Doubles
-    table: NDArray[np.float32]
-    covariance: Doubles
-    weighted: bool
-    goes_round: bool
+    phase: Doubles  # (N,), radians from 0 to a turn
+    weights: Doubles  # (N,), above 0
+    matrix: Doubles  # (3, N): see `fit_matrix`
+    table: NDArray[np.float32]  # (6, N): cosines, sines, roots of the weights, and the matrix
+    covariance: Doubles  # (3, 3), of mean, cosine and sine, where samples of weight 1 have variance 1
+    weighted: bool  # whether a frame has another weight than 1
+    goes_round: bool  # see `goes_round`
 
 
 def turn_fit(phase: Doubles, weights: Doubles) -> TurnFit | None:

@@ -87,14 +87,7 @@ def find_edges(
 
 
 class EdgeDrawing:
-    """The maps of one picture on a device, and the kernels over them, which may be run in parts.
-
-    Parameters
-    ----------
-    device : Device
-    shape : (int, int)
-        Rows and columns.
-    """
+    """The maps of one picture on a device, and the kernels over them, which may be run in parts."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device, (rows, columns) = device, shape

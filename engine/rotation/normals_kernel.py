@@ -80,18 +80,10 @@ class TurnModel:
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Where the samples of a turn lie on the device.
+    """Where the samples of a turn lie on the device: in ``count`` frames of a stack, from ``start`` on.
 
-    Attributes
-    ----------
-    stack : Array or BorrowedBuffer
-    start : int
-        Frame of the turn's first one.
-    count : int
-        Frames of the turn.
-    ring : bool
-        Whether it is a ring of ``count`` frames as long as a band's stride, in which the turn goes round;
-        otherwise its frames follow each other, each as long as the band has pixels.
+    A ring has ``count`` frames, as long as a band's stride, in which the turn goes round; otherwise frames
+    are as long as the band has pixels.
     """
 
     stack: Operand
@@ -101,16 +93,7 @@ class Samples:
 
 
 class NormalKernel:
-    """Fits turns on a device; the parameters are those of `mirrorskin.engine.NormalEstimator`.
-
-    Attributes
-    ----------
-    device : Device
-    model : TurnModel or None
-        None where tilt or noise are to be estimated.
-    tables_at_once : int
-        Turns whose tables the device has at once, at most.
-    """
+    """Fits turns on a device; the parameters are those of `mirrorskin.engine.estimate_normals`."""
 
     def __init__(
         self,
@@ -143,6 +126,7 @@ class NormalKernel:
         if not self._scale.per_pixel:
             self._one_scale = self.device.given("scale", self._scale.planes)
         self._wall = None if response is None else self.device.given("wall", response.table)
+        # Turns whose tables the device has at once, at most.
         self.tables_at_once = max(1, min(_TABLES, self.device.max_allocation // _TABLE_BYTES))
         self._tables = self.device.array("turns", (self.tables_at_once, 6, LONGEST), np.float32)
         self._places: dict[TurnFit, int] = {}
@@ -155,15 +139,7 @@ class NormalKernel:
         return TurnModel(self._tilt, self._noise)
 
     def estimate_model(self, samples: NDArray[Any], fit: TurnFit) -> TurnModel:
-        """Estimate from a turn what was not given, the noise and the tilt.
-
-        Parameters
-        ----------
-        samples : ndarray, (N, n)
-            Of every n-th pixel of a frame; see `mirrorskin.engine.frames.thinning`.
-        fit : TurnFit
-            Of its frames.
-        """
+        """Estimate what was not given, noise or tilt, from samples, (N, n), of thinned-out pixels."""
         noise, tilt = self._noise, self._tilt
         if noise is None:
             with np.errstate(invalid="ignore"):
@@ -213,19 +189,10 @@ class NormalKernel:
         turns: int,
         bare: bool = False,
     ) -> None:
-        """Fit a resident band's samples of one turn.
+        """Fit a resident band's samples of one turn, whose table was among those written last.
 
-        Parameters
-        ----------
-        band : Band
-        samples : Samples
-        fit : TurnFit
-            One of those whose tables were written last.
-        model : TurnModel
-        turns : int
-            Of which the maps are to be the mean, this one included.
-        bare : bool
-            Whether to leave out the maps of the wave: mean, cosine, sine and residual.
+        The maps become the mean of ``turns`` turns, this one included. ``bare`` leaves out those of the wave:
+        mean, cosine, sine and residual.
         """
         layout, count, tilt, noise = self.device.layout, samples.count, model.tilt, model.noise
         lanes = min(_LANES, layout.lanes)

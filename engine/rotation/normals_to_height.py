@@ -276,16 +276,7 @@ def _stack(maps: list[NDArray[Any] | None], per_turn: bool) -> NDArray[Any] | No
 class SlopeKernels:
     """Turns normals into slopes and weights on the device, as `find_slopes` does of one turn.
 
-    Parameters
-    ----------
-    device : Device
-    shape : (int, int)
-        Rows and columns.
-
-    Attributes
-    ----------
-    typical : float
-        A weight of middle size, which bounds weights; it is found the first time. NaN to find it anew.
+    ``typical``, a weight of middle size, bounds weights. It is found the first time, and again after NaN.
     """
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
@@ -299,14 +290,8 @@ class SlopeKernels:
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
         """Put the work on the device's queue; the first time, wait for `typical`.
 
-        Parameters
-        ----------
-        tilt : float
-            Half-angle of the precession, radians.
-        normals : mapping of str to Array
-            ``vectors`` (H, W, 3), ``sigma`` and ``contact`` (H, W), and padding.
-        to : mapping of str to Array
-            ``dz_dx``, ``dz_dy``, ``weight_x`` and ``weight_y``, (H, W), float32.
+        From ``vectors``, ``sigma`` and ``contact``, which may have padding, to ``dz_dx``, ``dz_dy``,
+        ``weight_x`` and ``weight_y``, (H, W).
         """
         rows, columns = self._shape
         pixels, tile = rows * columns, self._device.layout.tile

@@ -26,27 +26,7 @@ class NormalWindow:
     the device, in a ring that the correlation's sums share: the normals are those of ``estimate_normals``
     from the same frames, bit by bit, and the correlation is that of ``Correlator``.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    window : int
-        Frames, 3 to 64.
-    tilt, gain, offset, method, noise, dark, bright, response, device
-        As for ``estimate_normals``.
-
-    Attributes
-    ----------
-    device : Device
-    count : int
-        Frames so far.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Parameters that cannot be used.
+    The window has 3 to 64 frames; other options are those of `mirrorskin.engine.estimate_normals`.
     """
 
     position = "phase"
@@ -89,14 +69,7 @@ class NormalWindow:
         self._model, self.count = self._kernel.model, 0
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Frames of another type or size, phases that cannot be used; or noise or tilt cannot be estimated
-            from the first full window.
-        """
+        """Take in the next frames; see `mirrorskin.engine.streaming.Estimator`."""
         check_frames(frames, self._dtype, self._shape)
         alpha, weights = check_phase(phase, len(frames), "phase"), np.ones(len(frames))
         filling = max(0, min(len(frames), self._window - self.count))
@@ -110,15 +83,8 @@ class NormalWindow:
     def estimate(self, bare: bool = True) -> None:
         """Put the estimate of the window's normals on the device's queue; their maps lie in the bands.
 
-        Parameters
-        ----------
-        bare : bool
-            Whether to leave out mean, cosine, sine and residual.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            The window is not full, or its phases do not determine a normal.
+        ``bare`` leaves out mean, cosine, sine and residual. InputError: the window is not full, or its phases
+        do not determine a normal.
         """
         fit = self._fit()
         self._kernel.write_tables([fit])
@@ -135,13 +101,7 @@ class NormalWindow:
             band.write("scale", heights[band.rows], plane=4)
 
     def result(self) -> Normals:
-        """Estimate the window's normals.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            As `estimate`.
-        """
+        """Estimate the window's normals; see `estimate`."""
         self.estimate(bare=False)
         return Normals.of([self.fetch(name) for name in MAPS], self._known_model, 1, self._window)
 

@@ -22,15 +22,7 @@ _FRAME: np.dtype[Any] = np.dtype(np.float32)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """How a camera's lines of sight lean.
-
-    Attributes
-    ----------
-    lean : float
-        By how much towards the axis, for each millimetre up and each millimetre from it: 1/mm.
-    axis : (float, float)
-        Millimetres.
-    """
+    """How lines of sight lean towards an axis, mm: by ``lean`` for each mm up and each mm from it."""
 
     lean: float
     axis: tuple[float, float]

@@ -24,21 +24,11 @@ _BEYOND = 1e-3  # share of the pixels whose sum of squares is that large by nois
 
 @dataclass(frozen=True, slots=True)
 class CountNoise:
-    """The noise of a sample by its brightness: read noise, and shot noise, which grows with the light.
+    """The noise of a sample by its brightness: read noise, and shot noise, which grows with the light."""
 
-    Attributes
-    ----------
-    base : float
-        Variance at 0 counts, extrapolated.
-    slope : float
-        Variance per count.
-    least : float
-        The smallest variance that there is.
-    """
-
-    base: float
-    slope: float
-    least: float
+    base: float  # variance at 0 counts, extrapolated
+    slope: float  # variance per count
+    least: float  # the smallest variance that there is
 
     def at(self, level: ArrayLike) -> Doubles:
         """Return the standard deviation of samples around a level, counts."""
@@ -53,13 +43,8 @@ def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> C
     then those beyond chi-square's quantile of 99.9 %, of pixels that lose contact, are left out until that
     changes nothing. Through the bins' variances goes a line that does not fall.
 
-    Parameters
-    ----------
-    samples : ndarray, (N, n), uint8, uint16 or float32
-        Of n pixels. Frames that have less than half as many valid samples as others are left out, and then
-        pixels of which a sample is clipped by its type or no number.
-    phase, weights : ndarray, (N,), float64
-        Radians, and weights above 0.
+    Samples are (N, n), of n pixels; weights are above 0. Frames that have less than half as many valid
+    samples as others are left out, and then pixels of which a sample is clipped by its type or no number.
     """
     if len(samples) == 3:
         raise InputError(

@@ -88,14 +88,9 @@ class Response:
             return np.asarray((mean - self.planes[0]) * self.planes[1] < max(rim, _DARK) + _DARK)
 
     def at(self, heights: ArrayLike, follows: bool = False) -> Response:
-        """Return the same with the object elsewhere.
+        """Return the same with the object at other heights, mm above the rest plane in the mean pose.
 
-        Parameters
-        ----------
-        heights : array_like, scalar or (H, W)
-            Millimetres above the rest plane in the mean pose.
-        follows : bool
-            Whether each pixel keeps seeing one point of the object; see ``Registered``.
+        ``follows`` is whether each pixel keeps seeing one point of the object; see ``Registered``.
         """
         planes = self.planes.copy()
         planes[4] = heights

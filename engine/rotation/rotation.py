@@ -38,20 +38,11 @@ _ROUNDS = 2  # in which it is found how high the object stands
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """What was found of each pixel.
+    """What was found of each pixel, and how.
 
-    Attributes
-    ----------
-    normals : Normals
-    independent_sigma : ndarray, (H, W), float32
-        The predicted errors, radians, that normals would have without registration. That makes errors smaller
-        but correlates those of neighbours, and means over many pixels are no better.
-    edges : ndarray, (H, W), uint8
-    device : Device
-    process : dict
-        What it was made with.
-    systematic : ndarray, (H, W), float32, or None
-        Standard errors, radians, that a calibration adds to the normals', alike for neighbours.
+    ``independent_sigma`` is the predicted errors, radians, that normals would have without registration: that
+    makes errors smaller but correlates those of neighbours, and means over many pixels are no better.
+    ``systematic`` are standard errors that a calibration adds to the normals', alike for neighbours.
     """
 
     normals: Normals

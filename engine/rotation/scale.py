@@ -51,18 +51,9 @@ def make_scale(
     bright: ArrayLike | None,
     shape: tuple[int, int],
 ) -> Scale:
-    """Check a scale and bring it into the kernels' form.
+    """Return a scale in the kernels' form, if it is one; see `mirrorskin.engine.estimate_normals`.
 
-    Parameters
-    ----------
-    gain : array_like, scalar or (H, W)
-        Counts per radian of zenith; below 0 where steeper is darker. A pixel with 0 or NaN has no answer.
-    offset : array_like, scalar or (H, W)
-        Counts at zenith 0.
-    dark, bright : array_like, scalar or (H, W), or None
-        Counts between which brightness is linear, where the pattern or the light ends.
-    shape : (int, int)
-        Rows and columns of a frame.
+    A gain below 0 is that of a sensor to which steeper is darker; a pixel with 0 or NaN has no answer.
     """
     if gain is None:
         raise InputError("a zenith gain is needed: counts per radian, such as 206, or a calibration")

@@ -28,15 +28,7 @@ def check_tilt(tilt: float) -> float:
 
 
 def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
-    """Return which pixels are steep enough to show one wave a turn and little else.
-
-    Parameters
-    ----------
-    wave : ndarray, (3, n), float64
-        Mean, cosine and sine of the samples, counts.
-    scale : ndarray, (4,) or (4, n), float64
-        See `mirrorskin.engine.rotation.scale.Scale`.
-    """
+    """Return which pixels are steep enough for one wave a turn, (3, n) counts, and little else."""
     offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
     return np.asarray((wave[0] - offset) * per_count > _STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
 
@@ -49,16 +41,7 @@ def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: Co
     more and show nothing but one wave and noise.
 
     The pivot's shift changes amplitudes too: where the heights differ much from the pivot's, the estimate is
-    wrong.
-
-    Parameters
-    ----------
-    samples : ndarray, (N, n), uint8, uint16 or float32
-        Of n pixels in one turn.
-    fit : TurnFit
-    scale : ndarray, (4,) or (4, n), float64
-        See `mirrorskin.engine.rotation.scale.Scale`.
-    noise : CountNoise
+    wrong. Samples are (N, n), of n pixels in one turn; ``scale`` is the planes of a `Scale`, (4,) or (4, n).
     """
     from scipy import special
 
