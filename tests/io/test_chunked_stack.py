@@ -3,49 +3,23 @@
 from __future__ import annotations
 
 import ctypes
-import itertools
+import gc
 import zlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from fetching import ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
+from fetching import GIVEN, ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mirrorskin import io
+from mirrorskin.io import chunked_stack
 from mirrorskin.io.selection import Region
 
 SHAPE = (11, 13, 17)
-CHUNKS = {
-    "a frame": (1, 13, 17),
-    "some frames": (3, 13, 17),
-    "tiles of a frame": (1, 5, 17),
-    "tiles of some frames": (4, 5, 6),
-    "a pixel's time": (11, 1, 1),
-    "tiles of all frames": (11, 5, 6),
-    "rows of all frames": (11, 2, 17),
-    "everything": (11, 13, 17),
-}
 REGION = Region((3, 11), (4, 12))
-
-
-@pytest.mark.parametrize("chunks", CHUNKS)
-@pytest.mark.parametrize("packing", ["raw", "bitshuffle", "shuffled gzip", "blosc2"])
-def test_chunks_of_any_shape_give_what_hdf5_gives(tmp_path, monkeypatch, chunks, packing):
-    path = write(
-        tmp_path / "a.h5", compressible(SHAPE, "u2"), CHUNKS[chunks], (PACKINGS | ONLY_HDF5)[packing]
-    )
-    counts = count_unpacked(monkeypatch)
-    for room, region in itertools.product((1, 5, 40), (None, REGION)):
-        counts.clear()
-        frames, how = ours(path, room, region=region)
-        np.testing.assert_array_equal(frames, theirs(path, region=region))
-        if (packing, chunks) == ("raw", "everything"):
-            assert how == "mapped"
-        else:
-            assert set(counts.values()) == {1}
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
@@ -159,18 +133,6 @@ def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packin
         assert len(counts) == np.prod(needed)
 
 
-def test_damage_is_told_with_the_frames(tmp_path):
-    path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (2, 50, 70), PACKINGS["bitshuffle"])
-    with h5py.File(path) as file:
-        chunk = file["x"].id.get_chunk_info(2)
-    data = bytearray(path.read_bytes())
-    data[chunk.byte_offset + 12] ^= 0xFF
-    path.write_bytes(data)
-    for region in (None, REGION):
-        with pytest.raises(io.InputError, match=r"a\.h5: frames 4 to 5 of /x cannot be read: it is damaged"):
-            ours(path, 9, region=region)
-
-
 def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
     path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
     with io.open_recording(path, motion="horizontal") as recording:
@@ -201,3 +163,77 @@ def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
         out[:] = 0
         assert not out.any()
     assert not out.any()
+
+
+LONG = (24, 13, 17)
+FRAME = 13 * 17 * 2
+BITSHUFFLE = PACKINGS["bitshuffle"]
+
+
+@pytest.mark.parametrize("chunks", [(8, 13, 17), (8, 5, 17), (8, 5, 6), (24, 4, 4)])
+@pytest.mark.parametrize("packing", ["bitshuffle", "blosc2"])
+@pytest.mark.parametrize("limit", [60 * FRAME, 30 * FRAME, 8 * FRAME])
+def test_long_chunks_are_unpacked_once(tmp_path, monkeypatch, chunks, packing, limit):
+    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), chunks, (PACKINGS | ONLY_HDF5)[packing])
+    counts = count_unpacked(monkeypatch)
+    for part in ({}, {"region": Region((2, 11), (3, 12))}, {"frames": (3, 22)}):
+        counts.clear()
+        frames, how = ours(path, 3, memory_limit=limit, threads=2, **part)
+        np.testing.assert_array_equal(frames, theirs(path, **part))
+        assert set(counts.values()) == {1}
+        alive = 1 if chunks[0] == 24 else 2
+        kept = alive * (min(chunks[0], len(frames)) * frames[0].nbytes + 64)
+        chunk = 2 * int(np.prod(chunks))
+        threads = 1 if packing == "blosc2" or limit < 8 * chunk else 2
+        assert how == ("unpacked into memory" if kept + threads * chunk <= limit else "unpacked to disk")
+
+
+@pytest.mark.parametrize("limit", [60 * FRAME, 8 * FRAME])
+def test_kept_frames_may_be_held_on_to(tmp_path, limit):
+    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
+    held = []
+    with io.open_recording(path, **GIVEN, memory_limit=limit) as recording:
+        out = np.empty((3, 13, 17), "u2")
+        while (block := recording.read(out)) is not None:
+            assert block.lent
+            held.append(block.frames)
+    del recording
+    gc.collect()
+    np.testing.assert_array_equal(np.concatenate(held), theirs(path))
+
+
+def test_memory_is_used_again_when_nobody_looks_at_it(tmp_path):
+    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
+    with io.open_recording(path, **GIVEN) as recording:
+        out, places = np.empty((4, 13, 17), "u2"), []
+        while (block := recording.read(out)) is not None:
+            places.append(block.frames.ctypes.data)
+            del block
+    step = 4 * FRAME
+    assert places == [places[0], places[0] + step] * 3
+
+
+def test_a_full_disk_is_told(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
+
+    def full(file, start, size):
+        raise OSError(28, "full")
+
+    monkeypatch.setattr(chunked_stack.os, "posix_fallocate", full)
+    line = (
+        r"a\.h5: /x is unpacked to disk, 1\.06e-05 GB: No space left on device; name a folder with more room"
+    )
+    with pytest.raises(io.InputError, match=line):
+        ours(path, 3, memory_limit=8 * FRAME)
+
+
+def test_damage_is_told_with_the_frames_on_every_way(tmp_path):
+    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
+    with h5py.File(path) as file:
+        chunk = file["x"].id.get_chunk_info(1)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + 12] ^= 0xFF
+    path.write_bytes(data)
+    for room, limit in ((24, 60 * FRAME), (3, 60 * FRAME), (3, 8 * FRAME)):
+        with pytest.raises(io.InputError, match="frames 8 to 15 of /x cannot be read: it is damaged"):
+            ours(path, room, memory_limit=limit)
