@@ -1,4 +1,4 @@
-"""A rotation told while it goes on: normals of its last turn, heights that follow, edges now and then."""
+"""A rotation while it goes on: normals of its last turn, heights that follow, edges now and then."""
 
 import math
 
@@ -40,7 +40,7 @@ def best_heights(normals):
     return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, slope_weights=weights).height
 
 
-def test_an_update_tells_the_last_turn(device):
+def test_an_update_is_of_the_last_turn(device):
     frames, live = make(device)
     live.warm()
     updates = feed(live, frames, [1] * SHAPE[0])
@@ -68,7 +68,7 @@ def test_heights_follow_those_that_fit_best(device):
         assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[np.isfinite(best)])
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
 def test_a_replay_in_other_cuts_is_the_same_bit_by_bit(dtype):
     results = []
     for cuts in ([1] * SHAPE[0], [13, 2, 9], [SHAPE[0]]):
@@ -176,28 +176,15 @@ def test_a_whole_run_uses_each_frame():
     np.testing.assert_array_equal(live.normals().vectors, exact.vectors)
 
 
-@pytest.mark.parametrize(
-    ("turn", "window", "every"), [(8, 8, 1), (64, 64, 1), (65, 32, 2), (400.3, 57, 7), (3.2, 3, 1)]
-)
-def test_a_window_is_a_turn_of_at_most_64_frames(turn, window, every):
-    assert choose_window(turn) == (window, every)
-    assert abs(window * every - turn) <= every
-
-
-@pytest.mark.parametrize("turn", [2.0, math.nan, math.inf])
-def test_a_turn_of_too_few_frames_is_refused(turn):
-    with pytest.raises(InputError, match="frames a turn"):
-        choose_window(turn)
-
-
-@pytest.mark.parametrize(
-    ("turn", "wanted", "every"), [(40, 24, 1), (40, 20, 2), (40, 8, 5), (39.6, 40, 1), (400, 64, 6)]
-)
-def test_a_window_that_is_wanted_is_spread_over_a_turn(turn, wanted, every):
-    assert choose_window(turn, wanted) == (wanted, every)
-
-
-def test_a_window_of_more_frames_than_a_turn_has_is_refused():
+def test_a_window_is_a_turn_of_at_most_64_frames():
+    for turn, window, every in ((8, 8, 1), (64, 64, 1), (65, 32, 2), (400.3, 57, 7), (3.2, 3, 1)):
+        assert choose_window(turn) == (window, every)
+        assert abs(window * every - turn) <= every
+    for turn, wanted, every in ((40, 24, 1), (40, 20, 2), (40, 8, 5), (39.6, 40, 1), (400, 64, 6)):
+        assert choose_window(turn, wanted) == (wanted, every)
+    for turn in (2.0, math.nan, math.inf):
+        with pytest.raises(InputError, match="frames a turn"):
+            choose_window(turn)
     with pytest.raises(InputError, match="--window 41: a turn has 40 frames only"):
         choose_window(40.2, 41)
 

@@ -28,13 +28,10 @@ def test_less_room_gives_the_same_answer(small_device, limit):
     assert (len(search._bands) > 1) == (limit < LARGEST)
 
 
-def test_the_room_shrinks_before_the_picture_is_cut(small_device):
+def test_the_room_shrinks_before_the_picture_is_cut_and_one_row_must_fit(small_device):
     small_device.max_allocation = 10 * 23 * 31
     search = OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
     assert 1 <= len(search.room) <= 10
-
-
-def test_one_row_that_does_not_fit_is_said_so(small_device):
     small_device.max_allocation = 2 * 64 * 4 - 1
     with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
         OnsetSearch((23, 31), FRAMES.dtype, device=small_device)

@@ -111,13 +111,6 @@ def test_a_device_agrees_with_the_reference_on_unknown_levels(device, dtype, eve
             assert_equal(search_in_blocks(search, frames, travel, list(cuts)), found)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (7, 1), (3, 1024), (5, 411)])
-def test_odd_sizes(device, shape):
-    frames, travel = stroke("uint8", 12, shape, seed=9)
-    found = find_change_point(frames, travel, **LEVELS["uint8"], noise=1.5, device=device)
-    assert_near(found, numpy_change(frames, travel, *SPEC["uint8"], noise=1.5), travel)
-
-
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("limit", [40_000, 31 * 25])
 def test_less_room_gives_the_same_answer(small_device, limit, known):

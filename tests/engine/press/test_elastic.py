@@ -11,7 +11,6 @@ from mirrorskin.engine.press.elastic import (
     Splines,
     correct_onset,
     correct_press,
-    cut_into_cells,
     threshold_at,
     touched,
 )
@@ -104,13 +103,6 @@ def test_a_weak_stage_lets_the_surface_in_less():
     ball = np.sqrt(9 - r**2) - 3
     found = press(HalfSpace((48, 48), (0.08, 0.08)), ball + theory.depth + 0.05 * theory.force, 0.05)
     assert found.load == pytest.approx(theory.force, rel=0.003)
-
-
-def test_what_lies_below_the_rest_plane_touches_nothing():
-    found = press(HalfSpace((5, 4), (0.1, 0.2)), np.array([[-0.1, np.nan, 0.0, -1.0]] * 5))
-    assert found.load == 0
-    assert not found.contact.any()
-    assert not found.height.any()
 
 
 def test_the_threshold_falls_towards_the_wall_as_the_wall_is_seen():
@@ -214,19 +206,3 @@ def test_splines_have_the_slopes_and_the_bending_of_a_cubic():
     np.testing.assert_allclose(across.reshape(20, 24), 2 * rows * columns, atol=1e-7)
     # The third derivatives are 6 down the rows and, three times, 2 mixed.
     assert factors @ splines.roughness() @ factors == pytest.approx(36 + 3 * 4, rel=1e-6)
-
-
-def test_cells_cover_what_is_known_and_know_where_they_are():
-    known = np.zeros((51, 90), bool)
-    known[0:40, 30:71] = True
-    cells = cut_into_cells(known, (0.1, 0.1))
-    values = np.add.outer(np.arange(51.0), 1000 * np.arange(90.0))
-    means, (rows, columns) = cells.inside(cells.means(values)), cells.centres()
-    down, across = cells.block
-    expected = np.add.outer(rows * down - 0.5, 1000 * (columns * across - 0.5))
-    whole = np.isfinite(means)
-    assert whole.any()
-    inner = cells.inside(expected)
-    np.testing.assert_allclose(means[:-1, :-1], inner[:-1, :-1])
-    assert cells.before[0] > 0
-    assert cells.before[1] == 0

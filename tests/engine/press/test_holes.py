@@ -42,14 +42,7 @@ def inside(height, slope):
 
 @pytest.mark.parametrize(
     ("radius", "step", "error"),
-    [
-        (3, 0.01, 0.005),
-        (5, 0.01, 0.005),
-        (10, 0.01, 0.008),
-        (3, 0.1, 0.012),
-        (5, 0.1, 0.012),
-        (10, 0.1, 0.020),
-    ],
+    [(3, 0.01, 0.005), (10, 0.01, 0.008), (5, 0.1, 0.012), (10, 0.1, 0.020)],
 )
 def test_a_balls_cap_goes_on_over_its_hole(radius, step, error):
     height, slope = cap((161, 161), radius, pixel=0.012 * radius)
@@ -65,9 +58,9 @@ def test_a_balls_cap_goes_on_over_its_hole(radius, step, error):
     assert filled.dtype == np.uint8
 
 
-@pytest.mark.parametrize(("step", "count", "apex"), [(0.01, 100, 0.020), (0.1, 16, 0.020)])
-@pytest.mark.parametrize("noise", [0.0, 3.0])
-def test_the_twins_ball_is_closed_to_its_apex(step, count, apex, noise):
+@pytest.mark.parametrize(("step", "count", "noise"), [(0.01, 100, 3.0), (0.1, 16, 0.0)])
+def test_the_twins_ball_is_closed_to_its_apex(step, count, noise):
+    apex = 0.020
     travel = step * np.arange(1, count + 1)
     result = engine.reconstruct(ball((121, 121), PIXEL, travel, noise=noise, seed=4), fill=False)
     found, filled = fill_holes(result.height, result.height_sigma, PIXEL, deepest=-travel[-1])
@@ -214,56 +207,12 @@ def test_a_few_wrong_heights_and_dropouts_do_little():
     assert filled.sum() > hole.sum()  # single pixels as well
 
 
-@pytest.mark.parametrize(("noise", "error"), [(0.0, 0.003), (0.01, 0.010)])
-def test_heights_need_not_be_terraces(noise, error):
-    height, slope = cap((161, 161), 4.0)
-    lit = (slope > DARK_SLOPE) & (slope < 1)
-    given = np.where(lit, height + np.random.default_rng(1).normal(0, 1, height.shape) * noise, np.nan)
-    found, filled = fill_holes(given, noise, PIXEL)
-    assert np.max(np.abs(found - height)[filled > 0]) < error
-
-
-def test_heights_of_unknown_sigma_tell_nothing_of_smooth_surfaces():
-    height, slope = cap((161, 161), 4.0)
-    given, sigma = terraces(height, slope, 0.02)
-    hole = inside(height, slope)
-    vague = np.random.default_rng(2).random(given.shape) < 0.3
-    given[vague & np.isfinite(given)] -= 0.2
-    found, filled = fill_holes(given, np.where(vague, np.nan, sigma), PIXEL)
-    np.testing.assert_array_equal(filled, hole)
-    assert np.max(np.abs(found - height)[hole]) < 0.010
-    rough, filled = fill_holes(given, np.nan, PIXEL)
-    np.testing.assert_array_equal(filled, hole)
-    assert np.max(np.abs(rough - height)[hole]) > 0.05
-
-
-def test_small_holes_get_the_mean_of_their_rim():
-    height = np.add.outer(np.arange(6.0), 2 * np.arange(7.0))
-    given = height.copy()
-    given[2, 3] = given[4, 4] = given[4, 5] = np.nan
-    found, filled = fill_holes(given, 0.1, 1.0)
-    np.testing.assert_allclose(found, height, atol=1e-5)
-    assert filled.sum() == 3
-
-
 @pytest.mark.parametrize(
     "given", [np.full((1, 1), np.nan), np.full((7, 5), np.nan), np.ones((4, 6)), np.ones((1, 1))]
 )
 def test_without_holes_nothing_changes(given):
     found, filled = fill_holes(given, 0.01, PIXEL)
     np.testing.assert_array_equal(found, given.astype(np.float32))
-    assert not filled.any()
-
-
-def test_a_single_row_surrounds_nothing():
-    found, filled = fill_holes([[1.0, np.nan, 3.0]], 0.01, PIXEL)
-    np.testing.assert_array_equal(filled, [[0, 0, 0]])  # open above and below
-    assert np.isnan(found[0, 1])
-
-
-def test_integers_and_float32_are_heights_as_well():
-    found, filled = fill_holes(np.ones((5, 5), np.int32), np.float32(0.01), PIXEL)
-    assert found.dtype == np.float32
     assert not filled.any()
 
 
@@ -332,8 +281,3 @@ def test_what_is_neither_known_nor_wanted_leaves_it_free():
     found = stretch(height, np.isfinite(height), unknown, (1.0, 1.0))
     np.testing.assert_allclose(found[1], 2.0)
     assert np.isnan(found[0]).all()
-
-
-def test_nothing_unknown_is_nothing_to_do():
-    height = np.arange(6.0).reshape(2, 3)
-    np.testing.assert_array_equal(stretch(height, height >= 0, height < 0, (1.0, 1.0)), height)

@@ -123,14 +123,6 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, subframe, event):
         assert_within_an_ulp(found, by_reference(frames, travel, dark, bright, **options), travel)
 
 
-def test_frames_may_begin_anywhere_in_a_word(device):
-    for width in range(1, 131, 1 if device.layout.words == 1 else 2):
-        frames, travel = stroke("uint8", 40, (1 + width % 3, width), seed=width)
-        found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.5, device=device)
-        expected = by_reference(frames, travel, *SPEC["uint8"], noise=1.5)
-        assert_within_an_ulp(found, expected, travel)
-
-
 def test_long_runs_are_counted_over_spans_and_cuts(device):
     """Runs of about 33 light frames, broken now and then: where they begin and end is chance."""
     generator, hold, (dark, bright) = np.random.default_rng(33), 33, SPEC["uint16"]
@@ -176,14 +168,6 @@ def test_a_ramp_is_interpolated_exactly(device, event):
     found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
     assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
     assert found.sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-5)
-
-
-def test_without_subframe_the_height_is_equation_4_to_the_letter(device):
-    frames, travel = random_press("uint8", 30, (9, 9), seed=2), np.arange(1, 31) * 0.1
-    found = find_onset(frames, travel, **LEVELS["uint8"], hold=1, subframe=False, device=device)
-    answered = found.status == 1
-    np.testing.assert_array_equal(found.height[answered], -travel[found.frame[answered]].astype(np.float32))
-    np.testing.assert_allclose(found.sigma[answered], 0.1 / np.sqrt(3), rtol=1e-6)
 
 
 def test_sigma_is_honest_on_ramps(device):
@@ -444,17 +428,6 @@ def test_nothing_is_left_of_the_press_before(device):
     assert_within_an_ulp(search.result(), expected, travel[:12])
 
 
-def test_frames_read_into_the_room_are_not_copied(device):
-    frames, travel = stroke("uint8", 20, (9, 13))
-    search = OnsetSearch((9, 13), frames.dtype, device=device, memory_limit=2 * 6 * 9 * 13)
-    assert search.room.shape == (6, 9, 13)
-    for start in range(0, 20, 6):
-        count = min(6, 20 - start)
-        search.room[:count] = frames[start : start + count]
-        search.push(search.room[:count], travel=travel[start : start + count])
-    assert_equal(search.result(), find_onset(frames, travel, device=device))
-
-
 def test_a_hold_longer_than_any_stack_waits_for_the_end(device):
     frames = np.full((9, 1, 2), 20, np.float32)
     frames[2:5] = 200
@@ -501,13 +474,6 @@ def test_a_release_of_the_complement_is_an_onset(device):
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
     np.testing.assert_array_equal(release.height, -onset.height)
     np.testing.assert_array_equal(release.sigma, onset.sigma)
-
-
-def test_the_bright_reference_is_not_taken_for_a_pixels_light_plateau(device):
-    """It gives the level; how bright a pixel gets is its own affair, in a release as in a press."""
-    frames, travel = stroke("uint8", 40, ODD, "release", seed=8)
-    known = {"dark": 20, "noise": 1.5, "device": device, **RELEASE}
-    assert_equal(find_onset(frames, travel, bright=255, **known), find_onset(frames, travel, **known))
 
 
 @pytest.mark.parametrize(
