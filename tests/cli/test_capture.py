@@ -102,14 +102,6 @@ def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, wo
     assert not path.exists()
 
 
-def test_a_rig_file_that_is_missing_is_named(tmp_path):
-    ended = run(
-        "capture", "vertical", "--rig", tmp_path / "no.toml", "-o", tmp_path / "a.h5", "--stop", "1mm"
-    )
-    assert ended.code == 2
-    assert "no.toml" in ended.said
-
-
 def test_a_recording_is_not_written_over_the_rig_file(emulated):
     words = ("vertical", "--stop", "1mm", "--step", "1mm", "-o", emulated[1])
     ended = capture(emulated, *words)

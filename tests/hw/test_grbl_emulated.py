@@ -10,11 +10,18 @@ from scripted_grbl import stage_settings
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 LEAN = math.radians(2.5)
 QUICK = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 2000)
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """Emulators are late where other programs have the processors; that is no fault here."""
+    monkeypatch.setattr(Link, "_limit", lambda link: link.patience or 1.0)
 
 
 @pytest.fixture

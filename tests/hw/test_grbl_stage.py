@@ -15,7 +15,6 @@ from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
 LEAN = math.radians(2.5)
-HOMED = stage_settings(home=True)
 
 
 @pytest.fixture

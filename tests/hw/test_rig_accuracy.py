@@ -11,6 +11,8 @@ from mirrorskin.hw.rig import calibration
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 
+pytestmark = pytest.mark.slow  # it runs in real time
+
 DELAY = 0.05
 OPTICS = {"shape": (48, 64), "pixel_size": 0.125}
 CAMERA = {"delay": DELAY, "jitter": 0.003}

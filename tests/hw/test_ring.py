@@ -12,7 +12,6 @@ from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
 
 SHAPE = (5, 7)
 SOON = 5.0  # seconds, that nothing here takes
-KINDS = [np.uint8, np.uint16, np.float32]
 
 
 def put(ring: Ring, number: int, lost: int = 0) -> None:

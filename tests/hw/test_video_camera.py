@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-import contextlib
-import logging
 import queue
 import re
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -15,7 +12,6 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -26,12 +22,10 @@ from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.hw.video import VideoCamera, to_grey
 from mirrorskin.io import InputError
 
-FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
 SHAPE = (480, 640)
 SMALL = (24, 32)
 BYTE = np.dtype(np.uint8)
 SOON = 20.0  # seconds, that nothing here takes on the slowest machine
-_BITS = 16
 
 
 def settings(source, shape=SHAPE, dtype=BYTE, **more) -> CameraSettings:
@@ -43,37 +37,11 @@ def noise(count: int, shape=SMALL, dtype=np.uint8) -> np.ndarray:
     return np.random.default_rng(7).integers(0, top, (count, *shape), dtype=dtype, endpoint=True)
 
 
-def draw_number(number: int) -> np.ndarray:
-    """A grey ramp with the number in blocks of black and white, as wide as JPEG's biggest blocks or wider."""
-    picture = np.tile(np.linspace(40, 210, SHAPE[1]).astype(np.uint8), (SHAPE[0], 1))
-    for bit in range(_BITS):
-        picture[200:240, 32 * bit : 32 * bit + 32] = 255 * (number >> bit & 1)
-    return picture
-
-
-def read_number(picture: np.ndarray) -> int:
-    blocks = picture[208:232, : 32 * _BITS].reshape(24, _BITS, 32)[:, :, 8:24].mean(axis=(0, 2))
-    assert np.all((blocks < 20) | (blocks > 235)), "neither black nor white"
-    return sum(1 << bit for bit in range(_BITS) if blocks[bit] > 128)
-
-
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-def open_when_there(wanted: CameraSettings) -> VideoCamera:
-    """The server needs a moment for its start."""
-    deadline = time.monotonic() + SOON
-    while True:
-        try:
-            return VideoCamera(wanted)
-        except InputError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.05)
 
 
 def take(opened: VideoCamera, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -97,74 +65,6 @@ def wait_until(holds: Callable[[], bool]) -> None:
     while not holds():
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-class MjpegServer:
-    """FFmpeg that sends numbered frames as MJPEG to one client, at a rate that is measured here."""
-
-    def __init__(self, port: int, rate: float, first: int = 0) -> None:
-        self.url = f"http://127.0.0.1:{port}/"
-        self.sent: list[float] = []
-        self._rate, self._first = rate, first
-        raw = ["-f", "rawvideo", "-pixel_format", "gray", "-video_size", "640x480", "-framerate", f"{rate}"]
-        out = ["-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-q:v", "2", "-f", "mpjpeg", "-listen", "1", self.url]
-        self._ffmpeg = subprocess.Popen(
-            [FFMPEG, "-loglevel", "quiet", *raw, "-i", "pipe:0", *out], stdin=subprocess.PIPE
-        )
-        self._thread = threading.Thread(target=self._send)
-        self._thread.start()
-
-    def _send(self) -> None:
-        pipe = self._ffmpeg.stdin
-        assert pipe is not None
-        due = 0.0
-        try:
-            for number in range(self._first, 1 << _BITS):
-                pipe.write(draw_number(number).tobytes())
-                pipe.flush()
-                self.sent.append(time.monotonic())
-                due = max(due, self.sent[-1] - 0.2) + 1 / self._rate
-                time.sleep(max(0.0, due - time.monotonic()))
-        except OSError:
-            pass  # it was ended
-
-    def close(self) -> None:
-        self._ffmpeg.kill()
-        self._ffmpeg.wait()
-        self._thread.join()
-        assert self._ffmpeg.stdin is not None
-        with contextlib.suppress(OSError):
-            self._ffmpeg.stdin.close()
-
-
-def test_a_network_stream_has_the_right_frames_at_the_right_rate_and_comes_back(caplog) -> None:
-    port = free_port()
-    with contextlib.ExitStack() as leaving:
-        server = MjpegServer(port, rate=50.0)
-        leaving.callback(server.close)
-        opened = leaving.enter_context(open_when_there(settings(server.url, rate=50.0)))
-        pixels, numbers = take(opened, 100)
-        drawn = [read_number(picture) for picture in pixels]
-        assert np.all(np.diff(drawn) == np.diff(numbers))
-        np.testing.assert_allclose(pixels[50], draw_number(drawn[50]), atol=12)
-        sent = FrameCounter()
-        for number in drawn:
-            sent.add(server.sent[number])
-        assert opened.counts.rate == pytest.approx(sent.counts().rate, rel=0.02)
-        server.close()
-        opened.flush()
-        with pytest.raises(HardwareError, match="was lost"):
-            play_out(opened, 0.3)
-        assert opened.error is None
-        server = MjpegServer(port, rate=50.0, first=1000)
-        leaving.callback(server.close)
-        again = opened.take(1, SOON)
-        assert again.number[0] > numbers[-1] + 1
-        assert again.dropped > 0
-        assert read_number(again.pixels[0]) >= 1000
-        assert opened.counts.reconnects == 1
-        told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert ["was lost after" in told[0], "is back after" in told[1]] == [True, True]
 
 
 class Y4mServer:
@@ -363,13 +263,6 @@ def test_what_a_camera_does_not_take_is_told(driver, open_camera, caplog) -> Non
     assert "exposure 0.004 s was asked for, the camera set 0" in told
     assert "gain 3 was asked for, the camera set 0" in told
     assert "fourcc GREY was asked for, the camera set MJPG" in told
-
-
-def test_a_camera_that_sets_another_size_is_refused(driver, open_camera) -> None:
-    driver.refuses = {cv2.CAP_PROP_FRAME_WIDTH}
-    driver.values[cv2.CAP_PROP_FRAME_WIDTH] = 40
-    with pytest.raises(InputError, match="40 x 24, and 32 x 24 is asked for"):
-        open_camera()
 
 
 @pytest.mark.parametrize(
