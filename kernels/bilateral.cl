@@ -151,11 +151,11 @@ __kernel void bilateral_open(SIZE, MAP curl, const float level, OUT right, OUT d
     PIECE(ONE_OPEN)
 }
 
-__kernel void bilateral_left(SIZE, MAP pull_x, MAP pull_y, HELD_MAPS OUT left)
+__kernel void bilateral_residual(SIZE, MAP pull_x, MAP pull_y, HELD_MAPS OUT residual)
 {
-#define ONE_LEFT(p, before, after, above, below) \
-    left[p] = pull_x[p] - pull_x[before] + (pull_y[p] - pull_y[above]) HOLDS(p);
-    PIECE(ONE_LEFT)
+#define ONE_RESIDUAL(p, before, after, above, below) \
+    residual[p] = pull_x[p] - pull_x[before] + (pull_y[p] - pull_y[above]) HOLDS(p);
+    PIECE(ONE_RESIDUAL)
 }
 
 __kernel void bilateral_step(SIZE, MAP heights, MAP step, const float part, OUT stepped)

@@ -121,12 +121,12 @@ def bilateral_open(
     return x * right, y * down, x * pull_x, y * pull_y
 
 
-def bilateral_left(
+def bilateral_residual(
     pull_x: Doubles, pull_y: Doubles, anchor: Floats, known: Floats, heights: Floats
 ) -> Doubles:
     """Return the residual of the equations, b - A u, with the anchors in the unit of the links' weights."""
-    left = pull_x - np.roll(pull_x, 1, axis=1) + pull_y - np.roll(pull_y, 1, axis=0)
-    return np.asarray(left + anchor * (known - heights.astype(np.float64)))
+    residual = pull_x - np.roll(pull_x, 1, axis=1) + pull_y - np.roll(pull_y, 1, axis=0)
+    return np.asarray(residual + anchor * (known - heights.astype(np.float64)))
 
 
 def bilateral_step(heights: Floats, step: Floats, part: float) -> Doubles:

@@ -7,9 +7,9 @@
 //
 // All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
 // none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has four
-// neighbours in memory, and where there is no link its weight is 0. Nodes that have no place in the picture,
-// because their block has more than one, lie behind all levels; whatever has to do with them is done by the
-// passes for odd nodes, row by row of a sparse matrix, over what the plain passes left there.
+// neighbours in memory, and where there is no link its weight is 0. Extra nodes, which have no place in the
+// picture because their block has more than one, lie behind all levels; whatever has to do with them is done by
+// the passes for extra nodes, row by row of a sparse matrix, over what the plain passes wrote there.
 
 #include "common.clh"
 
@@ -72,7 +72,6 @@ typedef float reals;
 #define FLOWING(X) FLOW(X, i - stride, i, i + stride)
 
 #define HEIGHT(i) AT(x + (i))
-#define LEFT(i) AT(left + (i))
 
 // One over the diagonal.
 __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
@@ -120,64 +119,64 @@ __kernel void multigrid_smooth(LEVEL_ARGS, const float omega, GRAPH_ARGS, MAP b,
     smooth_nodes(begin, end, stride, omega, right, down, anchor, b, x, smoother);
 }
 
-// What is left over.
-void residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT left)
+// The residual, b - A x.
+void residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT residual)
 {
     EACH_NODE {
         LINKS
-        PUT(left + i) = AT(b + i) + FLOWING(HEIGHT);
+        PUT(residual + i) = AT(b + i) + FLOWING(HEIGHT);
     }
 }
 
-__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT left)
+__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT residual)
 {
     ITEMS_NODES
-    residual_nodes(begin, end, stride, right, down, anchor, b, x, left);
+    residual_nodes(begin, end, stride, right, down, anchor, b, x, residual);
 }
 
-// Ask for what is left over, and keep the heights so far.
-void keep_nodes(const int begin, const int end, MAP left, MAP x, OUT b, OUT kept)
+// The residual becomes the right side, and the heights so far are kept.
+void keep_nodes(const int begin, const int end, MAP residual, MAP x, OUT b, OUT kept)
 {
     EACH_NODE {
-        PUT(b + i) = AT(left + i);
+        PUT(b + i) = AT(residual + i);
         PUT(kept + i) = HEIGHT(i);
     }
 }
 
-__kernel void multigrid_keep(LEVEL_ARGS, MAP left, MAP x, OUT b, OUT kept)
+__kernel void multigrid_keep(LEVEL_ARGS, MAP residual, MAP x, OUT b, OUT kept)
 {
     ITEMS_NODES
-    keep_nodes(begin, end, left, x, b, kept);
+    keep_nodes(begin, end, residual, x, b, kept);
 }
 
-// What is left over, over the diagonal.
-void leave_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT left)
+// The residual over the diagonal.
+void scaled_residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT residual)
 {
     EACH_NODE {
         LINKS
         const reals diagonal = DIAGONAL;
-        PUT(left + i) = (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
+        PUT(residual + i) = (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
     }
 }
 
-__kernel void multigrid_leave(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT left)
+__kernel void multigrid_scaled_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT residual)
 {
     ITEMS_NODES
-    leave_nodes(begin, end, stride, right, down, anchor, b, x, left);
+    scaled_residual_nodes(begin, end, stride, right, down, anchor, b, x, residual);
 }
 
-// What is left over of heights of zero, over the diagonal.
-void scale_nodes(const int begin, const int end, MAP inverse, MAP b, OUT left)
+// The residual of heights of zero, over the diagonal.
+void scale_nodes(const int begin, const int end, MAP inverse, MAP b, OUT residual)
 {
     EACH_NODE {
-        PUT(left + i) = AT(inverse + i) * AT(b + i);
+        PUT(residual + i) = AT(inverse + i) * AT(b + i);
     }
 }
 
-__kernel void multigrid_scale(LEVEL_ARGS, MAP inverse, MAP b, OUT left)
+__kernel void multigrid_scale(LEVEL_ARGS, MAP inverse, MAP b, OUT residual)
 {
     ITEMS_NODES
-    scale_nodes(begin, end, inverse, b, left);
+    scale_nodes(begin, end, inverse, b, residual);
 }
 
 // Nothing, where no pass writes what others read.
@@ -203,8 +202,8 @@ __kernel void multigrid_add(LEVEL_ARGS, MAP other, OUT x)
     add_nodes(begin, end, other, x);
 }
 
-// The coarse right side: what is left over of a block's nodes, once a step of Jacobi's method has spread it.
-// Of each link that enters the block the far end counts, and of those inside both. What is left over lies, of the
+// The coarse right side: the residual of a block's nodes, once a step of Jacobi's method has spread it. Of each
+// link that enters the block the far end counts, and of those inside both. The residual lies, of the
 // row above the block, its own two and the one below, at `above` to `below`.
 void restrict_row(
     const int I, const int K, const int J, const int count, const int stride, MAP right, MAP down, MAP above, MAP upper,
@@ -227,10 +226,10 @@ void restrict_row(
 
 #define RESTRICT_ROW                                                                                       \
     const int I = base + stride * (2 * row + 1), K = I + stride, J = coarse_base + coarse_stride * (row + 1); \
-    restrict_row(I, K, J, stride / 2, stride, right, down, left + I - stride, left + I, left + K,       \
-                 left + K + stride, b);
+    restrict_row(I, K, J, stride / 2, stride, right, down, residual + I - stride, residual + I, residual + K,       \
+                 residual + K + stride, b);
 
-__kernel void multigrid_restrict(BETWEEN_ARGS, MAP right, MAP down, MAP left, OUT b)
+__kernel void multigrid_restrict(BETWEEN_ARGS, MAP right, MAP down, MAP residual, OUT b)
 {
     const int row = get_global_id(0);
     if (row < coarse_rows) {
@@ -238,7 +237,7 @@ __kernel void multigrid_restrict(BETWEEN_ARGS, MAP right, MAP down, MAP left, OU
     }
 }
 
-// The coarse right side of full multigrid, where no block is odd: all that a block's nodes are asked for.
+// The coarse right side of full multigrid, where no block is split: the sum over each block.
 void gather_row(
     const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, MAP fine, OUT b)
 {
@@ -319,12 +318,12 @@ __kernel void multigrid_coarsen(
     }
 }
 
-// The same passes for odd nodes: row k is of node[k], and SUM over its other nodes j of weight w.
-#define ODD_TILE GREATER(TILE / 16, 1)
-#define ODD_ROWS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, MAP weight
-#define ITEMS_ODD                                                                                          \
-    const int begin = at + (int)get_global_id(0) * ODD_TILE, end = LESSER(begin + ODD_TILE, at + count);
-#define EACH_ODD for (int k = begin; k < end; ++k)
+// The same passes for extra nodes: row k is of node[k], and SUM over its other nodes j of weight w.
+#define EXTRA_TILE GREATER(TILE / 16, 1)
+#define TABLE_ARGS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, MAP weight
+#define ITEMS_EXTRA                                                                                          \
+    const int begin = at + (int)get_global_id(0) * EXTRA_TILE, end = LESSER(begin + EXTRA_TILE, at + count);
+#define EACH_EXTRA for (int k = begin; k < end; ++k)
 #define SUM(sum, term)                                                                                     \
     float sum = 0;                                                                                         \
     for (int m = start[k]; m < start[k + 1]; ++m) {                                                        \
@@ -333,10 +332,10 @@ __kernel void multigrid_coarsen(
         sum += term;                                                                                       \
     }
 
-__kernel void multigrid_invert_odd(const int at, const int count, ODD_ROWS, MAP anchor, OUT inverse)
+__kernel void multigrid_invert_extra(const int at, const int count, TABLE_ARGS, MAP anchor, OUT inverse)
 {
-    ITEMS_ODD
-    EACH_ODD {
+    ITEMS_EXTRA
+    EACH_EXTRA {
         SUM(diagonal, w)
         const float whole = diagonal WITH_ANCHOR(anchor[node[k]]);
         inverse[node[k]] = INVERSE(whole);
@@ -344,89 +343,89 @@ __kernel void multigrid_invert_odd(const int at, const int count, ODD_ROWS, MAP 
 }
 
 #define SEED(i) (omega * b[i] * inverse[i])
-void begin_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
+void begin_extra(
+    const int begin, const int end, TABLE_ARGS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
 {
-    EACH_ODD {
+    EACH_EXTRA {
         const int i = node[k];
         SUM(flow, w * (SEED(j) - SEED(i)))
         x[i] = SEED(i) + then * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * SEED(i)));
     }
 }
 
-__kernel void multigrid_begin_odd(
-    const int at, const int count, ODD_ROWS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
+__kernel void multigrid_begin_extra(
+    const int at, const int count, TABLE_ARGS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
 {
-    ITEMS_ODD
-    begin_odd(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
+    ITEMS_EXTRA
+    begin_extra(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
 }
 
-void smooth_odd(
-    const int begin, const int end, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
+void smooth_extra(
+    const int begin, const int end, TABLE_ARGS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
 {
-    EACH_ODD {
+    EACH_EXTRA {
         const int i = node[k];
         SUM(flow, w * (x[j] - x[i]))
         smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
     }
 }
 
-__kernel void multigrid_smooth_odd(
-    const int at, const int count, ODD_ROWS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
+__kernel void multigrid_smooth_extra(
+    const int at, const int count, TABLE_ARGS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
 {
-    ITEMS_ODD
-    smooth_odd(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
+    ITEMS_EXTRA
+    smooth_extra(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
 }
 
 // Over the diagonal, if there is one to divide by.
-void leave_odd(
-    const int begin, const int end, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT left)
+void residual_extra(
+    const int begin, const int end, TABLE_ARGS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT residual)
 {
-    EACH_ODD {
+    EACH_EXTRA {
         const int i = node[k];
         SUM(flow, w * (x[j] - x[i]))
-        left[i] = (divide ? inverse[i] : 1) * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
+        residual[i] = (divide ? inverse[i] : 1) * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
     }
 }
 
-__kernel void multigrid_leave_odd(
-    const int at, const int count, ODD_ROWS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT left)
+__kernel void multigrid_residual_extra(
+    const int at, const int count, TABLE_ARGS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT residual)
 {
-    ITEMS_ODD
-    leave_odd(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, left);
+    ITEMS_EXTRA
+    residual_extra(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, residual);
 }
 
-void restrict_odd(const int begin, const int end, ODD_ROWS, MAP left, OUT b)
+void restrict_extra(const int begin, const int end, TABLE_ARGS, MAP residual, OUT b)
 {
-    EACH_ODD {
-        SUM(whole, w * left[j])
+    EACH_EXTRA {
+        SUM(whole, w * residual[j])
         b[node[k]] = whole;
     }
 }
 
-__kernel void multigrid_restrict_odd(const int at, const int count, ODD_ROWS, MAP left, OUT b)
+__kernel void multigrid_restrict_extra(const int at, const int count, TABLE_ARGS, MAP residual, OUT b)
 {
-    ITEMS_ODD
-    restrict_odd(begin, end, node, start, column, weight, left, b);
+    ITEMS_EXTRA
+    restrict_extra(begin, end, node, start, column, weight, residual, b);
 }
 
-void prolong_odd(const int begin, const int end, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
+void prolong_extra(const int begin, const int end, TABLE_ARGS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
 {
-    EACH_ODD {
+    EACH_EXTRA {
         const int i = node[k];
         SUM(whole, w * e[j])
         corrected[i] = keep * x[i] + inverse[i] * whole;
     }
 }
 
-__kernel void multigrid_prolong_odd(
-    const int at, const int count, ODD_ROWS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
+__kernel void multigrid_prolong_extra(
+    const int at, const int count, TABLE_ARGS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
 {
-    ITEMS_ODD
-    prolong_odd(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
+    ITEMS_EXTRA
+    prolong_extra(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
 }
 
-// The coarsest level: the pseudo-inverse of its matrix, times what is asked of its nodes.
+// The coarsest level: the pseudo-inverse of its matrix, times the right side of its nodes.
 void solve_node(const int k, const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
 {
     float sum = 0;
@@ -443,7 +442,7 @@ __kernel void multigrid_solve(const int count, __global const int *restrict bott
 }
 
 #if WIDTH > 1
-// Half a V-cycle over a large level without odd links, in one go: what passes hand on stays in the cache, in lines of
+// Half a V-cycle over a large level without extra links, in one go: what passes hand on stays in the cache, in lines of
 // an item's own. An item does a band of coarse rows, and at its borders what its neighbours do as well.
 #define LINES 8
 #define MARGIN 8
@@ -462,11 +461,11 @@ void clear_line(__global float *line, const int stride)
     for (int c = 0; c < stride; c += WIDTH) PUT(line + c) = 0;
 }
 
-// Two steps of Jacobi's method from heights of zero, what is left over then, and the coarse right side. What is left
-// over is kept if `keep` is 1.
+// Two steps of Jacobi's method from heights of zero, the residual then, which is written if `keep` is 1, and the
+// coarse right side.
 __kernel void multigrid_descend(
     LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band, const int keep,
-    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x, OUT left, OUT lines, OUT coarse_b)
+    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x, OUT residual, OUT lines, OUT coarse_b)
 {
     BAND
     if (first >= last) return;
@@ -487,7 +486,7 @@ __kernel void multigrid_descend(
             LINKS
             const reals rest = (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
             PUT(over + c) = rest;
-            if (keep && q >= top && q < bottom) PUT(left + i) = rest;
+            if (keep && q >= top && q < bottom) PUT(residual + i) = rest;
         }
         if (q > top && q % 2 == 0) {
             const int I = base + stride * (q - 1), J = coarse_base + coarse_stride * (q / 2);
@@ -498,11 +497,11 @@ __kernel void multigrid_descend(
 }
 
 // The coarse correction and two steps of Jacobi's method, and parts of the product of heights and right side. The
-// rows of the table for odd prolongation that belong to a row of the picture begin at odd[row].
+// rows of the table for the prolongation to extra nodes that belong to a row of the picture begin at first_extra[row].
 __kernel void multigrid_ascend(
     LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band,
     const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, MAP e, MAP x, OUT lines, OUT smoother,
-    OUT parts, const int odds, __global const int *restrict odd, ODD_ROWS)
+    OUT parts, const int extras, __global const int *restrict first_extra, TABLE_ARGS)
 {
     BAND
     if (first >= last) return;
@@ -514,7 +513,7 @@ __kernel void multigrid_ascend(
             clear_line(lower, stride);
         } else {
             prolong_row(row, base, stride, coarse_base, coarse_stride, 1, right, down, inverse, e, x, upper, lower);
-            for (int k = odds ? odd[2 * row] : 0; k < (odds ? odd[LESSER(2 * row + 2, rows)] : 0); ++k) {
+            for (int k = extras ? first_extra[2 * row] : 0; k < (extras ? first_extra[LESSER(2 * row + 2, rows)] : 0); ++k) {
                 SUM(whole, w * e[j])
                 const int i = node[k], r = (i - base) / stride - 1;
                 LINE(r)[i - base - stride * (r + 1)] = x[i] + inverse[i] * whole;
@@ -546,34 +545,34 @@ __kernel void multigrid_ascend(
 // All passes over the small levels by one item, for each launch would take longer than its pass.
 
 typedef struct {
-    int base, rows, stride, odd, odds, graph, graphs, restricting, restricts, prolonging, prolongs;
+    int base, rows, stride, first_extra, extras, graph, graphs, restricting, restricts, prolonging, prolongs;
 } Level;
 
 #define LEVEL(l) levels[l]
-#define ODDS node, start, column, weight
-#define ODD_OF(name, l) LEVEL(l).name##ing, LEVEL(l).name##ing + LEVEL(l).name##s
+#define TABLE node, start, column, weight
+#define EXTRAS_OF(name, l) LEVEL(l).name##ing, LEVEL(l).name##ing + LEVEL(l).name##s
 #define GRAPH_OF(l) LEVEL(l).graph, LEVEL(l).graph + LEVEL(l).graphs
 #define PICTURE_OF(l) LEVEL(l).base + LEVEL(l).stride, LEVEL(l).base + LEVEL(l).stride * (LEVEL(l).rows + 1)
-#define BEHIND(l) LEVEL(l).odd, LEVEL(l).odd + LEVEL(l).odds
+#define BEHIND(l) LEVEL(l).first_extra, LEVEL(l).first_extra + LEVEL(l).extras
 #define GRAPH right, down, anchor
 #define ALL_NODES(l) PICTURE_OF(l), LEVEL(l).stride
 #define TAIL                                                                                               \
     const int first, const int last, __global const Level *restrict levels, GRAPH_ARGS, \
-    MAP inverse, ODD_ROWS, const int count, __global const int *restrict bottom, MAP matrix, const float omega, \
+    MAP inverse, TABLE_ARGS, const int count, __global const int *restrict bottom, MAP matrix, const float omega, \
     const float then
 
-void tail_restrict(const int l, __global const Level *restrict levels, MAP right, MAP down, ODD_ROWS, MAP left, OUT b)
+void tail_restrict(const int l, __global const Level *restrict levels, MAP right, MAP down, TABLE_ARGS, MAP residual, OUT b)
 {
     const int base = LEVEL(l).base, stride = LEVEL(l).stride;
     const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
     for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
         RESTRICT_ROW
     }
-    restrict_odd(ODD_OF(restrict, l), ODDS, left, b);
+    restrict_extra(EXTRAS_OF(restrict, l), TABLE, residual, b);
 }
 
 void tail_prolong(
-    const int l, __global const Level *restrict levels, const float keep, MAP right, MAP down, MAP inverse, ODD_ROWS,
+    const int l, __global const Level *restrict levels, const float keep, MAP right, MAP down, MAP inverse, TABLE_ARGS,
     MAP e, MAP x, OUT corrected)
 {
     const int base = LEVEL(l).base, stride = LEVEL(l).stride;
@@ -581,19 +580,19 @@ void tail_prolong(
     for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
         PROLONG_ROW
     }
-    prolong_odd(ODD_OF(prolong, l), ODDS, keep, inverse, e, x, corrected);
+    prolong_extra(EXTRAS_OF(prolong, l), TABLE, keep, inverse, e, x, corrected);
 }
 
 void tail_smooth(
-    const int l, __global const Level *restrict levels, const float omega, GRAPH_ARGS, MAP inverse, ODD_ROWS, MAP b,
+    const int l, __global const Level *restrict levels, const float omega, GRAPH_ARGS, MAP inverse, TABLE_ARGS, MAP b,
     MAP x, OUT smoother)
 {
     smooth_nodes(ALL_NODES(l), omega, GRAPH, b, x, smoother);
-    smooth_odd(GRAPH_OF(l), ODDS, omega, anchor, inverse, b, x, smoother);
+    smooth_extra(GRAPH_OF(l), TABLE, omega, anchor, inverse, b, x, smoother);
 }
 
-// A cycle from level `first` on: what b asks for goes to x. Levels from `twice` to `once` are gone through a second time
-// for what the first left over.
+// A cycle from level `first` on: the answer to b goes to x. Levels from `twice` to `once` are gone through a second time
+// for the residual of the first.
 #define CYCLE                                                                                              \
     const int twice, const int once, __global float *b, __global float *x, __global float *t, __global float *kept
 void tail_cycle(TAIL, CYCLE)
@@ -602,18 +601,18 @@ void tail_cycle(TAIL, CYCLE)
     do {
         for (; l < last; ++l) {
             begin_nodes(ALL_NODES(l), omega, then, GRAPH, inverse, b, t);
-            begin_odd(GRAPH_OF(l), ODDS, omega, then, anchor, inverse, b, t);
-            leave_nodes(ALL_NODES(l), GRAPH, b, t, x);
-            leave_odd(GRAPH_OF(l), ODDS, 1, anchor, inverse, b, t, x);
-            tail_restrict(l, levels, right, down, ODDS, x, b);
+            begin_extra(GRAPH_OF(l), TABLE, omega, then, anchor, inverse, b, t);
+            scaled_residual_nodes(ALL_NODES(l), GRAPH, b, t, x);
+            residual_extra(GRAPH_OF(l), TABLE, 1, anchor, inverse, b, t, x);
+            tail_restrict(l, levels, right, down, TABLE, x, b);
         }
         for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, b, x);
         int again = 0;
         while (l > first && !again) {
             --l;
-            tail_prolong(l, levels, 1, right, down, inverse, ODDS, x, t, x);
-            tail_smooth(l, levels, then, GRAPH, inverse, ODDS, b, x, t);
-            tail_smooth(l, levels, omega, GRAPH, inverse, ODDS, b, t, x);
+            tail_prolong(l, levels, 1, right, down, inverse, TABLE, x, t, x);
+            tail_smooth(l, levels, then, GRAPH, inverse, TABLE, b, x, t);
+            tail_smooth(l, levels, omega, GRAPH, inverse, TABLE, b, t, x);
             if (second >> l & 1) {
                 add_nodes(PICTURE_OF(l), kept, x);
                 add_nodes(BEHIND(l), kept, x);
@@ -623,7 +622,7 @@ void tail_cycle(TAIL, CYCLE)
         }
         if (again) {
             residual_nodes(ALL_NODES(l), GRAPH, b, x, t);
-            leave_odd(GRAPH_OF(l), ODDS, 0, anchor, inverse, b, x, t);
+            residual_extra(GRAPH_OF(l), TABLE, 0, anchor, inverse, b, x, t);
             keep_nodes(PICTURE_OF(l), t, x, b, kept);
             keep_nodes(BEHIND(l), t, x, b, kept);
             second |= 1 << l;
@@ -633,7 +632,7 @@ void tail_cycle(TAIL, CYCLE)
 
 __kernel void multigrid_tail_cycle(TAIL, CYCLE)
 {
-    tail_cycle(first, last, levels, GRAPH, inverse, ODDS, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
+    tail_cycle(first, last, levels, GRAPH, inverse, TABLE, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
 }
 
 // Full multigrid from level `first` on.
@@ -647,27 +646,27 @@ __kernel void multigrid_tail_full(TAIL, CYCLE, __global float *full_b, __global 
         if (LEVEL(l).restricts == 0) continue;
         scale_nodes(PICTURE_OF(l), inverse, full_b, t);
         scale_nodes(BEHIND(l), inverse, full_b, t);
-        tail_restrict(l, levels, right, down, ODDS, t, full_b);
+        tail_restrict(l, levels, right, down, TABLE, t, full_b);
     }
     for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, full_b, x);
     for (int l = last - 1; l >= first; --l) {
-        tail_prolong(l, levels, 0, right, down, inverse, ODDS, x, full_b, full_x);
+        tail_prolong(l, levels, 0, right, down, inverse, TABLE, x, full_b, full_x);
         residual_nodes(ALL_NODES(l), GRAPH, full_b, full_x, b);
-        leave_odd(GRAPH_OF(l), ODDS, 0, anchor, inverse, full_b, full_x, b);
-        tail_cycle(l, last, levels, GRAPH, inverse, ODDS, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
+        residual_extra(GRAPH_OF(l), TABLE, 0, anchor, inverse, full_b, full_x, b);
+        tail_cycle(l, last, levels, GRAPH, inverse, TABLE, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
         add_nodes(PICTURE_OF(l), full_x, x);
         add_nodes(BEHIND(l), full_x, x);
     }
 }
 #endif
 
-// Conjugate gradients. Sums are told in parts, for the host to add up.
+// Conjugate gradients. Sums are written in parts, for the host to add up.
 #define EACH_PART                                                                                          \
     const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
     const int end = LESSER(begin + PART, base + stride * (rows + 1));                                      \
     reals sum = 0;                                                                                         \
     EACH_NODE
-#define TELL_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
+#define WRITE_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
 
 // The next direction, the matrix times it, and the product of both.
 #define DIRECTION(i) (AT(z + (i)) + beta * AT(before + (i)))
@@ -681,10 +680,10 @@ __kernel void multigrid_direct(
         PUT(image + i) = q;
         sum += p * q;
     }
-    TELL_PART
+    WRITE_PART
 }
 
-// A step along it, what is left over then, and the square of that.
+// A step along it, the residual then, and the square of that.
 __kernel void multigrid_advance(LEVEL_ARGS, const float alpha, MAP direction, MAP image, OUT b, OUT x, OUT parts)
 {
     EACH_PART {
@@ -693,7 +692,7 @@ __kernel void multigrid_advance(LEVEL_ARGS, const float alpha, MAP direction, MA
         PUT(b + i) = r;
         sum += r * r;
     }
-    TELL_PART
+    WRITE_PART
 }
 
 // Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,
@@ -752,7 +751,7 @@ __kernel void multigrid_dot(LEVEL_ARGS, MAP one, MAP other, OUT parts)
     EACH_PART {
         sum += AT(one + i) * AT(other + i);
     }
-    TELL_PART
+    WRITE_PART
 }
 
 // What the anchors weigh of heights.
@@ -761,7 +760,7 @@ __kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, MAP x, OUT parts)
     EACH_PART {
         sum += AT(anchor + i) * HEIGHT(i) * HEIGHT(i);
     }
-    TELL_PART
+    WRITE_PART
 }
 
 // Maps of pixels without margins, to and from the finest level, row by row.

@@ -6,15 +6,15 @@ anchors a. A V-cycle solves it nearly:
 
 - *begin*, *smooth*: x += omega D^-1 (b - A x), Jacobi's method; with two steps after Chebyshev it takes out
   what changes from node to node. It works in differences of neighbours, so that float32 heights are enough.
-- *restrict*: the coarse level, of a node for each block of two by two, is asked for P^T (b - A x).
+- *restrict*: the coarse level, of a node for each block of two by two, has the right side P^T (b - A x).
 - *prolong*: x += P e, the coarse answer e brought to each block's nodes and spread by a step of Jacobi's
   method, so P = D^-1 W I, where I gives a node what its block has.
 - *coarsen*: a coarse link's weight is the sum over those that it stands for of 1 / (1/w + 0.5/g + 0.5/h),
   where g and h are the greatest weights of its two nodes: of links that are all alike, the mean of two.
 
 All arrays are flat. A level's picture of `rows` by `stride` nodes lies at `base`, with a row of none before
-and behind it. Arguments are those of the kernels; of functions for odd nodes, rows `at` to `at` + `count` of
-a sparse matrix: row k is of ``node[k]``, its entries are those from ``start[k]`` to ``start[k + 1]`` of
+and behind it. Arguments are those of the kernels; of functions for extra nodes, rows `at` to `at` + `count`
+of a sparse matrix: row k is of ``node[k]``, its entries are those from ``start[k]`` to ``start[k + 1]`` of
 ``column`` and ``weight``. ``anchor`` is an array of zeros where there is none. The passes that do several of
 these in one go (*descend*, *ascend*, *tail_cycle*, *tail_full*) have no functions of their own.
 """
@@ -88,43 +88,45 @@ def multigrid_begin(base: int, rows: int, stride: int, omega: float, then: float
     part = _picture(base, rows, stride)
     first = np.zeros(part.stop + stride)
     first[part] = omega * _double(b, part) * inverse[part]
-    left = b[part] + _flow(part, stride, right, down, anchor, first)
-    x[part] = first[part] + then * inverse[part] * left
+    residual = b[part] + _flow(part, stride, right, down, anchor, first)
+    x[part] = first[part] + then * inverse[part] * residual
 
 
 def multigrid_smooth(base: int, rows: int, stride: int, omega: float, right: Array, down: Array,
                      anchor: Array, b: Array, x: Array, smoother: Array) -> None:  # fmt: skip
     """Do a step of Jacobi's method."""
     part = _picture(base, rows, stride)
-    left = b[part] + _flow(part, stride, right, down, anchor, x)
-    smoother[part] = x[part] + omega * left * _inverse(_diagonal(part, stride, right, down, anchor))
+    residual = b[part] + _flow(part, stride, right, down, anchor, x)
+    smoother[part] = x[part] + omega * residual * _inverse(_diagonal(part, stride, right, down, anchor))
 
 
 def multigrid_residual(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array,
-                       b: Array, x: Array, left: Array) -> None:  # fmt: skip
-    """Write what is left over."""
+                       b: Array, x: Array, residual: Array) -> None:  # fmt: skip
+    """Write the residual."""
     part = _picture(base, rows, stride)
-    left[part] = b[part] + _flow(part, stride, right, down, anchor, x)
+    residual[part] = b[part] + _flow(part, stride, right, down, anchor, x)
 
 
-def multigrid_leave(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array, b: Array,
-                    x: Array, left: Array) -> None:  # fmt: skip
-    """Write what is left over, over the diagonal."""
+def multigrid_scaled_residual(base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array,
+                              b: Array, x: Array, residual: Array) -> None:  # fmt: skip
+    """Write the residual over the diagonal."""
     part = _picture(base, rows, stride)
     rest = b[part] + _flow(part, stride, right, down, anchor, x)
-    left[part] = rest * _inverse(_diagonal(part, stride, right, down, anchor))
+    residual[part] = rest * _inverse(_diagonal(part, stride, right, down, anchor))
 
 
-def multigrid_keep(base: int, rows: int, stride: int, left: Array, x: Array, b: Array, kept: Array) -> None:
-    """Ask for what is left over, and keep the heights so far."""
+def multigrid_keep(
+    base: int, rows: int, stride: int, residual: Array, x: Array, b: Array, kept: Array
+) -> None:
+    """Make the residual the right side, and keep the heights so far."""
     part = _picture(base, rows, stride)
-    b[part], kept[part] = left[part], x[part]
+    b[part], kept[part] = residual[part], x[part]
 
 
-def multigrid_scale(base: int, rows: int, stride: int, inverse: Array, b: Array, left: Array) -> None:
-    """Write what is left over of heights of zero, over the diagonal."""
+def multigrid_scale(base: int, rows: int, stride: int, inverse: Array, b: Array, residual: Array) -> None:
+    """Write the residual of heights of zero, over the diagonal."""
     part = _picture(base, rows, stride)
-    left[part] = inverse[part] * _double(b, part)
+    residual[part] = inverse[part] * _double(b, part)
 
 
 def multigrid_clear(base: int, rows: int, stride: int, x: Array) -> None:
@@ -157,20 +159,20 @@ def _neighbours(node: Array, stride: int, right: Array, down: Array) -> list[tup
 
 
 def multigrid_restrict(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
-                       right: Array, down: Array, left: Array, b: Array) -> None:  # fmt: skip
-    """Write the coarse right side: what is left over, spread by a step of Jacobi's method, of each block."""
+                       right: Array, down: Array, residual: Array, b: Array) -> None:  # fmt: skip
+    """Write the coarse right side: the residual, spread by a step of Jacobi's method, of each block."""
     corner, steps = _blocks(base, stride, coarse_rows)
     whole = np.zeros(corner.shape)
     for step in steps:
         for w, other in _neighbours(corner + step, stride, right, down):
-            whole += w * left[other]
+            whole += w * residual[other]
     b[_coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)] = whole
 
 
 def multigrid_gather(
     base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int, fine: Array, b: Array
 ) -> None:
-    """Write the coarse right side of full multigrid where no block is odd: the sum of each block."""
+    """Write the coarse right side of full multigrid where no block is split: the sum of each block."""
     corner, steps = _blocks(base, stride, coarse_rows)
     whole = sum(fine[corner + step].astype(np.float64) for step in steps)
     b[_coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)] = whole
@@ -183,11 +185,11 @@ def multigrid_prolong(base: int, stride: int, coarse_base: int, coarse_rows: int
     corner, steps = _blocks(base, stride, coarse_rows)
     for step in steps:
         node = corner + step
-        told = np.zeros(node.shape)
+        correction = np.zeros(node.shape)
         for w, other in _neighbours(node, stride, right, down):
             row, column = np.divmod(other - base - stride, stride)
-            told += w * e[coarse_base + coarse_stride * (row // 2 + 1) + column // 2]
-        corrected[node] = keep * x[node].astype(np.float64) + inverse[node] * told
+            correction += w * e[coarse_base + coarse_stride * (row // 2 + 1) + column // 2]
+        corrected[node] = keep * x[node].astype(np.float64) + inverse[node] * correction
 
 
 def multigrid_coarsen(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
@@ -235,54 +237,54 @@ def _rows(
     return sums
 
 
-def multigrid_invert_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
-                         anchor: Array, inverse: Array) -> None:  # fmt: skip
-    """Write one over the diagonal of odd nodes."""
+def multigrid_invert_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                           anchor: Array, inverse: Array) -> None:  # fmt: skip
+    """Write one over the diagonal of extra nodes."""
     i = node[at : at + count]
     inverse[i] = _inverse(_rows(at, count, (node, start, column, weight)) + anchor[i])
 
 
-def multigrid_begin_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
-                        omega: float, then: float, anchor: Array, inverse: Array, b: Array,
-                        x: Array) -> None:  # fmt: skip
-    """Do two steps of Jacobi's method from heights of zero, at odd nodes."""
+def multigrid_begin_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                          omega: float, then: float, anchor: Array, inverse: Array, b: Array,
+                          x: Array) -> None:  # fmt: skip
+    """Do two steps of Jacobi's method from heights of zero, at extra nodes."""
     i, first = node[at : at + count], omega * b.astype(np.float64) * inverse
     flow = _rows(at, count, (node, start, column, weight), first, first) - anchor[i] * first[i]
     x[i] = first[i] + then * inverse[i] * (b[i] + flow)
 
 
-def multigrid_smooth_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
-                         omega: float, anchor: Array, inverse: Array, b: Array, x: Array,
-                         smoother: Array) -> None:  # fmt: skip
-    """Do a step of Jacobi's method at odd nodes."""
+def multigrid_smooth_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                           omega: float, anchor: Array, inverse: Array, b: Array, x: Array,
+                           smoother: Array) -> None:  # fmt: skip
+    """Do a step of Jacobi's method at extra nodes."""
     i = node[at : at + count]
     flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
     smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow)
 
 
-def multigrid_leave_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
-                        divide: int, anchor: Array, inverse: Array, b: Array, x: Array,
-                        left: Array) -> None:  # fmt: skip
-    """Write what is left over at odd nodes, over the diagonal or not."""
+def multigrid_residual_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                             divide: int, anchor: Array, inverse: Array, b: Array, x: Array,
+                             residual: Array) -> None:  # fmt: skip
+    """Write the residual at extra nodes, over the diagonal or not."""
     i = node[at : at + count]
     flow = _rows(at, count, (node, start, column, weight), x, x) - anchor[i] * x[i].astype(np.float64)
-    left[i] = (b[i] + flow) * (inverse[i] if divide else 1)
+    residual[i] = (b[i] + flow) * (inverse[i] if divide else 1)
 
 
-def multigrid_restrict_odd(
-    at: int, count: int, node: Array, start: Array, column: Array, weight: Array, left: Array, b: Array
+def multigrid_restrict_extra(
+    at: int, count: int, node: Array, start: Array, column: Array, weight: Array, residual: Array, b: Array
 ) -> None:
-    """Write the right side of nodes that stand for parts of odd blocks."""
-    b[node[at : at + count]] = _rows(at, count, (node, start, column, weight), left)
+    """Write the right side of nodes that stand for parts of split blocks."""
+    b[node[at : at + count]] = _rows(at, count, (node, start, column, weight), residual)
 
 
-def multigrid_prolong_odd(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
-                          keep: float, inverse: Array, e: Array, x: Array,
-                          corrected: Array) -> None:  # fmt: skip
-    """Add the coarse answer to heights of nodes that odd parts tell."""
+def multigrid_prolong_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                            keep: float, inverse: Array, e: Array, x: Array,
+                            corrected: Array) -> None:  # fmt: skip
+    """Add the coarse answer to heights of nodes whose blocks are split."""
     i = node[at : at + count]
-    told = _rows(at, count, (node, start, column, weight), e)
-    corrected[i] = keep * x[i].astype(np.float64) + inverse[i] * told
+    correction = _rows(at, count, (node, start, column, weight), e)
+    corrected[i] = keep * x[i].astype(np.float64) + inverse[i] * correction
 
 
 def multigrid_solve(count: int, bottom: Array, matrix: Array, b: Array, x: Array) -> None:
@@ -307,7 +309,7 @@ def multigrid_direct(base: int, rows: int, stride: int, beta: float, right: Arra
 
 def multigrid_advance(base: int, rows: int, stride: int, alpha: float, direction: Array, image: Array,
                       b: Array, x: Array, parts: Array) -> None:  # fmt: skip
-    """Take a step along it; write the square of what is left over in the first part."""
+    """Take a step along it; write the square of the residual in the first part."""
     part = _picture(base, rows, stride)
     x[part] = _double(x, part) + alpha * direction[part]
     b[part] = _double(b, part) - alpha * image[part]

@@ -140,7 +140,7 @@ class Hierarchy:
     def over_rows(self, name: str, rows: Rows, **arguments: Any) -> None:
         """Run a pass over rows of the tables."""
         if rows.count:
-            kernel = self.kernel(f"{name}_odd")
+            kernel = self.kernel(f"{name}_extra")
             at = {"at": rows.at, "count": rows.count}
             kernel(rows.count, **at, **self.table, **arguments, moved=64 * rows.count)
 

@@ -288,7 +288,7 @@ class _Bound:
             self._run("open", curl=curl, level=level, **self._links)
         known = {**self._known, "anchor": self._anchor, "heights": relief} if self._known else {}
         pulls = {name: self._links[name] for name in ("pull_x", "pull_y")}
-        self._run("left", **pulls, **known, left=self._source)
+        self._run("residual", **pulls, **known, residual=self._source)
         return self.last
 
     @property

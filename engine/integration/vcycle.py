@@ -149,7 +149,7 @@ class Multigrid:
 
     def _find_residual(self) -> None:
         h, cycle = self._hierarchy, self._cycle
-        h.over_grid("residual", h.levels[0], **h.graph, b=cycle.full_b, x=self._x, left=cycle.b)
+        h.over_grid("residual", h.levels[0], **h.graph, b=cycle.full_b, x=self._x, residual=cycle.b)
 
     def _find_residual_square(self) -> float:
         self._find_residual()
@@ -316,7 +316,7 @@ class VCycle:
         self._down_and_up(number)
         if self.twice and number in _TWICE:
             self._find_residual(number, self.b, self.x, self._t)
-            self._over_nodes("keep", number, left=self._t, x=self.x, b=self.b, kept=self._kept)
+            self._over_nodes("keep", number, residual=self._t, x=self.x, b=self.b, kept=self._kept)
             self._down_and_up(number)
             self._over_nodes("add", number, other=self._kept, x=self.x)
 
@@ -341,15 +341,19 @@ class VCycle:
     def _descend(self, number: int) -> None:
         """Go down by one level in one pass."""
         h, rows = self._h, self._h.extra[number].restrict
-        arrays = {"b": self.b, "x": self._t, "left": self.x, "coarse_b": self.b}
+        arrays = {"b": self.b, "x": self._t, "residual": self.x, "coarse_b": self.b}
         self._half_cycle("descend", number, 21, keep=rows.count > 0, **arrays)
-        h.over_rows("restrict", rows, left=self.x, b=self.b)
+        h.over_rows("restrict", rows, residual=self.x, b=self.b)
 
     def _ascend(self, number: int) -> None:
         """Go up by one level in one pass."""
         h, rows = self._h, self._h.extra[number].prolong
         arrays = {"b": self.b, "e": self.x, "x": self._t, "smoother": self.x, "parts": self.parts}
-        extra: dict[str, Any] = {"odds": rows.count, "odd": self._prolong_rows[number], **h.table}
+        extra: dict[str, Any] = {
+            "extras": rows.count,
+            "first_extra": self._prolong_rows[number],
+            **h.table,
+        }
         self._half_cycle("ascend", number, 25, **arrays, **extra)
         self.parts_filled = -(-h.levels[number + 1].rows // _BAND)
 
@@ -371,7 +375,7 @@ class VCycle:
         """Bring the right side of full multigrid to the next level."""
         h = self._h
         if h.extra[number].restrict.count:
-            self._over_nodes("scale", number, inverse=h.inverse, b=self.full_b, left=self._t)
+            self._over_nodes("scale", number, inverse=h.inverse, b=self.full_b, residual=self._t)
             self._restrict(number, self._t, self.full_b)
         else:
             h.over_blocks("gather", number, fine=self.full_b, b=self.full_b)
@@ -380,16 +384,20 @@ class VCycle:
         extra = {"inverse": self._h.inverse}
         self._over_links("smooth", number, extra, omega=omega, b=self.b, x=x, smoother=smoother)
 
-    def _find_residual(self, number: int, b: Array, x: Array, left: Array, *, divide: bool = False) -> None:
+    def _find_residual(
+        self, number: int, b: Array, x: Array, residual: Array, *, divide: bool = False
+    ) -> None:
         """Find the residual, or that over the diagonal."""
         extra = {"divide": divide, "inverse": self._h.inverse}
-        name = ("leave" if divide else "residual"), "leave"
-        self._over_links(name, number, extra, b=b, x=x, left=left)
+        name = ("scaled_residual" if divide else "residual"), "residual"
+        self._over_links(name, number, extra, b=b, x=x, residual=residual)
 
-    def _restrict(self, number: int, left: Array, b: Array) -> None:
+    def _restrict(self, number: int, residual: Array, b: Array) -> None:
         h = self._h
-        h.over_blocks("restrict", number, right=h.graph["right"], down=h.graph["down"], left=left, b=b)
-        h.over_rows("restrict", h.extra[number].restrict, left=left, b=b)
+        h.over_blocks(
+            "restrict", number, right=h.graph["right"], down=h.graph["down"], residual=residual, b=b
+        )
+        h.over_rows("restrict", h.extra[number].restrict, residual=residual, b=b)
 
     def _prolong(self, number: int, keep: float, x: Array, corrected: Array) -> None:
         h = self._h

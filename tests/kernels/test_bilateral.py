@@ -80,10 +80,10 @@ def test_links_and_what_is_left_over_are_those_of_the_reference(device, shape):
     found = run(device, "links", shape, arguments, [None] * 4)
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-6)
-    (left,) = run(device, "left", shape, [*found[2:], *maps[6:]], [None])
-    np.testing.assert_allclose(left, bilateral.bilateral_left(*wanted[2:], *maps[6:]), atol=6e-6)
-    (free,) = run(device, "left", shape, found[2:], [None], known=0)
-    np.testing.assert_allclose(free, bilateral.bilateral_left(*wanted[2:], 0, 0, maps[8]), atol=6e-6)
+    (left,) = run(device, "residual", shape, [*found[2:], *maps[6:]], [None])
+    np.testing.assert_allclose(left, bilateral.bilateral_residual(*wanted[2:], *maps[6:]), atol=6e-6)
+    (free,) = run(device, "residual", shape, found[2:], [None], known=0)
+    np.testing.assert_allclose(free, bilateral.bilateral_residual(*wanted[2:], 0, 0, maps[8]), atol=6e-6)
 
 
 @SHAPES
@@ -137,7 +137,7 @@ def test_what_is_left_over_is_how_the_energy_falls():
     share_x, share_y, _ = bilateral.bilateral_shares(*maps, 2.0, *SIZE)
     pulls = bilateral.bilateral_links(*maps[:6], share_x, share_y, maps[8], *SIZE)[2:]
     area = SIZE[0] * SIZE[1]
-    left = bilateral.bilateral_left(*pulls, area * maps[6], *maps[7:])
+    left = bilateral.bilateral_residual(*pulls, area * maps[6], *maps[7:])
     change = 2.0**-10  # exact in float32 at these heights, nearly
     for place in np.ndindex(5, 6):
         energies = []

@@ -30,7 +30,7 @@ class Arrays:
                 getattr(self, name)[inside] = weights * rng.choice([1, 1e-3], inside.shape, p=[0.9, 0.1])
             if anchored:
                 self.anchor[node] = rng.uniform(0, 1, node.shape) * (rng.random(node.shape) < 0.3)
-        for name in ("b", "x", "e", "z", "before", "left", "inverse"):
+        for name in ("b", "x", "e", "z", "before", "residual", "inverse"):
             setattr(self, name, rng.normal(size=NODES))
         self.inverse = np.abs(self.inverse)
         self.smoother, self.direction, self.image, self.split = (np.zeros(NODES) for _ in range(4))
@@ -61,22 +61,22 @@ PASSES = {
     "invert": (FINE, *GRAPH, "inverse"),
     "begin": (FINE, *STEPS, *GRAPH, "inverse", "b", "x"),
     "smooth": (FINE, 0.5617, *GRAPH, "b", "x", "smoother"),
-    "residual": (FINE, *GRAPH, "b", "x", "left"),
-    "leave": (FINE, *GRAPH, "b", "x", "left"),
-    "keep": (FINE, "left", "x", "b", "smoother"),
-    "scale": (FINE, "inverse", "b", "left"),
+    "residual": (FINE, *GRAPH, "b", "x", "residual"),
+    "scaled_residual": (FINE, *GRAPH, "b", "x", "residual"),
+    "keep": (FINE, "residual", "x", "b", "smoother"),
+    "scale": (FINE, "inverse", "b", "residual"),
     "clear": (FINE, "x"),
     "add": (FINE, "e", "x"),
-    "restrict": (PAIR, "right", "down", "left", "b"),
+    "restrict": (PAIR, "right", "down", "residual", "b"),
     "gather": (PAIR, "e", "b"),
     "prolong": (PAIR, 1.0, "right", "down", "inverse", "e", "x", "smoother"),
     "coarsen": (PAIR, *GRAPH, *GRAPH, "split"),
-    "invert_odd": ((1, 7), *TABLE, "anchor", "inverse"),
-    "begin_odd": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
-    "smooth_odd": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
-    "leave_odd": ((2, 7), *TABLE, 1, "anchor", "inverse", "b", "x", "left"),
-    "restrict_odd": ((0, ROWS), *TABLE, "left", "b"),
-    "prolong_odd": ((3, 6), *TABLE, 0.0, "inverse", "e", "x", "smoother"),
+    "invert_extra": ((1, 7), *TABLE, "anchor", "inverse"),
+    "begin_extra": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
+    "smooth_extra": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
+    "residual_extra": ((2, 7), *TABLE, 1, "anchor", "inverse", "b", "x", "residual"),
+    "restrict_extra": ((0, ROWS), *TABLE, "residual", "b"),
+    "prolong_extra": ((3, 6), *TABLE, 0.0, "inverse", "e", "x", "smoother"),
     "solve": ((30,), "bottom", "matrix", "b", "x"),
     "direct": (FINE, 0.7, *GRAPH, "z", "before", "direction", "image", "parts"),
     "advance": (FINE, 0.3, "e", "before", "b", "x", "parts"),
@@ -99,7 +99,7 @@ def items_of(name, device):
         return FINE[1]
     if name == "solve":
         return 30
-    if name.endswith("odd"):
+    if name.endswith("extra"):
         return ROWS
     nodes = FINE[1] * FINE[2]
     return -(-nodes // (64 if name in SUMS else device.layout.tile))
