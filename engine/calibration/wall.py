@@ -25,7 +25,7 @@ from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
     STEPS,
-    Samples,
+    LightSamples,
     meet_balls,
     predict,
     split,
@@ -39,21 +39,21 @@ Mask = NDArray[np.bool_]
 Numbers = NDArray[np.intp]
 
 _FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
-_SETTLES = {_FEW: 1e-4, _MANY: 3e-6}  # change of the sum of squares at which these end, as a share
+_TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # change of the sum of squares at which these end, as a share
 _COARSE = 0.1  # of full light: noise that the first fit reckons with, so that it finds its way
 _QUIET = 1e-3  # of full light, which the model may always be off
 _INNER = 0.7  # of the light's outline, within which the ball is surely touched
 _RING = 0.05  # of the outline: width of the rings by which that grows
 _AT_ONCE = 2  # rings that are tried at a time
-_SETTLED = 1.2  # times the usual spread that a ring may show
-_ASIDE = 0.3  # times the usual spread that its median may be off
+_USUAL = 1.2  # times the usual spread that a ring may show
+_BIASED = 0.3  # times the usual spread that its median may be off
 _CHANCE = 4.0  # over the root of the ring's samples, by which it may be more by chance
 _BAD = 2.0  # times the other presses' noise that one may show
 _STRAIN = 1.5  # standard deviations, root mean square, by which the sensor may be unlikely
 _TOUCHED = 0.02  # mm above the rest plane
 _MODEST = 0.01  # of full light: noise that such a fit reckons with
 _LEAST = 30  # samples that a ring is judged by
-_BINS = 6  # of brightness, in which noise is told
+_BINS = 6  # of brightness, in which noise is estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +61,11 @@ class Touch:
     """A fit, the samples of touched places that went into it, and their noise, (n,), as shares of light."""
 
     fit: WallFit
-    samples: Samples
+    samples: LightSamples
     noise: Doubles
 
 
-def fit_touch(samples: Samples, presses: Sequence[BallPress], prior: Prior) -> Touch:
+def fit_touch(samples: LightSamples, presses: Sequence[BallPress], prior: Prior) -> Touch:
     """Fit the wall to samples where the sheet lies on the ball.
 
     From well within the light's outline on, each press grows by rings as long as these can be fitted as well
@@ -94,7 +94,7 @@ def fit_touch(samples: Samples, presses: Sequence[BallPress], prior: Prior) -> T
 class _Rings:
     """In which ring about where its ball was found each sample lies, and of which press it is."""
 
-    def __init__(self, samples: Samples, presses: Sequence[BallPress]) -> None:
+    def __init__(self, samples: LightSamples, presses: Sequence[BallPress]) -> None:
         middle = np.concatenate([moved(press.centre, press.lean, press.pivot) for press in presses])
         self.press: Numbers = samples.press[samples.pose]
         outline = np.array([press.outline for press in presses])[self.press]
@@ -106,7 +106,7 @@ class _Rings:
         return np.asarray(self.number < rings[self.press])
 
 
-def _begin(samples: Samples, prior: Prior) -> WallFit:
+def _begin(samples: LightSamples, prior: Prior) -> WallFit:
     """Return a first fit, from the nominal sensor and the curve that goes best with it."""
     start, rising = prior.mean, prior.rising
     if prior.sigma[STEPS].all():
@@ -115,7 +115,7 @@ def _begin(samples: Samples, prior: Prior) -> WallFit:
 
 
 def _refit(
-    samples: Samples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
+    samples: LightSamples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
 ) -> tuple[Touch, Doubles]:
     """Fit once more, to at most so many of the touched samples that are chosen.
 
@@ -124,7 +124,7 @@ def _refit(
     named, _, centres = split(fit.parameters)
     touched = meet_balls(samples, named, centres).z >= _TOUCHED
     chosen = _some(inside & touched, count)
-    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _SETTLES[count])
+    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _TOLERANCES[count])
     off = (samples.light - predict(samples, fit.parameters, fit.rising)) / noise
     return Touch(fit, samples[chosen], noise[chosen]), np.where(touched, off, np.nan)
 
@@ -142,15 +142,15 @@ def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
         if len(own) < _LEAST:
             return number, False
         chance = _CHANCE / np.sqrt(len(own))
-        if _scale(own) / usual > _SETTLED + chance or abs(np.median(own)) / usual > _ASIDE + chance:
+        if _scale(own) / usual > _USUAL + chance or abs(np.median(own)) / usual > _BIASED + chance:
             return number - 1, False
     return taken + _AT_ONCE, True
 
 
-def _noise(samples: Samples, fit: WallFit, inside: Mask) -> Doubles:
+def _noise(samples: LightSamples, fit: WallFit, inside: Mask) -> Doubles:
     """Return the noise of all samples, (N,), from what is left of some: its square is linear in the light.
 
-    The medians of some bins of brightness tell it.
+    Estimated by the medians of some bins of brightness.
     """
     light = predict(samples, fit.parameters, fit.rising)
     left = samples.light - light
@@ -164,7 +164,7 @@ def _noise(samples: Samples, fit: WallFit, inside: Mask) -> Doubles:
 
 
 def _scale(off: Doubles) -> float:
-    """Return the root mean square of normal values, told by the median of their sizes; inf of none."""
+    """Return the root mean square of normal values, estimated by the median of their sizes; inf of none."""
     return 1.4826 * float(np.median(np.abs(off))) if len(off) else np.inf
 
 
@@ -204,7 +204,9 @@ def _without(touch: Touch, prior: Prior, press: int) -> WallFit:
     others = _some(samples.press[samples.pose] != press, _FEW)
     start = prior.mean.copy()
     start[STEPS] = touch.fit.parameters[STEPS]
-    return fit_wall(samples[others], prior, start, np.maximum(touch.noise[others], _MODEST), _SETTLES[_FEW])
+    return fit_wall(
+        samples[others], prior, start, np.maximum(touch.noise[others], _MODEST), _TOLERANCES[_FEW]
+    )
 
 
 def _strain(fit: WallFit, prior: Prior) -> float:
@@ -252,7 +254,7 @@ def fit_zenith(
     some ten thousand samples at once. A sphere looks the same however it is turned: the tilt of the rotation
     hardly matters, only where the ball moves to, and the pivot is fitted too.
 
-    How far the sheet takes the ball's shape is told by the data: from the middle on, rings of samples are
+    How far the sheet takes the ball's shape is found from the data: from the middle on, rings of samples are
     taken in until one does not fit.
 
     Parameters
@@ -264,14 +266,14 @@ def fit_zenith(
     references : References, optional
         Dark and bright; by default each recording's own.
     precession : Precession, optional
-        The calibrated rotation; by default the tilt and the pivot that the recordings tell.
+        The calibrated rotation; by default the tilt and the pivot of the recordings.
     pattern : {"graded", "uniform"}
         Whether the wall's brightness changes with its height.
     body : (float, float)
         Nominal radius of the body and height of the wall, mm: the fit begins with them, and they count as
         known within a tenth.
     progress : callable, optional
-        Told the number of presses read so far.
+        Called with the number of presses read so far.
 
     Returns
     -------
@@ -303,8 +305,8 @@ def _prior(
     """Return what is known before."""
     radius, rim = body
     known = dict(_KNOWN, radius=(radius, 0.1 * radius), rim=(rim, 0.1 * rim))
-    for axis, *told in zip("xyz", pivot.place, pivot.sigma, strict=True):
-        known[f"pivot_{axis}"] = told[0], told[1]
+    for axis, place, sigma in zip("xyz", pivot.place, pivot.sigma, strict=True):
+        known[f"pivot_{axis}"] = place, sigma
     known["phase_offset"] = (0.0, pivot.phase_sigma)
     mean, sigma = np.array([known[name] for name in SENSOR], np.float64).T
     centres = np.concatenate([press.centre for press in presses])
@@ -329,6 +331,6 @@ def _check(presses: Sequence[Source], ball: float, pattern: str, body: tuple[flo
         raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height cannot be: give more")
     first = presses[0]
     for source in presses[1:]:
-        told = source.shape[1:], source.header.pixel_size
-        if told != (first.shape[1:], first.header.pixel_size):
+        pixels = source.shape[1:], source.header.pixel_size
+        if pixels != (first.shape[1:], first.header.pixel_size):
             raise InputError(f"{source.name} and {first.name} differ in pixels or their size: take all alike")

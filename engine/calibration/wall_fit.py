@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky
-from scipy.optimize import lsq_linear, nnls
 
 from mirrorskin.engine.calibration.ball import find_ball, moved
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
     STEPS,
-    Samples,
+    LightSamples,
     curve_from_steps,
     curve_roughness,
     linearise,
@@ -30,51 +28,30 @@ Doubles = NDArray[np.float64]
 _STEEPEST = math.radians(50.0)  # zenith on the ball up to which samples are taken
 _BEYOND = 1.35  # times the outline of the light up to which they are, too
 _PLACE = 1.0  # mm by which the picture alone may misplace a ball
-_DEPTH = 0.2  # mm by which a travel that was told may be off from how deep the ball is pressed
+_DEPTH = 0.2  # mm by which the recorded press may be off from how deep the ball is pressed
 _LEAST = 20  # samples of a frame
 _FRAMES = 16  # of a recording that are held at most
 _CLIPPED = 64  # samples at one value of the form 2^n - 1 from which on it is the camera's end
-_FAR = 30.0  # mm of the pivot where nothing is told of it
-_NEAR = 3.0  # mm by which a pivot may be off that was told, not calibrated
-_OFFSET = math.radians(2.0)  # by which a phase may be off that was calibrated
-_ANY = math.radians(45.0)  # by which it may be off that a recording tells
+_FAR = 30.0  # mm of an unknown pivot
+_NEAR = 3.0  # mm by which a recorded pivot may be off
+_OFFSET = math.radians(2.0)  # by which a calibrated phase may be off
+_ANY = math.radians(45.0)  # by which a recorded one may be off
 _DOUBT = 0.02  # of these, by which calibrated ones may be off at least
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallPress:
-    """An axial recording of a ball, read.
+    """Samples of M pixels of an axial recording of a ball, and what is known of it; lengths in mm."""
 
-    Attributes
-    ----------
-    name : str
-        Of its source.
-    light : ndarray, (M,), float64
-    place : ndarray, (2, M), float64
-        Of each sample's pixel on the rest plane, mm.
-    frame : ndarray, (M,), intp
-    lean : ndarray, (T, 2), float64
-        Radians, of each frame.
-    centre : ndarray, (3,), float64
-        Of the ball in the mean pose, mm: where the picture has it, as deep as the recording says if that can
-        be.
-    centre_sigma : ndarray, (3,), float64
-        By how much that may be off, mm.
-    outline : float
-        Radius of the circle in which light is seen, mm.
-    pivot : (float, float, float)
-        What is known of the pivot, mm.
-    """
-
-    name: str
-    light: Doubles
-    place: Doubles
-    frame: NDArray[np.intp]
-    lean: Doubles
-    centre: Doubles
-    centre_sigma: Doubles
-    outline: float
-    pivot: tuple[float, float, float]
+    name: str  # of its source
+    light: Doubles  # (M,)
+    place: Doubles  # (2, M): of each sample's pixel on the rest plane
+    frame: NDArray[np.intp]  # (M,)
+    lean: Doubles  # (T, 2): radians, of each frame
+    centre: Doubles  # (3,): of the ball in the mean pose, as deep as the recording says if that can be
+    centre_sigma: Doubles  # (3,): by how much that may be off
+    outline: float  # radius of the circle in which light is seen
+    pivot: tuple[float, float, float]  # what is known of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,16 +137,16 @@ def pivot_of(source: Source, precession: Precession | None) -> Pivot:
 
 
 def _error(precession: Precession, name: str, unknown: float) -> float:
-    """Return a standard error that a calibration tells, and not quite to the letter."""
-    told = precession.sigma.get(name, math.nan)
-    return math.hypot(told, _DOUBT * unknown) if math.isfinite(told) else unknown
+    """Return a calibration's standard error, but not less than a share of the usual one."""
+    known = precession.sigma.get(name, math.nan)
+    return math.hypot(known, _DOUBT * unknown) if math.isfinite(known) else unknown
 
 
-def join(presses: Sequence[BallPress], ball: float) -> Samples:
+def join(presses: Sequence[BallPress], ball: float) -> LightSamples:
     """Return the samples of all presses."""
     frames = np.array([len(press.lean) for press in presses])
     first = np.cumsum(frames) - frames
-    return Samples(
+    return LightSamples(
         np.concatenate([press.light for press in presses]),
         np.concatenate([press.place for press in presses], axis=1),
         np.concatenate([press.frame + start for press, start in zip(presses, first, strict=True)]),
@@ -199,13 +176,15 @@ def _levels(source: Source, references: References | None) -> tuple[Doubles, Dou
 
 def _pixel_size(source: Source) -> tuple[float, float]:
     if source.header.pixel_size is None:
-        raise InputError(f"{source.name}: its pixel size is not told: give it, as in --pixel-size 0.03mm")
+        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
     return source.header.pixel_size
 
 
 def _circle(source: Source, phase: Doubles) -> Doubles:
     if source.header.tilt is None:
-        raise InputError(f"{source.name}: the tilt of its rotation is not told: give it, as in --tilt 2.5deg")
+        raise InputError(
+            f"{source.name}: the tilt of its rotation is not known: give it, as in --tilt 2.5deg"
+        )
     return source.header.tilt * np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
@@ -221,7 +200,7 @@ def _read(source: Source) -> tuple[NDArray[Any], Doubles]:
     room, kept = np.empty((min(total, _FRAMES), *source.shape[1:]), source.dtype), 0
     while (block := source.read(room)) is not None:
         if block.phase is None:
-            raise InputError(f"{source.name}: its phases are not told: give --phase-step, as in 45deg")
+            raise InputError(f"{source.name}: its phases are not known: give --phase-step, as in 45deg")
         for number in range(len(block.frames)):
             if kept < len(wanted) and block.index + number >= wanted[kept]:
                 frames[kept], phase[kept] = block.frames[number], block.phase[number]
@@ -230,7 +209,7 @@ def _read(source: Source) -> tuple[NDArray[Any], Doubles]:
 
 
 def _ends(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return the counts at which samples may be clipped: 0, and the most that so many bits can tell."""
+    """Return the counts at which samples may be clipped: 0, and the most that so many bits can hold."""
     if frames.dtype.kind == "f":
         return np.empty(0, frames.dtype)
     most = int(frames.max())
@@ -270,7 +249,7 @@ class WallFit:
 
 
 def fit_wall(
-    samples: Samples, prior: Prior, start: Doubles, noise: float | Doubles, tolerance: float = 1e-7
+    samples: LightSamples, prior: Prior, start: Doubles, noise: float | Doubles, tolerance: float = 1e-7
 ) -> WallFit:
     """Find the most likely parameters, by damped Gauss-Newton steps (Levenberg and Marquardt).
 
@@ -295,8 +274,10 @@ def fit_wall(
     return WallFit(parameters, problem.covariance(parameters, residuals), residuals, prior.rising)
 
 
-def start_curve(samples: Samples, start: Doubles) -> tuple[Doubles, bool]:
+def start_curve(samples: LightSamples, start: Doubles) -> tuple[Doubles, bool]:
     """Return parameters with the curve that fits best to what the others say, and whether it rises."""
+    from scipy.optimize import nnls
+
     fits = []
     for rising in (True, False):
         basis = linearise(samples, start, rising)[1][:, STEPS]
@@ -313,7 +294,7 @@ def start_curve(samples: Samples, start: Doubles) -> tuple[Doubles, bool]:
 class _Problem:
     """The sum of squares that is made least, and its normal equations."""
 
-    def __init__(self, samples: Samples, prior: Prior, noise: Doubles) -> None:
+    def __init__(self, samples: LightSamples, prior: Prior, noise: Doubles) -> None:
         self._samples, self._prior, self._noise = samples, prior, noise
         self._free = np.flatnonzero(prior.sigma > 0)
         self._per_sigma = 1 / np.where(prior.sigma > 0, prior.sigma, np.inf)
@@ -350,6 +331,9 @@ class _Problem:
 
     def step(self, parameters: Doubles, curvature: Doubles, pull: Doubles, damping: float) -> Doubles:
         """Return the damped step, as far as the bounds let it go."""
+        from scipy.linalg import cholesky
+        from scipy.optimize import lsq_linear
+
         free = self._free
         scale = 1 / np.sqrt(np.diag(curvature)[free])
         scaled = curvature[np.ix_(free, free)] * np.outer(scale, scale) + damping * np.eye(len(free))

@@ -1,7 +1,9 @@
-"""How much light a printed pattern lets through, as a monotone curve, and what scatter makes of it.
+"""What pixels see of balls under the lit wall, and how that changes with the parameters that are fitted.
 
-The place on the wall is told by a share u: 0 at the rim and 1 at the rest plane, evenly in the elevation at
-which the sheet's centre sees it.
+A printed pattern is a monotone curve of light, which scatter blurs: here a ray is spread evenly over the
+angles that the sheet's flakes turn it by, and what passes over the rim or below the rest plane is dark.
+Otherwise the formula is that of `mirrorskin.kernels.response`. The place on the wall is given by a share u:
+0 at the rim and 1 at the rest plane, evenly in the elevation at which the sheet's centre sees it.
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline
 
 from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.kernels.response import reflect, way_to_wall
@@ -29,6 +30,8 @@ _KNOTS = np.pad(np.linspace(0, 1, _PIECES + 1), _CUBIC, "edge")
 
 def curve_values(coefficients: ArrayLike, share: ArrayLike) -> Doubles:
     """Return the curve at shares u, (n,); 0 outside 0 to 1."""
+    from scipy.interpolate import BSpline
+
     share = np.asarray(share, np.float64)
     spline = BSpline(_KNOTS, np.asarray(coefficients, np.float64), _CUBIC)
     return np.where((share >= 0) & (share <= 1), spline(np.clip(share, 0, 1)), 0.0)
@@ -66,6 +69,8 @@ def _antiderivatives(share: Doubles) -> Doubles:
     That of a cubic spline of coefficients c is a spline of fourth degree, whose coefficients are the running
     sums of c_i (t[i+4] - t[i]) / 4 (de Boor, A Practical Guide to Splines, chapter X).
     """
+    from scipy.interpolate import BSpline
+
     order = _CUBIC + 1
     widths = (_KNOTS[order:] - _KNOTS[:-order]) / order
     sums = np.vstack([np.zeros(CURVE_COEFFICIENTS), np.tril(np.tile(widths, (CURVE_COEFFICIENTS, 1)))])
@@ -92,39 +97,23 @@ SCALES = dict(zip(SENSOR, (1, 1, 1, 1, 1e-3, 1e-6, 1e-2, 1, 1, 1, 1e-2, *[0.1] *
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
-    """What pixels see of balls in axial rotations.
+class LightSamples:
+    """The light of N pixels that see balls in axial rotations."""
 
-    Attributes
-    ----------
-    light : ndarray, (N,), float64
-        Share of the pixel's own full light.
-    place : ndarray, (2, N), float64
-        x and y at which the pixel looks on the rest plane, mm.
-    pose : ndarray, (N,), intp
-        Number of the frame, counted through all presses.
-    press : ndarray, (poses,), intp
-        Press that each frame belongs to.
-    lean : ndarray, (poses, 2), float64
-        Of the body in each frame, radians; see `mirrorskin.engine.calibration.ball.rotations`.
-    ball : float
-        Radius of the ball, mm.
-    """
+    light: Doubles  # (N,): share of the pixel's own full light
+    place: Doubles  # (2, N): x and y at which the pixel looks on the rest plane, mm
+    pose: NDArray[np.intp]  # (N,): number of the frame, counted through all presses
+    press: NDArray[np.intp]  # (poses,): press that each frame belongs to
+    lean: Doubles  # (poses, 2): of the body in each frame, radians; see `rotations`
+    ball: float  # radius of the ball, mm
 
-    light: Doubles
-    place: Doubles
-    pose: NDArray[np.intp]
-    press: NDArray[np.intp]
-    lean: Doubles
-    ball: float
-
-    def __getitem__(self, some: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Samples:
+    def __getitem__(self, some: NDArray[np.bool_] | NDArray[np.intp] | slice) -> LightSamples:
         """Return some of the samples."""
         chosen = self.light[some], self.place[:, some], self.pose[some]
-        return Samples(*chosen, self.press, self.lean, self.ball)
+        return LightSamples(*chosen, self.press, self.lean, self.ball)
 
 
-class Met(NamedTuple):
+class SheetPoints(NamedTuple):
     """Where lines of sight meet the sheet: from the body's axis, mm; sight and normal are unit vectors."""
 
     x: Doubles
@@ -134,19 +123,15 @@ class Met(NamedTuple):
     normal: Doubles
 
 
-class Wall(NamedTuple):
-    """What a mirrored ray sees of the wall.
+class WallHit(NamedTuple):
+    """What mirrored rays see of the wall."""
 
-    ``low`` and ``high`` are the shares between which it is spread, ``azimuth`` the direction of the wall's
-    point, (2, N), a unit vector.
-    """
-
-    low: Doubles
-    high: Doubles
-    azimuth: Doubles
+    low: Doubles  # (N,): share from which a ray is spread
+    high: Doubles  # (N,): and up to which
+    azimuth: Doubles  # (2, N): direction of the wall's point, a unit vector
 
 
-def meet_balls(samples: Samples, named: Mapping[str, float], centres: Doubles) -> Met:
+def meet_balls(samples: LightSamples, named: Mapping[str, float], centres: Doubles) -> SheetPoints:
     """Return where pixels see the balls, whose centres in the mean pose are (presses, 3), mm.
 
     A line of sight that misses its ball is taken to where it is nearest.
@@ -159,7 +144,7 @@ def meet_balls(samples: Samples, named: Mapping[str, float], centres: Doubles) -
     room = linear**2 - square * (start_x**2 + start_y**2 + start_z**2 - samples.ball**2)
     z = (np.sqrt(np.maximum(room, 0)) - linear) / square
     normal = np.stack([start_x + z * across, start_y + z * up, start_z + z]) / samples.ball
-    return Met(x + z * across, y + z * up, z, down(np.stack([across, up])), normal)
+    return SheetPoints(x + z * across, y + z * up, z, down(np.stack([across, up])), normal)
 
 
 def down(lean: Doubles) -> Doubles:
@@ -176,7 +161,7 @@ def look(place: Doubles, named: Mapping[str, float]) -> tuple[Doubles, Doubles]:
     return from_axis, -(named["sight_0"] + named["sight_2"] * (from_axis**2).sum(axis=0)) * from_axis
 
 
-def reach_wall(met: Met, named: Mapping[str, float]) -> Wall:
+def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     """Return where the mirrored rays meet the wall, spread along the direction in which that matters most.
 
     A turn of the ray by da moves its height there by up to ``way da sqrt(c^2 + rz^2) / c`` with c the cosine
@@ -195,10 +180,10 @@ def reach_wall(met: Met, named: Mapping[str, float]) -> Wall:
         1 - np.arctan2(met.z + way * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
         for angle in (elevation - turn, elevation + turn)
     )
-    return Wall(low, high, np.stack([met.x + way * ray[0], met.y + way * ray[1]]) / radius)
+    return WallHit(low, high, np.stack([met.x + way * ray[0], met.y + way * ray[1]]) / radius)
 
 
-def shade_terms(met: Met, radius: float) -> Doubles:
+def shade_terms(met: SheetPoints, radius: float) -> Doubles:
     """Return the five functions of the pixels' place on the rest plane that the shade is made of, (5, N)."""
     back = met.z / met.sight[2]
     x, y = (met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius
@@ -211,7 +196,7 @@ def split(parameters: Doubles) -> tuple[dict[str, float], Doubles, Doubles]:
     return named, parameters[STEPS], parameters[STEPS.stop :].reshape(-1, 3)
 
 
-def light_of(met: Met, named: Mapping[str, float], coefficients: Doubles) -> Doubles:
+def light_of(met: SheetPoints, named: Mapping[str, float], coefficients: Doubles) -> Doubles:
     """Return the light of mirrors, (N,): shares of each pixel's own full light."""
     wall = reach_wall(met, named)
     return np.asarray(
@@ -219,13 +204,13 @@ def light_of(met: Met, named: Mapping[str, float], coefficients: Doubles) -> Dou
     )
 
 
-def predict(samples: Samples, parameters: Doubles, rising: bool) -> Doubles:
+def predict(samples: LightSamples, parameters: Doubles, rising: bool) -> Doubles:
     """Return the light that samples should have, (N,)."""
     named, steps, centres = split(parameters)
     return light_of(meet_balls(samples, named, centres), named, curve_from_steps(rising) @ steps)
 
 
-def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doubles, Doubles]:
+def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple[Doubles, Doubles]:
     """Return the light that samples should have, (N,), and how it changes with the parameters, (N, P).
 
     The geometry is differenced, and everything else differentiated.
@@ -239,7 +224,7 @@ def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doub
     by_high = per_width * (curve_values(coefficients, wall.high) - level)
     by_low = per_width * (level - curve_values(coefficients, wall.low))
 
-    def change(step: float, bent: Mapping[str, float], there: Met) -> Doubles:
+    def change(step: float, bent: Mapping[str, float], there: SheetPoints) -> Doubles:
         other = reach_wall(there, bent)
         by_ends = by_high * (other.high - wall.high) + by_low * (other.low - wall.low)
         return np.asarray((by_ends + level * (_factor(there, other, bent) - factor)) / step)
@@ -262,7 +247,7 @@ def linearise(samples: Samples, parameters: Doubles, rising: bool) -> tuple[Doub
     return factor * level, slopes
 
 
-def _centres(samples: Samples, named: Mapping[str, float], centres: Doubles) -> Doubles:
+def _centres(samples: LightSamples, named: Mapping[str, float], centres: Doubles) -> Doubles:
     """Return where the balls' centres are in each frame, (poses, 3), mm."""
     pivot = np.array([named["pivot_x"], named["pivot_y"], named["pivot_z"]])
     cos, sin = np.cos(named["phase_offset"]), np.sin(named["phase_offset"])
@@ -270,7 +255,7 @@ def _centres(samples: Samples, named: Mapping[str, float], centres: Doubles) -> 
     return np.asarray(pivot + np.einsum("pij,pj->pi", turned, centres[samples.press] - pivot))
 
 
-def _factor(met: Met, wall: Wall, named: Mapping[str, float]) -> Doubles:
+def _factor(met: SheetPoints, wall: WallHit, named: Mapping[str, float]) -> Doubles:
     """Return what lamps and shade make of the light."""
     lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
     shade = np.array([named[f"shade_{number}"] for number in range(5)])

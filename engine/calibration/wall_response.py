@@ -1,4 +1,4 @@
-"""The zenith at which a mirror turns light: it depends on the place and the azimuth."""
+"""What a fit of the wall says of every pixel, how sure that is, and from which zenith mirrors are light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.engine.calibration.wall_fit import WallFit
@@ -17,8 +16,8 @@ from mirrorskin.engine.calibration.wall_model import (
     SCALES,
     SENSOR,
     STEPS,
-    Met,
-    Samples,
+    LightSamples,
+    SheetPoints,
     curve_from_steps,
     curve_means,
     down,
@@ -29,12 +28,31 @@ from mirrorskin.engine.calibration.wall_model import (
     split,
 )
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
+from mirrorskin.kernels.response import reflect, way_to_wall
 
 Doubles = NDArray[np.float64]
 
-_STEPS = 16  # of zenith, in which the first light is looked for
+_ZENITHS = 16  # at which the first light is looked for
 _HALVINGS = 16
 _STEEPEST = math.radians(89.0)  # elevation up to which rays are followed
+
+_MARGIN = 1.05  # of the scatter: its edges are not sharp, and off the centre it is a little wider
+_EXACT = 1e-4  # of full light by which the polynomial may miss the curve
+_TERMS = 12
+_PLACES = 400  # of the curve, at which the polynomial is fitted
+_HALF = 0.5  # of the light of a uniform wall
+_GRADED = 0.2  # of its greatest light by which a graded wall's changes at least
+_FLAT = 0.02  # of its middle's steepness that a curve must have to be read
+_FEW = 2e-3  # of the samples that may lie beyond the reach at either end
+
+_SIDE = 5  # places along a side at which errors are computed
+_TURN = 8  # azimuths there
+_LEAN = math.radians(2.5)  # of a usual rotation; errors of the normals hardly depend on it
+_FRAMES = 8
+_STEP = 1e-4  # radians, of differences
+_SMALL = 1e-3  # step of a parameter, as a share of its scale
+_OUTLIER = 3.0  # times the noise at which residuals are clipped
+_RINGS, _OCTANTS = 6, 8  # cells of a press, whose mean residual is compared with noise
 
 
 def threshold_zenith(
@@ -66,11 +84,10 @@ def threshold_zenith(
         Shaped as the arguments broadcast; NaN where no zenith up to 45 degrees gets so much light.
     """
     given = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z, azimuth)))
-    shape = given[0].shape
     *place, turn = (value.ravel() for value in given)
     places = np.stack(place)
     dark, light = np.zeros(turn.shape), np.full(turn.shape, np.nan)
-    for zenith in np.linspace(0, math.pi / 4, _STEPS + 1)[1:]:
+    for zenith in np.linspace(0, math.pi / 4, _ZENITHS + 1)[1:]:
         lit = full_light(response, places, np.full(turn.shape, zenith), turn) >= threshold
         light = np.where(np.isnan(light) & lit, zenith, light)
         dark = np.where(np.isnan(light), zenith, dark)
@@ -78,7 +95,7 @@ def threshold_zenith(
         middle = (dark + light) / 2
         lit = full_light(response, places, middle, turn) >= threshold
         dark, light = np.where(lit, dark, middle), np.where(lit, middle, light)
-    return np.asarray(((dark + light) / 2).reshape(shape))
+    return np.asarray(((dark + light) / 2).reshape(given[0].shape))
 
 
 def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth: Doubles) -> Doubles:
@@ -87,186 +104,52 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     ``places`` are x and y on the rest plane and the mirror's height, (3, n), mm; zenith and azimuth are those
     of its normal. Beyond what is known of the wall it is as bright as at the end of that.
     """
-    z = places[2]
-    from_axis = places[:2] - np.array(response.axis)[:, np.newaxis]
-    lean = -(response.sight[0] + response.sight[1] * (from_axis**2).sum(axis=0)) * from_axis
-    sight = -np.stack([*lean, np.ones_like(z)]) / np.sqrt((lean**2).sum(axis=0) + 1)
-    across = np.sin(zenith)
-    normal = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.cos(zenith)])
-    ray = sight - 2 * (sight * normal).sum(axis=0) * normal
+    z, radius = places[2], response.radius
+    (axis_x, axis_y), (near, far) = response.axis, response.sight
+    named = {"axis_x": axis_x, "axis_y": axis_y, "sight_0": near, "sight_2": far}
+    from_axis, lean = look(places[:2], named)
+    ray = reflect(down(lean), _normals(zenith, azimuth))
     at = from_axis + z * lean
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
     with np.errstate(invalid="ignore"):
-        room = response.radius**2 - (at**2).sum(axis=0)
+        room = radius**2 - (at**2).sum(axis=0)
         room = np.where(room > 0, room, np.nan)
-        along = (at * ray[:2]).sum(axis=0)
-        way = room / (along + np.sqrt(along**2 + out**2 * room))
-        share = _share_of_wall(response, z, way * out, np.arctan2(ray[2], out))
+        way, _ = way_to_wall((at * ray[:2]).sum(axis=0), out**2, room)
+        # The share of the ray, spread evenly over its scatter, that meets the wall.
+        elevation, spread = np.arctan2(ray[2], out), max(response.scatter, 1e-9)
+        top = np.minimum(np.arctan2(response.rim - z, way * out), _STEEPEST)
+        bottom = np.arctan2(-z, way * out)
+        lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
         height = z + way * ray[2]
-        q = np.clip(height / (response.radius + np.hypot(height, response.radius)), *response.reach)
-        lamp = 1 + np.array(response.lamps) @ (at + way * ray[:2]) / response.radius
+        q = np.clip(height / (radius + np.hypot(height, radius)), *response.reach)
+        lamp = 1 + np.array(response.lamps) @ (at + way * ray[:2]) / radius
+    u, v = from_axis / radius
+    shade = 1 + response.shade @ np.stack([u, v, u * u, u * v, v * v])
     level = np.polynomial.polynomial.polyval(q, response.curve)
-    return np.asarray(_shade(response, from_axis) * lamp * share * level)
+    return np.asarray(shade * lamp * np.clip(lit / (2 * spread), 0, 1) * level)
 
 
-def _share_of_wall(response: WallResponse, z: Doubles, level: Doubles, elevation: Doubles) -> Doubles:
-    """Return which share of a ray, spread evenly over its scatter, meets the wall."""
-    top = np.minimum(np.arctan2(response.rim - z, level), _STEEPEST)
-    bottom = np.arctan2(-z, level)
-    spread = max(response.scatter, 1e-9)
-    lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
-    return np.asarray(np.clip(lit / (2 * spread), 0, 1))
-
-
-def _shade(response: WallResponse, from_axis: Doubles) -> Doubles:
-    x, y = from_axis / response.radius
-    return np.asarray(1 + response.shade @ np.stack([x, y, x * x, x * y, y * y]))
-
-
-_SIDE = 5  # places along a side at which errors are worked out
-_TURN = 8  # azimuths there
-_LEAN = math.radians(2.5)  # of a usual rotation; errors of the normals hardly depend on it
-_FRAMES = 8
-_STEP = 1e-4  # radians, of differences
-_SMALL = 1e-3  # step of a parameter, as a share of its scale
-_WILD = 3.0  # times the noise that a sample is taken to be off at most
-_RINGS, _OCTANTS = 6, 8  # cells of a press whose mean residual is told from noise
-
-
-def error_places(source: Source) -> tuple[Doubles, Doubles]:
-    """Return places over the picture, (2, n), mm, and azimuths, (n,): every azimuth at every place."""
-    pixel_size = source.header.pixel_size
-    if pixel_size is None:
-        raise InputError(f"{source.name}: its pixel size is not told: give it, as in --pixel-size 0.03mm")
-    x, y = pixel_axes(source.shape[1:], pixel_size)
-    grid = np.meshgrid(*(np.linspace(axis[0], axis[-1], _SIDE) for axis in (x, y)))
-    places = np.repeat(np.stack([axis.ravel() for axis in grid]), _TURN, axis=1)
-    return places, np.tile(np.arange(_TURN) * 2 * np.pi / _TURN, _SIDE * _SIDE)
-
-
-def error_maps(
-    fit: WallFit, shape: tuple[int, int], places: Doubles, azimuth: Doubles, zenith: Doubles
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the standard deviations of zenith, and of azimuth times the zenith's sine, (H, W), radians.
-
-    What a fit says of the light of 8 frames is off by its slopes times the parameters' errors, and the normal
-    of least squares by what comes of that. The root of the mean square over the azimuths is told; NaN where
-    none of them shows the wall.
-    """
-    seen = np.isfinite(zenith)
-    slopes = np.full((2, len(zenith), STEPS.stop), np.nan)
-    slopes[:, seen] = _normal_slopes(fit, places[:, seen], azimuth[seen], zenith[seen])
-    covariance = fit.covariance[: STEPS.stop, : STEPS.stop]
-    variance = np.einsum("inp,pq,inq->in", slopes, covariance, slopes).reshape(2, -1, _TURN)
-    known = np.isfinite(variance)
-    count = np.where(known.any(axis=-1), known.sum(axis=-1), np.nan)
-    mean = np.where(known, variance, 0).sum(axis=-1) / count
-    coarse = np.sqrt(mean).reshape(2, _SIDE, _SIDE)
-    # Rows go down the picture as the coarse ones do: both follow the pixels' axes.
-    where = np.meshgrid(*(np.linspace(0, _SIDE - 1, size) for size in shape), indexing="ij")
-    zenith_sigma, azimuth_sigma = (
-        ndimage.map_coordinates(one, where, order=1, mode="nearest").astype(np.float32) for one in coarse
-    )
-    return zenith_sigma, azimuth_sigma
-
-
-def error_left(samples: Samples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
-    """Return the RMS error of the zenith that the fit leaves on the balls, and its upper end, radians.
-
-    Told by the mean residuals of cells, octants of some rings of each ball, whose noise averages out. The
-    first is what is left beyond noise, 0 where that is none; the upper end is what one standard error of its
-    square more would be, which noise never lets be 0.
-    """
-    named, steps, centres = split(fit.parameters)
-    met = meet_balls(samples, named, centres)
-    coefficients = curve_from_steps(fit.rising) @ steps
-    flat = np.hypot(met.normal[0], met.normal[1])
-    steeper = np.cos(_STEP) * met.normal + np.sin(_STEP) * np.stack(
-        [*(met.normal[:2] * met.normal[2] / np.maximum(flat, _STEP)), -flat]
-    )
-    light = light_of(met, named, coefficients)
-    slope = (light_of(met._replace(normal=steeper), named, coefficients) - light) / _STEP
-    turn = np.arctan2(met.normal[1], met.normal[0]) / (2 * np.pi) + 0.5
-    octant = np.minimum((turn * _OCTANTS).astype(np.intp), _OCTANTS - 1)
-    ring = np.minimum((flat / flat.max() * _RINGS).astype(np.intp), _RINGS - 1)
-    cell = (samples.press[samples.pose] * _RINGS + ring) * _OCTANTS + octant
-    off = np.clip(samples.light - light, -_WILD * noise, _WILD * noise)
-    summed = np.ones_like(light), off, noise**2, slope**2
-    count, left, expected, steep = (np.bincount(cell, values) for values in summed)
-    # A mean's square less what noise makes of it, summed over samples.
-    known = count > 0
-    share = expected[known] / count[known]
-    excess = max(0.0, float(np.sum(left[known] ** 2 / count[known] - share)))
-    # The square of a normal number of variance v has variance 2 v^2.
-    chance = math.sqrt(2 * float(np.sum(share**2)))
-    over = max(float(np.sum(steep)), 1e-12)
-    return math.sqrt(excess / over), math.sqrt((excess + chance) / over)
-
-
-def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doubles) -> Doubles:
-    """Return how zenith, and azimuth times its sine, change with the parameters, (2, n, STEPS.stop)."""
-    parameters = fit.parameters[: STEPS.stop]
-
-    def light(values: Doubles, theta: Doubles, phi: Doubles) -> Doubles:
-        return _turned_light(values, fit.rising, places, theta, phi)
-
-    across = _STEP / np.sin(zenith)
-    design = np.stack(
-        [
-            light(parameters, zenith + _STEP, azimuth) - light(parameters, zenith - _STEP, azimuth),
-            light(parameters, zenith, azimuth + across) - light(parameters, zenith, azimuth - across),
-        ],
-        axis=-1,
-    ) / (2 * _STEP)
-    by_parameter = np.zeros((*design.shape[:2], len(parameters)))
-    scales = [*(SCALES[name] for name in SENSOR), *([1.0] * (STEPS.stop - STEPS.start))]
-    for number, step in enumerate(_SMALL * np.array(scales)):
-        moved = np.repeat(parameters[np.newaxis], 2, axis=0)
-        moved[:, number] += step, -step
-        by_parameter[..., number] = (light(moved[0], zenith, azimuth) - light(moved[1], zenith, azimuth)) / (
-            2 * step
-        )
-    return np.asarray(np.moveaxis(-np.linalg.pinv(design, rcond=1e-6) @ by_parameter, 1, 0), np.float64)
-
-
-def _turned_light(
-    parameters: Doubles, rising: bool, places: Doubles, zenith: Doubles, azimuth: Doubles
-) -> Doubles:
-    """Return the light of normals at places on the rest plane in the frames of a rotation, (n, frames)."""
-    named, steps, _ = split(parameters)
-    phase = np.arange(_FRAMES) * 2 * np.pi / _FRAMES
-    turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))
-    upright = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
-    normal = np.moveaxis(turns @ upright, 0, -1).reshape(3, -1)
-    from_axis, lean = look(np.repeat(places, _FRAMES, axis=1), named)
-    met = Met(from_axis[0], from_axis[1], np.zeros(from_axis.shape[1]), down(lean), normal)
-    return light_of(met, named, curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)
-
-
-_MARGIN = 1.05  # of the scatter: its edges are not sharp, and off the centre it is a little wider
-_EXACT = 1e-4  # of full light by which the polynomial may miss the curve
-_TERMS = 12
-_PLACES = 400  # of the curve, at which the polynomial is fitted
-_HALF = 0.5  # of the light of a uniform wall
-_GRADED = 0.2  # of its greatest light by which a graded wall's changes at least
-_FLAT = 0.02  # of its middle's steepness that a curve must have to be read
-_FEW = 2e-3  # of the samples that may lie beyond the reach at either end
+def _normals(zenith: Doubles, azimuth: Doubles) -> Doubles:
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)])
 
 
 def make_response(
-    fit: WallFit, samples: Samples, noise: Doubles, pattern: str, source: Source
+    fit: WallFit, samples: LightSamples, noise: Doubles, pattern: str, source: Source
 ) -> WallResponse:
-    """Tell a fit as a response.
+    """Return a fit, to samples of so much noise, as a response for the pixels of a source.
 
     Its scatter is 5 % above the fitted one, so that what is within its range is so safely.
     """
-    named, steps, _ = split(fit.parameters)
-    left, most = error_left(samples, fit, noise)
+    named, steps, centres = split(fit.parameters)
+    residual, most = error_left(samples, fit, noise)
     coefficients = curve_from_steps(fit.rising) @ steps
     if pattern == "uniform":
-        powers, reach = coefficients[:1], _ends(named)
+        powers, reach = coefficients[:1], _reach(named)
     else:
-        powers, reach = _polynomial(named, coefficients, _ends(named, _shares(samples, fit)))
+        wall = reach_wall(meet_balls(samples, named, centres), named)
+        low, high = np.quantile((wall.low + wall.high) / 2, [_FEW, 1 - _FEW])
+        powers, reach = _polynomial(named, coefficients, _reach(named, (float(low), float(high))))
     response = WallResponse(
         radius=named["radius"],
         rim=named["rim"],
@@ -284,38 +167,13 @@ def make_response(
         covariance=fit.covariance[: STEPS.stop, : STEPS.stop],
         error=most,
     )
-    return _with_errors(response, fit, source, left)
-
-
-def _with_errors(response: WallResponse, fit: WallFit, source: Source, left: float) -> WallResponse:
-    """Add how far zenith and azimuth are off: in the middle of the reach, or where light begins.
-
-    ``left`` is what the fit leaves of the zenith beyond noise, radians.
-    """
-    places, azimuth = error_places(source)
-    if response.pattern == "uniform":
-        zenith = threshold_zenith(response, places[0], places[1], azimuth, _HALF * response.curve[0])
-    else:
-        middle = math.pi / 4 - math.atan(sum(response.reach) / 2)
-        outside = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1]) >= response.radius
-        zenith = np.where(outside, np.nan, middle)
-    zenith_sigma, azimuth_sigma = error_maps(fit, source.shape[1:], places, azimuth, zenith)
-    if response.pattern == "uniform":
-        azimuth_sigma[:] = np.nan
-    zenith_sigma = np.hypot(zenith_sigma, np.float32(left))
+    zenith_sigma, azimuth_sigma = _error_maps(response, fit, source)
+    zenith_sigma = np.hypot(zenith_sigma, np.float32(residual))
     return replace(response, zenith_sigma=zenith_sigma, azimuth_sigma=azimuth_sigma)
 
 
-def _shares(samples: Samples, fit: WallFit) -> tuple[float, float]:
-    """Return the places on the wall, as shares, between which the samples see it."""
-    named, _, centres = split(fit.parameters)
-    wall = reach_wall(meet_balls(samples, named, centres), named)
-    low, high = np.quantile((wall.low + wall.high) / 2, [_FEW, 1 - _FEW])
-    return float(low), float(high)
-
-
-def _ends(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
-    """Return the q between which the whole scattered ray meets the wall, and the samples tell of it."""
+def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
+    """Return the q between which the whole scattered ray meets the wall, and there are samples."""
     whole, turn = math.atan2(named["rim"], named["radius"]), _MARGIN * named["scatter"]
     low = max(turn, (1 - shares[1]) * whole)
     high = min(whole - turn, (1 - shares[0]) * whole)
@@ -325,10 +183,7 @@ def _ends(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) 
 def _polynomial(
     named: Mapping[str, float], coefficients: Doubles, ends: tuple[float, float]
 ) -> tuple[Doubles, tuple[float, float]]:
-    """Return the scattered curve at the centre as a polynomial in q, and where it can be read.
-
-    It has as few terms as meet the curve.
-    """
+    """Return the scattered curve at the centre as a polynomial in q, of few terms, and where it is valid."""
     q = np.linspace(*ends, _PLACES)
     whole = math.atan2(named["rim"], named["radius"])
     elevation, turn = 2 * np.arctan(q), named["scatter"]
@@ -347,3 +202,115 @@ def _polynomial(
     first = flat[flat < middle].max(initial=-1) + 1
     last = flat[flat > middle].min(initial=_PLACES) - 1
     return np.asarray(fit.convert().coef), (float(q[first]), float(q[last]))
+
+
+def _error_maps(
+    response: WallResponse, fit: WallFit, source: Source
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the standard deviations of zenith, and of azimuth times the zenith's sine, (H, W), radians.
+
+    What a fit says of the light of 8 frames is off by its slopes times the parameters' errors, and the normal
+    of least squares by what comes of that. Root mean square over azimuths, in the middle of the reach, or
+    where light begins under a uniform wall; NaN where no azimuth shows the wall.
+    """
+    from scipy.ndimage import map_coordinates
+
+    pixel_size, shape = source.header.pixel_size, source.shape[1:]
+    if pixel_size is None:
+        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
+    axes = (np.linspace(axis[0], axis[-1], _SIDE) for axis in pixel_axes(shape, pixel_size))
+    places = np.repeat(np.stack([axis.ravel() for axis in np.meshgrid(*axes)]), _TURN, axis=1)
+    azimuth = np.tile(np.arange(_TURN) * 2 * np.pi / _TURN, _SIDE * _SIDE)
+    if response.pattern == "uniform":
+        zenith = threshold_zenith(response, places[0], places[1], azimuth, _HALF * response.curve[0])
+    else:
+        middle = math.pi / 4 - math.atan(sum(response.reach) / 2)
+        outside = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1]) >= response.radius
+        zenith = np.where(outside, np.nan, middle)
+    seen = np.isfinite(zenith)
+    slopes = np.full((2, len(zenith), STEPS.stop), np.nan)
+    slopes[:, seen] = _normal_slopes(fit, places[:, seen], azimuth[seen], zenith[seen])
+    covariance = fit.covariance[: STEPS.stop, : STEPS.stop]
+    variance = np.einsum("inp,pq,inq->in", slopes, covariance, slopes).reshape(2, -1, _TURN)
+    known = np.isfinite(variance)
+    count = np.where(known.any(axis=-1), known.sum(axis=-1), np.nan)
+    coarse = np.sqrt(np.where(known, variance, 0).sum(axis=-1) / count).reshape(2, _SIDE, _SIDE)
+    # Rows go down the picture as the coarse ones do: both follow the pixels' axes.
+    where = np.meshgrid(*(np.linspace(0, _SIDE - 1, size) for size in shape), indexing="ij")
+    zenith_sigma, azimuth_sigma = (
+        map_coordinates(one, where, order=1, mode="nearest").astype(np.float32) for one in coarse
+    )
+    if response.pattern == "uniform":
+        azimuth_sigma[:] = np.nan
+    return zenith_sigma, azimuth_sigma
+
+
+def error_left(samples: LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
+    """Return the RMS error of the zenith that the fit leaves on the balls, and its upper bound, radians.
+
+    Estimated by the mean residuals of cells, octants of some rings of each ball, whose noise averages out.
+    The first is what is left beyond noise, 0 where that is none; the upper bound is one standard error of its
+    square more, which noise never lets be 0.
+    """
+    named, steps, centres = split(fit.parameters)
+    met = meet_balls(samples, named, centres)
+    coefficients = curve_from_steps(fit.rising) @ steps
+    flat = np.hypot(met.normal[0], met.normal[1])
+    steeper = np.cos(_STEP) * met.normal + np.sin(_STEP) * np.stack(
+        [*(met.normal[:2] * met.normal[2] / np.maximum(flat, _STEP)), -flat]
+    )
+    light = light_of(met, named, coefficients)
+    slope = (light_of(met._replace(normal=steeper), named, coefficients) - light) / _STEP
+    turn = np.arctan2(met.normal[1], met.normal[0]) / (2 * np.pi) + 0.5
+    octant = np.minimum((turn * _OCTANTS).astype(np.intp), _OCTANTS - 1)
+    ring = np.minimum((flat / flat.max() * _RINGS).astype(np.intp), _RINGS - 1)
+    cell = (samples.press[samples.pose] * _RINGS + ring) * _OCTANTS + octant
+    residual = np.clip(samples.light - light, -_OUTLIER * noise, _OUTLIER * noise)
+    summed = np.ones_like(light), residual, noise**2, slope**2
+    count, total, expected, steep = (np.bincount(cell, values) for values in summed)
+    # A mean's square less what noise makes of it, summed over samples.
+    known = count > 0
+    share = expected[known] / count[known]
+    excess = max(0.0, float(np.sum(total[known] ** 2 / count[known] - share)))
+    # The square of a normal number of variance v has variance 2 v^2.
+    chance = math.sqrt(2 * float(np.sum(share**2)))
+    over = max(float(np.sum(steep)), 1e-12)
+    return math.sqrt(excess / over), math.sqrt((excess + chance) / over)
+
+
+def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doubles) -> Doubles:
+    """Return how zenith, and azimuth times its sine, change with the parameters, (2, n, STEPS.stop)."""
+    parameters = fit.parameters[: STEPS.stop]
+
+    def light(values: Doubles, theta: Doubles, phi: Doubles) -> Doubles:
+        return _light_of_turn(values, fit.rising, places, theta, phi)
+
+    across = _STEP / np.sin(zenith)
+    design = np.stack(
+        [
+            light(parameters, zenith + _STEP, azimuth) - light(parameters, zenith - _STEP, azimuth),
+            light(parameters, zenith, azimuth + across) - light(parameters, zenith, azimuth - across),
+        ],
+        axis=-1,
+    ) / (2 * _STEP)
+    by_parameter = np.zeros((*design.shape[:2], len(parameters)))
+    scales = [*(SCALES[name] for name in SENSOR), *([1.0] * (STEPS.stop - STEPS.start))]
+    for number, step in enumerate(_SMALL * np.array(scales)):
+        moved = np.repeat(parameters[np.newaxis], 2, axis=0)
+        moved[:, number] += step, -step
+        change = light(moved[0], zenith, azimuth) - light(moved[1], zenith, azimuth)
+        by_parameter[..., number] = change / (2 * step)
+    return np.asarray(np.moveaxis(-np.linalg.pinv(design, rcond=1e-6) @ by_parameter, 1, 0), np.float64)
+
+
+def _light_of_turn(
+    parameters: Doubles, rising: bool, places: Doubles, zenith: Doubles, azimuth: Doubles
+) -> Doubles:
+    """Return the light of normals at places on the rest plane in the frames of a rotation, (n, frames)."""
+    named, steps, _ = split(parameters)
+    phase = np.arange(_FRAMES) * 2 * np.pi / _FRAMES
+    turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))
+    normal = np.moveaxis(turns @ _normals(zenith, azimuth), 0, -1).reshape(3, -1)
+    from_axis, lean = look(np.repeat(places, _FRAMES, axis=1), named)
+    met = SheetPoints(from_axis[0], from_axis[1], np.zeros(from_axis.shape[1]), down(lean), normal)
+    return light_of(met, named, curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)

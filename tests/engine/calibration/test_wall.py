@@ -197,7 +197,7 @@ def test_what_cannot_be_is_refused(presses, options, said):
     ("fields", "said"),
     [
         ({"pixel_size": None}, "differ in pixels or their size"),
-        ({"tilt": None}, "place-2: the tilt of its rotation is not told"),
+        ({"tilt": None}, "place-2: the tilt of its rotation is not known"),
         ({"dark": None}, "place-2: there are no dark and bright references"),
     ],
 )

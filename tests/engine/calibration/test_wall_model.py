@@ -12,8 +12,8 @@ from mirrorskin.engine.calibration.wall_model import (
     SCALES,
     SENSOR,
     STEPS,
-    Met,
-    Samples,
+    LightSamples,
+    SheetPoints,
     curve_from_steps,
     curve_values,
     down,
@@ -64,9 +64,9 @@ def some_samples(count, seed, noise=0.0):
     away, turn = 1.45 * np.sqrt(rng.random(count)), rng.random(count) * 2 * np.pi
     place = CENTRES[pose // 8, :2].T + away * np.stack([np.cos(turn), np.sin(turn)])
     lean = np.tile(LEAN, (len(CENTRES), 1))
-    samples = Samples(np.zeros(count), place, pose, np.repeat(np.arange(len(CENTRES)), 8), lean, 2.0)
+    samples = LightSamples(np.zeros(count), place, pose, np.repeat(np.arange(len(CENTRES)), 8), lean, 2.0)
     light = predict(samples, true_parameters(), True) + noise * rng.normal(size=count)
-    return Samples(light, place, pose, samples.press, lean, 2.0)
+    return LightSamples(light, place, pose, samples.press, lean, 2.0)
 
 
 def test_the_ball_is_met_where_the_shared_geometry_has_it():
@@ -93,7 +93,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
     zenith, azimuth = np.radians(rng.uniform(15, 42, 500)), rng.uniform(-np.pi, np.pi, 500)
     normal = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     coefficients = curve_from_steps(True) @ STEEP
-    found = light_of(Met(*(from_axis + z * lean), z, down(lean), normal), named, coefficients)
+    found = light_of(SheetPoints(*(from_axis + z * lean), z, down(lean), normal), named, coefficients)
 
     whole = math.atan2(TRUE["rim"], TRUE["radius"])
     q = np.linspace(0.0, math.tan(whole / 2), 400)
@@ -112,7 +112,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
 
 
 def test_what_is_beyond_the_wall_is_dark():
-    level = Met(*np.zeros((3, 1)), np.array([[0.0], [0.0], [-1.0]]), np.array([[0.0], [0.0], [1.0]]))
+    level = SheetPoints(*np.zeros((3, 1)), np.array([[0.0], [0.0], [-1.0]]), np.array([[0.0], [0.0], [1.0]]))
     steep = level._replace(normal=np.array([[math.sin(0.9)], [0.0], [math.cos(0.9)]]))
     coefficients = np.ones(CURVE_COEFFICIENTS)
     assert light_of(level, TRUE, coefficients)[0] == 0
@@ -164,7 +164,7 @@ def test_a_fit_finds_the_curve_and_where_the_wall_stands():
 def test_a_curve_that_falls_is_told_from_one_that_rises():
     samples = some_samples(800, 5)
     parameters = true_parameters()
-    fallen = Samples(
+    fallen = LightSamples(
         predict(samples, parameters, False), samples.place, samples.pose, samples.press, samples.lean, 2.0
     )
     assert not start_curve(fallen, parameters)[1]
@@ -174,7 +174,7 @@ def test_wild_samples_hardly_matter():
     samples = some_samples(1500, 6, noise=2e-3)
     light = samples.light.copy()
     light[::25] += 0.4
-    wild = Samples(light, samples.place, samples.pose, samples.press, samples.lean, 2.0)
+    wild = LightSamples(light, samples.place, samples.pose, samples.press, samples.lean, 2.0)
     prior = known()
     clean, spoilt = (fit_wall(one, prior, prior.mean, 2e-3, 1e-5) for one in (samples, wild))
     sigma = np.sqrt(np.diag(clean.covariance))

@@ -12,8 +12,8 @@ from mirrorskin.engine.calibration.wall_fit import BallPress, Prior, join
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
-    Met,
-    Samples,
+    LightSamples,
+    SheetPoints,
     curve_means,
     down,
     light_of,
@@ -65,7 +65,9 @@ def some_presses(coefficients, balls=(2.0,) * 5, touched=1.0, each=720):
         # The light of a flatter sheet is that of a place farther in.
         seen = offset * np.minimum(1, 1.44 * touched / away)
         samples, inner = (
-            Samples(np.zeros(each), centre[:2, np.newaxis] + one, frame, np.zeros(8, np.intp), LEAN, ball)
+            LightSamples(
+                np.zeros(each), centre[:2, np.newaxis] + one, frame, np.zeros(8, np.intp), LEAN, ball
+            )
             for one in (offset, seen)
         )
         light = predict(inner, np.concatenate(parts), True) + NOISE * rng.normal(size=each)
@@ -103,7 +105,7 @@ def bias(response, coefficients, highest):
     def true(theta):
         normal = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
         at, lean = look(place, TRUE)
-        met = Met(*(at + z * lean), z, down(lean), normal)
+        met = SheetPoints(*(at + z * lean), z, down(lean), normal)
         return light_of(met, TRUE, coefficients), normal
 
     (light, normal), (more, _) = true(zenith), true(zenith + 1e-4)
