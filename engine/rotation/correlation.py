@@ -107,7 +107,7 @@ def correlate(
     >>> from mirrorskin import engine
     >>> phase = np.arange(8) * np.pi / 4
     >>> frames = (100 + 10 * np.cos(phase - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
-    >>> float(engine.correlate(frames, phase).azimuth[0, 0].round(4))
+    >>> round(float(engine.correlate(frames, phase).azimuth[0, 0]), 4)
     1.0
     """
     if frames.ndim != 3 or 0 in frames.shape:

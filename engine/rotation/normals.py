@@ -168,7 +168,7 @@ def estimate_normals(
     >>> cosine = np.cos(0.3) * np.cos(0.05) - np.sin(0.3) * np.sin(0.05) * np.cos(phase)
     >>> frames = (500 * np.arccos(cosine)[:, None, None] * np.ones((2, 3))).astype(np.float32)
     >>> normals = engine.estimate_normals(frames, phase, tilt=0.05, gain=500, noise=1.0)
-    >>> float(normals.zenith[0, 0].round(4))
+    >>> round(float(normals.zenith[0, 0]), 4)
     0.3
     """
     if frames.ndim != 3 or 0 in frames.shape:

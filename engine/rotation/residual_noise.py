@@ -13,10 +13,8 @@ from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError
 
 _FLOAT_NOISE = 1e-6  # of the greatest count: the least noise that float frames are taken to have
-_FRAMES_OF_TWO, _MAX_CONDITION = (
-    7,
-    100.0,
-)  # least frames, and condition, to fit a second wave beside the first
+_FRAMES_OF_TWO = 7  # least frames to fit a second wave with the first
+_MAX_CONDITION = 100.0  # of both
 _BINS, _BIN_PIXELS = 16, 200  # bins of brightness at most, and pixels of one at least
 _ROUNDS, _OUTLYING = 10, 0.2  # of the line's robust fit, and share by which a variance may miss it
 _BEYOND = 1e-3  # share of the pixels whose sum of squares is that large by noise alone

@@ -234,17 +234,10 @@ def correlate_source(
         correlator = Correlator(source.shape[1:], source.dtype, device=opened, memory_limit=limit)
         feed(source, correlator, range(source.shape[0]), progress)
         wave = correlator.result()
-    result = Result(
-        azimuth=wave.azimuth,
-        mean=wave.mean,
-        cosine=wave.cosine,
-        sine=wave.sine,
-        modulation=wave.modulation,
-        residual=wave.residual,
-    )
-    return attach_provenance(
-        result, source, opened, {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
-    )
+    names = "azimuth", "mean", "cosine", "sine", "modulation", "residual"
+    result = Result(**{name: getattr(wave, name) for name in names})
+    process: dict[str, ProcessValue] = {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
+    return attach_provenance(result, source, opened, process)
 
 
 def rotation_maps(rotation: Rotation) -> Result:
@@ -314,12 +307,12 @@ class _Passes:
         response = initial_response(wall, self.source, self.header)
         if heights is not None:
             known = check_heights(heights, self.source.shape[1:])
-            origin, stand = "given", fill_with_nearest(known).astype(np.float64)
+            origin, heights = "given", fill_with_nearest(known).astype(np.float64)
         elif self.source.rewindable:
-            origin, stand = "found in the first turn", self._stand(response)
+            origin, heights = "found in the first turn", self._first_heights(response)
         else:
-            origin, stand = "half the press: the source cannot be read twice", self._half_way()
-        frames, response = self._placed_at(self.source, response, stand)
+            origin, heights = "half the press: the source cannot be read twice", self._half_way()
+        frames, response = self._placed_at(self.source, response, np.asarray(heights))
         process: dict[str, ProcessValue] = {
             "zenith": "calibrated",
             "zenith_error": wall.error,
@@ -328,7 +321,7 @@ class _Passes:
         }
         return replace(self._rotation(frames, response), process=process, systematic=response.sigma)
 
-    def _stand(self, response: Response) -> Doubles:
+    def _first_heights(self, response: Response) -> Doubles:
         """Find from the first turn how high the object is, less the press, (H, W), mm."""
         pixel_size, press = self.header.pixel_size, self._press
         assert pixel_size is not None

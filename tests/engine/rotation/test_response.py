@@ -52,15 +52,6 @@ def test_each_pixel_has_its_counts_its_place_and_its_shading():
     np.testing.assert_allclose(shade(replace(walls.response(SHAPE), shade=np.zeros(5)), x, y), 1)
 
 
-def test_the_inverse_of_the_curve_leads_near_the_place_on_the_wall():
-    for gamma in (1.0, 2.2):
-        wall = made(walls.response(SHAPE, gamma)).wall
-        q = np.linspace(*wall.reach, 50)
-        light = np.polynomial.Polynomial(wall.curve)(q)
-        assert np.max(np.abs(np.polynomial.Polynomial(wall.inverse)(light) - q)) < 0.03
-        assert wall.ends[0] < light.min() < light.max() < wall.ends[1]
-
-
 def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
     dark = np.full(SHAPE, 10.0)
     dark[3, 4] = np.nan
