@@ -18,7 +18,7 @@ import typer
 from mirrorskin.cli import options
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.table import Show
+    from mirrorskin.cli.batch_table import Show
     from mirrorskin.engine.batch.jobs import Job, Plan
     from mirrorskin.engine.batch.work import Outcome
 
@@ -56,9 +56,9 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
+    from mirrorskin.cli.batch_table import show_batch
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.settings import read_settings
-    from mirrorskin.cli.table import show_batch
     from mirrorskin.engine.batch.jobs import make_jobs
 
     _refuse_both(device, workers, scheduler)
@@ -68,7 +68,7 @@ def command(
     outcomes: list[Outcome] = []
     start = time.perf_counter()
     with (
-        _telling_of_interruption(outcomes, len(jobs)),
+        _reporting_interruption(outcomes, len(jobs)),
         show_batch(len(jobs), as_json) as show,
         closing(_run(jobs, plan, device, workers, scheduler, show)) as run,
     ):
@@ -80,7 +80,7 @@ def command(
 
 
 def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: str | None) -> None:
-    """Refuse to be told twice who does the work."""
+    """Refuse more than one choice of who does the work."""
     from mirrorskin.io import InputError
 
     given = {"--device": device, "--workers": workers, "--scheduler": scheduler}
@@ -170,7 +170,7 @@ def _run(
 
 
 @contextmanager
-def _telling_of_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator[None]:
+def _reporting_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, SystemExit):
@@ -179,16 +179,16 @@ def _telling_of_interruption(outcomes: Sequence[Outcome], total: int) -> Iterato
 
 
 def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: bool) -> None:
-    """Tell what became of all."""
+    """Print what became of all."""
+    from mirrorskin.cli.batch_table import printable, problem
     from mirrorskin.cli.output import print_json
-    from mirrorskin.cli.table import printable, problem
 
     states = Counter({"done": 0, "kept": 0, "failed": 0})
     states.update(outcome.state for outcome in outcomes)
     size = sum(outcome.bytes for outcome in outcomes)
     if as_json:
-        told = {"output": str(folder), **states, "bytes": size, "seconds": seconds}
-        print_json(told | {"files": [_fields(outcome) for outcome in outcomes]})
+        summary = {"output": str(folder), **states, "bytes": size, "seconds": seconds}
+        print_json(summary | {"files": [_fields(outcome) for outcome in outcomes]})
         return
     for outcome in outcomes:
         if outcome.state == "failed":

@@ -1,4 +1,4 @@
-"""The settings of a batch, a file of TOML: what is said of stacks, and how they are reconstructed."""
+"""The settings of a batch, a file of TOML: what is given of stacks, and how they are reconstructed."""
 
 from __future__ import annotations
 
@@ -84,22 +84,25 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
     """Read what a batch does with every recording, as ``docs/batch.md`` describes it."""
     settings = _Settings() if path is None else load_toml(path, _Settings, "docs/batch.md")
     where = f"{path}: "
-    opening = _opening(_said(settings.stack), f"{where}stack.")
+    opening = _opening(_given(settings.stack), f"{where}stack.")
     return Plan(
-        opening, _said(settings.press), _rotation(_said(settings.rotation), f"{where}rotation."), memory_limit
+        opening,
+        _given(settings.press),
+        _rotation(_given(settings.rotation), f"{where}rotation."),
+        memory_limit,
     )
 
 
-def _said(table: Struct) -> dict[str, Any]:
+def _given(table: Struct) -> dict[str, Any]:
     return {name: value for name, value in structs.asdict(table).items() if value is not None}
 
 
-def _opening(said: dict[str, Any], where: str) -> dict[str, Any]:
+def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [stack] to keywords of ``open_recording``; refuse what no stack can have."""
-    dataset = {name: said.pop(name) for name in ("dataset",) if name in said}
-    if "motion" in said:
-        said["motion"] = MotionName(said["motion"])
-    options = stack_options(**said, where=where)
+    dataset = {name: values.pop(name) for name in ("dataset",) if name in values}
+    if "motion" in values:
+        values["motion"] = MotionName(values["motion"])
+    options = stack_options(**values, where=where)
     if "tilt" in options:
         _check_tilt(options["tilt"], f"{where}tilt")
     if min(options.get("pixel_size", (1.0,))) <= 0:
@@ -107,18 +110,18 @@ def _opening(said: dict[str, Any], where: str) -> dict[str, Any]:
     return {**dataset, **options}
 
 
-def _rotation(said: dict[str, Any], where: str) -> dict[str, Any]:
+def _rotation(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [rotation] to keywords of ``reconstruct``."""
-    if said.get("tilt", "estimate") != "estimate":
-        said["tilt"] = _check_tilt(angle(said["tilt"], f"{where}tilt"), f"{where}tilt")
-    if "zenith_gain" in said:
-        text = said.pop("zenith_gain")
-        said["gain"] = per_angle(text, f"{where}zenith-gain")
-        if said["gain"] == 0:
+    if values.get("tilt", "estimate") != "estimate":
+        values["tilt"] = _check_tilt(angle(values["tilt"], f"{where}tilt"), f"{where}tilt")
+    if "zenith_gain" in values:
+        text = values.pop("zenith_gain")
+        values["gain"] = per_angle(text, f"{where}zenith-gain")
+        if values["gain"] == 0:
             raise InputError(f'{where}zenith-gain {text}: other than 0 is needed; write e.g. "5.7/deg"')
-    if "zenith_offset" in said:
-        said["offset"] = said.pop("zenith_offset")
-    return said
+    if "zenith_offset" in values:
+        values["offset"] = values.pop("zenith_offset")
+    return values
 
 
 def _check_tilt(radians: float, where: str) -> float:

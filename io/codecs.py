@@ -98,7 +98,7 @@ def _lzf(_values: tuple[int, ...]) -> Codec:
 def _bitshuffle(values: tuple[int, ...]) -> Codec:
     """Bitshuffle: blocks of which the bits are sorted by their place; LZ4, Zstandard or nothing packs them.
 
-    ChunkReader chunks begin with their unpacked size and that of a block; each block tells its packed size.
+    Packed chunks begin with their unpacked size and that of a block; each block begins with its packed size.
     """
     itemsize, method = values[2], values[4] if len(values) > 4 else 0
     name = {0: "bshuf_bitunshuffle", 2: "bshuf_decompress_lz4", 3: "bshuf_decompress_zstd"}[method]

@@ -161,8 +161,8 @@ def save_table(
         It cannot be written there.
     """
     text = StringIO(newline="")
-    for name, said in notes.items():
-        text.write(f"# {name}: {' '.join(said.split())}\n")
+    for name, note in notes.items():
+        text.write(f"# {name}: {' '.join(note.split())}\n")
     table = csv.writer(text, lineterminator="\n")
     table.writerow([f"{name} [{units[name]}]" if units.get(name) else name for name in columns])
     table.writerows(zip(*(_cells(values) for values in columns.values()), strict=True))

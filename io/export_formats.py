@@ -74,7 +74,7 @@ def encode_xyz(result: Result) -> Encoded:
     """Encode points as text, one a line, after comments, of which the last names the columns."""
     columns = _points(result)
     names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
-    head = [*(f"{name}: {said}" for name, said in notes_of(result).items()), " ".join(names)]
+    head = [*(f"{name}: {note}" for name, note in notes_of(result).items()), " ".join(names)]
     formats = ["%d" if values.dtype.kind == "u" else "%.6f" for values in columns.values()]
     file = BytesIO()
     rows = np.stack([values.astype(np.float64) for values in columns.values()], axis=1)
@@ -92,8 +92,8 @@ def encode_png(result: Result) -> Encoded:
     from PIL.PngImagePlugin import PngInfo
 
     counts, notes, texts = _counts(result), notes_of(result), PngInfo()
-    for name, said in (*_texts(counts, notes), *_gwyddion(counts, notes.get(_SOURCE, "height"))):
-        texts.add_text(name, said)
+    for name, note in (*_texts(counts, notes), *_gwyddion(counts, notes.get(_SOURCE, "height"))):
+        texts.add_text(name, note)
     width, height = counts.pixel_size
     file = BytesIO()
     Image.fromarray(counts.values).save(file, "png", pnginfo=texts, dpi=(_INCH / width, _INCH / height))
@@ -215,7 +215,7 @@ def _ply(
         vertices[name] = values
     head = ["ply", "format binary_little_endian 1.0"]
     head += [
-        f"comment {name}: {said.encode('ascii', 'backslashreplace').decode()}" for name, said in notes.items()
+        f"comment {name}: {note.encode('ascii', 'backslashreplace').decode()}" for name, note in notes.items()
     ]
     head += [f"element vertex {len(vertices)}"]
     head += [f"property {_PLY_TYPES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
@@ -274,8 +274,8 @@ def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str
     yield "height offset", f"{counts.offset!r} mm"
     yield "height step", f"{counts.step!r} mm"
     yield "pixel size", " ".join(f"{size!r}" for size in counts.pixel_size) + " mm"
-    for name, said in notes.items():
-        yield _PNG_KEYWORDS.get(name, name), said
+    for name, note in notes.items():
+        yield _PNG_KEYWORDS.get(name, name), note
 
 
 def _gwyddion(counts: _Counts, title: str) -> Iterator[tuple[str, str]]:
@@ -314,5 +314,5 @@ def _description(counts: _Counts, notes: Mapping[str, str]) -> str:
         "max": int(counts.values.max()),
         "scale": counts,
     }
-    lines |= {name: said.replace("\\", r"\\") for name, said in notes.items()}  # which begins an escape
-    return "".join(f"{name}={said}\n" for name, said in lines.items())
+    lines |= {name: note.replace("\\", r"\\") for name, note in notes.items()}  # which begins an escape
+    return "".join(f"{name}={note}\n" for name, note in lines.items())

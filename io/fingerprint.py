@@ -1,4 +1,4 @@
-"""What tells one recording from another, in less time than reading it takes."""
+"""Fingerprints of recordings: a hash of a sample of the bytes, in less time than reading all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our layout of a recording, and what it says beside the frames."""
+"""Our layout of a recording: where its header, positions, state and truth lie, and how they are read."""
 
 from __future__ import annotations
 
@@ -104,8 +104,8 @@ class Layout:
         own = self._text(f"{STAGE}/motion")
         motion = motion or cast(Motion, own)
         if motion not in MOTIONS:
-            said = f"says the motion {motion!r}" if motion else "does not say how the sensor moved"
-            raise InputError(f"{self._file.path} {said}: give --motion, one of {', '.join(MOTIONS)}")
+            problem = f"says the motion {motion!r}" if motion else "does not say how the sensor moved"
+            raise InputError(f"{self._file.path} {problem}: give --motion, one of {', '.join(MOTIONS)}")
         # Of a vertical press the travel is no press but the positions.
         pressed = "vertical" not in (own, motion)
         pixel_size = self._pixel_size() if pixel_size is None else self._above_zero(pixel_size)

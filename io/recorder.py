@@ -149,7 +149,7 @@ class Recorder(TeeSource[Source]):
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
         Raw frames are stored in one piece, which is the fastest to read; the others in one chunk a frame.
     truth : Truth or callable, optional
-        What a simulation knows; a callable is asked for it after the last frame.
+        What a simulation knows; a callable is called after the last frame.
     calibration : Calibration, optional
         What the recording is to carry a copy of; positions and references stay those of the source.
 
@@ -210,7 +210,7 @@ class Recorder(TeeSource[Source]):
         return block
 
     def drain(self, progress: Callable[[int], None]) -> None:
-        """Write all frames, for their recording alone; ``progress`` is told how many there are so far."""
+        """Write all frames, for their recording alone; ``progress`` gets how many there are so far."""
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
         while self.read(room) is not None:

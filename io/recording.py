@@ -224,7 +224,7 @@ def open_recording(
     Raises
     ------
     InputError
-        The file, the stack, or something said about it cannot be used.
+        The file, the stack, or a parameter of it cannot be used.
     """
     with ExitStack() as opening:
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))

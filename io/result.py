@@ -129,7 +129,7 @@ def open_result(path: str | Path) -> Result:
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
     """Read how a result came about, or only some of that; its maps are looked for, and not read.
 
-    What is not told is missing. See ``open_result``.
+    What is not there is missing. See ``open_result``.
     """
     with _opened(Path(path)) as file:
         for node, shape in _find_maps(file).values():
@@ -160,7 +160,7 @@ def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
 
 
 def _read_offsets(file: Hdf5File, component: NDArray[np.int32] | None) -> dict[str, NDArray[Any]]:
-    """Read which components have an unknown offset, if that is told: a list, one number a component."""
+    """Read which components have an unknown offset, if that is known: a list, one number a component."""
     node = file.find(f"{_RESULT}/{_OFFSETS}")
     if component is not None and component.min(initial=-1) < -1:
         raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: {_AGAIN}")
@@ -192,7 +192,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
     Returns
     -------
     Result
-        With maps (H, W); its components are numbered from 0, and its process tells the turn.
+        With maps (H, W); its components are numbered from 0, and its process has the turn.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class Region:
 def source_region(process: Mapping[str, object]) -> Region | None:
     """Return the part of the picture that a result was made of, from its process; None if that is not known.
 
-    A result of 'fuse' tells the part of both recordings, which is the same.
+    A result of 'fuse' names the part of both recordings, which is the same.
     """
     texts = (str(process.get(name, "")) for name in ("source_region", "vertical_source_region"))
     return next((region for region in map(Region.read, texts) if region is not None), None)

@@ -245,7 +245,7 @@ def _own_cluster(workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Let Dask say nothing: what goes wrong is told by outcomes and errors."""
+    """Keep Dask's own messages off the terminal: outcomes and errors have what went wrong."""
     names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
@@ -265,7 +265,7 @@ def _reach(distributed: ModuleType, address: str) -> Any:
         return distributed.Client(address, timeout=_REACH, set_as_default=False)
     except (OSError, ValueError, OverflowError) as error:
         problem = " ".join(str(error).split()) or f"no answer within {_REACH:g} s"
-        remedy = "start one with 'dask scheduler', and give the address that it tells"
+        remedy = "start one with 'dask scheduler', and give the address that it prints"
         raise InputError(f"no Dask scheduler can be reached at {address} ({problem}): {remedy}") from error
 
 

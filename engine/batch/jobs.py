@@ -40,7 +40,7 @@ def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
     """Name a result in a folder for each recording.
 
     ``NAME.h5`` becomes ``NAME-result.h5``. Recordings of one name keep their folders below the one that they
-    have in common, and their endings where those alone tell them apart.
+    have in common, and their endings where only those differ.
 
     Parameters
     ----------
@@ -107,9 +107,9 @@ def _check(sources: Sequence[Path], targets: Iterable[Path]) -> None:
         taken.add(real)
 
 
-# These change how a result is made, not what it says.
+# These change how a result is made, not what is in it.
 _NO_MATTER = {"source", "memory_limit", "device", "progress", "threads"}
-# What only one motion reads of what is said of a stack.
+# Parameters of a stack that only one motion uses.
 _OF_MOTION = {"travel": "vertical", "phase": "axial", "tilt": "axial"}
 
 
@@ -140,7 +140,7 @@ class Plan:
     def key(self, motion: Motion) -> str:
         """Write down, always in the same words, everything of the plan that changes a motion's results.
 
-        Defaults are told as well: a parameter that is given with its default's value changes nothing.
+        Defaults are included: a parameter that is given with its default's value changes nothing.
 
         Parameters
         ----------
@@ -151,12 +151,12 @@ class Plan:
         str
             JSON.
         """
-        said = {
+        opening = {
             name: value
             for name, value in self.opening.items()
             if value is not None and name not in _NO_MATTER and _OF_MOTION.get(name, motion) == motion
         }
-        used: dict[str, Any] = {"version": program_version(), "opening": said}
+        used: dict[str, Any] = {"version": program_version(), "opening": opening}
         if motion == "vertical":
             used["press"] = {**_defaults(reconstruct_press), **self.press}
         if motion == "axial":
@@ -175,7 +175,7 @@ def _defaults(function: Callable[..., Result]) -> Mapping[str, Any]:
 
 
 def _as_json(value: Any) -> Any:
-    """Turn a value into what JSON can tell."""
+    """Convert a value to what JSON can hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {one.name: _as_json(getattr(value, one.name)) for one in dataclasses.fields(value)}
         return {type(value).__name__: fields}

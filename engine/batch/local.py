@@ -46,7 +46,7 @@ def run_local(
     devices : sequence of Device
         At least one; each does one job at a time.
     watch : callable, optional
-        Told, by the devices' threads, which job is under way and how many frames of it were read.
+        Called by the devices' threads with the job under way and how many frames of it were read.
 
     Yields
     ------
@@ -57,17 +57,17 @@ def run_local(
     todo: SimpleQueue[Job] = SimpleQueue()
     for job in jobs:
         todo.put(job)
-    told: SimpleQueue[Outcome | BaseException] = SimpleQueue()
+    outcomes: SimpleQueue[Outcome | BaseException] = SimpleQueue()
     stop, ended = Event(), Semaphore(0)
 
     def work(device: Device) -> None:
         try:
             while not stop.is_set():
-                told.put(run_job(job := todo.get_nowait(), plan, device, _telling(job, watch, stop)))
+                outcomes.put(run_job(job := todo.get_nowait(), plan, device, _reporter(job, watch, stop)))
         except (Empty, _Stopped):
             pass
         except BaseException as error:
-            told.put(error)
+            outcomes.put(error)
         finally:
             ended.release()
 
@@ -75,7 +75,7 @@ def run_local(
     try:
         threads.extend(_started(work, device) for device in devices)
         for _ in jobs:
-            outcome = told.get()
+            outcome = outcomes.get()
             if isinstance(outcome, BaseException):
                 raise outcome
             yield outcome
@@ -110,14 +110,14 @@ def _wait(ended: Semaphore) -> None:
     os._exit(_INTERRUPTED)
 
 
-def _telling(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:
-    """Tell that a job begins; return what is to be told of its frames, and gives it up when all ends."""
+def _reporter(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:
+    """Report that a job begins; return what reports its frames, and gives the job up when the batch ends."""
 
-    def tell(frames: int) -> None:
+    def report(frames: int) -> None:
         if stop.is_set():
             raise _Stopped
         if watch is not None:
             watch(job, frames)
 
-    tell(0)
-    return tell
+    report(0)
+    return report

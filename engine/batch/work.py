@@ -58,7 +58,7 @@ def run_job(
 ) -> Outcome:
     """Make a job's result, unless it is there already.
 
-    Whatever goes wrong with one recording is told, not raised, so that the others go on.
+    Whatever goes wrong with one recording is in the outcome, not raised, so that the others go on.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def run_job(
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
     progress : callable, optional
-        Told the number of frames so far.
+        Called with the number of frames so far.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def _done(
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)
     opened = open_device(device)
-    with naming(source):  # also says so if the file was written to meanwhile
+    with naming(source):  # raises if the file was written to meanwhile
         result = reconstruct(source, device=opened, progress=progress, **plan.options(source.motion))
     signed: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
     io.save_result(replace(result, process=signed), target)

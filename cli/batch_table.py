@@ -25,7 +25,7 @@ _OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pix
 
 
 class Show(Protocol):
-    """Who is told how a batch goes."""
+    """Shows how a batch goes."""
 
     def under_way(self, job: Job, frames: int, /) -> None:
         """Take note, from any thread, that so many frames of a job were read."""
@@ -107,8 +107,8 @@ class _Table:
             self._running.pop(outcome.job, None)
             self._last.append(outcome)
             self._states[outcome.state] += 1
-            told = ", ".join(f"{count} {state}" for state, count in sorted(self._states.items()))
-        self._bar.update(self._task, advance=1, description=told)
+            counts = ", ".join(f"{count} {state}" for state, count in sorted(self._states.items()))
+        self._bar.update(self._task, advance=1, description=counts)
 
     def render(self) -> RenderableType:
         """Draw it as it is now."""
