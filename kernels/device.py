@@ -12,7 +12,7 @@ import re
 import threading
 import time
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +30,7 @@ DeviceKind = Literal["gpu", "cpu", "other"]
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 """OpenCL's names of the types that a frame's sample can have."""
 
+_FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
@@ -129,7 +130,7 @@ class Device:
             cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
             for _ in range(2)
         )
-        self._programs: dict[tuple[str, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
+        self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
@@ -203,13 +204,15 @@ class Device:
         """
         return pinned(self, shape, np.dtype(dtype))
 
-    def kernel(self, file: str, name: str, **defines: str | int) -> Kernel:
-        """Return a kernel of ``file.cl``, compiled once for each set of defines.
+    def kernel(self, file: str | Path, name: str, /, **defines: str | int) -> Kernel:
+        """Return a kernel, compiled once for each set of defines.
 
         Parameters
         ----------
-        file, name : str
-            The file in ``mirrorskin.kernels`` without its ending, and the function in it.
+        file : str or Path
+            A file of ``mirrorskin.kernels`` without its ending, or the path of any other.
+        name : str
+            The function in it.
         **defines : str or int
             Macros to set; ``LANES``, ``WORDS`` and ``TILE`` are those of the device's layout otherwise.
 
@@ -229,7 +232,7 @@ class Device:
         """Wait until everything given to the device is done."""
         self.queue.finish()
 
-    def _make_kernel(self, file: str, name: str, options: tuple[str, ...]) -> Kernel:
+    def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
             program, signatures = self._program(file, options)
             return Kernel(self, name, cl.Kernel(program, name), signatures[name], self.layout.group)
@@ -237,20 +240,21 @@ class Device:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
 
-    def _program(self, file: str, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
+    def _program(self, file: str | Path, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
         with self._lock:
             if (file, options) not in self._programs:
                 self._programs[file, options] = self._build(file, options)
             return self._programs[file, options]
 
-    def _build(self, file: str, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
-        source = _read_source(f"{file}.cl")
+    def _build(self, file: str | Path, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
+        path = file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
+        source = _read_source(path)
         start = time.perf_counter()
         try:
             program: cl.Program = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
-            raise DeviceError(_explain_build(f"{file}.cl", str(error), self.info)) from error
-        self.profile.add("compile", file, time.perf_counter() - start)
+            raise DeviceError(_explain_build(path, str(error), self.info)) from error
+        self.profile.add("compile", path.stem, time.perf_counter() - start)
         defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
         return program, read_signatures(source, defines)
 
@@ -428,23 +432,25 @@ def _open(device: cl.Device) -> Device:
     return Device(device)
 
 
-def _read_source(name: str) -> str:
+def _read_source(path: Path) -> str:
     """Return a file of kernels with the files that it includes: all of it is the key of what was compiled."""
-    text = resources.files("mirrorskin.kernels").joinpath(name).read_text(encoding="utf-8")
-    lines = [f'#line 1 "{name}"']
-    for number, line in enumerate(text.splitlines(), 1):
+    lines = [f'#line 1 "{path.name}"']
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         included = re.fullmatch(r'#include "(\w+\.clh)"', line)
-        lines += [_read_source(included[1]), f'#line {number + 1} "{name}"'] if included else [line]
+        lines += (
+            [_read_source(_FOLDER / included[1]), f'#line {number + 1} "{path.name}"'] if included else [line]
+        )
     return "\n".join(lines) + "\n"
 
 
-def _explain_build(file: str, log: str, info: DeviceInfo) -> str:
+def _explain_build(path: Path, log: str, info: DeviceInfo) -> str:
     """Quote the first line that a compiler complains of, in one line."""
     found = re.search(r"(\w+\.clh?):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
     if found is None:
         errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
-        return f"{file} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
+        return f"{path.name} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
     file, number, message = found[1], int(found[2]), found[4].strip()
-    lines = resources.files("mirrorskin.kernels").joinpath(file).read_text(encoding="utf-8").splitlines()
+    path = path if file == path.name else _FOLDER / file
+    lines = path.read_text(encoding="utf-8").splitlines()
     quoted = f" `{lines[number - 1].strip()}`" if 0 < number <= len(lines) else ""
     return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"

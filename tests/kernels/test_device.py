@@ -51,6 +51,23 @@ def test_a_kernel_that_does_not_compile_is_quoted(device):
     assert "`const long item = get_global_id(0);`" in str(caught.value)
 
 
+def test_a_kernel_of_ones_own_runs_and_may_use_what_ours_share(device, tmp_path):
+    (tmp_path / "mine.cl").write_text(
+        """#include "common.clh"
+        __kernel void roots(const int count, OUT x)
+        {
+            for (int i = get_global_id(0) * TILE; i < LESSER((int)(get_global_id(0) + 1) * TILE, count); ++i)
+                x[i] = root(x[i]);
+        }"""
+    )
+    x = device.given("x", np.arange(1.0, 3000.0))
+    device.kernel(tmp_path / "mine.cl", "roots")(2999, count=2999, x=x, moved=0)
+    np.testing.assert_allclose(x.download(), np.sqrt(np.arange(1.0, 3000.0)), rtol=1e-6)
+    (tmp_path / "worse.cl").write_text("__kernel void worse(const int x) { y = x; }")
+    with pytest.raises(DeviceError, match="worse.cl line 1 does not compile"):
+        device.kernel(tmp_path / "worse.cl", "worse")
+
+
 def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
     mine = device.kernel("limits", "copy_all", **MACROS)
     assert device.kernel("limits", "copy_all", **MACROS) is mine
