@@ -220,6 +220,15 @@ class Device:
         ------
         DeviceError
             It does not compile; the message quotes the line.
+
+        Examples
+        --------
+        >>> device = open_device()
+        >>> words = device.given("words", np.arange(8), np.uint32)
+        >>> copy = device.kernel("limits", "copy_all", LANES=1, WORDS=4, STRIDE=1)
+        >>> copy(1, words=words, count=4, moved=32)
+        >>> words.download().tolist()
+        [0, 1, 2, 3, 0, 1, 2, 3]
         """
         made, key = self._kernels.made, (file, name, self.layout, *defines.items())
         if key not in made:

@@ -64,7 +64,7 @@ def test_a_kernel_of_ones_own_runs_and_may_use_what_ours_share(device, tmp_path)
     device.kernel(tmp_path / "mine.cl", "roots")(2999, count=2999, x=x, moved=0)
     np.testing.assert_allclose(x.download(), np.sqrt(np.arange(1.0, 3000.0)), rtol=1e-6)
     (tmp_path / "worse.cl").write_text("__kernel void worse(const int x) { y = x; }")
-    with pytest.raises(DeviceError, match="worse.cl line 1 does not compile"):
+    with pytest.raises(DeviceError, match=r"worse\.cl line 1 does not compile"):
         device.kernel(tmp_path / "worse.cl", "worse")
 
 
