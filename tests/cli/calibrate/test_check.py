@@ -68,11 +68,3 @@ def test_what_cannot_be_is_refused_in_a_line(folder, words, message):
     assert ended.code == 2
     assert message in ended.said
     assert len(ended.said.splitlines()) == 1
-
-
-def test_a_calibration_of_another_camera_is_refused(folder):
-    ended = run(
-        "calibrate", "check", folder / "press.h5", "--calibration", folder / "other.h5", "--ball", "10mm"
-    )
-    assert ended.code == 2
-    assert len(ended.said.splitlines()) == 1

@@ -95,14 +95,6 @@ def test_what_cannot_be_learned_from_is_refused_in_a_line(words, complaint):
     assert len(ended.said.splitlines()) == 1
 
 
-def test_a_calibration_of_another_camera_is_refused_before_the_work():
-    camera = io.CameraId("", (9, 9), np.dtype(np.uint8))
-    io.save_calibration(io.Calibration(camera, gel=io.Gel(0.2, 0.0)), "other.h5")
-    ended = run("calibrate", "elastic", "ball.h5", "--ball", "4mm", "-o", "other.h5")
-    assert ended.code == 2
-    assert "9 x 9" in ended.said
-
-
 def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
     asked = []
 

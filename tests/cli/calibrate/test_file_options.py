@@ -92,14 +92,6 @@ def test_a_press_is_reconstructed_with_the_references_of_the_calibration():
     np.testing.assert_array_equal(found.height, by_hand.height)
 
 
-def test_what_is_given_besides_is_believed():
-    press()
-    save(references=flat_references(dark=90.0))
-    found = reconstruct("press.h5", "--calibration", "cal.h5", "--dark", "20")
-    by_hand = reconstruct("press.h5", "--dark", "20", "--bright", "220")
-    np.testing.assert_array_equal(found.height, by_hand.height)
-
-
 def test_a_calibration_that_is_carried_is_used_unless_another_is_given():
     carried = replace(a_calibration(SHAPE, only=[]), references=flat_references())
     steps = press(calibration=carried)
@@ -148,16 +140,6 @@ def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precess
     assert np.degrees(np.median(between(without.normals, true))) > 5
     assert np.degrees(np.median(between(found.normals, true))) < 1
     assert found.process["calibration_parts"] == "tilt"
-
-
-def test_a_tilt_that_is_given_is_believed():
-    turn()
-    precession = io.Precession(TILT * 1.1, 0.0, 1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 5.0))
-    save(dtype="uint16", precession=precession)
-    told = f"{np.degrees(TILT)}deg"
-    assert reconstruct("turn.h5", "--calibration", "cal.h5").process["tilt"] == pytest.approx(TILT * 1.1)
-    given = reconstruct("turn.h5", "--calibration", "cal.h5", "--tilt", told)
-    assert given.process["tilt"] == pytest.approx(TILT)
 
 
 def test_the_engine_takes_a_path_a_calibration_or_a_source_that_has_one():
@@ -228,15 +210,6 @@ def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(monkeypatch, 
     assert ended.code == 2
     assert said.format("fake") in ended.said
     assert ended.said.count("\n") == 1
-
-
-def test_a_pixel_size_beside_that_of_a_lens_is_refused():
-    press()
-    io.save_calibration(a_calibration(SHAPE, only=["lens"]), "cal.h5")
-    words = ("--calibration", "cal.h5", "--pixel-size", "0.1mm")
-    ended = run("reconstruct", "press.h5", "-o", "out.h5", *words)
-    assert ended.code == 2
-    assert "cal.h5 gives the pixel size: leave --pixel-size out" in ended.said
 
 
 def test_the_calibration_is_not_overwritten():

@@ -1,7 +1,5 @@
 """``mirrorskin calibrate references`` from recordings to the calibration file."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -54,22 +52,6 @@ def test_a_dark_and_a_bright_recording_become_references(scene, tmp_path):
     assert known.process["references.bright_sources"] == str(scene / "bright.h5")
 
 
-def test_machines_are_told_all_numbers(scene, tmp_path):
-    told = json.loads(references(scene, tmp_path / "cal.h5", "--json").out)
-    assert told["dark"]["noise"] == pytest.approx(NOISE, rel=0.1)
-    assert told["bright"]["sigma"] == pytest.approx(NOISE / 24**0.5, rel=0.1)
-    assert told["defects"] == {"hot": 1, "dead": 1, "saturated": 0}
-
-
-def test_several_recordings_of_a_rolled_ball_are_taken_together(scene, tmp_path):
-    path = tmp_path / "cal.h5"
-    ended = references(scene, path, "--rolled", "--bright", scene / "ball.h5", bright="ball.h5")
-    assert ended.code == 0, ended.said
-    assert "160 frames" in ended.out
-    known = io.open_calibration(path)
-    assert known.process["references.bright_light"] == "of a ball rolled about"
-
-
 def test_a_folder_of_pictures_will_do(scene, tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
@@ -118,20 +100,6 @@ def test_a_call_that_cannot_be_is_one_line(scene, tmp_path, monkeypatch, words, 
     assert said in ended.said
     assert ended.said.count("\n") == 1
     assert not (tmp_path / "cal.h5").exists()
-
-
-def test_a_calibration_of_another_camera_is_left_as_it_is(scene, tmp_path):
-    path = tmp_path / "cal.h5"
-    assert references(scene, path).code == 0
-    before = path.read_bytes()
-    small = tmp_path / "small.h5"
-    record(source(expose(np.full((5, 7), 16.0), NOISE, 8)), small)
-    record(source(expose(np.full((5, 7), 200.0), NOISE, 8)), tmp_path / "lit.h5")
-    ended = references(tmp_path, path, dark="small.h5", bright="lit.h5")
-    assert ended.code == 2
-    assert "33 x 21" in ended.said
-    assert ended.said.count("\n") == 1
-    assert path.read_bytes() == before
 
 
 def test_a_rig_is_asked_for_the_dark_and_for_the_ball_at_each_place(scene, tmp_path, monkeypatch):

@@ -140,24 +140,6 @@ def test_a_board_that_cannot_be_is_refused(text, said):
         board_of(text)
 
 
-def test_a_refusal_is_one_line_and_code_2():
-    assert "none.png cannot be read" in refused(calibrate("none.png", *TO))
-
-
-def test_recordings_of_two_cameras_are_refused():
-    recorded(np.stack([SHOWN] * 2), "a.h5")
-    recorded(np.stack([SHOWN] * 2), "b.h5", camera="other")
-    assert "lab and other" in refused(calibrate("a.h5", "b.h5", *TO))
-
-
-def test_a_file_of_another_camera_is_left_as_it_is():
-    cv2.imwrite("b.png", np.pad(SHOWN, 8, constant_values=208))
-    assert calibrate("a.png", *TO).code == 0
-    before = io.open_calibration("cal.h5")
-    assert "cal.h5 is of 252 x 196 pixels, this of 268 x 212" in refused(calibrate("b.png", *TO))
-    assert io.open_calibration("cal.h5").camera.shape == before.camera.shape
-
-
 def test_a_board_is_painted_in_its_true_size():
     ended = run("calibrate", "board", "--board", CHARUCO, "-o", "board.png", "--dpi", "508")
     assert ended.code == 0, ended.said

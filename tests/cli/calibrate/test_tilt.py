@@ -1,6 +1,5 @@
 """`mirrorskin calibrate tilt`: from turns on a flat and a ball to a precession in a file."""
 
-import json
 import re
 from pathlib import Path
 
@@ -94,18 +93,6 @@ def test_a_flat_and_a_ball_become_a_precession_in_a_file():
     assert "within 90 deg" in known.process["tilt.taken_for_granted"]
 
 
-def test_json_tells_values_with_their_errors():
-    ended = tilt("ball.h5", "--flat", "flat.h5", "--json")
-
-    assert ended.code == 0, ended.said
-    told = json.loads(ended.out)
-    assert told["direction"] == -1
-    assert told["tilt"]["value"] == pytest.approx(2.53, abs=0.02)
-    assert 0 < told["pivot_z"]["sigma"] < 1
-    assert told["output"] == "cal.h5"
-    assert len(told["notes"]) == 1
-
-
 def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_is_believed():
     one = np.ones(SHAPE, np.float32)
     references = io.References(16 * one, 224 * one, one, one, np.zeros(SHAPE, np.uint8))
@@ -151,18 +138,6 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
     assert said in ended.said
     assert ended.said.count("\n") == 1
     assert not Path("cal.h5").exists()
-
-
-def test_a_calibration_of_another_camera_is_refused():
-    one = np.ones((5, 5), np.float32)
-    references = io.References(16 * one, 224 * one, one, one, np.zeros((5, 5), np.uint8))
-    io.save_calibration(io.Calibration(io.CameraId("right", (5, 5), np.dtype("u1")), references), "cal.h5")
-
-    ended = tilt("ball.h5", "--flat", "flat.h5")
-
-    assert ended.code == 2
-    assert "name another file than cal.h5 with -o" in ended.said
-    assert io.open_calibration("cal.h5").precession is None
 
 
 def test_a_rig_is_asked_for_balls_at_several_places(monkeypatch):

@@ -107,15 +107,6 @@ def test_a_call_that_cannot_be_is_refused(folder, fitted, words, said):
     assert not (folder / "cal.h5").exists()
 
 
-def test_without_recordings_and_rig_there_is_nothing_to_do(folder):
-    ended = calibrate(presses=0)
-    assert ended.code == 2
-    assert "take them with --rig" in ended.said
-    ended = calibrate("--rig", "rig.toml", presses=0)
-    assert ended.code == 2
-    assert "--press is missing" in ended.said
-
-
 def test_a_calibration_of_another_camera_is_refused_before_the_fit(folder, fitted):
     other = io.CameraId("right", SHAPE, np.dtype(np.uint8))
     io.save_calibration(io.Calibration(other, references=some_references()), "cal.h5")
@@ -132,19 +123,6 @@ def test_recordings_of_two_cameras_are_refused(folder, fitted):
     ended = calibrate()
     assert ended.code == 2
     assert "left and right" in ended.said
-
-
-def test_too_few_presses_are_told_in_a_line(folder):
-    ended = calibrate(presses=3)
-    assert ended.code == 2
-    assert "3 presses do not determine the wall" in ended.said
-
-
-def test_a_recording_without_references_is_told_in_a_line(folder):
-    ended = calibrate()
-    assert ended.code == 2
-    assert "no dark and bright references" in ended.said
-    assert ended.said.count("\n") == 1
 
 
 def known(**parts):

@@ -14,7 +14,9 @@ from calibration_scenes import Lab, press_for
 from mirrorskin.engine.calibration import wall
 from mirrorskin.engine.calibration.check import check_ball
 
-# What the recordings tell of the movement is wrong by so much.
+pytestmark = pytest.mark.slow  # nine balls and three objects are traced
+
+# What the recordings say of the movement is wrong by so much.
 LAB = Lab(
     shape=(128, 124),
     pixel_size=0.0625,

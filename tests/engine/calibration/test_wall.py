@@ -156,18 +156,6 @@ def test_a_calibrated_rotation_tells_leans_and_how_well_its_pivot_is_known(press
     assert np.ptp(np.hypot(*read.lean.T)) > 5e-3
 
 
-def test_of_many_frames_some_all_round_are_read(presses):
-    many = Frames(
-        "long",
-        np.repeat(presses[0].frames, 5, axis=0),
-        presses[0].header,
-        phase=np.repeat(presses[0].series["phase"], 5),
-    )
-    read = read_press(many, 2.0, None, None, 500)
-    assert len(read.lean) == 16
-    assert len(np.unique(read.lean.round(6), axis=0)) == 8
-
-
 def replaced(press, **fields):
     header = dataclasses.replace(press.header, **fields)
     return Frames(press.name, press.frames, header, **press.series)
@@ -204,14 +192,3 @@ def test_what_cannot_be_is_refused(presses, options, said):
 def test_what_a_recording_lacks_is_told(presses, fields, said):
     with pytest.raises(io.InputError, match=said):
         fit_zenith([presses[0], replaced(presses[1], **fields), *presses[2:]], 2.0)
-
-
-def test_four_presses_are_too_few(presses):
-    with pytest.raises(io.InputError, match="4 presses do not determine the wall"):
-        fit_zenith(presses[:4], 2.0)
-
-
-def test_a_vertical_recording_is_refused(presses):
-    vertical = replaced(presses[1], motion="vertical")
-    with pytest.raises(io.InputError, match="its motion is vertical"):
-        fit_zenith([presses[0], vertical, *presses[2:]], 2.0)

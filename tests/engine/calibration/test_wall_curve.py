@@ -33,11 +33,6 @@ def test_a_curve_of_steps_from_0_up_never_turns_back(rising):
         assert light.min() >= 0
 
 
-def test_a_curve_ends_at_the_ends_of_the_wall():
-    light = curve_values(np.ones(CURVE_COEFFICIENTS), [-0.1, -1e-9, 0, 0.5, 1, 1 + 1e-9])
-    np.testing.assert_allclose(light, [0, 0, 1, 1, 1, 0])
-
-
 @pytest.mark.parametrize(
     ("low", "high"), [(0.2, 0.3), (-0.2, 0.1), (0.93, 1.4), (-1, 2), (1.1, 1.2), (0.5, 0.51)]
 )

@@ -111,14 +111,6 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
     np.testing.assert_allclose(found[within[0]], wall[0][within[0]], atol=1e-3)
 
 
-def test_what_is_beyond_the_wall_is_dark():
-    level = SheetPoints(*np.zeros((3, 1)), np.array([[0.0], [0.0], [-1.0]]), np.array([[0.0], [0.0], [1.0]]))
-    steep = level._replace(normal=np.array([[math.sin(0.9)], [0.0], [math.cos(0.9)]]))
-    coefficients = np.ones(CURVE_COEFFICIENTS)
-    assert light_of(level, TRUE, coefficients)[0] == 0
-    assert light_of(steep, TRUE, coefficients)[0] == 0
-
-
 def test_slopes_are_those_of_differences():
     samples, parameters = some_samples(300, 3), true_parameters()
     light, slopes = linearise(samples, parameters, True)
@@ -159,15 +151,6 @@ def test_a_fit_finds_the_curve_and_where_the_wall_stands():
     fitted = curve_values(curve_from_steps(True) @ fit.parameters[STEPS], np.linspace(0.1, 0.95, 40))
     true = curve_values(curve_from_steps(True) @ STEEP, np.linspace(0.1, 0.95, 40))
     np.testing.assert_allclose(fitted, true, atol=0.02)
-
-
-def test_a_curve_that_falls_is_told_from_one_that_rises():
-    samples = some_samples(800, 5)
-    parameters = true_parameters()
-    fallen = LightSamples(
-        predict(samples, parameters, False), samples.place, samples.pose, samples.press, samples.lean, 2.0
-    )
-    assert not start_curve(fallen, parameters)[1]
 
 
 def test_wild_samples_hardly_matter():

@@ -65,16 +65,6 @@ def test_a_higher_mirror_sees_the_rim_sooner_and_a_place_is_told_from_the_axis()
     assert there == pytest.approx(here, abs=1e-12)
 
 
-def test_a_lower_line_of_sight_needs_another_mirror():
-    # At 4 mm the line of sight leans by 0.08 towards the axis; a mirror facing the axis' way sees that half.
-    leaning = response(sight=(0.02, 0.0))
-    found = threshold_zenith(leaning, 4.0, 0.0, 0.0)
-    straight = threshold_zenith(response(), 4.0, 0.0, 0.0)
-    assert found - straight == pytest.approx(math.atan(0.08) / 2, abs=1e-4) or (
-        straight - found == pytest.approx(math.atan(0.08) / 2, abs=1e-4)
-    )
-
-
 def test_a_graded_wall_turns_light_where_its_curve_says():
     # Light 1 - q: the elevation is 2 atan(q), so half the light is at q = 0.5 if the wall reaches so far.
     graded = response(curve=(1.0, -1.0))

@@ -161,10 +161,3 @@ def test_a_press_of_another_ball_is_named():
     presses = some_presses(coefficients_of(1.0), balls=(2.0, 2.0, 2.5, 2.0, 2.0), each=480)
     with pytest.raises(io.InputError, match="place-3: its ball does not fit to the other presses"):
         respond(presses)
-
-
-def test_a_press_in_which_the_ball_slipped_is_named():
-    presses = some_presses(coefficients_of(1.0), each=400)
-    presses[1].place[0, presses[1].frame >= 4] += 0.6
-    with pytest.raises(io.InputError, match="place-2: its ball does not fit to the other presses"):
-        respond(presses)

@@ -5,13 +5,11 @@ from dataclasses import fields, replace
 import h5py
 import numpy as np
 import pytest
-from calibrations import a_calibration, a_lens, a_map, a_precession, assert_same, some_references
-from growing import Feed, frames_of, stream
+from calibrations import a_calibration, a_lens, a_map, a_precession, assert_same
+from growing import Feed, frames_of
 from stacks import SHAPE, MadeUp, random_stack, read_all, record
 
 from mirrorskin import io
-from mirrorskin.io.atomic import new_file
-from mirrorskin.io.growing import GrowingRecording
 
 PICTURE = SHAPE[1:]
 PHASE = np.linspace(0.1, 7.0, 8)
@@ -69,12 +67,6 @@ def test_each_part_tells_what_it_knows_and_the_rest_is_the_source_s(only, change
     for name in changed:
         np.testing.assert_array_equal(getattr(header, name), told[name]())
     assert (with_calibration.whole, with_calibration.calibration) == (calibration, calibration)
-
-
-def test_a_press_has_neither_tilt_nor_pivot():
-    source = MadeUp(random_stack(), io.Header("vertical"), travel=PHASE)
-    header = calibrated(["precession"], source).header
-    assert (header.tilt, header.pivot) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -147,14 +139,6 @@ def test_a_live_source_tells_time_and_corrected_positions_and_can_be_left():
     assert feed.left
 
 
-def test_travel_is_told_as_it_is():
-    feed = Feed(8, (3,))
-    source = calibrated(None, feed)
-    while source.read() is not None:
-        pass
-    np.testing.assert_array_equal(source.positions()["travel"], feed.positions()["travel"])
-
-
 def test_what_else_a_recording_has_is_there_and_what_it_has_not_is_not(tmp_path):
     path = record(a_source(), tmp_path / "turn.h5")
     with io.open_recording(path) as recording:
@@ -208,13 +192,6 @@ def test_places_are_told_from_the_centre_of_a_part(tmp_path, lens, pixel):
         assert here[2:] == there[2:]
 
 
-def test_all_of_the_picture_is_the_calibration_itself(tmp_path):
-    path = record(a_source(), tmp_path / "turn.h5")
-    with io.open_recording(path, region=io.Region.whole(PICTURE)) as recording:
-        source = calibrated(None, recording)
-        assert source.calibration is source.whole
-
-
 # What is refused.
 
 
@@ -235,20 +212,6 @@ def test_the_calibration_of_another_camera_is_refused_in_a_line(known, said):
     with pytest.raises(io.InputError, match=rf"^cal\.h5 is of {said}") as told:
         io.Calibrated(a_source(), calibration)
     assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize(("mine", "its"), [("", "left"), ("left", ""), ("", "")])
-def test_a_camera_without_a_name_may_be_any(mine, its):
-    io.Calibrated(a_source(camera=its), a_calibration(name=mine))
-
-
-def test_the_part_of_a_picture_of_another_size_is_refused(tmp_path):
-    path = record(a_source(), tmp_path / "turn.h5")
-    with (
-        io.open_recording(path, region=io.Region((0, 3), (0, 4))) as recording,
-        pytest.raises(io.InputError, match=r"is of 4 x 3 pixels, .* of 7 x 5"),
-    ):
-        io.Calibrated(recording, a_calibration((3, 4)))
 
 
 @pytest.mark.parametrize(("tilt", "fits"), [(0.033, True), (0.049, True), (0.031, False), (0.051, False)])
@@ -283,15 +246,6 @@ def test_a_recording_carries_a_copy_and_stays_what_the_source_said(tmp_path):
     assert_same(io.open_calibration(path), calibration)
 
 
-def test_a_part_of_a_recording_carries_the_copy_of_the_whole(tmp_path):
-    path = tmp_path / "turn.h5"
-    with io.Recorder(a_source(), path, calibration=a_calibration()) as recorder:
-        recorder.drain(lambda count: None)
-    with io.open_recording(path, region=io.Region((1, 4), (2, 7)), frames=(1, 5)) as recording:
-        assert_same(recording.carried, a_calibration())
-        assert io.Calibrated(recording, recording.carried).header.dark.shape == (3, 5)
-
-
 @pytest.mark.parametrize("compression", ["raw", "lzf"])
 def test_a_recording_that_is_written_while_frames_come_carries_a_copy(tmp_path, compression):
     path = tmp_path / "live.h5"
@@ -306,20 +260,6 @@ def test_a_recording_that_is_written_while_frames_come_carries_a_copy(tmp_path, 
         assert (recording.how == "mapped") == (compression == "raw")
         np.testing.assert_array_equal(read_all(recording, 7).frames, frames_of(np.arange(20)))
         np.testing.assert_array_equal(recording.phase, feed.positions()["phase"])
-
-
-def test_others_see_the_copy_while_frames_come(tmp_path):
-    path, feed = tmp_path / "live.h5", Feed(8, (4,))
-    with new_file(path) as descriptor:
-        known = feed.header, feed.shape, feed.dtype, "raw", a_calibration()
-        growing = GrowingRecording(path, descriptor, *known)
-    with growing:
-        growing.append(feed.read())
-        growing.publish()
-        assert_same(io.open_calibration(path), a_calibration())
-        growing.append(feed.read())
-        growing.finish({}, "complete")
-    assert_same(io.open_calibration(path), a_calibration())
 
 
 def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path):
@@ -340,17 +280,6 @@ def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path
             assert io.describe(path)["carried calibration"].startswith("references, scale")
 
 
-def test_recordings_and_results_of_before_carry_nothing_and_name_no_camera(tmp_path):
-    path = record(a_source(camera=""), tmp_path / "old.h5")
-    with io.open_recording(path) as recording:
-        assert recording.carried is None
-        assert recording.header.camera == ""
-    assert not {"camera", "carried calibration"} & set(io.describe(path))
-    stream(Feed(4), tmp_path / "live.h5")
-    with io.open_recording(tmp_path / "live.h5") as recording:
-        assert recording.carried is None
-
-
 def test_a_copy_that_is_damaged_is_told_when_it_is_asked_for_and_only_then(tmp_path):
     path = tmp_path / "turn.h5"
     with io.Recorder(a_source(), path, calibration=a_calibration()) as recorder:
@@ -361,9 +290,3 @@ def test_a_copy_that_is_damaged_is_told_when_it_is_asked_for_and_only_then(tmp_p
         assert recording.shape == SHAPE
         with pytest.raises(io.InputError, match="newer layout, 7"):
             _ = recording.carried
-
-
-def test_references_know_which_pixels_are_defect():
-    references = some_references()
-    source = calibrated(["references"])
-    np.testing.assert_array_equal(np.isnan(source.header.dark), references.defects > 0)

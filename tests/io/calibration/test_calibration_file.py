@@ -9,12 +9,11 @@ import pytest
 from calibrations import (
     SHAPE,
     a_calibration,
-    a_lens,
     a_precession,
     assert_same,
     some_references,
 )
-from stacks import plot_of, record, sphere
+from stacks import record, sphere
 
 from mirrorskin import io
 
@@ -52,20 +51,6 @@ def test_parts_may_be_missing(path, part):
     assert list(found.parts()) == ([] if part is None else [part])
 
 
-def test_a_camera_may_have_no_name(path):
-    io.save_calibration(a_calibration(name=""), path)
-    assert io.open_calibration(path).camera.name == ""
-
-
-def test_what_nobody_knows_may_be_no_number(path):
-    calibration = a_calibration(only=["precession"])
-    unknown = replace(calibration.precession, pivot=(np.nan,) * 3, sigma={})
-    io.save_calibration(replace(calibration, precession=unknown), path)
-    found = io.open_calibration(path).precession
-    assert np.isnan(found.pivot).all()
-    assert found.sigma == {}
-
-
 def test_it_has_the_layout_that_is_documented(saved):
     found = {}
     with h5py.File(saved) as file:
@@ -97,15 +82,6 @@ def test_it_has_the_layout_that_is_documented(saved):
     assert shapes["references/defects"] == shapes["zenith/azimuth_sigma"] == SHAPE
     assert (shapes["camera/name"], shapes["camera/shape"], shapes["zenith/curve"]) == ((), (2,), (3,))
     assert shapes["process/tilt.frames"] == ()
-
-
-@pytest.mark.parametrize(("only", "shown"), [(PARTS, "bright"), (["zenith"], "zenith_sigma")])
-def test_viewers_show_a_map_unasked(path, only, shown):
-    calibration = a_calibration(only=only)
-    io.save_calibration(calibration, path)
-    _, signal, _ = plot_of(path)
-    part = calibration.references if shown == "bright" else calibration.zenith
-    np.testing.assert_array_equal(signal, getattr(part, shown))
 
 
 def test_units_are_obeyed(saved):
@@ -145,13 +121,6 @@ def test_a_part_is_replaced_with_what_is_told_of_it_and_others_stay(saved):
     assert after.process["zenith.weight"] == 0.5
 
 
-@pytest.mark.parametrize(("first", "then", "kept"), [("", "left", "left"), ("left", "", "left")])
-def test_a_camera_gets_the_name_that_is_told_once(path, first, then, kept):
-    io.update_calibration(path, a_precession(), replace(CAMERA, name=first))
-    io.update_calibration(path, a_lens(), replace(CAMERA, name=then))
-    assert io.open_calibration(path).camera.name == kept
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -165,14 +134,6 @@ def test_a_part_of_another_camera_is_refused(saved, changes, said):
     with pytest.raises(io.InputError, match=f"cal.h5 is of .*{said}: name another file with -o"):
         io.update_calibration(saved, a_precession(), replace(CAMERA, **changes))
     assert saved.read_bytes() == before
-
-
-def test_a_recording_is_not_taken_for_a_calibration_to_be_updated(path):
-    record(sphere(), path)
-    before = path.read_bytes()
-    with pytest.raises(io.InputError, match="no calibration: name another file with -o"):
-        io.update_calibration(path, a_precession(), CAMERA)
-    assert path.read_bytes() == before
 
 
 def test_a_part_that_does_not_fit_leaves_the_file_as_it_was(saved):
@@ -256,13 +217,6 @@ def test_a_file_that_is_damaged_or_of_another_version_is_told_in_a_line(saved, c
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("length", [0, 100, 5000])
-def test_a_truncated_file_is_told(saved, length):
-    saved.write_bytes(saved.read_bytes()[:length])
-    with pytest.raises(io.InputError, match=r"cal\.h5"):
-        io.open_calibration(saved)
-
-
 def test_what_is_no_calibration_is_told(path, tmp_path):
     with pytest.raises(io.InputError, match="no such file"):
         io.open_calibration(path)
@@ -287,22 +241,6 @@ def test_a_calibration_is_described(saved):
     assert facts["tilt.tilt"] == "2.2918 deg"
     assert facts["tilt.sigma"] == "pivot_z 0.3 mm, tilt 0.0057296 deg"
     assert facts["tilt.frames"] == "8"
-
-
-def test_numbers_of_how_it_came_about_are_told_with_four_digits(path):
-    process = {"references.dark_sigma": 0.19073192774615977, "references.frames": 12345678}
-    io.save_calibration(replace(a_calibration(), process=process), path)
-    facts = io.describe(path)
-    assert facts["references.dark_sigma"] == "0.1907"
-    assert facts["references.frames"] == "12345678"
-    assert io.open_calibration(path).process == process
-
-
-def test_parts_that_are_missing_are_described_as_such(path):
-    io.save_calibration(a_calibration(name="", only=["gel"]), path)
-    facts = io.describe(path)
-    assert facts["camera"] == "7 x 5, uint8"
-    assert {facts[name] for name in ("references", "scale", "zenith", "tilt")} == {"none"}
 
 
 def test_every_dataset_is_documented(saved):

@@ -60,11 +60,6 @@ def test_the_scale_counts_rather_than_what_the_recording_says(motion):
     assert io.Calibrated(source(motion), calibration).header.pixel_size == (0.5, 0.6)
 
 
-@pytest.mark.parametrize(("motion", "only"), [("vertical", ["zenith", "precession"]), ("axial", ["gel"])])
-def test_what_a_motion_does_not_need_may_be_old(motion, only):
-    assert io.Calibrated(source(motion), made_with((0.3, 0.3), only)).header.pixel_size == (0.1, 0.2)
-
-
 def test_a_thousandth_is_the_same_size_and_what_nobody_told_is_believed():
     parts = ["zenith", "precession", "gel"]
     assert not list(outdated(made_with((0.1, 0.2), parts), (0.10005, 0.19995)))
