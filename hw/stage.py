@@ -25,6 +25,11 @@ class Position:
         How far the body is lowered, mm, positive down.
     pitch, roll : float
         Radians: half-angle times the cosine and the sine of the phase.
+
+    Examples
+    --------
+    >>> Position(1.0, pitch=0.03, roll=0.04).tilt
+    0.05
     """
 
     travel: float = 0.0
@@ -44,21 +49,11 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a stage said of itself.
+    """What a stage said of itself."""
 
-    Attributes
-    ----------
-    time : float
-        Seconds of `time.monotonic` at which it was so.
-    position : Position
-        Where the body was.
-    state : str
-        ``idle``, ``run``, ``hold``, ``jog``, ``alarm``, ``home``, ``door``, ``check`` or ``sleep``.
-    """
-
-    time: float
+    time: float  # seconds of time.monotonic at which it was so
     position: Position
-    state: str
+    state: str  # idle, run, hold, jog, alarm, home, door, check or sleep
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,31 +75,12 @@ class Limits:
     press: float
 
     def check(self, position: Position, name: str) -> None:
-        """Refuse a place beyond the limits.
-
-        Parameters
-        ----------
-        position : Position
-            Where the body is to go.
-        name : str
-            What to call the stage in the message.
-
-        Raises
-        ------
-        InputError
-            Naming the limit and what to change.
-        """
+        """Refuse a place beyond the limits: an InputError names the limit, and the stage by `name`."""
         self._check_travel(position.travel, name)
         self._check_tilt(position.tilt, name)
 
     def check_precession(self, travel: float, tilt: float, name: str) -> None:
-        """Refuse a precession beyond the limits: a turn at half-angle `tilt`, rad, pressed by `travel`, mm.
-
-        Raises
-        ------
-        InputError
-            Naming the limit and what to change.
-        """
+        """Refuse a precession beyond the limits: turns at half-angle `tilt`, rad, pressed by `travel`, mm."""
         self._check_travel(travel, name)
         self._check_tilt(tilt, name)
 

@@ -70,6 +70,12 @@ class VideoCamera(ThreadedCamera):
     ------
     InputError
         It is not there, cannot be opened, gives no frame within 7 s, or frames of another size or type.
+
+    Examples
+    --------
+    >>> with VideoCamera(CameraSettings(source=0, size=(640, 480))) as camera:  # doctest: +SKIP
+    ...     camera.take(most=8, timeout=1.0).pixels.shape
+    (1, 480, 640)
     """
 
     def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:

@@ -69,6 +69,14 @@ class GrblStage(Closing):
     ------
     InputError
         No such port, one in use, or one behind which there is no GRBL 1.1.
+
+    Examples
+    --------
+    >>> with GrblStage(load_rig("rig.toml").stage) as stage:  # doctest: +SKIP
+    ...     stage.home()
+    ...     stage.move(Position(travel=1.0), speed=0.5)
+    ...     stage.wait().position.travel
+    1.0
     """
 
     def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:

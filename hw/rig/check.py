@@ -43,27 +43,13 @@ _NEAR = {"mm": 0.02, "deg": math.radians(0.02)}  # how near it must come, mm and
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One thing that was looked at."""
 
-    Attributes
-    ----------
-    part : str
-        Of the rig: stage, camera or move.
-    what : str
-        What was looked at.
-    found : str
-        What it is, with its unit.
-    verdict : {"ok", "warning", "failed"}
-        Whether a recording can be made with it.
-    remedy : str
-        What is wrong and what to do; empty if all is well.
-    """
-
-    part: str
-    what: str
-    found: str
-    verdict: Verdict = "ok"
-    remedy: str = ""
+    part: str  # of the rig: stage, camera or move
+    what: str  # what was looked at
+    found: str  # what it is, with its unit
+    verdict: Verdict = "ok"  # whether a recording can be made with it
+    remedy: str = ""  # what is wrong and what to do; empty if all is well
 
 
 def check_rig(
@@ -132,13 +118,7 @@ def _logged_warnings() -> Iterator[list[str]]:
 
 
 def check_stage(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
-    """Look at a stage that was opened, for about a second; nothing moves.
-
-    Raises
-    ------
-    HardwareError
-        The stage was lost meanwhile.
-    """
+    """Look at a stage that was opened, for about a second; nothing moves."""
     yield Finding("stage", "firmware", stage.firmware)
     report, parameters = stage.report(), stage.parameters
     yield _state(report, settings)
@@ -271,13 +251,7 @@ def _listen(stage: Stage, settings: StageSettings) -> list[float]:
 
 
 def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
-    """Look at a camera that was opened, for about a second.
-
-    Raises
-    ------
-    HardwareError
-        No frame came, or the camera was lost meanwhile.
-    """
+    """Look at a camera that was opened, for about a second."""
     rows, columns = camera.shape
     yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
     camera.take(1, _FIRST)
@@ -331,13 +305,7 @@ def _brightness(picture: NDArray[Any]) -> Finding:
 
 
 def check_moves(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
-    """Home the stage if the file says so, set it upright within its limits, and move each axis from there.
-
-    Raises
-    ------
-    HardwareError
-        An alarm, or the stage was lost.
-    """
+    """Home the stage if the file says so, set it upright within its limits, and move each axis from there."""
     if settings.home:
         stage.home()
         yield Finding("move", "homing", f"done; now {_in_words(stage.report().position, settings)}")

@@ -79,6 +79,11 @@ class VerticalPlan:
     ------
     InputError
         A value cannot be.
+
+    Examples
+    --------
+    >>> VerticalPlan(0.0, 1.0, step=0.5).values
+    array([0. , 0.5, 1. ])
     """
 
     start: float
@@ -111,8 +116,7 @@ class VerticalPlan:
     @property
     def values(self) -> Floats:
         """Travel of each step, (n,), mm."""
-        if self.step is None:
-            raise ValueError("this plan has no steps")
+        assert self.step is not None
         count = _whole((self.stop - self.start) / self.step) + 1
         return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
@@ -124,8 +128,7 @@ class VerticalPlan:
     @property
     def path(self) -> Trapezoid:
         """The way without a halt, from 0 at the start, mm."""
-        if self.speed is None:
-            raise ValueError("this plan has steps")
+        assert self.speed is not None
         return Trapezoid.planned(self.stop - self.start, self.speed)
 
     def check(self, limits: Limits, name: str) -> None:
@@ -155,6 +158,11 @@ class AxialPlan:
     ------
     InputError
         A value cannot be.
+
+    Examples
+    --------
+    >>> AxialPlan(1.0, math.radians(2.5), phase_step=math.pi / 4).values.shape
+    (8,)
     """
 
     press: float
@@ -187,8 +195,7 @@ class AxialPlan:
     @property
     def values(self) -> Floats:
         """Phase of each step, (n,), radians."""
-        if self.phase_step is None:
-            raise ValueError("this plan has no steps")
+        assert self.phase_step is not None
         # The end of whole turns is their beginning; a step that ends short of it is taken.
         count = math.ceil(math.tau * self.turns / self.phase_step - _ROUNDING)
         return np.asarray(self.phase_step * np.arange(count), np.float64)
@@ -201,8 +208,7 @@ class AxialPlan:
     @property
     def path(self) -> Trapezoid:
         """The way without a halt, from phase 0, radians."""
-        if self.rate is None:
-            raise ValueError("this plan has steps")
+        assert self.rate is not None
         return Trapezoid.planned(math.tau * self.turns, math.tau * self.rate)
 
     def frames_a_turn(self, frame_rate: float, each: int = 1) -> float:
@@ -216,7 +222,7 @@ class AxialPlan:
             turn = frame_rate / (self.rate or math.inf)
             if not math.isfinite(turn) or turn <= 0:
                 raise InputError(
-                    "nobody knows how many frames a turn has: give the camera's rate in the rig file"
+                    "how many frames a turn has is not known: give the camera's rate in the rig file"
                 )
         return turn * min(1.0, self.turns)
 

@@ -221,6 +221,13 @@ class StepScan(Scan):
         Seconds from rest to the first exposure.
     frames : int
         At each place, 1 or more.
+
+    Examples
+    --------
+    >>> with open_rig(load_rig("rig.toml")) as rig:  # doctest: +SKIP
+    ...     with StepScan(rig, VerticalPlan(0.0, 1.5, step=0.1)) as scan:
+    ...         scan.read().travel
+    array([0.])
     """
 
     def __init__(self, rig: Rig, plan: Plan, settle: float = 0.1, frames: int = 1) -> None:

@@ -38,6 +38,13 @@ class SweepScan(Scan):
         With a speed or a rate.
     turn_frames : int, optional
         Frames that a turn has at most: only every second, third, ... frame is given, as it takes.
+
+    Examples
+    --------
+    >>> with open_rig(load_rig("rig.toml")) as rig:  # doctest: +SKIP
+    ...     with StreamRecorder(SweepScan(rig, VerticalPlan(0.0, 1.5, speed=0.5)), "press.h5") as recorder:
+    ...         while recorder.read() is not None:
+    ...             pass
     """
 
     def __init__(self, rig: Rig, plan: Plan, turn_frames: int | None = None) -> None:
