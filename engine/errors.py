@@ -2,6 +2,6 @@
 
 
 class NotConverged(Exception):  # noqa: N818  # its name is a promise to users
-    """A solver did not get as near as was asked for; the message is one line: how near, and what to do."""
+    """A solver did not reach its tolerance; the message is one line: how near it came, and what to do."""
 
     exit_code = 1

@@ -48,12 +48,12 @@ def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int,
     ----------
     frames_a_turn : float
     window : int, optional
-        How many are wanted; by default as many as there are, up to 64.
+        Frames of the window; by default as many as there are, up to 64.
 
     Raises
     ------
     mirrorskin.io.InputError
-        A turn has fewer than three, which determine no wave, or fewer than are wanted.
+        A turn has fewer than three, which determine no wave, or fewer than the window.
     """
     if not _FEWEST <= frames_a_turn < math.inf:
         raise InputError(f"{frames_a_turn:g} frames a turn: at least 3 are needed; turn more slowly")

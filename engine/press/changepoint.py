@@ -188,7 +188,7 @@ class ChangePointSearch:
             Fewer than two frames came in the first pass.
         """
         count = len(self._travel)
-        self._check_count()
+        self._known_noise()
         self._travel.clear()
         split = np.arange(1.0, count)
         self._weight = self.device.array("weight", (count + 1,), np.float32)
@@ -255,7 +255,7 @@ class ChangePointSearch:
         mirrorskin.io.InputError
             There are fewer than two frames, or the second pass over them is missing.
         """
-        count, noise = len(self._travel), self._check_count()
+        count, noise = len(self._travel), self._known_noise()
         if self.passes == 2 and (self._weight is None or count + 1 != len(self._weight.host)):
             raise InputError("a change between unknown levels needs all frames twice: give dark and bright")
         maps = [self._finish(band, noise) for band in self._bands]
@@ -315,8 +315,8 @@ class ChangePointSearch:
         """The travel of the frames so far, (T,), mm."""
         return np.array(self._travel, np.float64)
 
-    def _check_count(self) -> float:
-        """Return the noise, which two frames tell."""
+    def _known_noise(self) -> float:
+        """Return the noise, or raise InputError where there are fewer than two frames."""
         if len(self._travel) < 2 or self._noise.value is None:
             raise InputError(
                 f"a press of {len(self._travel)} frames has no change-point: at least 2 are needed"

@@ -25,7 +25,7 @@ LEARNED_AT = 0.5
 
 _LIT, _DARK, _HIDDEN = 1, 2, 3  # of an onset's status
 _FEWEST = 12  # cells that must have turned light
-_SAMPLED = 250  # cells whose onset is looked at; more tell no more of so few splines
+_SAMPLED = 250  # cells whose onsets are used; more add nothing to so few splines
 _TRAVELS = 16  # at which the press is gone through
 # Third derivatives that surfaces usually have, 1/mm^2, in the first steps; the last from there on.
 _BENDING = 0.1, 0.1, 0.3, 1.0
@@ -33,14 +33,14 @@ _MOST_ROUNDS = 14
 _DAMPING, _STUCK = 1.0, 1e3  # at first, in units of steps; beyond the second nothing moves any more
 _STEP = 0.3  # mm that the surface may move in a round
 _SETTLED = 0.9  # of the cost of the round before: no better is good enough
-_SLOPE_ERROR = 0.006  # of the sheet, as cells so large tell it
+_SLOPE_ERROR = 0.006  # of the sheet, as cells so large resolve it
 _ROBUST = 2.0  # errors beyond which a cell counts less
 _MISFIT = 0.08  # median error of the slope beyond which the surface explains nothing
 _DEPTH = 0.6  # of a depth by eq. 3: half of it on a paraboloid, more on what is steeper
 _KNOWN = 0.01  # mm, of the heights that a first surface goes through
 _BEYOND = 0.3  # of the touch that may lie beyond the picture, where the object is a guess
 _SHARE_LEFT = 0.02  # of a change that is left, as the cells are coarse
-_FARTHEST = 0.05  # mm, standard deviation up to which a height goes on beyond the touch
+_FARTHEST = 0.05  # mm, standard deviation up to which heights beyond the contact are kept
 _RIDGE = 1e-12
 _CELLS = 32  # along a side of what turned light, were it square
 _AROUND = 2  # cells beyond it
@@ -58,11 +58,10 @@ class Corrected:
     Attributes
     ----------
     height, sigma : ndarray, (H, W), float32
-        Millimetres, and their standard deviations, which hold what is left of the correction's own error.
-        NaN where the light came early and the touch never: there the object is known to be smooth only, and
-        soon that tells its height no more.
+        Millimetres, and their standard deviations, with the correction's own. NaN where a pixel turned light
+        but was never touched, unless near the contact: farther off, only smoothness is known of the object.
     touched : ndarray, (H, W), bool
-        What the sheet lies on at the greatest travel.
+        What is in contact at the greatest travel.
     """
 
     height: NDArray[np.float32]
@@ -116,7 +115,7 @@ def correct_press(
     result : Result
         With height, its sigma and status, not filled yet.
     source : Source
-        Which tells the pixels' size.
+        With the pixels' size.
     deepest : float
         Greatest travel of the frames that it was made of, mm.
     threshold : float
@@ -240,7 +239,7 @@ def _scene_of(maps: _Maps, size: tuple[float, float], gel: Gel, deepest: float |
     onsets = -means[np.isfinite(means)]
     if len(onsets) < _FEWEST:
         raise NotConverged(
-            f"light in {len(onsets)} places is too little to tell a surface: {_FEWEST} are needed"
+            f"light in {len(onsets)} places is too little to determine a surface: {_FEWEST} are needed"
         )
     dark = cells.share(maps.status == _DARK) == 1
     hidden = cells.inside(cells.share(maps.status == _HIDDEN)) >= 0.5

@@ -20,10 +20,10 @@ Mask = NDArray[np.bool_]
 
 _SQUARE = np.ones((3, 3), bool)
 _SMALL = 2.0  # pixels from its rim that a hole must reach to be worth a smooth surface
-_RING = 1.1  # width of the ring that tells of a hole, in radii of the hole
+_RING = 1.1  # width of the ring that determines the fill, in radii of the hole
 _NARROW = 0.6  # of one tried where the surface beyond is another one
 _LEAST_RING = 3.0  # pixels
-_TERRACES = 1.9  # that a ring's heights must span: two steps, but for rounding, tell how the slope changes
+_TERRACES = 1.9  # that a ring's heights must span: two steps, but for rounding, show how the slope changes
 _WIDEST, _WIDER = 3.0, 1.3  # radii, and by how much to widen
 _CELLS = 2  # of the splines in a hole's radius
 _LEAST_CELLS = 1.2  # below which a hole is too long and thin for splines
@@ -149,7 +149,7 @@ class _Smooth(NamedTuple):
 
 
 class _Ring(NamedTuple):
-    """What tells of a hole: the pixels around it that are known, in a box of the map."""
+    """What determines a fill: the pixels around the hole that are known, in a box of the map."""
 
     box: tuple[slice, slice]
     known: Mask

@@ -1,4 +1,10 @@
-"""Heights from onsets whose surroundings are known: intervals as likelihoods, and trends through them."""
+"""Heights from onsets whose surroundings are known: intervals as likelihoods, and paraboloids through them.
+
+All heights between two frames have one onset. Pixel by pixel their errors are spread evenly over the
+interval, but on a surface they are correlated: over each terrace they run from one end to the other. So
+their mean is not better for there being more pixels, as that of independent errors would be. But where the
+shape of a surface is known, the lines at which one terrace meets the next give its height precisely.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +24,7 @@ _LEAST = 0.02  # of half an interval: what its ends are blurred by at least
 _FAR = 6.0  # blurs beyond an end, from which on an onset is an outlier
 _SPAN = 20.0  # half intervals that outliers are spread over at least
 _FEWEST, _MOST = 1e-4, 0.5  # share of outliers
-_SAMPLES = 8192  # of errors that tell how they are spread
+_SAMPLES = 8192  # of errors that their distribution is estimated from
 _ROUNDS = 12  # until the share of outliers is found
 _FAINT = 1e-4  # of an end's own weight, below which a weight is not taken to be more sure
 
@@ -31,38 +37,25 @@ class Evidence(NamedTuple):
 
 
 class IntervalErrors(NamedTuple):
-    """How errors of known heights are spread.
+    """How errors of known heights are distributed."""
 
-    Attributes
-    ----------
-    blur : float
-        Standard deviation that the ends of intervals are blurred by, mm.
-    outlier_density : float
-        Density of the heights that are outliers, 1/mm, over the share of those that are none.
-    """
-
-    blur: float
-    outlier_density: float
+    blur: float  # standard deviation that the ends of intervals are blurred by, mm
+    outlier_density: float  # of outliers, 1/mm, over the share of heights that are none
 
 
 def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
-    """Estimate how sharp the intervals' ends are, and how many onsets are outliers, by maximum likelihood.
+    """Estimate by maximum likelihood how sharp intervals' ends are, and how many onsets are outliers.
 
     An error e is from a blurred interval with the chance 1 - m, and an outlier, which may be anything, with
-    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Outliers are on one side, as late onsets
-    are, and what is within intervals does not hold against them: they must not count as blurred ends.
+    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Outliers lie on one side, as late onsets
+    do, and what is within intervals is no evidence against them: they must not count as blurred ends.
 
     Parameters
     ----------
     error : ndarray, (n,), float64
         Middles of intervals less the heights, mm.
     half : ndarray, (n,), float64
-        Half the intervals' widths, mm.
-
-    Returns
-    -------
-    IntervalErrors
-        Its blur is at least a fiftieth of half an interval.
+        Half the intervals' widths, mm. The blur is at least a fiftieth of it.
     """
     thin = slice(None, None, -(-error.size // _SAMPLES))
     error, half = error[thin], half[thin]
@@ -92,12 +85,12 @@ def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
 
 
 def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: IntervalErrors) -> Evidence:
-    """Tell what intervals say of heights, by one Newton step on their likelihood.
+    """Return what intervals say of heights, by one Newton step on their likelihood.
 
-    That of a height u is the chance that u and an error of standard deviation ``spread.blur`` lie between the
-    interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). Its logarithm has the derivative g
-    and the curvature -h at u; the same have a known height u + g / h of the weight h. It counts by the chance
-    that it is no outlier.
+    The likelihood of a height u is the chance that u and an error of the standard deviation ``blur`` lie
+    between the interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). Its logarithm has the
+    derivative g and the curvature -h at u; the same have a known height u + g / h of the weight h, which is
+    multiplied by the chance that it is no outlier. Far outside its interval the weight is 0.
 
     Parameters
     ----------
@@ -106,11 +99,6 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
     middle, half : ndarray, (n,), float64
         Of the intervals, mm.
     spread : IntervalErrors
-
-    Returns
-    -------
-    Evidence
-        Of the weight 0 where the height is far outside.
     """
     blur, outlier_density = spread
     below, above = (middle - half - height) / blur, (middle + half - height) / blur
@@ -135,46 +123,22 @@ _FLAT = 1e-9  # least share of a fit's information that is worth inverting
 
 
 class Paraboloids(NamedTuple):
-    """Paraboloids at n pixels, (n,), float64.
+    """Paraboloids at n pixels, (n,), float64."""
 
-    Attributes
-    ----------
-    height : ndarray
-        Millimetres.
-    along : ndarray, (2, n)
-        Slopes along columns and rows, mm per pixel.
-    variance : ndarray, (2, n)
-        Of these.
-    misfit : ndarray
-        Mean squared error in standard deviations; NaN where too little is known for a paraboloid.
-    pixels : ndarray
-        Number of known heights.
-    """
-
-    height: Doubles
-    along: Doubles
-    variance: Doubles
-    misfit: Doubles
-    pixels: Doubles
+    height: Doubles  # mm
+    along: Doubles  # (2, n): slopes along columns and rows, mm per pixel
+    variance: Doubles  # (2, n): of these
+    misfit: (
+        Doubles  # mean squared error in standard deviations; NaN where too little is known for a paraboloid
+    )
+    pixels: Doubles  # with a known height
 
 
 def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_], width: float) -> Paraboloids:
-    """Fit paraboloids by least squares in a Gaussian window around pixels.
+    """Fit paraboloids by least squares in a Gaussian window around some places, (H, W).
 
-    Parameters
-    ----------
-    height : ndarray, (H, W), float64
-        Millimetres; of any value where the weight is 0.
-    weight : ndarray, (H, W), float64
-        Inverse variances.
-    places : ndarray, (H, W), bool
-        Where to fit.
-    width : float
-        Standard deviation of the window, pixels.
-
-    Returns
-    -------
-    Paraboloids
+    Heights are in mm, of any value where the weight, an inverse variance, is 0. The window's width is a
+    standard deviation in pixels.
     """
     known = weight > 0
     datum = float(np.average(height[known], weights=weight[known])) if known.any() else 0.0

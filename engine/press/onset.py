@@ -167,7 +167,7 @@ class OnsetSearch:
         self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), length)
         self.room = room_of(self._bands, length)
         self._travel = _TravelTable(self.device)
-        # The plateau that a run comes from: no reference tells how light a pixel was before its release.
+        # The plateau that a run comes from: no reference says how light a pixel was before its release.
         self._own_dark = self._release or dark is None
         self._macros: dict[str, str | int] = {
             "FRAME": C_TYPES[self._dtype.name],
@@ -240,7 +240,7 @@ class OnsetSearch:
         maps, known = "marks closed busy times", {}
         if self._subframe:
             maps += " levels samples answers status"
-            # One frame alone tells no noise, and needs none: it is taken for dark.
+            # From one frame no noise is estimated, and none is needed: it is taken for dark.
             known = self._travel.arguments | self._tolerances(self._noise.value or 0.0)
         self._launch(band, "onset_scan", maps, staged=staged, pixels=band.pixels, first=first, **known)
 
