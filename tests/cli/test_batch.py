@@ -81,19 +81,6 @@ def test_patterns_are_understood_when_quoted():
     assert results("three") == ["c-result.h5", "d-result.h5"]
 
 
-def test_results_are_no_recordings():
-    presses("a.h5", "deep/x-result.h5")
-    assert "2 done" in run("batch", "**/*.h5", "-o", ".").out
-    code, out, said = run("batch", "**/*.h5", "-o", ".")
-    assert (code, said) == (0, "left out, as results: 2 files\n")
-    assert "2 recordings: 0 done, 2 kept" in out
-    assert (
-        "2 recordings: 2 done" in run("batch", "a.h5", "a-result.h5", "deep/x-result.h5", "-o", "other").out
-    )
-    code, _, said = run("batch", "a-result.h5", "-o", ".")
-    assert (code, said) == (2, "mirrorskin: a-result.h5: nothing but results: name recordings\n")
-
-
 def test_remedies_are_those_of_a_batch():
     foreign = {"x": np.zeros((8, 5, 7), np.uint8), "y": np.zeros((8, 5, 7), np.uint8)}
     with h5py.File("a.h5", "w") as file:
@@ -141,16 +128,6 @@ def test_json_tells_of_every_file():
     assert (first["source"], first["result"], first["state"]) == ("a.h5", "out/a-result.h5", "done")
     assert (first["motion"], first["bytes"]) == ("vertical", 8 * 5 * 7)
     assert (second["state"], second["message"]) == ("failed", "b.h5: no such file")
-
-
-def test_devices_can_be_named():
-    presses("a.h5", "b.h5")
-    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out", "--device", "0", "--device", "0", "--json")
-    assert code == 0
-    assert json.loads(out)["files"][0]["device"] == io.open_result("out/a-result.h5").process["device"]
-    code, out, said = run("batch", "a.h5", "-o", "out", "--device", "nothing like it")
-    assert (code, out) == (2, "")
-    assert "no such device" in said
 
 
 def test_half_written_files_of_the_killed_are_removed(folder):

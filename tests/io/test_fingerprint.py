@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 
 import h5py
 import hdf5plugin
@@ -108,16 +107,6 @@ def test_files_that_frames_are_taken_from_count(tmp_path, monkeypatch):
         assert fingerprint(tmp_path / name, **given) != before
         (tmp_path / other).write_bytes(data)
         assert fingerprint(tmp_path / name, **given) == before
-
-
-def test_the_time_of_the_last_change_is_told_to_the_nanosecond(tmp_path):
-    path = write(tmp_path / "a.h5", compressible(SHAPE, "u1"))
-    os.utime(path, ns=(0, 1_700_000_000_012_345_678))
-    with io.open_recording(path, **GIVEN) as recording:
-        assert recording.modified == "2023-11-14T22:13:20.012345678Z"
-    os.utime(path)
-    with io.open_recording(path, **GIVEN) as recording:
-        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", recording.modified)
 
 
 @pytest.mark.parametrize("packing", [{}, {"chunks": (1, 50, 70), "compression": "gzip"}])

@@ -161,18 +161,6 @@ def test_a_virtual_stack_is_read(path, tmp_path, monkeypatch):
         assert recording.storage == "virtual"
 
 
-def test_a_virtual_stack_that_grows_is_read(path, tmp_path):
-    growing = (None, 5, 7)
-    with h5py.File(tmp_path / "camera.h5", "w") as file:
-        file.create_dataset("x", data=STACK, maxshape=growing)
-    layout = h5py.VirtualLayout((1, 5, 7), "u1", maxshape=growing)
-    source = h5py.VirtualSource("camera.h5", "x", (1, 5, 7), maxshape=growing)
-    layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
-    with h5py.File(path, "w") as file:
-        file.create_virtual_dataset("x", layout)
-    np.testing.assert_array_equal(read(path), STACK)
-
-
 def test_a_virtual_stack_that_is_not_whole_is_refused(path, tmp_path):
     names = [f"part{k}.h5" for k in range(4)]
     virtual(path, names, missing=1)
@@ -308,25 +296,12 @@ def test_a_type_that_frames_cannot_have_is_refused(path, dtype):
     refused(path, r"/x is of type .*: frames are uint8, uint16 or float32; convert it first")
 
 
-def test_a_result_is_no_recording(path):
-    io.save_result(io.Result(height=np.zeros((5, 7), np.float32)), path)
-    refused(path, r"theirs\.h5 is a result: give the recording that it was made from")
-
-
 def huge_in_one_piece(file):
     file.create_dataset("x", (10**6, 1000, 1000), "u1")
 
 
 def huge_in_chunks(file):
     file.create_dataset("x", (10**6, 1000, 1000), "u1", chunks=(1, 1000, 1000), compression="gzip")[3] = 1
-
-
-def huge_in_many_chunks(file):
-    file.create_dataset("x", (2**40, 2**10, 2**13), "u1", chunks=(1, 1, 1))
-
-
-def huge_in_no_raw_file(file):
-    file.create_dataset("x", (10**6, 1000, 1000), "u1", external=[("theirs.h5", 0, h5py.h5f.UNLIMITED)])
 
 
 def huge_by_a_virtual_source(file):
@@ -337,7 +312,7 @@ def huge_by_a_virtual_source(file):
     file.create_virtual_dataset("x", layout)
 
 
-HUGE = [huge_in_one_piece, huge_in_chunks, huge_in_many_chunks, huge_in_no_raw_file, huge_by_a_virtual_source]
+HUGE = [huge_in_one_piece, huge_in_chunks, huge_by_a_virtual_source]
 
 
 @pytest.mark.parametrize("write", HUGE)
@@ -350,24 +325,6 @@ def test_more_than_the_file_holds_is_refused_before_memory_is_taken(path, write)
             path,
             r"/x claims [0-9]+ (bytes|chunks) and its file holds [0-9]+: it was cut short; copy it again",
         )
-        assert tracemalloc.get_traced_memory()[1] < 2_000_000
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.parametrize("name", ["stage/travel", "detector/frame_time", "detector/dark", "stage/pivot"])
-@pytest.mark.parametrize("shape", [(10**6, 10**6), (10**12,)])
-def test_numbers_beside_the_frames_take_no_memory_either(path, name, shape):
-    record(sphere(), path)
-    with h5py.File(path, "r+") as file:
-        file.pop(f"entry/instrument/{name}", None)
-        file[f"entry/instrument/{name}"] = 0
-        del file[f"entry/instrument/{name}"]
-        file.create_dataset(f"entry/instrument/{name}", shape, "f8")
-    tracemalloc.start()
-    try:
-        with pytest.raises(io.InputError, match=r"has shape .* where .* is needed"):
-            io.open_recording(path)
         assert tracemalloc.get_traced_memory()[1] < 2_000_000
     finally:
         tracemalloc.stop()
@@ -387,53 +344,10 @@ def test_a_filter_that_is_not_installed_is_named(path):
     )
 
 
-PACKINGS = {
-    "gzip": {"compression": "gzip"},
-    "lzf": {"compression": "lzf"},
-    "fletcher32": {"fletcher32": True},
-}
-
-
-@pytest.mark.parametrize("packing", PACKINGS)
-def test_a_damaged_chunk_names_its_frames(path, packing):
-    with h5py.File(path, "w") as file:
-        stack = file.create_dataset(
-            "x", data=np.zeros((9, 50, 70), "u1"), chunks=(3, 50, 70), **PACKINGS[packing]
-        )
-        chunk = stack.id.get_chunk_info(1)
-    data = bytearray(path.read_bytes())
-    start = chunk.byte_offset
-    data[start : start + chunk.size] = bytes(0xA5 ^ byte for byte in data[start : start + chunk.size])
-    path.write_bytes(data)
-    with io.open_recording(path, **GIVEN) as recording:
-        room = np.empty((4, 50, 70), "u1")
-        assert recording.read(room).frames.shape == (3, 50, 70)
-        line = r"theirs\.h5: frames 3 to 5 of /x cannot be read: it is damaged .*: copy it again"
-        with pytest.raises(io.InputError, match=line) as caught:
-            recording.read(room)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_file_that_was_cut_is_refused_wherever(path):
     record(sphere(), path, "gzip")
     data = path.read_bytes()
-    for length in (
-        0,
-        4,
-        7,
-        8,
-        9,
-        20,
-        47,
-        48,
-        95,
-        96,
-        600,
-        2048,
-        len(data) // 2,
-        len(data) - 200,
-        len(data) - 1,
-    ):
+    for length in (0, 7, 8, 47, 96, 600, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
         line = (
             "is not an HDF5 file"
@@ -475,16 +389,6 @@ def test_a_file_that_is_being_written_is_refused(path, libver, monkeypatch):
         refused(path, r"theirs\.h5: another program is writing it: wait until it is done")
         writer.stdin.close()
     np.testing.assert_array_equal(read(path), STACK)
-
-
-def test_a_file_whose_writer_died_is_refused(tmp_path, path):
-    with h5py.File(tmp_path / "open.h5", "w", libver="latest") as file:
-        bare(file)
-        file.flush()
-        path.write_bytes((tmp_path / "open.h5").read_bytes())
-    refused(
-        path, r"theirs\.h5: another program is writing it: wait until it is done \('h5clear -s' if it died\)"
-    )
 
 
 def test_another_s_file_is_described(path):

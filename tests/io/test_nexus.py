@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from typing import NamedTuple
 
 import nexusformat.nexus
@@ -124,12 +123,6 @@ def test_a_recording_of_a_live_run_is_shown_once_it_is_complete(seen, packing, t
     assert_shows(seen(tmp_path / "rec.h5"), "frames", "counts", frames, [travel, NONE, NONE])
 
 
-def test_a_recording_that_nothing_is_known_of_but_its_frames_is_shown_all_the_same(seen, tmp_path):
-    frames = random_stack("uint8", (T, H, W))
-    record(MadeUp(frames, io.Header("horizontal"), displacement=np.zeros((T, 2))), tmp_path / "rec.h5")
-    assert_shows(seen(tmp_path / "rec.h5"), "frames", "counts", frames, [NONE, NONE, NONE])
-
-
 SHOWN = """
 import json, sys, silx.io
 from silx.io.nxdata import get_default
@@ -181,25 +174,11 @@ def test_heights_are_shown_in_millimetres_over_millimetres_and_with_their_errors
     np.testing.assert_array_equal(plot.errors, result.height_sigma)
 
 
-def test_what_has_no_height_is_shown_by_its_azimuth_in_radians(seen, tmp_path):
-    result = made_up(*OF_A_WAVE)
-    io.save_result(result, tmp_path / "res.h5")
-    plot = seen(tmp_path / "res.h5")
-    assert_shows(plot, "azimuth", "rad", result.azimuth, PLACES)
-    assert plot.errors is None
-
-
 def test_each_turn_is_a_picture_of_a_stack(seen, tmp_path):
     result = made_up(*OF_A_ROTATION, turns=(3,))
     io.save_result(result, tmp_path / "res.h5")
     turns = ("turn", None, range(3))
     assert_shows(seen(tmp_path / "res.h5"), "height", "mm", result.height, [turns, *PLACES])
-
-
-def test_without_a_pixel_size_heights_are_shown_over_pixels(seen, tmp_path):
-    result = replace(made_up(*OF_A_PRESS), x=None, y=None)
-    io.save_result(result, tmp_path / "res.h5")
-    assert_shows(seen(tmp_path / "res.h5"), "height", "mm", result.height, [NONE, NONE])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from stacks import MadeUp, ball, read_all
 
 from mirrorskin import engine, io
 from mirrorskin.io.atomic import remove_leftovers
-from mirrorskin.io.growing import GrowingRecording
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 
@@ -101,32 +100,6 @@ def test_kill_loses_at_most_the_last_second(tmp_path, packing):
         assert recording.time[-1] > at - 2.0  # a period of 0.1 s, and whatever keeps this machine busy
     remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def growing(path, frames, **given):
-    """Make a recording of so many frames that nobody finishes."""
-    source = Feed(max(frames, 1), (max(frames, 1),), **given)
-    with path.open("w+b") as file:
-        made = GrowingRecording(path, file.fileno(), source.header, source.shape, source.dtype, "raw")
-        with made:
-            if frames:
-                made.append(source.read())
-            made.flush()
-    return path
-
-
-@pytest.mark.parametrize("shorter", ["data", "frame_time", "used", "dropped", "travel_live"])
-def test_what_is_short_of_something_is_left_out(tmp_path, shorter):
-    path = growing(tmp_path / "a.h5", 9)
-    with h5py.File(path, "r+") as file:
-        group = file[STAGE if shorter == "travel_live" else DETECTOR]
-        group[shorter].resize(6, axis=0)
-    with io.open_recording(path) as recording:
-        assert recording.shape == recording.full_shape == (6, *SHAPE)
-        assert hold(recording) == 6
-        assert recording.state == "cut short: its writer was killed"
-    with pytest.raises(io.InputError, match="frames 2 to 7 of 6"):
-        io.open_recording(path, frames=(2, 7))
 
 
 # What a live run used, where it thought the body was.

@@ -204,14 +204,6 @@ def test_no_scheduler_is_refused(recordings, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scheduler_without_workers_is_refused(recordings, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE", 0.3)
-    with start(0) as running:
-        message = refusal(make_jobs(recordings, tmp_path), running.scheduler_address)
-    assert f"no workers for 0.3 s: start some with 'dask worker {running.scheduler_address}'" in message
-
-
-@pytest.mark.slow
 def test_a_cluster_that_goes_away_is_told(recordings, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PATIENCE", 1.0)
     with start(1) as running:
@@ -263,10 +255,6 @@ def test_a_trace_is_no_leftover_and_leaves_none(tmp_path):
         assert remove_leftovers(tmp_path) == []
         assert trace.exists()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_batch_of_nothing_needs_nobody():
-    assert list(run_cluster([], PLAN, "tcp://127.0.0.1:1")) == []
 
 
 def test_what_keeps_a_worker_from_taking_part(tmp_path, monkeypatch):

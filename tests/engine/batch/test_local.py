@@ -29,13 +29,6 @@ def jobs(tmp_path):
     return make_jobs([press(tmp_path / f"{name}.h5") for name in "abcd"], tmp_path / "out")
 
 
-def test_all_jobs_are_done(jobs, device):
-    outcomes = list(run_local(jobs, Plan(), [device]))
-    assert [one.job for one in outcomes] == jobs
-    assert {one.state for one in outcomes} == {"done"}
-    assert {one.state for one in run_local(jobs, Plan(), [device])} == {"kept"}
-
-
 def test_several_devices_work_at_the_same_time(jobs):
     devices = [Device(device_layer._find()[0]) for _ in range(2)]
     met = threading.Barrier(2)

@@ -116,18 +116,6 @@ def test_a_png_tells_gwyddion_what_it_asks_for(slope, tmp_path):
     )
 
 
-def test_a_png_says_where_it_comes_from(slope, tmp_path):
-    path = tmp_path / "out.png"
-    io.export_result(slope, path)
-    with Image.open(path) as picture:
-        texts = picture.text
-    assert texts["Title"] == "Münze 五円.h5"
-    assert texts["Software"] == "mirrorskin 1.2.3"
-    assert texts["Creation Time"] == "2026-01-02T03:04:05+00:00"
-    assert texts["heights"] == "from the sheet at rest"
-    assert texts["pixel size"] == "0.5 0.25 mm"
-
-
 @pytest.mark.parametrize("suffix", ["png", "tif"])
 def test_heights_that_are_all_one_come_back(tmp_path, suffix):
     path = tmp_path / f"out.{suffix}"

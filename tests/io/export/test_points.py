@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import trimesh
 
 from mirrorskin import io
@@ -40,15 +39,3 @@ def test_text_is_one_line_a_point_and_names_its_columns(slope, tmp_path):
     # What has no normal says so, and does not get one from its neighbours.
     assert np.isnan(table[0, 3:6]).all()
     assert np.isnan(table[:, 6]).sum() == 1
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (6, 9)])
-def test_text_of_any_size_is_whole(shape, tmp_path):
-    path = tmp_path / "out.xyz"
-    x, y = io.pixel_axes(shape, (0.5, 0.25))
-    height = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    height[0, 1:2] = np.nan
-    told = io.export_result(io.Result(height=height, x=x, y=y), path)
-    assert told == f"{np.isfinite(height).sum()} points"
-    table = np.loadtxt(path, ndmin=2)
-    np.testing.assert_allclose(table[:, 2], height[np.isfinite(height)], atol=0.51e-6)
