@@ -37,14 +37,9 @@ _ITERATIONS = 5  # of where the intervals lift a component
 
 @dataclass(frozen=True, slots=True)
 class PressHeights:
-    """Heights of a press.
+    """Heights of a press."""
 
-    Attributes
-    ----------
-    height, sigma : ndarray, (H, W), float64
-        Millimetres, and their standard deviations; NaN where unknown.
-    """
-
+    # (H, W), float64: millimetres, and their standard deviations; NaN where unknown.
     height: Doubles
     sigma: Doubles
 
@@ -71,23 +66,8 @@ class PressHeights:
 class FusionSolver:
     """Integrates heights and slopes in three passes: as given, with the slopes of heights, with intervals.
 
-    Parameters
-    ----------
-    press : PressHeights
-    slopes : Slopes
-        On the same pixels.
-    pixel_size : float or (float, float)
-        Millimetres along x and y.
-    robust : bool
-        Whether the surface may break, at discontinuities that are found in it.
-    device : Device
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is neither a height nor a slope, or the pixel size cannot be.
-    mirrorskin.engine.NotConverged
-        A surface was not found.
+    InputError where there is neither a height nor a slope, or the pixel size cannot be; NotConverged where a
+    surface was not found.
     """
 
     def __init__(

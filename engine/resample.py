@@ -17,30 +17,14 @@ _ROUNDING = 1e-6  # of a pixel: places nearer than that are the pixel's own
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
-    """Places in a picture, and the four pixels around each.
+    """Places in a picture, and the four pixels around each."""
 
-    Attributes
-    ----------
-    pixels : ndarray, (4, n), intp
-        Numbers of the pixels, row by row; any where the share is 0.
-    shares : ndarray, (4, n), float64
-        Bilinear weights; 0 of pixels outside the picture.
-    nearest : ndarray, (n,), intp
-        Number of the nearest pixel; any where it is outside.
-    closest : ndarray, (n,), intp
-        Which of the four that is.
-    inside : ndarray, (n,), bool
-        Whether the nearest pixel is in the picture.
-    whole : ndarray, (n,), bool
-        Whether all four are.
-    """
-
-    pixels: NDArray[np.intp]
-    shares: Doubles
-    nearest: NDArray[np.intp]
-    closest: NDArray[np.intp]
-    inside: Mask
-    whole: Mask
+    pixels: NDArray[np.intp]  # (4, n), intp: numbers of the pixels, row by row; any where the share is 0
+    shares: Doubles  # (4, n), float64: bilinear weights; 0 of pixels outside the picture
+    nearest: NDArray[np.intp]  # (n,), intp: number of the nearest pixel; any where it is outside
+    closest: NDArray[np.intp]  # (n,), intp: which of the four that is
+    inside: Mask  # (n,), bool: whether the nearest pixel is in the picture
+    whole: Mask  # (n,), bool: whether all four are
 
     @classmethod
     def at(cls, column: ArrayLike, row: ArrayLike, shape: tuple[int, int]) -> Spots:

@@ -29,40 +29,27 @@ class Links:
     """The normal equations A u = b of a weighted least-squares problem on the pixels' graph, on the device.
 
     The sum is that of w (u_j - u_i - d)^2 over links and a (u_i - k_i)^2 over known heights.
-
-    Attributes
-    ----------
-    device : Device
-    shape : (int, int)
-        Rows and columns.
-    right, down : Array, (H, W), float32
-        Weight w of the link to the pixel on the right, and to the one below; 0 where there is none.
-    anchor : Array, (H, W), float32, or None
-        Weight a of a known height; 0 where there is none. None without any.
-    source : Array, (H, W), float32
-        Right side b: of each pixel the sum of -w d over links that leave it and w d over those that end in
-        it, and a k.
     """
 
     device: Device
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns
+    # (H, W), float32: weight w of the link to the pixel on the right, and to the one below; 0 where there is
+    # none.
     right: Array
     down: Array
+    # (H, W), float32: weight a of a known height; 0 where there is none. None without any.
     anchor: Array | None
+    # (H, W), float32: right side b: of each pixel the sum of -w d over links that leave it and w d over those
+    # that end in it, and a k.
     source: Array
 
 
 class PixelGraph:
     """A picture's maps on a device and the links that they make; memory is kept for the next picture.
 
-    Attributes
-    ----------
-    scale : float
-        The weights are multiplied by it, to be about 1.
-    flags : Array, (H, W), uint8
-        What the pixels are; see ``mirrorskin.kernels.links``.
-    known_heights : dict of Array, (H, W), float32
-        Known heights above the inputs' datum, and their weights; empty without any.
+    ``flags`` say what the pixels are (see ``mirrorskin.kernels.links``), ``known_heights`` are maps of
+    heights above the inputs' datum and of their weights, or empty. Weights are multiplied by ``scale``, to be
+    about 1.
     """
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
@@ -206,18 +193,11 @@ def _weighted(links: Links | None) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """The connected components of a surface.
+    """The connected components of a surface."""
 
-    Attributes
-    ----------
-    labels : ndarray, (H, W), int32
-        Numbered in reading order of their first pixels; -1 where there is no answer.
-    offset_unknown : ndarray, (components,), bool
-        Whether a component has no known height.
-    """
-
+    # (H, W), int32: numbered in reading order of their first pixels; -1 where there is no answer.
     labels: Labels
-    offset_unknown: NDArray[np.bool_]
+    offset_unknown: NDArray[np.bool_]  # (components,), bool: whether a component has no known height
 
     @property
     def count(self) -> int:

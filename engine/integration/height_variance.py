@@ -47,21 +47,10 @@ def find_sigma(
 ) -> Floats:
     """Return the expected standard deviation of heights, (H, W), mm; NaN where there is no answer.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    graph : PixelGraph
-        With these inputs; its slopes and known heights are overwritten.
-    levelling : Levelling
-    labels : ndarray, (H, W), int32
-        Of the components.
-    solve : callable
-        Returns heights, of low accuracy, for what ``graph`` holds by then.
-    links : Links or None
-        With weights of their own.
-    misfit : float or None
-        Of the slopes themselves: their weights are then relative, and all are as noisy as they fit worse than
-        noise of variance 1. None where weights are inverse variances.
+    ``solve`` returns heights, of low accuracy, for what ``graph`` holds by then: it has these inputs, and its
+    slopes and known heights are overwritten. ``links`` have weights of their own. ``misfit`` is that of the
+    slopes themselves, whose weights are then relative: all are as noisy as they fit worse than noise of
+    variance 1. It is None where weights are inverse variances.
     """
     noise = _Noise(inputs, graph, labels)
 

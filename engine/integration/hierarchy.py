@@ -31,20 +31,13 @@ class Rows:
 
 @dataclass(slots=True)
 class ExtraRows:
-    """What the extra nodes of one level need.
+    """What the extra nodes of one level need."""
 
-    Attributes
-    ----------
-    nodes : Rows
-        The level's nodes without a place in its grid, up to a multiple of `WIDTH`.
-    graph : Rows
-        The level's own links, of all nodes that are extra or linked with one.
-    restrict, prolong : Rows
-        To the next level's split aggregates, and from them.
-    """
-
+    # The level's nodes without a place in its grid, up to a multiple of `WIDTH`.
     nodes: Rows = field(default_factory=Rows)
+    # The level's own links, of all nodes that are extra or linked with one.
     graph: Rows = field(default_factory=Rows)
+    # To the next level's split aggregates, and from them.
     restrict: Rows = field(default_factory=Rows)
     prolong: Rows = field(default_factory=Rows)
 
@@ -52,29 +45,11 @@ class ExtraRows:
 class Hierarchy:
     """All levels of a graph.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the picture.
-    anchored : bool
-        Whether there are known heights.
-    device : Device
-
-    Attributes
-    ----------
-    levels : list of Level
-    in_grids, nodes : int
-        Nodes of all grids, behind which the extra ones lie, and room for all of them.
-    graph : dict of Array, float32
-        Links right and down, and known heights' weights as anchor; see ``kernels/multigrid.cl``.
-    inverse : Array, float32
-        One over the diagonal.
-    extra : list of ExtraRows
-        One a level.
-    table : dict of Array
-        Their rows' nodes, where each begins and the last ends, and of their entries the nodes and weights.
-    bottom : (Array, Array)
-        Nodes of the coarsest level, and the pseudo-inverse of its matrix.
+    ``in_grids`` nodes have a place in a level's grid, the extra ones lie behind them, and there is room for
+    ``nodes``. ``graph`` has their links right and down, and known heights' weights as anchor (see
+    ``kernels/multigrid.cl``); ``inverse`` is one over the diagonal. ``table`` has the rows for extra nodes,
+    which ``extra`` counts level by level: the rows' nodes, where each begins and the last ends, and of their
+    entries the nodes and weights. ``bottom`` has the coarsest level's nodes and the pseudo-inverse.
     """
 
     def __init__(self, shape: tuple[int, int], anchored: bool, device: Device) -> None:

@@ -10,21 +10,12 @@ _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A grid of nodes among others in one array; see ``kernels/multigrid.cl``.
+    """A grid of nodes among others in one array; see ``kernels/multigrid.cl``."""
 
-    Attributes
-    ----------
-    base : int
-        Where it begins.
-    rows, columns : int
-    stride : int
-        Nodes from one row to the next.
-    """
-
-    base: int
+    base: int  # where it begins
     rows: int
     columns: int
-    stride: int
+    stride: int  # nodes from one row to the next
 
     @property
     def nodes(self) -> int:

@@ -32,35 +32,23 @@ _CHIRP_COST = 4.5  # of a transform by convolution, in those of a smooth length
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Tables for the transforms of lines of one length, in the order in which the kernels take them.
+    """Tables for the transforms of lines of one length, in the order in which the kernels take them."""
 
-    Attributes
-    ----------
-    length : int
-        Points of a line.
-    size : int
-        Points of the Fourier transform that does it: as many, or those of a convolution.
-    steps : ndarray, (S, 3), int32
-        Of each step its radix, the distance of the points that it adds, and where its factors begin.
-    factors : ndarray, (N,), float64
-        Of all steps: an odd radix' roots of 1, and the factors between the steps; real and imaginary parts.
-    place : ndarray, (modes, 2), int32
-        Where modes k and length - k come out.
-    turns : ndarray, (modes, 2), float64
-        Cosine and sine of k's quarter turns, pi k / (2 length).
-    chirp : ndarray, (length, 2), float64
-        What points and modes are multiplied by for a convolution; empty where there is none.
-    other : ndarray, (size, 2), float64
-        Fourier transform of the other factor of the convolution, in the order of the modes; or empty.
-    """
-
-    length: int
-    size: int
+    length: int  # points of a line
+    size: int  # points of the Fourier transform that does it: as many, or those of a convolution
+    # (S, 3), int32: of each step its radix, the distance of the points that it adds, and where its factors
+    # begin.
     steps: Whole
+    # (N,), float64: of all steps: an odd radix' roots of 1, and the factors between the steps; real and
+    # imaginary parts.
     factors: Doubles
-    place: Whole
-    turns: Doubles
+    place: Whole  # (modes, 2), int32: where modes k and length - k come out
+    turns: Doubles  # (modes, 2), float64: cosine and sine of k's quarter turns, pi k / (2 length)
+    # (length, 2), float64: what points and modes are multiplied by for a convolution; empty where there is
+    # none.
     chirp: Doubles
+    # (size, 2), float64: fourier transform of the other factor of the convolution, in the order of the modes;
+    # or empty.
     other: Doubles
 
 
@@ -258,22 +246,10 @@ def are_rows_easier(shape: tuple[int, int], *, side_by_side: bool) -> bool:
 def find_rates(
     length: int, lines: int, along: float, across: float, screening: float
 ) -> tuple[NDArray[np.int32], Doubles, Doubles]:
-    """Return the elimination of all modes' tridiagonal systems; see ``rectangle_columns``.
+    """Return the elimination of all modes' tridiagonal systems as ``rectangle_columns`` takes it.
 
-    Parameters
-    ----------
-    length, lines : int
-        Points of a line, and lines.
-    along, across : float
-        Weights of the links along lines and across them.
-    screening : float
-        On the diagonal.
-
-    Returns
-    -------
-    reach : ndarray, (strips, 2), int32
-    fading : ndarray, (N, 16)
-    ends : ndarray, (strips, 16)
+    Of each strip of modes where its rates begin and how many there are, the rates, and those of the last
+    line; for lines of a length, with weights of the links along and across them.
     """
     low = np.arange(-(-(length // 2 + 1) // HALF) * HALF).reshape(-1, HALF)
     mode = np.clip(np.concatenate([low, length - low], axis=1), 0, length)

@@ -30,36 +30,19 @@ _ROUGH, _REST = 1e-3, 1e-6  # parts of the energy; to fall by less is to rest: a
 
 @dataclass(frozen=True, slots=True)
 class Robust:
-    """Heights of a surface that may break, and where it does.
+    """Heights of a surface that may break, and where it does."""
 
-    Attributes
-    ----------
-    relief : Array, (H, W), float32
-        Heights above the plane, mm; meaningless where there is no pixel.
-    links : Links
-        The graph that they solve, with the final weights.
-    flags : ndarray, (H, W), uint8
-        Those given, without links whose weight is 0 now.
-    edges : ndarray, (H, W), uint8
-        1 on either side of a discontinuity.
-    energies : tuple of float
-        Energy of the heights that the best descent began with, and after each of its steps.
-    iterations : int
-        Steps of all descents.
-    residual : float
-        Norm of b - A u, of the links' final weights, over that of b; times the solver's own residual, if a
-        last solution was needed.
-    converged : bool
-        Whether the energy is stationary, and the residual within the tolerance or too small to lower it.
-    """
-
-    relief: Array
-    links: Links
-    flags: Flags
-    edges: Flags
+    relief: Array  # (H, W), float32: heights above the plane, mm; meaningless where there is no pixel
+    links: Links  # the graph that they solve, with the final weights
+    flags: Flags  # (H, W), uint8: those given, without links whose weight is 0 now
+    edges: Flags  # (H, W), uint8: 1 on either side of a discontinuity
+    # Energy of the heights that the best descent began with, and after each of its steps.
     energies: tuple[float, ...]
-    iterations: int
+    iterations: int  # steps of all descents
+    # Norm of b - A u, of the links' final weights, over that of b; times the solver's own residual, if a last
+    # solution was needed.
     residual: float
+    # Whether the energy is stationary, and the residual within the tolerance or too small to lower it.
     converged: bool
 
 
@@ -110,26 +93,11 @@ def solve_robust(
     - Creases err towards their flatter side by s^3 / (2 (2 + s^2)) pixels, s the slope on the other: 0.07 at
       35 degrees. It is how the energy counts, and 2 % of a step of 7 pixels with two creases.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    links : Links
-        Of heights above the plane; only these can be cut.
-    flags : ndarray, (H, W), uint8
-        What the pixels are; see ``mirrorskin.kernels.links``.
-    plane : (float, float, float)
-        What heights are relative to, besides the inputs' datum.
-    sharpness : float
-        k, 1/pixel^2: a link is cut where it misses the slopes by well above the square root of 1 / k, seen
-        across the surface.
-    start : ndarray, (H, W), optional
-        Heights above the plane, mm: the only start then.
-    tolerance : float
-        Residual of the least squares that the last weights make.
-    limit : int
-        Of the steps of a descent.
-    deadline : float, optional
-        Of ``time.perf_counter``: no step is begun after it.
+    ``links`` are of heights above the plane; only these can be cut. ``sharpness`` is k, 1/pixel^2: a link is
+    cut where it misses the slopes by well above the square root of 1 / k, seen across the surface. ``start``,
+    heights above the plane, is the only start where it is given. ``tolerance`` is the residual of the least
+    squares that the last weights make; a descent ends after ``limit`` steps, or at the ``deadline``, of
+    ``time.perf_counter``.
     """
     search = _Search(_Bound(inputs, links, flags, plane), limit, deadline)
     starts = [(search.given(start), 1.0)] if start is not None else search.starts()

@@ -57,21 +57,11 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class ExtraNodes:
-    """Nodes of one level without a place in its grid.
+    """Nodes of one level without a place in its grid."""
 
-    Attributes
-    ----------
-    node : ndarray, (n,), int64
-        Consecutive numbers.
-    block : ndarray, (n, 2), int64
-        Row and column of the block that each belongs to.
-    links : Pairs
-        Each link once that has such a node at an end.
-    """
-
-    node: Ints
-    block: Ints
-    links: Pairs
+    node: Ints  # (n,), int64: consecutive numbers
+    block: Ints  # (n, 2), int64: row and column of the block that each belongs to
+    links: Pairs  # each link once that has such a node at an end
 
     @classmethod
     def none(cls) -> ExtraNodes:
@@ -168,25 +158,15 @@ class Lookup:
 
 @dataclass(frozen=True, slots=True)
 class Coarsening:
-    """How one level goes over into the next where aggregates are split.
+    """How one level goes over into the next where aggregates are split."""
 
-    Attributes
-    ----------
-    extra : ExtraNodes
-        Of the coarse level.
-    blocks : ndarray, (n,), int64
-        Nodes of the coarse grid whose blocks are split.
-    members : (ndarray, ndarray), (m,), int64
-        Fine nodes in split blocks, and the coarse ones that they belong to.
-    restrict, prolong, graph : Pairs
-        Complete rows of sparse matrices: from coarse nodes to the fine ones that restriction takes, from fine
-        nodes to the coarse ones that prolongation takes, and from coarse nodes that are extra or linked with
-        one to all that they are linked with.
-    """
-
-    extra: ExtraNodes
-    blocks: Ints
+    extra: ExtraNodes  # of the coarse level
+    blocks: Ints  # (n,), int64: nodes of the coarse grid whose blocks are split
+    # (ndarray), (m,), int64: fine nodes in split blocks, and the coarse ones that they belong to.
     members: tuple[Ints, Ints]
+    # Complete rows of sparse matrices: from coarse nodes to the fine ones that restriction takes, from fine
+    # nodes to the coarse ones that prolongation takes, and from coarse nodes that are extra or linked with
+    # one to all that they are linked with.
     restrict: Pairs
     prolong: Pairs
     graph: Pairs
@@ -204,20 +184,9 @@ class Coarsening:
     ) -> Coarsening:
         """Split aggregates, and correct the coarse grid's links around them in place.
 
-        Parameters
-        ----------
-        fine : Grid
-        extra : ExtraNodes
-            Of the fine level.
-        changed : ndarray, (n,), int64
-            Nodes of the fine grid whose links are others than the device's pass knew.
-        coarse : Grid
-            As the device's pass left it.
-        split : ndarray, (n,), int64
-            Nodes of the coarse grid whose blocks have several parts by their links in the grid.
-        following : int
-            Number of the first extra node of the coarse level.
-        lookup : Lookup
+        ``extra`` are the fine level's, ``changed`` the nodes of the fine grid whose links are others than the
+        device's pass knew, ``split`` the nodes of the coarse grid whose blocks have several parts by their
+        links in the grid, and ``following`` the number of the first extra node of the coarse level.
         """
         blocks = split
         if len(extra.node) or len(changed):

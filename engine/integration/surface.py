@@ -86,24 +86,13 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
-    """How near a solver comes, and what it tells besides.
+    """How near a solver comes, and what it tells besides."""
 
-    Attributes
-    ----------
-    tolerance : float or None
-        Of the residual; None: as near as two cycles get.
-    deadline : float or None
-        Of ``time.perf_counter``; where there is one, no tolerance must be met.
-    sharpness : float or None
-        Of the bilateral weights that look for discontinuities; None where none are looked for.
-    sigma : bool
-        Whether to estimate the heights' standard deviation.
-    """
-
-    tolerance: float | None = None
-    deadline: float | None = None
+    tolerance: float | None = None  # of the residual; None: as near as two cycles get
+    deadline: float | None = None  # of ``time.perf_counter``; where there is one, no tolerance must be met
+    # Of the bilateral weights that look for discontinuities; None where none are looked for.
     sharpness: float | None = None
-    sigma: bool = False
+    sigma: bool = False  # whether to estimate the heights' standard deviation
 
 
 @dataclass(frozen=True, slots=True)

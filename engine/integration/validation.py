@@ -23,44 +23,27 @@ _SAMPLES = 65536  # pixels that the median is taken of
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Maps of one size, (H, W), and numbers, fit to be integrated.
+    """Maps of one size, (H, W), and numbers, fit to be integrated."""
 
-    Attributes
-    ----------
-    dz_dx, dz_dy : ndarray, (H, W), float32
-    pixel_size : (float, float)
-        Width and height, mm.
-    mask, edges : ndarray, (H, W), uint8, or None
-    weight_x, weight_y : ndarray, (H, W), float32, or None
-        ``weight_y`` is None where it is ``weight_x``; both are where all have the same.
-    weight : float
-        That same weight, else 1.
-    typical_weight : float
-        The median weight.
-    weights_given : bool
-        Whether the weights of the slopes were given, and are to be taken for inverse variances.
-    known_heights, known_height_weights : ndarray, (H, W), float32, or None
-        Heights relative to ``datum``; weights None where all have the same.
-    known_height_weight : float
-        That same weight, else 1.
-    datum : float
-        What the known heights are relative to, mm.
-    """
-
+    # (H, W), float32
     dz_dx: Floats
     dz_dy: Floats
-    pixel_size: tuple[float, float]
+    pixel_size: tuple[float, float]  # width and height, mm
+    # (H, W), uint8
     mask: Flags | None = None
     edges: Flags | None = None
+    # (H, W), float32: ``weight_y`` is None where it is ``weight_x``; both are where all have the same.
     weight_x: Floats | None = None
     weight_y: Floats | None = None
-    weight: float = 1.0
-    typical_weight: float = 1.0
+    weight: float = 1.0  # that same weight, else 1
+    typical_weight: float = 1.0  # the median weight
+    # Whether the weights of the slopes were given, and are to be taken for inverse variances.
     weights_given: bool = True
+    # (H, W), float32: heights relative to ``datum``; weights None where all have the same.
     known_heights: Floats | None = None
     known_height_weights: Floats | None = None
-    known_height_weight: float = 1.0
-    datum: float = 0.0
+    known_height_weight: float = 1.0  # that same weight, else 1
+    datum: float = 0.0  # what the known heights are relative to, mm
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -29,25 +29,16 @@ _NEAR = 0.03  # residual from which on down the heights' energy is known well en
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """What a solver found.
+    """What a solver found."""
 
-    Attributes
-    ----------
-    height : Array, (H, W), float32
-        On the device, until the next solution; a component without an anchor has an arbitrary offset.
-    iterations : int
-        Cycles that were done.
-    residual : float
-        Norm of the error over that of the heights, both as u A u has it, so of slopes and anchors by their
-        weights.
-    converged : bool
-        Whether the residual is within the tolerance; without one, whether it is below 0.3.
-    """
-
+    # (H, W), float32: on the device, until the next solution; a component without an anchor has an arbitrary
+    # offset.
     height: Array
-    iterations: int
+    iterations: int  # cycles that were done
+    # Norm of the error over that of the heights, both as u A u has it, so of slopes and anchors by their
+    # weights.
     residual: float
-    converged: bool
+    converged: bool  # whether the residual is within the tolerance; without one, whether it is below 0.3
 
 
 class Multigrid:
@@ -214,17 +205,9 @@ class VCycle:
     transfers. Three of the coarser levels are gone through twice, which mends what coarsening does to cuts.
     Of levels without extra links half a cycle is one pass, and all small levels together are one.
 
-    Attributes
-    ----------
-    b, x : Array, (nodes,), float32
-        Of all levels, the right side and the answer.
-    full_b : Array, (nodes,), float32
-        The right side of full multigrid.
-    twice : bool
-        Whether coarser levels are gone through twice. Where their answers are more than twice too large, as
-        in a comb, that is not positive definite any more.
-    parts, parts_filled : Array, int
-        Parts of the product of the finest level's right side and answer, and how many there are.
+    Of all nodes ``b`` and ``x`` are the right side and the answer, ``full_b`` the right side of full
+    multigrid. ``twice`` says whether coarser levels are gone through twice: where their answers are more than
+    twice too large, as in a comb, that is not positive definite any more.
     """
 
     def __init__(self, hierarchy: Hierarchy) -> None:

@@ -57,23 +57,13 @@ class Form(Protocol):
 
 
 class Fit(NamedTuple):
-    """A form that fits, and how well.
+    """A form that fits, and how well."""
 
-    Attributes
-    ----------
-    parameters : ndarray, (k,), float64
-    covariance : ndarray, (k, k), float64
-        NaN where points are too few.
-    kept : ndarray, (n,), bool
-        False of outliers.
-    birge : float
-        Birge's ratio: root mean square of the weighted residuals over that by the standard deviations; much
-        more than 1 if the surface is not of this form. NaN where these are unknown.
-    """
-
-    parameters: Doubles
-    covariance: Doubles
-    kept: Mask
+    parameters: Doubles  # (k,), float64
+    covariance: Doubles  # (k, k), float64: naN where points are too few
+    kept: Mask  # (n,), bool: false of outliers
+    # Birge's ratio: root mean square of the weighted residuals over that by the standard deviations; much
+    # more than 1 if the surface is not of this form. NaN where these are unknown.
     birge: float
 
     def sigma(self, *direction: float) -> float:
@@ -85,21 +75,11 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """The known points of a height map.
+    """The known points of a height map."""
 
-    Attributes
-    ----------
-    points : ndarray, (3, n), float64
-        Millimetres.
-    sigma : ndarray, (n,), float64
-        Standard deviations of their heights, mm; all NaN where there are none.
-    where : ndarray, (H, W), bool
-        Which pixels they are.
-    """
-
-    points: Doubles
-    sigma: Doubles
-    where: Mask
+    points: Doubles  # (3, n), float64: millimetres
+    sigma: Doubles  # (n,), float64: standard deviations of their heights, mm; all NaN where there are none
+    where: Mask  # (H, W), bool: which pixels they are
 
     @classmethod
     def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> PointCloud:

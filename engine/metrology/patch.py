@@ -16,43 +16,25 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """Heights to measure, in a rectangle of the picture.
+    """Heights to measure, in a rectangle of the picture."""
 
-    Attributes
-    ----------
-    height, filled : ndarray, (H, W), float64
-        Millimetres where heights were measured, or where they were filled, else NaN.
-    sigma : ndarray, (H, W), float64, or None
-        Standard deviations of the measured heights, mm.
-    contact : ndarray, (H, W), bool
-        Where the object was touched: as the result has it (``contact_given``), else where there is a height,
-        filled ones too.
-    secant : ndarray, (H, W), float64, or None
-        Surface for each area of the picture, from the normals; NaN where they are unknown.
-    normal_sigma : ndarray, (H, W), float64, or None
-        Standard deviations of the normals, radians.
-    x, y : ndarray, (W,) and (H,), float64
-        Millimetres of the pixel centres.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    absolute : bool
-        Whether heights are above the sheet's rest plane; else above the mean of their component.
-    notes : tuple of str
-        What was left out.
-    """
-
+    # (H, W), float64: millimetres where heights were measured, or where they were filled, else NaN.
     height: Doubles
     filled: Doubles
-    sigma: Doubles | None
+    sigma: Doubles | None  # (H, W), float64: standard deviations of the measured heights, mm
+    # (H, W), bool: where the object was touched: as the result has it (``contact_given``), else where there
+    # is a height, filled ones too.
     contact: Mask
     contact_given: bool
+    # (H, W), float64: surface for each area of the picture, from the normals; NaN where they are unknown.
     secant: Doubles | None
-    normal_sigma: Doubles | None
+    normal_sigma: Doubles | None  # (H, W), float64: standard deviations of the normals, radians
+    # (W,) and (H,), float64: millimetres of the pixel centres.
     x: Doubles
     y: Doubles
-    pixel_size: tuple[float, float]
-    absolute: bool
-    notes: tuple[str, ...]
+    pixel_size: tuple[float, float]  # millimetres along x and y
+    absolute: bool  # whether heights are above the sheet's rest plane; else above the mean of their component
+    notes: tuple[str, ...]  # what was left out
 
     @property
     def measured(self) -> Mask:
