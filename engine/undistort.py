@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -83,7 +82,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     are those of the nearest pixel. What the camera did not see is NaN, 0, and in no component. Where a place
     is a pixel's own to a millionth, its value is taken as it is.
 
-    Vectors are made unit again. They are not turned: a normal was told from brightness, in the directions of
+    Vectors are made unit again. They are not turned: a normal came from brightness, in the directions of
     the sensor's light, and not from where it lies in the picture; it is only shown elsewhere. The axes of the
     map run as those of the picture do at its centre. Zenith and azimuth are those of the vectors; without
     vectors, azimuths are interpolated the short way round.
@@ -116,54 +115,32 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     if result.process.get(UNDISTORTED):
         raise InputError("these maps were undistorted before, which is done once: take them as they are")
     maps = result.maps()
-    (row, column), (rows, columns) = _part(result, maps, lens, origin)
-    across, up = pixel_axes(lens.shape, lens.pixel_size)
-    x, y = across[column : column + columns], up[row : row + rows]
-    made = {name: np.empty_like(values) for name, values in maps.items()}
-    for band in _bands(rows, columns):
-        seen = picture_places(lens, *np.meshgrid(x, y[band]))
-        spots = Spots.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
-        for turn in _turns(maps):
-            found = _resampled({name: values[turn] for name, values in maps.items()}, spots)
-            for name, values in found.items():
-                room = made[name][turn][band]
-                room[...] = values.reshape(room.shape)
-    told: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
-    return replace(result, **told)
-
-
-def _part(
-    result: Result, maps: Maps, lens: Lens, origin: tuple[int, int] | None
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the first pixel of the maps in the full picture, and their size."""
     if not maps:
         raise InputError("there are no maps to undistort: reconstruct first")
-    rows, columns = _size(maps)[-2:]
-    told = source_region(result.process)
-    row, column = (told.origin if told else (0, 0)) if origin is None else origin
+    name, values = next(iter(maps.items()))
+    *turns, rows, columns = values.shape[:-1] if name == "normals" else values.shape
+    region = source_region(result.process)
+    row, column = (region.origin if region else (0, 0)) if origin is None else origin
     if min(row, column) < 0 or row + rows > lens.shape[0] or column + columns > lens.shape[1]:
         raise InputError(
             f"maps of {columns} x {rows} pixels from column {column}, row {row} on are not in the picture of "
             f"{lens.shape[1]} x {lens.shape[0]} that the lens is of: calibrate again"
         )
-    return (row, column), (rows, columns)
-
-
-def _size(maps: Maps) -> tuple[int, ...]:
-    """Return (H, W), or (turns, H, W)."""
-    name, values = next(iter(maps.items()))
-    return values.shape[:-1] if name == "normals" else values.shape
-
-
-def _turns(maps: Maps) -> Iterator[Any]:
-    """Yield what picks one picture of each map: all, or turn after turn."""
-    size = _size(maps)
-    yield from range(size[0]) if len(size) == 3 else [...]
-
-
-def _bands(rows: int, columns: int) -> Iterator[slice]:
-    step = max(1, _BAND // columns)
-    yield from (slice(first, min(first + step, rows)) for first in range(0, rows, step))
+    across, up = pixel_axes(lens.shape, lens.pixel_size)
+    x, y = across[column : column + columns], up[row : row + rows]
+    made = {name: np.empty_like(values) for name, values in maps.items()}
+    height = max(1, _BAND // columns)
+    for band in (slice(first, min(first + height, rows)) for first in range(0, rows, height)):
+        seen = picture_places(lens, *np.meshgrid(x, y[band]))
+        spots = Spots.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
+        turn: Any
+        for turn in range(turns[0]) if turns else [...]:
+            found = _resampled({name: values[turn] for name, values in maps.items()}, spots)
+            for name, values in found.items():
+                room = made[name][turn][band]
+                room[...] = values.reshape(room.shape)
+    changed: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
+    return replace(result, **changed)
 
 
 def _resampled(maps: Maps, spots: Spots) -> Maps:
@@ -186,13 +163,13 @@ def _resampled(maps: Maps, spots: Spots) -> Maps:
 
 
 def _directions(maps: Maps, normals: NDArray[np.float32], spots: Spots) -> Maps:
-    """Return the zenith and azimuth of vectors, if there were such maps; a pixel's own are kept."""
+    """Return those maps of zenith and azimuth that there were, of vectors; a pixel's own are kept."""
     x, y, z = normals.T
     across = np.hypot(x, y)
     level = np.where(across == 0, np.float32(np.nan), np.float32(0))
     angles = {"zenith": np.arctan2(across, z), "azimuth": np.arctan2(y, x) + level}
     return {
-        name: np.where(spots.alone, spots.labels(maps[name], np.nan), told)
-        for name, told in angles.items()
+        name: np.where(spots.alone, spots.labels(maps[name], np.nan), angle)
+        for name, angle in angles.items()
         if name in maps
     }

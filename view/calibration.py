@@ -41,7 +41,7 @@ _SHOWN = 1.0, 99.0  # per cent of the values that the colours tell apart
 
 
 def new_sheet(width: float, height: float) -> Figure:
-    """Return an empty figure, of so many inches, on which maps keep their colour bars beside them."""
+    """Return an empty figure, in inches, on which maps keep their colour bars beside them."""
     figure = new_figure(width, height)
     figure.set_layout_engine("compressed")
     return figure
@@ -61,9 +61,9 @@ def draw_pixels(
         low, high = low - 0.5, high + 0.5
     beyond = exceeded(known, low, high)
     draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
-    told = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
+    summary = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
     blue = "; blue: no answer" if 0 < known.size < shown.size else ""
-    axes.set(title=f"{title}\n{told}{blue}", xlabel="column (px)", ylabel="row (px)")
+    axes.set(title=f"{title}\n{summary}{blue}", xlabel="column (px)", ylabel="row (px)")
 
 
 _COLOURS = {
@@ -73,7 +73,7 @@ _COLOURS = {
     "saturated": "tab:orange",
     "several": "tab:purple",
 }
-_VISIBLE = 100  # dots in a row that can be told apart
+_VISIBLE = 100  # dots in a row that can be distinguished
 
 
 def draw_references(references: References) -> Figure:
@@ -318,8 +318,8 @@ def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> 
     draw_image(axes, errors.error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
     digits = 3 if errors.unit == "deg" else 4
     rms, bias = (round(float(value), digits) + 0.0 for value in (errors.whole.rms, errors.whole.bias))
-    told = f"RMS {rms:.{digits}f}, bias {bias:+.{digits}f} {errors.unit}"
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}\n{told}")
+    summary = f"RMS {rms:.{digits}f}, bias {bias:+.{digits}f} {errors.unit}"
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}\n{summary}")
 
 
 def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:

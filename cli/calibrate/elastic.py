@@ -107,7 +107,7 @@ def _report(output: Path, fit: GelFit, as_json: bool) -> None:
         print_json({"output": str(output), "gel": gel, "balls": fit.places, "untold": fit.undetermined})
         return
     sigma = gel.sigma
-    told = [
+    parts = [
         f"light from {math.degrees(gel.threshold):.2f} +- {math.degrees(sigma['threshold']):.2f} deg",
         *(
             f"{name} {getattr(gel, name):.3f} +- {sigma[name]:.3f} /mm"
@@ -117,7 +117,7 @@ def _report(output: Path, fit: GelFit, as_json: bool) -> None:
         f"met at a travel of {gel.travel_zero:.3f} +- {sigma['travel_zero']:.3f} mm",
         f"{gel.error:.3f} mm left",
     ]
-    typer.echo(f"{output}: {', '.join(told)}")
+    typer.echo(f"{output}: {', '.join(parts)}")
     for name in fit.undetermined:
         typer.echo(
             f"{name}: not determined by the presses, 0 is kept; press deeper, at more places or larger balls",

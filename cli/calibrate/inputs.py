@@ -123,7 +123,7 @@ def names_of(paths: Sequence[Path]) -> str:
 class Place(NamedTuple):
     """A recording that is to be taken."""
 
-    name: str  # what its file is told apart by: "dark", "ball-1"
+    name: str  # what its file is named by: "dark", "ball-1"
     prompt: str  # what the user is to do before: "put the ball at place 1 of 9"
     plan: Plan  # what the body does then
     frames: int = 1  # at each step of a plan in steps

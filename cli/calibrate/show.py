@@ -41,8 +41,14 @@ def command(
     rows = calibration_table(known)
     pictures = [] if output is None else calibration_figures(known, output)
     if as_json:
-        told = {"numbers": [row._asdict() for row in rows], "process": dict(known.process)}
-        print_json({"calibration": str(calibration), **told, "pictures": list(map(str, pictures))})
+        print_json(
+            {
+                "calibration": str(calibration),
+                "numbers": [row._asdict() for row in rows],
+                "process": dict(known.process),
+                "pictures": list(map(str, pictures)),
+            }
+        )
         return
     _print(str(calibration), rows)
     if output is not None:

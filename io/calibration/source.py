@@ -119,7 +119,7 @@ def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -
 
 
 class Calibrated:
-    """A source with the header and the phases that a calibration tells; frames are passed on untouched.
+    """A source with the header and the phases of a calibration; frames are passed on untouched.
 
     What else the source has (``travel``, ``region``, ``fingerprint`` ...) this has as well. A live source is
     not asked for its header before someone asks this, because that moves the stage.
@@ -206,7 +206,7 @@ class Calibrated:
         return self._turned(getattr(self.source, "phase", None))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the source's next frames, and tell their phases better; see ``Source.read``."""
+        """Read the source's next frames, with corrected phases; see ``Source.read``."""
         block = self.source.read(out)
         if block is None or block.phase is None:
             return block
@@ -221,11 +221,11 @@ class Calibrated:
         return cast(LiveSource, self.source).now()
 
     def positions(self) -> Mapping[str, Floats]:
-        """Return the positions of a live source, its phases told better."""
-        told = dict(cast(LiveSource, self.source).positions())
-        if "phase" in told:
-            told["phase"] = cast(Floats, self._turned(told["phase"]))
-        return told
+        """Return the positions of a live source, its phases corrected."""
+        positions = dict(cast(LiveSource, self.source).positions())
+        if "phase" in positions:
+            positions["phase"] = cast(Floats, self._turned(positions["phase"]))
+        return positions
 
     def __enter__(self) -> Self:
         self.source.__enter__()
@@ -244,8 +244,8 @@ class Calibrated:
         shape: tuple[int, ...] = getattr(self.source, "full_shape", self.source.shape)
         check_camera(self.whole, CameraId(camera, (shape[1], shape[2]), self.source.dtype), self.name)
 
-    def _check_sizes(self, told: tuple[float, float] | None) -> None:
-        size = told if self.whole.lens is None else self.whole.lens.pixel_size
+    def _check_sizes(self, known: Size | None) -> None:
+        size = known if self.whole.lens is None else self.whole.lens.pixel_size
         check_sizes(self.whole, size, self.name, _MEASURED[self.motion])
 
     def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:

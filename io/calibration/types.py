@@ -81,7 +81,7 @@ class CameraId:
     Attributes
     ----------
     name : str
-        As the rig file calls it; empty where that is not told.
+        As the rig file calls it; empty where unknown.
     shape : (int, int)
         Rows and columns of its full picture.
     dtype : dtype
@@ -176,8 +176,8 @@ class WallResponse:
 
     A pixel looks at (x, y) on the rest plane; X = x - x0, Y = y - y0. Its light is
     (E - dark) / ((bright - dark) V) with
-    V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2. ``kernels/response.py`` tells the light of
-    a normal.
+    V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2. ``kernels/response.py`` gives the light
+    of a normal.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ class WallResponse:
     shade : ndarray, (5,), float64
         s0 to s4, the shading of the picture.
     pattern : {"graded", "uniform"}
-        Whether the wall tells angles, or only a threshold.
+        Whether the wall gives angles, or only a threshold.
     zenith_sigma, azimuth_sigma : ndarray, (H, W), float32
         Radians: standard deviations of what the response says of zenith, and of azimuth times sin(zenith).
     parameters : tuple of str
@@ -237,7 +237,7 @@ class WallResponse:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Precession:
-    """How the body's axis goes round while the phase does.
+    """How the body's axis goes round with the phase.
 
     Attributes
     ----------
@@ -274,7 +274,7 @@ class Precession:
         Parameters
         ----------
         phase : ndarray, (n,), float64
-            Radians, as the recording tells them.
+            Radians, as the recording has them.
 
         Returns
         -------
@@ -293,7 +293,7 @@ class Precession:
         Parameters
         ----------
         phase : ndarray, (n,), float64
-            Radians, as the recording tells them.
+            Radians, as the recording has them.
         """
         even = self._angle(phase)
         along, across = self._ellipse(phase)
