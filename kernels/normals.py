@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 Array = NDArray[Any]
 Doubles = NDArray[np.float64]
@@ -324,6 +323,8 @@ def tell(samples: Samples, seen: Doubles, inside: NDArray[np.bool_]) -> tuple[Do
     in standard deviations and m the ratio of the normal distribution's density to its integral there, its
     pull is m and its information m (m + z).
     """
+    from scipy import special
+
     error = samples.zenith - seen
     clipped = samples.under | samples.over
     bound = (np.where(samples.under, 0.5, samples.top - 0.5) - samples.offset) * samples.per_count
