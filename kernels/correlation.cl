@@ -304,7 +304,8 @@ __kernel void correlation_keep(
 
 __kernel void correlation_window(
     __global const FRAME *restrict ring, const int count, const int pixels, const int stride,
-    __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine, OUT sine, OUT residual)
+    __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine_part, OUT sine_part,
+    OUT residual)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int low = base; low < end; low += CHUNK) {
@@ -314,6 +315,6 @@ __kernel void correlation_window(
         for (int t = 0; t < count; ++t)
             add(&sums, width, ring + (size_t)place[t] * stride + low, basis[3 * t], basis[3 * t + 1],
                 basis[3 * t + 2]);
-        solve(&sums, width, fit, mean + low, cosine + low, sine + low, residual + low);
+        solve(&sums, width, fit, mean + low, cosine_part + low, sine_part + low, residual + low);
     }
 }

@@ -8,9 +8,8 @@ floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,13 @@ _STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in ker
 _PIECE = 256  # frames whose tables a kernel gets at once
 _MAX_FRAMES = 2**23  # that integer sums can take
 _SUMS = {"total": "sum", "cosine": "cosine sum", "sine": "sine sum", "square": "square sum"}
-_ANSWERS = {"mean": "wave mean", "cosine": "wave cosine", "sine": "wave sine", "residual": "wave residual"}
+_PAIRS = {"reference": "reference", **_SUMS}
+_ANSWERS = {
+    "mean": "wave mean",
+    "cosine_part": "wave cosine",
+    "sine_part": "wave sine",
+    "residual": "wave residual",
+}
 """Maps of a band, by the arguments of kernels."""
 
 
@@ -290,21 +295,23 @@ class _Sums:
         kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
 
     def _answer(
-        self, name: str, moved: int, known: Callable[[Band], dict[str, Any]], **arguments: Any
+        self, name: str, moved: int, maps: Mapping[str, str], **arguments: Any
     ) -> list[NDArray[np.float32]]:
-        """Have a kernel turn what is known of each band into the answers."""
+        """Have a kernel turn maps of each band into the answers."""
         parts = []
         for band in self.bands:
+            known = {"fit": self._fit, **_maps_of(band, maps), **_maps_of(band, _ANSWERS), **arguments}
+            if "ring" in maps:
+                known["stride"] = band.stride
             with band.resident():
-                self._run(band, name, moved, **arguments, fit=self._fit, **known(band))
+                self._run(band, name, moved, **known)
                 parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
         return [np.concatenate(part) for part in zip(*parts, strict=True)]  # copies
 
     def _answer_counts(self, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
         """Return the answers of integer sums of ``size`` bytes."""
         _fill(self._fit, _fit_table(self._phase, rows))
-        known = _counted(rows)
-        return self._answer("correlation_solve_counts", 4 * (size + 4), _sums_and_answers, **known)
+        return self._answer("correlation_solve_counts", 4 * (size + 4), _SUMS, **_counted(rows))
 
 
 class TurnSums(_Sums):
@@ -344,7 +351,7 @@ class TurnSums(_Sums):
         rows /= [1, self._step, self._step]
         rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
         _fill(self._fit, _fit_table(self._phase, rows))
-        return self._answer("correlation_solve_pairs", 52, partial(_sums_and_answers, pairs=True))
+        return self._answer("correlation_solve_pairs", 52, _PAIRS)
 
     def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
@@ -358,7 +365,7 @@ class TurnSums(_Sums):
                 places = used[piece : piece + _PIECE]
                 _fill(self._place, places - staged.frames.start)
                 _fill(basis, rows[places])
-                known: dict[str, Any] = _sums_of(band, pairs=not counts)
+                known = _maps_of(band, _SUMS if counts else _PAIRS)
                 if not counts:
                     known["fresh"] = fresh and not np.any(weight[: places[0]])
                 known |= {"frames": staged.array, "count": len(places), "place": self._place, "basis": basis}
@@ -376,7 +383,7 @@ class TurnSums(_Sums):
             known = _counted(self._rows_in_steps(self._phase, self._weight))
             for band in self.bands:
                 with band.resident():
-                    sums = _sums_of(band, pairs=True)
+                    sums = _maps_of(band, _PAIRS)
                     self._run(band, "correlation_convert", 68, unit=1 / self._step, **known, **sums)
 
 
@@ -441,7 +448,7 @@ class WindowSums(_Sums):
                 continue
             _fill(self._steps, moves[staged.frames])
             moved += self._size * staged.count + 8 * self._width
-            self._run(band, "correlation_slide", moved, basis=self._steps, **known, **_sums_of(band))
+            self._run(band, "correlation_slide", moved, basis=self._steps, **known, **_maps_of(band, _SUMS))
         self.oldest = (self.oldest + len(frames)) % self._window
         self._phase, self._weight = phase[-self._window :], weight[-self._window :]
 
@@ -454,24 +461,12 @@ class WindowSums(_Sums):
         _fill(self._place, (self.oldest + used) % self._window)
         _fill(self._floats, rows[used])
         known = {"count": len(used), "place": self._place, "basis": self._floats}
-        return self._answer("correlation_window", self._size * len(used) + 16, _ring_and_answers, **known)
+        return self._answer("correlation_window", self._size * len(used) + 16, {"ring": "ring"}, **known)
 
 
-def _sums_of(band: Band, pairs: bool = False) -> dict[str, Any]:
-    """Return the maps that sums are kept in, by the arguments of kernels."""
-    sums = {key: band.maps[name] for key, name in _SUMS.items()}
-    return {"reference": band.maps["reference"], **sums} if pairs else sums
-
-
-def _sums_and_answers(band: Band, pairs: bool = False) -> dict[str, Any]:
-    answers = {key: band.maps[name] for key, name in _ANSWERS.items()}
-    parts = {"cosine_part": answers.pop("cosine"), "sine_part": answers.pop("sine")}
-    return {**_sums_of(band, pairs), **parts, **answers}
-
-
-def _ring_and_answers(band: Band) -> dict[str, Any]:
-    answers = {key: band.maps[name] for key, name in _ANSWERS.items()}
-    return {"ring": band.maps["ring"], "stride": band.stride, **answers}
+def _maps_of(band: Band, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return maps of a band by the arguments of kernels."""
+    return {argument: band.maps[name] for argument, name in names.items()}
 
 
 def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:
