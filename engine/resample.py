@@ -16,7 +16,7 @@ _ROUNDING = 1e-6  # of a pixel: places nearer than that are the pixel's own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spots:
+class SamplePoints:
     """Places in a picture, and the four pixels around each."""
 
     pixels: NDArray[np.intp]  # (4, n), intp: numbers of the pixels, row by row; any where the share is 0
@@ -24,10 +24,10 @@ class Spots:
     nearest: NDArray[np.intp]  # (n,), intp: number of the nearest pixel; any where it is outside
     closest: NDArray[np.intp]  # (n,), intp: which of the four that is
     inside: Mask  # (n,), bool: whether the nearest pixel is in the picture
-    whole: Mask  # (n,), bool: whether all four are
+    all_inside: Mask  # (n,), bool: whether all four are
 
     @classmethod
-    def at(cls, column: ArrayLike, row: ArrayLike, shape: tuple[int, int]) -> Spots:
+    def at(cls, column: ArrayLike, row: ArrayLike, shape: tuple[int, int]) -> SamplePoints:
         """Take places, (n,), in pixels from the first one's centre, NaN where there is none."""
         (rows, low, i), (columns, left, j) = _pair(row, shape[0]), _pair(column, shape[1])
         pixels = np.stack([y * shape[1] + x for y in rows for x in columns])
@@ -39,20 +39,20 @@ class Spots:
         return cls(pixels, shares, nearest, closest, inside, whole)
 
     @property
-    def alone(self) -> Mask:
+    def on_pixel(self) -> Mask:
         """Where a place is a pixel's own, (n,)."""
         return np.asarray(self.shares.max(axis=0) == 1)
 
-    def beside(self, labels: NDArray[Any]) -> Mask:
+    def same_label(self, labels: NDArray[Any]) -> Mask:
         """Tell which of the four pixels have the nearest one's label, (4, n), in a map (H, W)."""
         flat = labels.ravel()
         return np.asarray(flat[self.pixels] == flat[self.nearest])
 
-    def labels(self, values: NDArray[Any], outside: int | float) -> NDArray[Any]:
+    def nearest_values(self, values: NDArray[Any], outside: int | float) -> NDArray[Any]:
         """Return the nearest pixels' values, (n,), of a map (H, W), and another outside."""
         return np.where(self.inside, values.ravel()[self.nearest], np.asarray(outside, values.dtype))
 
-    def numbers(self, values: Floats, count: Mask | None = None) -> Floats:
+    def interpolate(self, values: Floats, count: Mask | None = None) -> Floats:
         """Interpolate a map.
 
         Parameters
@@ -68,22 +68,22 @@ class Spots:
             NaN where the nearest pixel has no answer.
         """
         mean = self._mean([values.ravel()[self.pixels]], count)[0].astype(np.float32)
-        return np.where(self.alone, self.labels(values, np.nan), mean)
+        return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)
 
-    def vectors(self, values: Floats, count: Mask | None = None) -> Floats:
-        """Interpolate unit vectors, (H, W, 3), to such vectors, (n, 3); see ``numbers``."""
+    def interpolate_vectors(self, values: Floats, count: Mask | None = None) -> Floats:
+        """Interpolate unit vectors, (H, W, 3), to such vectors, (n, 3); see `interpolate`."""
         flat = values.reshape(-1, 3)
         mean = np.stack(self._mean(list(np.moveaxis(flat[self.pixels], -1, 0)), count))
         unit = (mean / np.sqrt(np.sum(mean * mean, axis=0))).astype(np.float32)
-        own = self.inside & self.alone
+        own = self.inside & self.on_pixel
         return np.where(own[:, np.newaxis], flat[self.nearest], unit.T)
 
-    def angles(self, values: Floats, count: Mask | None = None) -> Floats:
-        """Interpolate angles, (H, W), radians, the short way round the circle; see ``numbers``."""
+    def interpolate_angles(self, values: Floats, count: Mask | None = None) -> Floats:
+        """Interpolate angles, (H, W), radians, the short way round the circle; see `interpolate`."""
         around = values.ravel()[self.pixels]
         cosine, sine = self._mean([np.cos(around), np.sin(around)], count)
         mean = np.arctan2(sine, cosine).astype(np.float32)
-        return np.where(self.alone, self.labels(values, np.nan), mean)
+        return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)
 
     def _mean(self, around: list[Floats], count: Mask | None) -> list[Doubles]:
         """Return weighted means, (n,) each, of values around, (4, n), that are known or unknown together."""
@@ -91,7 +91,7 @@ class Spots:
         own = np.where(
             self.inside, np.take_along_axis(around[0], self.closest[np.newaxis], axis=0)[0], np.nan
         )
-        easy = np.isfinite(means[0]) & self.whole
+        easy = np.isfinite(means[0]) & self.all_inside
         if count is not None:
             easy &= count.all(axis=0)
         few = np.flatnonzero(~easy & np.isfinite(own))

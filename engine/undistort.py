@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.resample import Spots
+from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import UNDISTORTED, InputError, Lens, Result, pixel_axes, source_region
 
 Doubles = NDArray[np.float64]
@@ -132,10 +132,10 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     height = max(1, _BAND // columns)
     for band in (slice(first, min(first + height, rows)) for first in range(0, rows, height)):
         seen = picture_places(lens, *np.meshgrid(x, y[band]))
-        spots = Spots.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
+        points = SamplePoints.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
         turn: Any
         for turn in range(turns[0]) if turns else [...]:
-            found = _resampled({name: values[turn] for name, values in maps.items()}, spots)
+            found = _resampled({name: values[turn] for name, values in maps.items()}, points)
             for name, values in found.items():
                 room = made[name][turn][band]
                 room[...] = values.reshape(room.shape)
@@ -143,33 +143,33 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     return replace(result, **changed)
 
 
-def _resampled(maps: Maps, spots: Spots) -> Maps:
+def _resampled(maps: Maps, points: SamplePoints) -> Maps:
     """Return all maps of one picture at some places, (n,) or (n, 3)."""
     touched, pieces = (
-        spots.beside(maps[name]) if name in maps else None for name in ("contact", "component")
+        points.same_label(maps[name]) if name in maps else None for name in ("contact", "component")
     )
     made: Maps = {}
     for name, values in maps.items():
         if name in _NOTHING:
-            made[name] = spots.labels(values, _NOTHING[name])
+            made[name] = points.nearest_values(values, _NOTHING[name])
         elif name == "normals":
-            made[name] = spots.vectors(values, touched)
+            made[name] = points.interpolate_vectors(values, touched)
         elif name == "azimuth":
             if "normals" not in maps:
-                made[name] = spots.angles(values, touched)
+                made[name] = points.interpolate_angles(values, touched)
         elif name != "zenith" or "normals" not in maps:
-            made[name] = spots.numbers(values, pieces if name in _OF_PIECES else touched)
-    return made | _directions(maps, made["normals"], spots) if "normals" in maps else made
+            made[name] = points.interpolate(values, pieces if name in _OF_PIECES else touched)
+    return made | _directions(maps, made["normals"], points) if "normals" in maps else made
 
 
-def _directions(maps: Maps, normals: NDArray[np.float32], spots: Spots) -> Maps:
+def _directions(maps: Maps, normals: NDArray[np.float32], points: SamplePoints) -> Maps:
     """Return those maps of zenith and azimuth that there were, of vectors; a pixel's own are kept."""
     x, y, z = normals.T
     across = np.hypot(x, y)
     level = np.where(across == 0, np.float32(np.nan), np.float32(0))
     angles = {"zenith": np.arctan2(across, z), "azimuth": np.arctan2(y, x) + level}
     return {
-        name: np.where(spots.alone, spots.labels(maps[name], np.nan), angle)
+        name: np.where(points.on_pixel, points.nearest_values(maps[name], np.nan), angle)
         for name, angle in angles.items()
         if name in maps
     }

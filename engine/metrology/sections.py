@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.metrology.fitting import covariance
 from mirrorskin.engine.metrology.patch import heights_of, pixel_size_of
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.resample import Spots
+from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
 
 Doubles = NDArray[np.float64]
@@ -95,7 +95,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
         _check_near((start, end), x, y, size)
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
-    values = _between(result, height, Spots.at(column, row_of, (height.shape[0], height.shape[1])))
+    values = _between(result, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
     return Section(distance, along[0], along[1], *values, "mm" if known else "px")
 
 
@@ -147,28 +147,30 @@ def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubl
     return np.add.outer(np.asarray(start), 0 * share) + np.multiply.outer(step, share), length * share
 
 
-def _between(result: Result, height: NDArray[np.float32], spots: Spots) -> tuple[Doubles, Doubles, Mask]:
+def _between(
+    result: Result, height: NDArray[np.float32], points: SamplePoints
+) -> tuple[Doubles, Doubles, Mask]:
     """Return heights, their standard deviations and whether they were filled, (n,), at places."""
-    counts = spots.shares > _ROUNDING
-    inside = spots.whole
+    counts = points.shares > _ROUNDING
+    inside = points.all_inside
     if result.component is not None:
-        inside = inside & np.all(spots.beside(result.component) | ~counts, axis=0)
-    values = _mean(height, spots, counts)
+        inside = inside & np.all(points.same_label(result.component) | ~counts, axis=0)
+    values = _mean(height, points, counts)
     filled = np.zeros(values.shape, bool)
     if result.filled is not None:
-        filled = np.any((result.filled.ravel()[spots.pixels] != 0) & counts, axis=0)
+        filled = np.any((result.filled.ravel()[points.pixels] != 0) & counts, axis=0)
     sigma = np.full(values.shape, np.nan)
     if result.height_sigma is not None:
         # Errors of neighbours are correlated, so those of a mean are no smaller.
-        sigma = _mean(result.height_sigma, spots, counts)
+        sigma = _mean(result.height_sigma, points, counts)
     there = inside & np.isfinite(values)
     return np.where(there, values, np.nan), np.where(there & ~filled, sigma, np.nan), filled & there
 
 
-def _mean(values: NDArray[np.float32], spots: Spots, counts: Mask) -> Doubles:
+def _mean(values: NDArray[np.float32], points: SamplePoints, counts: Mask) -> Doubles:
     """Return weighted means of four pixels, NaN where one that counts is."""
-    around = np.where(counts, values.ravel()[spots.pixels], 0).astype(np.float64)
-    return np.asarray(np.sum(np.where(counts, spots.shares, 0) * around, axis=0))
+    around = np.where(counts, values.ravel()[points.pixels], 0).astype(np.float64)
+    return np.asarray(np.sum(np.where(counts, points.shares, 0) * around, axis=0))
 
 
 @dataclass(frozen=True, slots=True)
