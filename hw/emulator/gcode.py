@@ -119,9 +119,13 @@ class Interpreter:
             for letter, at in zip(self.axes, self.place, strict=True)
         )
         if motion in ("G2", "G3"):
-            if not any(axis in values for axis in self.axes):
+            plane = _PLANES[modes["plane"]]
+            named = {axis for axis, letter in enumerate(self.axes) if letter in values}
+            if not named:
                 raise GrblError(26)
-            return Drive(self._arc(_PLANES[modes["plane"]], values, end, motion == "G2"), feed / 60)
+            if not named <= set(plane):  # the firmware would go along a helix
+                raise GrblError(20)
+            return Drive(self._arc(plane, values, end, motion == "G2"), feed / 60)
         if math.dist(self.place, end) < _NO_WAY:
             return None
         return Drive(Line(self.place, end), math.inf if motion == "G0" else feed / 60)

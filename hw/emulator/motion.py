@@ -62,11 +62,10 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Arc:
-    """A circular arc in the plane of two axes; the other axes go along evenly.
+    """A circular arc in the plane of two axes; a positive sweep, radians, turns from the first to the second.
 
     Where the ends' distances from the centre differ (by the rounding of the numbers in the program), the
-    radius changes evenly from the one to the other. A positive sweep, radians, turns from the plane's first
-    axis to its second.
+    radius changes evenly from the one to the other.
     """
 
     start: Place
@@ -77,11 +76,8 @@ class Arc:
 
     @property
     def length(self) -> float:
-        """The distance: of a helix where other axes go along."""
-        along = [b - a for a, b in zip(self.start, self.end, strict=True)]
-        for axis in self.plane:
-            along[axis] = 0.0
-        return math.hypot(self._radius * self.sweep, *along)
+        """The distance along it."""
+        return abs(self._radius * self.sweep)
 
     @property
     def samples(self) -> int:
@@ -93,43 +89,34 @@ class Arc:
         part = min(max(distance / self.length, 0.0), 1.0)
         if part in (0, 1):
             return self.end if part else self.start
-        place = [a + (b - a) * part for a, b in zip(self.start, self.end, strict=True)]
         first, second = self._radius_at(self.start), self._radius_at(self.end)
         radius, angle = first + (second - first) * part, self._angle(part)
+        place = list(self.start)
         place[self.plane[0]] = self.centre[0] + radius * math.cos(angle)
         place[self.plane[1]] = self.centre[1] + radius * math.sin(angle)
         return tuple(place)
 
     def tangent(self, distance: float) -> Place:
         """Return the direction there; the radius counts as constant."""
-        length = self.length
-        angle, share = self._angle(distance / length), self._radius * self.sweep / length
-        unit = [(b - a) / length for a, b in zip(self.start, self.end, strict=True)]
-        unit[self.plane[0]] = -share * math.sin(angle)
-        unit[self.plane[1]] = share * math.cos(angle)
+        angle, sense = self._angle(distance / self.length), math.copysign(1.0, self.sweep)
+        unit = [0.0] * len(self.start)
+        unit[self.plane[0]] = -sense * math.sin(angle)
+        unit[self.plane[1]] = sense * math.cos(angle)
         return tuple(unit)
 
     def limits(
         self, feed: float, rates: Sequence[float], accelerations: Sequence[float]
     ) -> tuple[float, float]:
-        """Return the limits that hold all along: those of a direction that points along every axis.
+        """Return the limits that hold all along.
 
         The acceleration towards the centre at the greatest speed may take 1/sqrt(2) of what the plane's
         weaker axis can do; the rest, as the sides of a right triangle, is left for the one along the arc.
         """
-        length = self.length
-        worst = [(b - a) / length for a, b in zip(self.start, self.end, strict=True)]
-        in_plane = abs(self._radius * self.sweep) / length
-        for axis in self.plane:
-            worst[axis] = in_plane
         weaker = min(accelerations[axis] for axis in self.plane)
-        turning = math.sqrt(weaker / math.sqrt(2.0) * self._radius) / in_plane
-        speed = min(feed, _share(rates, worst), turning)
-        inwards = (speed * in_plane) ** 2 / self._radius
-        left = list(accelerations)
-        for axis in self.plane:
-            left[axis] = math.sqrt(max(0.0, weaker * weaker - inwards * inwards))
-        return speed, _share(left, worst)
+        turning = math.sqrt(weaker / math.sqrt(2.0) * self._radius)
+        speed = min(feed, turning, *(rates[axis] for axis in self.plane))
+        inwards = speed**2 / self._radius
+        return speed, math.sqrt(max(0.0, weaker * weaker - inwards * inwards))
 
     @property
     def _radius(self) -> float:

@@ -101,6 +101,7 @@ def test_it_greets_and_with_homing_is_locked_until_it_is_told_otherwise() -> Non
         ("G1X1", "error:22"),
         ("G0X1X2", "error:25"),
         ("G2F100", "error:26"),
+        ("G2X2Z1I1F100", "error:20"),
         ("G2X10I1F100", "error:33"),
         ("G2X1Y1F100", "error:35"),
         ("G0X1" + "0" * 76, "error:11"),
@@ -267,8 +268,8 @@ def moves() -> st.SearchStrategy[list[str]]:
     line = st.tuples(st.sampled_from(["G0", "G1"]), number, number, number).map(
         lambda v: f"G90{v[0]}X{v[1]}Y{v[2]}Z{v[3]}"
     )
-    arc = st.tuples(st.sampled_from(["G2", "G3"]), number, number.filter(bool), st.integers(-2, 2)).map(
-        lambda v: f"G91{v[0]}X{2 * v[2]}Y{2 * v[1]}Z{v[3]}I{v[2]}J{v[1]}"
+    arc = st.tuples(st.sampled_from(["G2", "G3"]), number, number.filter(bool)).map(
+        lambda v: f"G91{v[0]}X{2 * v[2]}Y{2 * v[1]}I{v[2]}J{v[1]}"
     )
     return st.lists(st.one_of(line, arc), min_size=1, max_size=15)
 
