@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections import deque
 from contextlib import suppress
 from fractions import Fraction
@@ -41,99 +42,76 @@ class FrameServer(Closing):
             f" C{_COLOURS[camera.dtype]}\n"
         ).encode()
         self._camera = camera
-        self._ended = threading.Event()
-        self._viewers: list[_Viewer] = []
-        self._lock = threading.Lock()  # of the list
+        self._ended = False
+        self._viewers: dict[socket.socket, deque[bytes]] = {}  # the frames that wait for each
+        self._change = threading.Condition()
         try:
             self._door = socket.create_server(("127.0.0.1", port))
         except (OSError, OverflowError) as error:
             raise InputError(f"port {port} cannot be listened on: {error}; take another, or 0") from None
         self._door.settimeout(_LOOK)
         self.url = f"tcp://127.0.0.1:{self._door.getsockname()[1]}"
-        self._threads = [threading.Thread(target=work) for work in (self._admit, self._send)]
+        self._threads = [threading.Thread(target=work) for work in (self._admit, self._take)]
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
         """End all connections and listen no more; a second time does nothing."""
-        self._ended.set()
-        for thread in self._threads:
+        self._ended = True
+        self._dismiss()
+        for thread in self._threads:  # those of viewers come after the one that admits them
             thread.join()
-        self._dismiss(self._viewers)
         self._door.close()
 
     def _admit(self) -> None:
-        while not self._ended.is_set():
+        while not self._ended:
             try:
                 line, _ = self._door.accept()
             except TimeoutError:
                 continue
-            with self._lock:
-                self._viewers.append(_Viewer(line, self._header))
+            line.settimeout(None)
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._change:
+                self._viewers[line] = deque(maxlen=_QUEUE)
+            self._threads.append(threading.Thread(target=self._serve, args=(line,)))
+            self._threads[-1].start()
+        self._dismiss()
 
-    def _send(self) -> None:
-        while not self._ended.is_set():
+    def _take(self) -> None:
+        """Offer each frame of the camera to all viewers."""
+        while not self._ended:
             try:
                 frames = self._camera.take(1, _LOOK)
             except HardwareError:
-                if self._camera.error is None:
-                    continue  # it is only silent
-                self._dismiss(self._viewers)
-                self._ended.wait(_LOOK)
+                if self._camera.error is not None:  # otherwise it is only silent
+                    self._dismiss()
+                    time.sleep(_LOOK)
                 continue
             pixels = frames.pixels[0]
             data = b"FRAME\n" + pixels.astype(pixels.dtype.newbyteorder("<")).tobytes()
-            with self._lock:
-                viewers = list(self._viewers)
-            for viewer in viewers:
-                viewer.offer(data)
-            self._dismiss([viewer for viewer in viewers if not viewer.watches])
+            with self._change:
+                for waiting in self._viewers.values():
+                    waiting.append(data)
+                self._change.notify_all()
 
-    def _dismiss(self, some: list[_Viewer]) -> None:
-        for viewer in list(some):
-            viewer.close()
-            with self._lock:
-                self._viewers.remove(viewer)
-
-
-class _Viewer:
-    """A connection, and the frames that wait for it."""
-
-    def __init__(self, line: socket.socket, header: bytes) -> None:
-        line.settimeout(None)
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._line, self._header = line, header
-        self._waiting: deque[bytes] = deque()
-        self._came = threading.Condition()
-        self.watches = True
-        self._thread = threading.Thread(target=self._work)
-        self._thread.start()
-
-    def offer(self, frame: bytes) -> None:
-        """Send a frame as soon as it can be, and if need be drop the oldest that waits."""
-        with self._came:
-            self._waiting.append(frame)
-            if len(self._waiting) > _QUEUE:
-                del self._waiting[0]
-            self._came.notify()
-
-    def close(self) -> None:
-        """End the connection, also in the middle of a frame."""
-        with self._came:
-            self.watches = False
-            self._came.notify()
-        with suppress(OSError):  # the other end was first
-            self._line.shutdown(socket.SHUT_RDWR)
-        self._thread.join()
-
-    def _work(self) -> None:
-        with self._line, suppress(OSError):  # the viewer went
-            self._line.sendall(self._header)
+    def _serve(self, line: socket.socket) -> None:
+        with line, suppress(OSError):  # the viewer went
+            line.sendall(self._header)
             while True:
-                with self._came:
-                    self._came.wait_for(lambda: self._waiting or not self.watches)
-                    if not self.watches:
+                with self._change:
+                    self._change.wait_for(lambda: self._viewers.get(line, True))
+                    if line not in self._viewers:
                         return
-                    data = self._waiting.popleft()
-                self._line.sendall(data)
-        self.watches = False
+                    data = self._viewers[line].popleft()
+                line.sendall(data)
+        with self._change:
+            self._viewers.pop(line, None)
+
+    def _dismiss(self) -> None:
+        """End all connections, also in the middle of a frame."""
+        with self._change:
+            lines, self._viewers = list(self._viewers), {}
+            self._change.notify_all()
+        for line in lines:
+            with suppress(OSError):  # the other end was first
+                line.shutdown(socket.SHUT_RDWR)
