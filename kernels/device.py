@@ -115,6 +115,8 @@ class Device:
         How work is cut for it; a guess by its kind until it was tuned.
     tuned : bool
         Whether the layout was measured.
+    spare : dict of str to object
+        What callers keep on it from one call to the next, taken out while in use.
     """
 
     def __init__(self, device: cl.Device) -> None:
@@ -133,6 +135,7 @@ class Device:
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
+        self.spare: dict[str, Any] = {}
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Array:

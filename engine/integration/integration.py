@@ -21,10 +21,9 @@ from mirrorskin.engine.integration.validation import (
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device, open_device
 
-# The memory of the last call, some 100 bytes a pixel, is kept for the next one: making it takes as long as a
-# solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
+# The memory of the last call, some 100 bytes a pixel, stays with the device for the next one: making it takes
+# as long as a solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
 _KEPT = 2**21
-_spare: list[tuple[tuple[Device, tuple[int, int], tuple[float, float]], SurfaceSolver]] = []
 
 
 def integrate(
@@ -144,17 +143,14 @@ def integrate(
 @contextmanager
 def _borrowed_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
     """Take the last call's solver if it fits, and give it back."""
-    key = device, inputs.shape, inputs.pixel_size
-    try:
-        kept, solver = _spare.pop()  # at once, so that no two threads have it
-    except IndexError:
-        kept, solver = None, None
-    if solver is None or kept != key:
+    key = inputs.shape, inputs.pixel_size
+    kept, solver = device.spare.pop("integration", (None, None))  # at once, so that no two threads have it
+    if kept != key:
         solver = SurfaceSolver(device, inputs.shape)
     yield solver  # one that failed is not kept
     solver.reset()
-    if math.prod(inputs.shape) <= _KEPT and not _spare:
-        _spare.append((key, solver))
+    if math.prod(inputs.shape) <= _KEPT:
+        device.spare["integration"] = key, solver
 
 
 class Integrator:

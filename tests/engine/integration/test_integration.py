@@ -15,7 +15,8 @@ import surfaces
 from slope_oracle import Problem
 
 from mirrorskin import engine, io
-from mirrorskin.engine.integration import integration, vcycle
+from mirrorskin.engine.integration import vcycle
+from mirrorskin.kernels.device import open_device
 
 SHAPE, PIXEL = (49, 62), (0.03, 0.05)
 ROW, COLUMN = np.indices(SHAPE)
@@ -373,7 +374,7 @@ def heights(case):
 def alone():
     found = []
     for case in range(len(CASES)):
-        integration._spare.clear()
+        open_device().spare.clear()
         found.append(heights(case))
     return found
 
