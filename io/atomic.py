@@ -41,6 +41,10 @@ def check_output(path: Path, *keep: Path | None) -> None:
     InputError
         Its folder does not exist or cannot be written to, it is a folder itself, it is the input, or an HDF5
         file that is being written.
+
+    Examples
+    --------
+    >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
     with as_input_error(f"{path} cannot be written", "choose another place with -o"):
         if path.is_dir():

@@ -30,6 +30,11 @@ def describe(path: str | Path) -> dict[str, str]:
     ------
     InputError
         The file cannot be read, or is damaged.
+
+    Examples
+    --------
+    >>> describe("press.h5")["motion"]  # doctest: +SKIP
+    'vertical'
     """
     path = Path(path)
     with Hdf5File(path) as file:

@@ -159,6 +159,11 @@ def save_table(
     ------
     InputError
         It cannot be written there.
+
+    Examples
+    --------
+    >>> columns = {"x": np.arange(3.0), "height": np.zeros(3)}
+    >>> save_table("section.csv", columns, {"x": "mm", "height": "mm"}, {})  # doctest: +SKIP
     """
     text = StringIO(newline="")
     for name, note in notes.items():

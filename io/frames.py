@@ -41,6 +41,11 @@ def open_frames(
     ------
     InputError
         The path holds no such frames, or travel or phase is missing or does not fit them.
+
+    Examples
+    --------
+    >>> open_frames("pictures", Header("vertical"), travel=Steps(0.1)).shape  # doctest: +SKIP
+    (240, 480, 640)
     """
     from mirrorskin.io.pictures import PICTURE_SUFFIXES, Pictures
     from mirrorskin.io.video import Video

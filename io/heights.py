@@ -33,6 +33,11 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
     ------
     InputError
         There is no such file, it holds no heights or those of other pixels, or it is damaged.
+
+    Examples
+    --------
+    >>> open_heights("press-result.h5").shape  # doctest: +SKIP
+    (480, 640)
     """
     path = Path(path)
     with Hdf5File(path) as file:

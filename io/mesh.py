@@ -50,6 +50,12 @@ def surface_mesh(
     Returns
     -------
     Mesh
+
+    Examples
+    --------
+    >>> surface_mesh([[0, 0], [0, 1]], x=[0, 1], y=[1, 0]).faces
+    array([[0, 2, 1],
+           [1, 2, 3]], dtype=int32)
     """
     heights = np.asarray(height, np.float64)
     pieces = np.zeros(heights.shape, np.int32) if component is None else np.asarray(component)

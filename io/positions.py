@@ -41,6 +41,11 @@ def check_travel(
     ------
     InputError
         It is missing, of another length, not a finite number throughout, or runs back.
+
+    Examples
+    --------
+    >>> check_travel([0, 1, 2], 3, "travel")
+    array([0., 1., 2.])
     """
     values = _known(travel, count, name)
     whole = np.concatenate([after, values])
@@ -60,6 +65,11 @@ def check_stroke(
     It rises to its greatest value, where it may rest, and falls from there on; either way may be missing.
     Parameters and errors are those of ``check_travel``; ``within`` are the first and the end of the frames
     that are meant, of which alone the travel is checked and returned.
+
+    Examples
+    --------
+    >>> check_stroke([0, 1, 1, 0], 4, "travel")
+    array([0., 1., 1., 0.])
     """
     values = _known(travel, count, name, within)
     deepest = np.flatnonzero(values == np.max(values, initial=-np.inf))
@@ -85,6 +95,11 @@ def check_phase(
     ------
     InputError
         They are missing, of another length, or not finite numbers throughout.
+
+    Examples
+    --------
+    >>> check_phase([0, 1.5, 3], 3, "phase")
+    array([0. , 1.5, 3. ])
     """
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")

@@ -157,6 +157,11 @@ class Recorder(TeeSource[Source]):
     ----------
     name, header, shape, dtype, motion, rewindable
         The source's; what was recorded cannot be read again.
+
+    Examples
+    --------
+    >>> with Recorder(source, "press.h5") as recorder:  # doctest: +SKIP
+    ...     recorder.drain(print)
     """
 
     def __init__(

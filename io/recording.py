@@ -28,7 +28,13 @@ from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, In
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians."""
+    """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians.
+
+    Examples
+    --------
+    >>> Steps(0.1, start=1.0).positions(3)
+    array([1. , 1.1, 1.2])
+    """
 
     step: float
     start: float = 0.0
@@ -225,6 +231,12 @@ def open_recording(
     ------
     InputError
         The file, the stack, or a parameter of it cannot be used.
+
+    Examples
+    --------
+    >>> with open_recording("press.h5") as recording:  # doctest: +SKIP
+    ...     print(recording.motion, recording.shape)
+    vertical (240, 480, 640)
     """
     with ExitStack() as opening:
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))

@@ -113,6 +113,11 @@ def open_result(path: str | Path) -> Result:
     ------
     InputError
         There is no such file, it is no result, or it is damaged.
+
+    Examples
+    --------
+    >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
+    (480, 640)
     """
     with _opened(Path(path)) as file:
         maps: dict[str, NDArray[Any]] = {
@@ -198,6 +203,12 @@ def select_turn(result: Result, turn: int | None) -> Result:
     ------
     InputError
         The result has turns and none is chosen, or it does not have that one.
+
+    Examples
+    --------
+    >>> turns = Result(zenith=np.zeros((3, 4, 5), np.float32))
+    >>> select_turn(turns, 1).zenith.shape
+    (4, 5)
     """
     maps = result.maps()
     size = next((values.shape[: values.ndim - (name == "normals")] for name, values in maps.items()), (0, 0))

@@ -107,6 +107,11 @@ def source_region(process: Mapping[str, object]) -> Region | None:
     """Return the part of the picture that a result was made of, from its process; None if that is not known.
 
     A result of 'fuse' names the part of both recordings, which is the same.
+
+    Examples
+    --------
+    >>> source_region({"source_region": "2,1,4x3"}).rows
+    (1, 4)
     """
     texts = (str(process.get(name, "")) for name in ("source_region", "vertical_source_region"))
     return next((region for region in map(Region.read, texts) if region is not None), None)

@@ -72,6 +72,12 @@ class StreamRecorder(TeeSource[LiveSource]):
         The source's; what was recorded cannot be read again.
     count, written : int
         Frames that were taken, and those of them that are in the file.
+
+    Examples
+    --------
+    >>> with StreamRecorder(rig, "press.h5") as recorder:  # doctest: +SKIP
+    ...     while (block := recorder.read()) is not None:
+    ...         print(block.index)
     """
 
     def __init__(

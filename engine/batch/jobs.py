@@ -58,6 +58,11 @@ def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
     ------
     InputError
         A result would overwrite a recording, or another result.
+
+    Examples
+    --------
+    >>> make_jobs([Path("a.h5")], Path("out"))[0].target
+    PosixPath('out/a-result.h5')
     """
     once: dict[Path, Path] = {}
     for path in paths:

@@ -52,6 +52,12 @@ def run_local(
     ------
     Outcome
         Of each job, as they are completed.
+
+    Examples
+    --------
+    >>> jobs = make_jobs(Path("data").glob("*.h5"), Path("results"))
+    >>> [outcome.state for outcome in run_local(jobs, Plan(), default_devices())]  # doctest: +SKIP
+    ['done', 'kept']
     """
     keep_memory()
     todo: SimpleQueue[Job] = SimpleQueue()
