@@ -10,15 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.calibration.board import (
-    FEWEST,
-    Board,
-    Charuco,
-    Marks,
-    centre_marks,
-    find_marks,
-    stretch_contrast,
-)
+from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
+from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, stretch_contrast
 from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
 

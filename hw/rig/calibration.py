@@ -19,18 +19,17 @@ from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Floats
 
 _SECONDS = 1.5  # one way, or more
-_FRAMES = 60  # one way, or more
-_FRAMES_MOST = 150
-_PRESSED = 0.5  # of a press, that comes before the calibration
+_FRAMES, _MOST_FRAMES = 60, 150  # one way, at least and at most
+_PRESSED = 0.5  # share of a press that comes before the move
 _LONGEST_DELAY = 0.6  # seconds that late frames are waited for
-_TOGETHER = 8  # frames
-_KEEPS_TIME = 1.3  # by which a whole line may be worse than lines near each frame
-_HURRY = 0.9  # of an axis's greatest speed; as much above its least
+_BLOCK = 8  # frames
+_STEADY = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
+_SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
 
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """From one place to another, and what part of it a place is."""
+    """From one place to another, and how far along it a place is."""
 
     begin: Position
     end: Position
@@ -52,12 +51,12 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     seconds = max(_SECONDS, _FRAMES * rig.period)
     speed = min(max(way.length / seconds, way.slowest), way.fastest)
     seconds = way.length / speed
-    every = max(1, math.floor(seconds * rig.rate / _FRAMES_MOST))
-    _Watched(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
-    watched = _Watched(rig, every)
-    there = watched.follow(rig.begin(lambda: rig.stage.move(way.end, speed)))
-    back = watched.follow(rig.begin(lambda: rig.stage.move(way.begin, speed)))
-    watched.until(back.ended + _LONGEST_DELAY)
+    every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
+    _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
+    log = _FrameLog(rig, every)
+    there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed)))
+    back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed)))
+    log.until(back.ended + _LONGEST_DELAY)
 
     path = Trapezoid.planned(way.length, speed)
     turned = (there.ended + back.began) / 2
@@ -67,8 +66,8 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     def place(times: Floats) -> Floats:
         return np.where(times < turned, down.at(times), way.length - up.at(times))
 
-    clock, unsure = watched.clock()
-    delay = estimate_delay(clock, np.concatenate(watched.pictures), place, rig.camera.name)
+    clock, unsure = log.clock()
+    delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
     rig.go(plan.first)
     of_reports = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
     return replace(delay, error=math.hypot(delay.error, unsure, *of_reports))
@@ -88,7 +87,7 @@ def _speeds(axis: Axis | None) -> tuple[float, float]:
     """Return how fast and how slowly an axis may go, mm/s or rad/s."""
     if axis is None:  # cannot be: what does not lean does not go round
         return math.inf, 0.0
-    return _HURRY * axis.top_speed, SLOWEST / 60 / axis.scale / _HURRY
+    return _SPEED_MARGIN * axis.top_speed, SLOWEST / 60 / axis.scale / _SPEED_MARGIN
 
 
 def _track(
@@ -98,7 +97,7 @@ def _track(
     return Track([report.time for report in reports], [along(report.position) for report in reports], path)
 
 
-class _Watched:
+class _FrameLog:
     """Frames of the move, of which only block means are kept."""
 
     def __init__(self, rig: Rig, every: int) -> None:
@@ -115,7 +114,7 @@ class _Watched:
         number, time = np.concatenate(self._numbers), np.concatenate(self._times)
         line = even_times(number, time, len(time))
         off, near_off = (np.std(time - even) for even in (line, even_times(number, time)))
-        if off > _KEEPS_TIME * near_off:
+        if off > _STEADY * near_off:
             return time, 0.0
         return line, float(off / math.sqrt(len(time)))
 
@@ -132,7 +131,7 @@ class _Watched:
             pass
 
     def _take(self) -> float:
-        frames = self._rig.take(_TOGETHER)
+        frames = self._rig.take(_BLOCK)
         some = frames.number % self._every == 0
         self._times.append(frames.time[some])
         self._numbers.append(frames.number[some])

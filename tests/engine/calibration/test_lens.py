@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mirrorskin.engine.calibration.board import Charuco, Dots, Marks, centre_marks, paint_board
+from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
 from mirrorskin.engine.calibration.lens import calibrate_lens, fit_lens, locate_marks
+from mirrorskin.engine.calibration.marks import Marks, centre_marks
 from mirrorskin.engine.undistort import picture_places
 from mirrorskin.io import InputError
 
