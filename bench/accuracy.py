@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from fractions import Fraction
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,19 +12,14 @@ from numpy.typing import NDArray
 from mirrorskin.bench.harness import Case, Cases, Target, at_most, within
 from mirrorskin.bench.scenes import STEPS, TILT
 from mirrorskin.engine import (
-    Correlation,
-    Correlator,
     Onset,
     Surface,
-    correlate,
     estimate_normals,
     find_change_point,
-    find_edges,
     find_onset,
     fuse,
     integrate,
 )
-from mirrorskin.hw.twin import Camera, Twin, Vertical
 from mirrorskin.kernels.device import Device
 
 Doubles = NDArray[np.float64]
@@ -126,10 +119,6 @@ def _rms(error: Doubles) -> float:
 # Degrees; a normal at the tilt meets an axis of the body, where linear theory is at its limit.
 _BINS = (0, 1), (1, 2), (2.4, 2.6), (3, 5), (5, 10), (10, 20), (20, 35), (35, 50), (50, 58)
 _DRAWS, _FEW_DRAWS = 10_000, 2_000
-_TURNS = 64  # of a stack of whole counts
-_HELD = 1.2e-7  # of a number, that float32 holds
-_ROUNDED = 5e-7  # of the largest count, where cosines are rounded to multiples of 2^-17: with uint8
-_JUMP = 20.0  # degrees, of a roof
 _PHASES = np.arange(STEPS, dtype=np.float64) * (2 * np.pi / STEPS)
 
 
@@ -227,86 +216,6 @@ def _bound(normals: Doubles, sensor: Sensor) -> Doubles:
 def _axes() -> Doubles:
     """Return the body's axis at each phase, (STEPS, 3): it leans away from the phase."""
     return toward(np.full(STEPS, TILT), _PHASES + np.pi)
-
-
-def run_correlation(device: Device, quick: bool) -> Case:
-    """Hold waves against sums in fractions, and look for drift where a window moves on."""
-    shape, turns = ((9, 13), 4) if quick else ((60, 80), _TURNS)
-    targets = []
-    for kind in ("uint8", "uint16", "float32"):
-        frames = _whole_counts(kind, (turns * STEPS, *shape))
-        phase = np.tile(_PHASES, turns)
-        targets += _score_exact_waves(f"{kind}, a stack", correlate(frames, phase, device=device), frames)
-        window = Correlator(shape, kind, window=STEPS, device=device)
-        for number, frame in enumerate(frames):
-            window.push(frame[np.newaxis], phase=phase[number : number + 1])
-        moved, last = window.result(), frames[-STEPS:]
-        targets += _score_exact_waves(f"{kind}, a window", moved, last)
-        anew = correlate(last, _PHASES, device=device)
-        drift = max(float(np.max(np.abs(a - b))) for a, b in zip(_parts(moved), _parts(anew), strict=True))
-        what = f"{kind}, a window that moved on against a new one: apart, of the largest count"
-        targets.append(at_most(what, drift / float(frames.max()), _HELD if kind == "float32" else 0.0))
-    return _case("accuracy-correlation", f"waves of {turns} turns against exact sums", targets)
-
-
-def _score_exact_waves(what: str, found: Correlation, frames: NDArray[Any]) -> list[Target]:
-    """Return targets of what float32 holds of a wave, and of the residual, a root of a small difference."""
-    apart = [np.max(np.abs(a - b)) for a, b in zip(_parts(found), _exact_waves(frames), strict=True)]
-    near = _ROUNDED if frames.dtype == np.uint8 else _HELD
-    wave, residual = (float(one) / float(frames.max()) for one in (max(apart[:3]), apart[3]))
-    return [
-        at_most(f"{what}: mean, cosine and sine, largest error of the largest count", wave, near),
-        at_most(f"{what}: residual, largest error of the largest count", residual, 4 * _HELD),
-    ]
-
-
-def _whole_counts(kind: str, shape: tuple[int, int, int]) -> NDArray[Any]:
-    """Return frames of any whole counts that the type holds, the extreme ones among them."""
-    top = np.iinfo(kind).max if kind != "float32" else 4095
-    frames = np.random.default_rng(7).integers(0, top, shape, endpoint=True).astype(kind)
-    frames[:, 0, 0] = top
-    return frames
-
-
-def _exact_waves(frames: NDArray[Any]) -> Doubles:
-    """Return mean, cosine, sine and residual of whole turns, (4, H, W), from sums of whole numbers."""
-    count, samples = len(frames), frames.astype(np.int64)
-    total, square = samples.sum(axis=0), (samples**2).sum(axis=0)
-    # Samples of one phase are summed first, as whole numbers; eight products are left to round.
-    eighths = samples.reshape(-1, STEPS, *samples.shape[1:]).sum(axis=0).astype(np.float64)
-    cosine, sine = (2 / count * np.tensordot(wave(_PHASES), eighths, 1) for wave in (np.cos, np.sin))
-    left = np.empty(total.shape)
-    for place in np.ndindex(total.shape):
-        exact = Fraction(int(square[place])) - Fraction(int(total[place]) ** 2, count)
-        left[place] = float(exact) - count / 2 * (cosine[place] ** 2 + sine[place] ** 2)
-    return np.stack([total / count, cosine, sine, np.sqrt(np.maximum(left, 0) / (count - 3))])
-
-
-def _parts(wave: Correlation) -> tuple[NDArray[np.float32], ...]:
-    return wave.mean, wave.cosine, wave.sine, wave.residual
-
-
-def run_edges(device: Device, quick: bool) -> Case:
-    """Hold the edges of a roof against its ridge, with noise and on a bend that is none."""
-    rows, columns = (60, 80) if quick else (480, 640)
-    ridge, noise = columns // 2, np.radians(1.0)
-    column = np.arange(columns)
-    lean = np.radians(np.where(column < ridge, 10.0, 10.0 - _JUMP) + 0.5 * np.sin(column / 15))
-    zenith = np.broadcast_to(lean, (rows, columns))
-    vectors = np.stack([np.sin(zenith), np.zeros(zenith.shape), np.cos(zenith)], -1)
-    vectors += np.random.default_rng(8).normal(0, noise / np.sqrt(2), vectors.shape)
-    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
-    sigma, touched = np.full(zenith.shape, noise, np.float32), np.ones(zenith.shape, np.uint8)
-    drawn = find_edges(vectors.astype(np.float32), sigma, touched, device=device) != 0
-    inner = drawn[8:-8]
-    found = inner[:, ridge - 2 : ridge + 2].any(axis=1)
-    elsewhere = np.abs(column - (ridge - 0.5)) > 3
-    targets = [
-        at_most("rows of the ridge without an edge", float(np.mean(~found)), 0.01),
-        at_most("pixels elsewhere with an edge", float(inner[:, elsewhere].mean()), 1e-3),
-        within("pixels across the ridge", float(inner[:, ~elsewhere].sum() / found.sum()), 0.99, 1.2),
-    ]
-    return _case("accuracy-edges", f"a ridge of {_JUMP:.0f} degrees, normals as noisy as 1 degree", targets)
 
 
 _PIXEL = 0.05  # mm
@@ -411,15 +320,15 @@ def run_fusion(device: Device, quick: bool) -> Case:
     truth = np.where(there, np.sqrt(np.maximum(_RADIUS**2 - away**2, 0)) - _RADIUS, np.nan)
     lit = (zenith >= _LIT[0]) & (zenith <= _LIT[1])
     middle = (np.floor(np.nan_to_num(truth) / _PRESS_STEP) + 0.5) * _PRESS_STEP
-    press = _Press(
-        np.where(lit, middle, np.nan).astype(np.float32),
-        np.where(lit, _PRESS_STEP / np.sqrt(12), np.nan).astype(np.float32),
+    height, sigma = (
+        np.where(lit, values, np.nan).astype(np.float32) for values in (middle, _PRESS_STEP / np.sqrt(12))
     )
+    press = Onset(height, sigma, lit.astype(np.uint8), np.zeros(lit.shape, np.int32), 0.0)
     sensor = _SENSORS[1]
     normals = toward(np.where(there, zenith, 0.0), np.arctan2(y, x))
     frames = expose(normals, sensor, 10)
     told = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    turn = _Turn(told.vectors, told.sigma, (told.contact * there).astype(np.uint8))
+    turn = replace(told, contact=(told.contact * there).astype(np.uint8))
     found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
     inner = zenith <= _LIT[1]
     error = (found.height - truth)[inner]
@@ -433,17 +342,6 @@ def run_fusion(device: Device, quick: bool) -> Case:
     return _case(
         "accuracy-fusion", f"a ball of 10 mm on {size} x {size} pixels, pressed in steps of 0.1 mm", targets
     )
-
-
-class _Press(NamedTuple):
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-
-
-class _Turn(NamedTuple):
-    vectors: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    contact: NDArray[np.uint8]
 
 
 def _grid(shape: tuple[int, int]) -> tuple[Doubles, Doubles]:
@@ -467,71 +365,6 @@ def _range_error(found: Surface, known: Known) -> float:
     return float(np.std(error) / np.ptp(known.height[np.isfinite(found.height)]))
 
 
-_READ_NOISE, _ELECTRONS = 2.0, 4.0  # standard deviation, counts; electrons of a count
-_LIGHTS = 8  # of light, from dark to bright
-_WAY = 12.0  # width of the picture, mm
-
-
-def run_twin(device: Device, quick: bool) -> Case:
-    """Hold the moments of a camera's noise against its numbers, from the dark to full light.
-
-    Read noise is normal, shot noise Poisson's: in counts, light L above the dark has the variance r^2 + L / e
-    and the third moment L / e^2, with e electrons a count.
-    """
-    shape, count = ((60, 80), 12) if quick else ((240, 320), 30)
-    travel = np.linspace(0.05, 3.0, count)
-    clean = _render(shape, travel, Camera(np.dtype(np.float32), noise=0.0), device)
-    noisy = _render(
-        shape, travel, Camera(np.dtype(np.float32), noise=_READ_NOISE, electrons=_ELECTRONS), device
-    )
-    whole = _render(shape, travel, Camera(noise=_READ_NOISE, electrons=_ELECTRONS), device)
-    targets = []
-    for number, part in enumerate(_cut(clean)):
-        if np.count_nonzero(part) > 2000:
-            targets += _moments(f"light {number + 1} of {_LIGHTS}", clean[part], noisy[part])
-    rounded = np.rint(np.clip(noisy, 0, 255))
-    targets.append(
-        at_most("8 bits: counts that are not the rounded ones", float(np.mean(whole != rounded)), 1e-4)
-    )
-    return _case(
-        "accuracy-twin", f"noise of {count} x {shape[0]} x {shape[1]} samples of the twin's camera", targets
-    )
-
-
-def _render(
-    shape: tuple[int, int], travel: NDArray[np.float64], camera: Camera, device: Device
-) -> NDArray[np.float64]:
-    """Return the frames of a press on the sphere, as float64."""
-    size = _WAY / shape[1]
-    twin = Twin(
-        object="sphere", movement=Vertical(travel), shape=shape, pixel_size=size, camera=camera, device=device
-    )
-    out = np.empty((len(travel), *shape), camera.dtype)
-    twin.read(out)
-    return out.astype(np.float64)
-
-
-def _cut(clean: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
-    """Return where samples are of each level of light."""
-    ends = np.linspace(clean.min(), clean.max(), _LIGHTS + 1)
-    ends[-1] += 1
-    return [(clean >= low) & (clean < high) for low, high in pairwise(ends)]
-
-
-def _moments(where: str, clean: NDArray[np.float64], noisy: NDArray[np.float64]) -> list[Target]:
-    """Return targets of the first three moments, each with the slack of four of its standard errors."""
-    light, count = clean - Camera().dark, clean.size
-    variance = _READ_NOISE**2 + np.maximum(light, 0) / _ELECTRONS
-    z = (noisy - clean) / np.sqrt(variance)
-    third = float(np.mean(np.maximum(light, 0) / _ELECTRONS**2 / variance**1.5))
-    slack = 4 / np.sqrt(count)
-    return [
-        at_most(f"{where}: mean, in standard errors of it", abs(float(z.mean())) * np.sqrt(count), 4.5),
-        within(f"{where}: variance of the expected one", float(z.var()), 1 - 1.6 * slack, 1 + 1.6 * slack),
-        within(f"{where}: third moment", float(np.mean(z**3)), third - 4 * slack, third + 4 * slack),
-    ]
-
-
 def _case(name: str, title: str, targets: list[Target]) -> Case:
     return Case(name, title, [], {}, (), tuple(targets))
 
@@ -539,9 +372,6 @@ def _case(name: str, title: str, targets: list[Target]) -> Case:
 CASES: Cases = {
     "accuracy-press": run_press,
     "accuracy-normals": run_normals,
-    "accuracy-correlation": run_correlation,
-    "accuracy-edges": run_edges,
     "accuracy-surfaces": run_surfaces,
     "accuracy-fusion": run_fusion,
-    "accuracy-twin": run_twin,
 }

@@ -1,4 +1,4 @@
-"""Correlation with a rotation's phase: the engine, the limits and NumPy, PyTorch and Numba on one stack."""
+"""Correlation with a rotation's phase: the engine, the limits and NumPy and Numba on one stack."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _ROOM = 128  # bytes of a pixel for what all works keep
 _STATE = 4 * 4  # bytes of a pixel's sums over a window
 _UNITS = 2**17  # of a cosine in a peer's sums
 _TILE = 1024  # pixels of Numba
-_SAMPLES = {"NumPy": 65_536, "PyTorch": 2_097_152}  # of a tile: more leave the cache, fewer pay for calls
+_SAMPLES = 65_536  # of a tile of NumPy: more leave the cache, fewer pay for calls
 
 
 class Wave(NamedTuple):
@@ -78,9 +78,8 @@ def run_stack(device: Device, quick: bool) -> Case:
         correlator.push(frames, phase=phase)
         return correlator.result()
 
-    absent = missing("torch", "numba")
+    absent = missing("numba")
     peers: dict[str, Callable[[Counts, Doubles], Wave]] = {"NumPy": _numpy}
-    peers |= {} if "torch" in absent else {"PyTorch": _torch}
     peers |= {} if "numba" in absent else {"Numba": _numba}
     theirs: dict[str, Work] = {name: functools.partial(fit, frames, phase) for name, fit in peers.items()}
 
@@ -116,9 +115,8 @@ def run_sliding(device: Device, quick: bool) -> Case:
             correlator.push(frames[k : k + 1], phase=phase[k : k + 1])
         device.finish()
 
-    absent = missing("torch", "numba")
+    absent = missing("numba")
     peers: dict[str, _Slide] = {"NumPy": _numpy_slide}
-    peers |= {} if "torch" in absent else {"PyTorch": _torch_slide}
     peers |= {} if "numba" in absent else {"Numba": _numba_slide}
     windows = {name: _Window(slide, frames, phase) for name, slide in peers.items()}
 
@@ -182,7 +180,7 @@ def _numpy(frames: Counts, phase: Doubles) -> Wave:
     maps, raw, size = (
         np.empty((4, frames[0].size), np.float32),
         frames.reshape(len(frames), -1),
-        _SAMPLES["NumPy"],
+        _SAMPLES,
     )
     fit, model = fit_matrix(phase).astype(np.float32), basis(phase)
     gram, size = (model.T @ model).astype(np.float32), size // len(frames)
@@ -213,38 +211,6 @@ def _numpy_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
             np.subtract(total, np.multiply(go, less, out=spare), out=total)
         np.add(flat[3, pixels], np.multiply(come, come, out=come), out=flat[3, pixels])
         np.subtract(flat[3, pixels], np.multiply(go, go, out=go), out=flat[3, pixels])
-
-
-def _torch(frames: Counts, phase: Doubles) -> Wave:
-    """Fit large tiles, each operation on all cores, in place."""
-    import torch
-
-    torch.set_num_threads(THREADS)
-    raw, maps = torch.from_numpy(frames.reshape(len(frames), -1)), torch.empty(4, frames[0].size)
-    size = _SAMPLES["PyTorch"] // len(frames)
-    room = torch.empty(len(frames), min(size, raw.shape[1]))
-    fit, model = torch.from_numpy(fit_matrix(phase)).float(), basis(phase)
-    gram = torch.from_numpy(model.T @ model).float()
-    for first in range(0, raw.shape[1], size):
-        pixels = slice(first, first + size)
-        x = room[:, : raw[:, pixels].shape[1]].copy_(raw[:, pixels])
-        reference = x[0].clone()
-        wave = fit @ x.sub_(reference)
-        left = x.square_().sum(0).sub_((gram @ wave).mul_(wave).sum(0)).clamp_(min=0)
-        torch.add(wave[0], reference, out=maps[0, pixels])
-        maps[1:3, pixels] = wave[1:]
-        torch.sqrt(left.div_(len(frames) - 3), out=maps[3, pixels])
-    return Wave(*maps.numpy().reshape(4, *frames.shape[1:]))
-
-
-def _torch_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
-    import torch
-
-    come, go = (torch.from_numpy(frame).int() for frame in (now, gone))
-    *totals, square = torch.from_numpy(sums)
-    for total, more, less in zip(totals, rows[:3].tolist(), rows[3:].tolist(), strict=True):
-        total.add_(come, alpha=more).sub_(go, alpha=less)
-    square.addcmul_(come, come).addcmul_(go, go, value=-1)
 
 
 def _numba(frames: Counts, phase: Doubles) -> Wave:

@@ -89,18 +89,9 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One work of a case.
+    """One work of a case: what a turn moves (in and out, each once), its frames and multiply-adds, or 0.
 
-    Attributes
-    ----------
-    name : str
-    measured : Measured
-    bytes : int
-        That a turn must move: what goes in and what comes out, each once; 0 where nobody counts.
-    frames, operations : int
-        That a turn handles; multiply-adds of a turn. 0 where there are none, or nobody counted.
-    limit : Row or None
-        Of which this row's bandwidth is a share; None: of the first row of its case.
+    Its bandwidth is a share of that of `limit`, or of the first row of its case.
     """
 
     name: str

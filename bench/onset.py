@@ -39,14 +39,14 @@ from mirrorskin.kernels.onset import onset_levels
 Maps = dict[str, NDArray[Any]]
 Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
 
-_HD, _MEMORY, _VGA, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (256, 480, 640), (12, 48, 64)
+_HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
+_BYTE = np.dtype(np.uint8)
 _THRESHOLD = 0.5
 _MAPS = 64  # bytes a pixel for all maps
 _PLATEAU, _SURELY = (
     3.0,
     6.0,
 )  # sigmas a sample may be off its plateau, and below the level that are surely dark
-_INVALID = -2  # instead of a frame's number: a sample that is no number came before the onset
 _TILE = 131_072  # pixels of a peer's tile: more leave the cache, fewer pay more for each call
 _NUMBA_TILE = 16_384
 _COUNTABLE = 255  # frames that a byte counts
@@ -62,43 +62,34 @@ class OnsetCase:
 
     name: str
     shape: tuple[int, int, int] = _HD
-    dtype: str = "uint8"
     stack: StackName = "random"
     full: bool = False
-    hold: int = 1
 
     @property
     def options(self) -> dict[str, Any]:
         """Keywords of `OnsetSearch`."""
-        dtype = np.dtype(self.dtype)
         if self.full:
-            dark, bright = references(self.shape[1:], dtype)
+            dark, bright = references(self.shape[1:], _BYTE)
             return {"dark": dark, "bright": bright}
-        low, high = LEVELS[self.dtype]
-        return {
-            "dark": low,
-            "bright": high,
-            "hold": self.hold,
-            "subframe": False,
-            "noise": press_noise(dtype),
-        }
+        low, high = LEVELS[_BYTE.name]
+        noise = press_noise(_BYTE)
+        return {"dark": low, "bright": high, "hold": 1, "subframe": False, "noise": noise}
 
     @property
     def known(self) -> References:
         """What peers know: the same, prepared in the same way."""
         shape = self.shape[1:] if self.full else ()
-        options, dtype = self.options, np.dtype(self.dtype)
-        dark, bright = reference_maps(options["dark"], options["bright"], shape, dtype)  # type: ignore[arg-type]
-        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, dtype)
+        options = self.options
+        dark, bright = reference_maps(options["dark"], options["bright"], shape, _BYTE)  # type: ignore[arg-type]
+        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, _BYTE)
         return References(np.asarray(level), np.asarray(light), plateau)
 
 
 def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
     """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
-    dtype = np.dtype(case.dtype)
-    size = math.prod(case.shape) * dtype.itemsize
+    size = math.prod(case.shape)
     check_memory(case.name, 3 * size + _MAPS * math.prod(case.shape[1:]))
-    search = OnsetSearch(case.shape[1:], dtype, **case.options, device=device, memory_limit=2 * size)
+    search = OnsetSearch(case.shape[1:], _BYTE, **case.options, device=device, memory_limit=2 * size)
     frames = search.room[: case.shape[0]]
     if len(frames) < case.shape[0]:
         raise DeviceError(f"{device.info.title} has no room for {case.shape[0]} frames at once: use --quick")
@@ -131,37 +122,9 @@ def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
     works: dict[str, Work] = {f"{OURS}, push only": push, OURS: find, **theirs}
     measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
     rows = [Row(name, measured[name], size, len(frames)) for name in works]
-    what = "full default" if case.full else f"frame of the onset, one threshold, hold {case.hold}"
-    title = f"{what}; {' x '.join(map(str, case.shape))} {case.dtype}, {case.stack}"
+    what = "full default" if case.full else "frame of the onset, one threshold, hold 1"
+    title = f"{what}; {' x '.join(map(str, case.shape))} uint8, {case.stack}"
     return Case(case.name, title, limits.rows(measured) + rows, missing("torch", "numba"))
-
-
-def run_pushed(cases: dict[str, OnsetCase], device: Device, rounds: int) -> Case:
-    """Time whole presses whose frames are pushed one by one, from memory that is not the engine's.
-
-    A turn begins with a reset and ends when the device is done; the limits are those of one frame.
-    """
-    case = next(iter(cases.values()))
-    frames = np.empty(case.shape, case.dtype)
-    fill_press(frames, case.stack)
-    travel = travel_of(len(frames))
-    searches = {
-        name: OnsetSearch(case.shape[1:], case.dtype, **one.options, device=device)
-        for name, one in cases.items()
-    }
-
-    def press(search: OnsetSearch) -> None:
-        search.reset()
-        for t in range(len(frames)):
-            search.push(frames[t : t + 1], travel=travel[t : t + 1])
-        device.finish()
-
-    limits = Limits(device, frames[0].nbytes)
-    works: dict[str, Work] = {name: functools.partial(press, search) for name, search in searches.items()}
-    measured = take_turns({**limits.works(), **works}, rounds, device.profile)
-    rows = [Row(name, measured[name], frames.nbytes, len(frames)) for name in works]
-    title = f"one frame a push; {' x '.join(map(str, case.shape))} {case.dtype}, {case.stack}"
-    return Case(case.name, title, limits.rows(measured) + rows, {})
 
 
 class References(NamedTuple):
@@ -182,7 +145,7 @@ class References(NamedTuple):
 
 FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
 """``(frames, light, hold)`` to the number of each pixel's onset, (H, W): the first frame of the first run of
-`hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one, -2 after an invalid sample."""
+`hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one."""
 
 
 def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]) -> dict[str, Work]:
@@ -190,18 +153,18 @@ def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float6
     peers: dict[str, FirstLight] = {"NumPy": first_light, "OpenCV": _opencv}
     if "torch" not in absent:
         peers["PyTorch"] = _torch
-    noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), frames.dtype.kind == "u")
+    noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
     works: dict[str, Work] = {}
     for name, find in peers.items():
         if case.full:
             works[name] = functools.partial(_heights, find, frames, travel, known, noise)
         else:
-            works[name] = functools.partial(_onsets, find, frames, known, case.hold)
+            works[name] = functools.partial(_onsets, find, frames, known, 1)
     if "numba" not in absent:
         works["Numba"] = (
             functools.partial(_numba_heights, frames, travel, known, noise)
             if case.full
-            else functools.partial(numba_onsets, frames, known.light, case.hold)
+            else functools.partial(numba_onsets, frames, known.light, 1)
         )
     return works
 
@@ -249,7 +212,7 @@ def first_light(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.in
             onset += few
             few[:] = 0
     onset[undecided] = -1
-    return _without_gaps(frames, light, hold, onset)
+    return onset
 
 
 def _opencv(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
@@ -272,22 +235,19 @@ def _opencv(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]
             onset += few
             few[:] = 0
     onset[undecided != 0] = -1
-    return _without_gaps(frames, light, hold, onset)
+    return onset
 
 
 def _torch(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Do the same with PyTorch on the host; uint16 samples must be below 32768."""
+    """Do the same with PyTorch on the host."""
     import torch
 
-    def tensor(values: NDArray[Any]) -> Any:
-        return torch.from_numpy(values.view(np.int16) if values.dtype == np.uint16 else values)
-
-    level = tensor(light) if light.ndim else light.item()
+    level: Any = torch.from_numpy(light) if light.ndim else light.item()
     shape = frames.shape[1:]
     undecided, few, onset = np.ones(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
 
     def less(frame: NDArray[Any], out: NDArray[Any]) -> None:
-        torch.lt(tensor(frame), level, out=torch.from_numpy(out.view(np.uint8)))
+        torch.lt(torch.from_numpy(frame), level, out=torch.from_numpy(out.view(np.uint8)))
 
     for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
         torch.from_numpy(undecided).bitwise_and_(torch.from_numpy(dark.view(np.uint8)))
@@ -296,7 +256,7 @@ def _torch(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
             onset += few
             few[:] = 0
     onset[undecided != 0] = -1
-    return _without_gaps(frames, light, hold, onset)
+    return onset
 
 
 def _dark_frames(
@@ -314,26 +274,6 @@ def _dark_frames(
     yield dark
 
 
-def _without_gaps(
-    frames: NDArray[Any], light: Levels, hold: int, onset: NDArray[np.int32]
-) -> NDArray[np.int32]:
-    """Correct the onsets of the few pixels of float frames that have a sample which is no number."""
-    if frames.dtype.kind != "f":
-        return onset
-    with np.errstate(invalid="ignore", over="ignore"):
-        gaps = ~np.isfinite(frames.sum(axis=0, dtype=np.float32))
-    samples = frames[:, gaps]
-    broken = ~np.isfinite(samples)
-    is_light = samples >= (light[gaps] if light.ndim else light)
-    if hold == 2:
-        is_light[:-1] &= is_light[1:]
-    found = is_light.any(axis=0)
-    first = np.where(found, is_light.argmax(axis=0), len(frames))
-    spoiled = broken.any(axis=0) & (broken.argmax(axis=0) < first + hold)
-    onset[gaps] = np.where(spoiled, _INVALID, np.where(found, first, -1))
-    return onset
-
-
 def _answer(
     frames: NDArray[Any],
     onset: NDArray[np.int32],
@@ -342,7 +282,7 @@ def _answer(
     noise: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return height, sigma and status of onsets in NumPy: the full default, decision 2."""
-    dead = np.isnan(known.level) | (onset == _INVALID)
+    dead = np.isnan(known.level)
     status = np.select([dead, onset == -1, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
     row, column = found = np.nonzero(status == 1)
@@ -378,7 +318,7 @@ def numba_onsets(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.i
     """Find onsets with Numba: tiles on all cores, frame by frame, so that the inner loop is vector code."""
     onset = np.empty(frames.shape[1:], np.int32)
     each = light.ndim > 0
-    scan = _numba_scan(each, hold, frames.dtype.kind == "f", whole=False)
+    scan = _numba_scan(each, hold, whole=False)
     scan(frames.reshape(len(frames), -1), light.reshape(-1) if each else light[()], onset.reshape(-1))
     return onset
 
@@ -389,35 +329,23 @@ def _numba_heights(
     shape = frames.shape[1:]
     maps = {"height": np.empty(shape, np.float32), "sigma": np.empty(shape, np.float32)}
     maps |= {"status": np.empty(shape, np.uint8)}
-    run = _numba_scan(True, 2, frames.dtype.kind == "f", whole=True)
+    run = _numba_scan(True, 2, whole=True)
     flat = (values.reshape(-1) for values in (*known, *maps.values()))
     run(frames.reshape(len(frames), -1), travel, *flat, noise)
     return maps
 
 
 @functools.cache
-def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # noqa: C901  # to compile
+def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
     """Compile the search for onsets, with a level of each pixel or one for all, and heights if `whole`."""
     import numba
 
     numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
 
     @numba.njit
-    def settle(series, light):  # type: ignore[no-untyped-def]
-        run = 0
-        for t in range(len(series)):
-            if not np.isfinite(series[t]):
-                return _INVALID
-            run = run + 1 if series[t] >= light else 0
-            if run == hold:
-                return t + 1 - hold
-        return len(series) - run if run else -1
-
-    @numba.njit
     def search(frames, first, end, light, onset):  # type: ignore[no-untyped-def]
         count, pixels = len(frames), end - first
         undecided, few = np.ones(pixels, np.uint8), np.zeros(pixels, np.uint8)
-        sums = np.zeros(pixels if floats else 0, np.float32)
         onset[:] = 0
         for t in range(count):
             # Cut from a whole row: of a part of all rows, Numba does not know that samples lie side by side.
@@ -427,9 +355,6 @@ def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # 
                 open_ = undecided[p] & np.uint8(sample < (light[p] if each else light))
                 undecided[p] = open_
                 few[p] += open_
-            if floats:
-                for p in range(pixels):
-                    sums[p] += now[p]
             if (t + 1) % _COUNTABLE == 0 or t + 1 == count:
                 for p in range(pixels):
                     onset[p] += few[p]
@@ -437,8 +362,6 @@ def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # 
         for p in range(pixels):
             if undecided[p]:
                 onset[p] = -1
-            if floats and not np.isfinite(sums[p]):
-                onset[p] = settle(frames[:, first + p], light[p] if each else light)
 
     @numba.njit(error_model="numpy")
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
@@ -474,7 +397,7 @@ def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # 
             search(frames, first, end, light[first:end], onset)
             for p in range(first, end):
                 start = onset[p - first]
-                dead = np.isnan(level[p]) or start == _INVALID
+                dead = np.isnan(level[p])
                 status[p] = 0 if dead else 2 if start == -1 else 3 if start == 0 else 1
                 if status[p] == 1:
                     height[p], sigma[p] = answer(frames, p, start, travel, level[p], light[p], dark[p], noise)
@@ -486,36 +409,16 @@ def _numba_scan(each: bool, hold: int, floats: bool, *, whole: bool) -> Any:  # 
 
 _ONSET = (
     OnsetCase("equation4-uint8"),
-    OnsetCase("equation4-uint16", dtype="uint16"),
-    OnsetCase("equation4-float32", dtype="float32"),
     OnsetCase("equation4-memory", _MEMORY),
-    OnsetCase("hold2-uint8", hold=2),
     OnsetCase("full-uint8", full=True, stack="press"),
-    OnsetCase("full-uint16", dtype="uint16", full=True, stack="press"),
-    OnsetCase("full-float32", dtype="float32", full=True, stack="press"),
     OnsetCase("full-memory", _MEMORY, full=True, stack="press"),
     OnsetCase("full-random", full=True),
 )
 
 
-def _sized(case: OnsetCase, quick: bool) -> OnsetCase:
-    return replace(case, shape=_QUICK) if quick else case
+def _run(case: OnsetCase) -> Callable[[Device, bool], Case]:
+    small = replace(case, shape=_QUICK)
+    return lambda device, quick: run_onset(small if quick else case, device, 1 if quick else ROUNDS)
 
 
-def _onset(case: OnsetCase) -> Callable[[Device, bool], Case]:
-    return lambda device, quick: run_onset(_sized(case, quick), device, 1 if quick else ROUNDS)
-
-
-def _pushed(name: str, stack: StackName) -> Callable[[Device, bool], Case]:
-    def run(device: Device, quick: bool) -> Case:
-        plain = _sized(OnsetCase(name, _VGA, stack=stack), quick)
-        cases = {f"{OURS}, equation 4": plain, f"{OURS}, full default": replace(plain, full=True)}
-        return run_pushed(cases, device, 1 if quick else ROUNDS)
-
-    return run
-
-
-CASES: Cases = {case.name: _onset(case) for case in _ONSET} | {
-    "live": _pushed("live", "press"),
-    "live-random": _pushed("live-random", "random"),
-}
+CASES: Cases = {case.name: _run(case) for case in _ONSET}

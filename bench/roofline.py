@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin.bench.report import is_limit
 from mirrorskin.bench.run import Data
@@ -27,7 +26,7 @@ _COLOURS = "#0072b2", "#d55e00", "#009e73", "#b5508f", "#b07d00", "#2b9ad6", "#6
 _ROOF, _INSIDE = "#333333", "#f4f6f8"
 _LINES = 24  # of names that a picture is high
 _SHARE = 0.69  # of the width for the roof, the rest is for names
-_DISC, _PUSHES = 13, 60  # a disc's size in points, and how often discs are pushed apart
+_DISC = 13  # points
 _BESIDE = 1.08  # factor by which a text is above or below its slope
 _NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "white", "fontsize": 7.5}
 
@@ -186,33 +185,13 @@ def _name_slope(axes: Axes, said: str, bandwidth: float, *, above: bool) -> None
 
 def _draw_kernels(axes: Axes, kernels: Sequence[Kernel]) -> None:
     """Draw each kernel with its number, and small where it is in other sizes and types."""
-    places = np.array([(one.best.intensity, one.best.rate / _GIGA) for one in kernels])
-    discs = _spread(axes, places)
     for number, (kernel, colour) in enumerate(zip(kernels, _colours(kernels), strict=True), 1):
         across = [point.intensity for point in kernel.points]
         up = [point.rate / _GIGA for point in kernel.points]
         axes.plot(across, up, "o", ms=3.5, color=colour, alpha=0.4, mew=0, zorder=3)
-        place, disc = places[number - 1], discs[number - 1]
-        axes.plot(*zip(place, disc, strict=True), "-", color=colour, lw=1, zorder=3)
-        axes.plot(*place, "o", ms=4, color=colour, mew=0, zorder=3)
-        axes.plot(*disc, "o", ms=_DISC, color=colour, mec="white", mew=0.8, zorder=4)
-        axes.text(disc[0], disc[1], str(number), zorder=5, **_NUMBER)
-
-
-def _spread(axes: Axes, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return places for discs, (N, 2), none on another: those that are too near are pushed apart."""
-    ends = np.log10([axes.get_xlim(), axes.get_ylim()])
-    scale = 72 * np.array([_WIDTH * _SHARE, _HEIGHT * 0.85]) / (ends[:, 1] - ends[:, 0])
-    found = np.log10(places) * scale
-    for _ in range(_PUSHES):
-        apart = found[:, np.newaxis] - found
-        # Two in one place are pushed to either side.
-        apart[..., 0] += 1e-3 * np.sign(np.subtract.outer(np.arange(len(found)), np.arange(len(found))))
-        distance = np.hypot(apart[..., 0], apart[..., 1]) + np.eye(len(found))
-        lack = np.clip(_DISC + 1.5 - distance, 0, None) * (1 - np.eye(len(found)))
-        found += (apart * (lack / distance / 2)[..., np.newaxis]).sum(axis=1)
-    spread: NDArray[np.float64] = 10 ** (found / scale)
-    return spread
+        place = kernel.best.intensity, kernel.best.rate / _GIGA
+        axes.plot(*place, "o", ms=_DISC, color=colour, mec="white", mew=0.8, zorder=4)
+        axes.text(*place, str(number), zorder=5, **_NUMBER)
 
 
 def _draw_list(axes: Axes, roofline: Roofline) -> None:

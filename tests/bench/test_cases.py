@@ -23,8 +23,7 @@ from mirrorskin.kernels.device import open_device
 
 QUICK = (
     "equation4-uint8",
-    "full-float32",
-    "live",
+    "full-uint8",
     "correlate-uint8",
     "sliding",
     "normals-uint8",
@@ -35,7 +34,7 @@ QUICK = (
     "file-press",
     "file-lab",
     "live-vertical-vga",
-    "accuracy-edges",
+    "accuracy-fusion",
 )
 
 

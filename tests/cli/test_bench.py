@@ -53,7 +53,7 @@ def names_of(told):
 
 
 def test_a_run_agrees_with_its_peers_and_writes_json_and_a_page(tmp_path):
-    words = ["--case", "equation4-uint8", "--case", "hold2-uint8", "-o", tmp_path / "run.json"]
+    words = ["--case", "equation4-uint8", "--case", "full-uint8", "-o", tmp_path / "run.json"]
     told = json.loads(ran(["--quick", "--json"], *words))
     assert told == json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
     assert {"date", "commit", "device", "processor", "threads", "versions"} <= set(told)
@@ -65,12 +65,12 @@ def test_a_run_agrees_with_its_peers_and_writes_json_and_a_page(tmp_path):
 
 
 def test_the_table_fits_a_hundred_columns():
-    names = ["--case", "full-float32", "--case", "live"]
+    names = ["--case", "full-uint8", "--case", "correlate-uint8"]
     table = ran(["--quick"], *names).splitlines()
     assert max(map(len, table)) <= 100
     works = [line.split("  ")[0] for line in table]
     assert works.count("read limit") == 2
-    assert {"mirrorskin", "NumPy", "OpenCV", "mirrorskin, full default"} <= set(works)
+    assert {"mirrorskin", "NumPy", "OpenCV", "mirrorskin, push only"} <= set(works)
 
 
 def test_the_names_of_all_cases_are_told():
