@@ -10,6 +10,7 @@ import pytest
 import rotations
 import walls
 from rotations import EIGHTHS, TILT
+from stacks import MadeUp
 
 from mirrorskin import engine, hw, io
 from mirrorskin.engine.live import LiveRotation
@@ -43,38 +44,15 @@ class Ball:
         return np.sqrt(np.where(square > 0, square, np.nan))
 
 
-class Frames:
+class Frames(MadeUp):
     """Frames in memory, which may be read again if that is said."""
 
-    name, motion = "a ball", "axial"
-
     def __init__(self, frames, phase, header, rewindable=True):
-        self.frames, self.phase, self.header, self.rewindable = frames, phase, header, rewindable
-        self.shape, self.dtype, self._next = frames.shape, frames.dtype, 0
+        super().__init__(frames, header, phase=phase)
+        self.phase, self.rewindable = phase, rewindable
 
     def rewind(self):
-        self._next = 0
-
-    def read(self, out=None, /):
-        part = slice(self._next, min(self._next + (1 if out is None else len(out)), len(self.frames)))
-        self._next = part.stop
-        if part.start == part.stop:
-            return None
-        frames = self.frames[part].copy() if out is None else out[: part.stop - part.start]
-        frames[:] = self.frames[part]
-        return io.Block(frames, part.start, phase=self.phase[part])
-
-    def now(self):
-        return 0.0
-
-    def positions(self):
-        return {"phase": self.phase}
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
+        self.frames_read = 0
 
 
 class Scene(NamedTuple):
@@ -175,12 +153,6 @@ def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_told():
     known = replace(scene().calibration, zenith=wall)
     doubtful = engine.reconstruct(scene().source(calibration=known)).normal_sigma
     np.testing.assert_allclose(doubtful, np.sqrt(plain().normal_sigma ** 2 + 0.005**2), rtol=1e-5)
-
-
-def test_a_gain_that_is_given_goes_before_the_response():
-    result = engine.reconstruct(scene().source(), gain=300.0, offset=-40.0)
-    assert "zenith" not in result.process
-    assert result.process["zenith_gain"] == 300
 
 
 @pytest.mark.parametrize("missing", ["pixel_size", "press"])

@@ -65,11 +65,6 @@ def test_a_roof_goes_on_to_its_ridge():
     np.testing.assert_allclose(found[known], (0.9 - fall * np.abs(X))[known], atol=0.02)
 
 
-def test_where_nothing_is_known_the_object_stands_at_the_press():
-    found, _ = stand((np.full_like(X, 0.5), np.zeros_like(X)), 0.7, contact=np.zeros_like(X, bool))
-    np.testing.assert_array_equal(found, 0.7)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 700), (600, 3)])
 def test_pictures_may_have_any_size(shape):
     vectors = np.zeros((*shape, 3), np.float32)

@@ -107,16 +107,6 @@ def test_a_jump_counts_from_ten_degrees_on(device, jump, azimuth):
     assert_follows(edges, lines, least=0.99)
 
 
-def test_where_contact_ends_is_an_edge_though_the_normal_does_not_jump(device):
-    x, y = grid()
-    contact = np.hypot(x - 0.3, y + 0.2) < 2.1
-    level = np.broadcast_to([0.0, 0.0, 1.0], (*SHAPE, 3))
-    lines = creases.edges_of(
-        creases.Dome(50.0, 0.01, name="plate"), lambda x, y: np.hypot(x - 0.3, y + 0.2) < 2.1, SHAPE, PIXEL
-    )
-    assert_follows(find(level, np.full(SHAPE, 1e-3), contact, device), lines, least=0.99)
-
-
 @cache
 def rotation(name):
     """Frames of the rotating twin on an object, and the lines that are true all the turn."""
@@ -148,25 +138,6 @@ def test_edges_are_found_in_what_the_twin_sees(device, relief):
     assert_follows(edges, lines)
 
 
-def test_agreement_is_of_lines_within_a_pixel():
-    circle = creases.edges_of(DOME, creases.pressed(DOME, 100.0), SHAPE, PIXEL)
-    row, column = np.indices(SHAPE)
-    away = np.hypot(row - (SHAPE[0] - 1) / 2, column - (SHAPE[1] - 1) / 2) - DOME.foot / PIXEL
-    line, half = (np.abs(away) < 0.6), (column < SHAPE[1] / 2)
-    assert creases.agreement(line, circle)[:2] == (1, 1)
-    assert creases.agreement(line & half, circle).recall == pytest.approx(0.5, abs=0.02)
-    assert creases.agreement(np.abs(away - 2) < 0.6, circle)[:2] == (0, 0)
-    stray = np.random.default_rng(0).random(SHAPE) < 0.2 * line.mean()
-    assert 0.8 < creases.agreement(line | stray, circle).precision < 0.9
-    assert (
-        creases.agreement(line, circle).thickness
-        < 1.4
-        < creases.agreement(np.abs(away) < 1, circle).thickness
-    )
-    assert creases.agreement(np.zeros(SHAPE), circle)[:2] == (0, 0)
-    assert creases.agreement(line, circle._replace(points=np.empty((0, 2))))[:2] == (0, 0)
-
-
 SMALL = (21, 34)
 
 
@@ -177,14 +148,6 @@ def plain_roof(degrees=30.0, sigma=0.01):
     vectors = np.stack([np.sin(facing), np.zeros_like(facing), np.cos(facing)], axis=-1)
     vectors = np.broadcast_to(vectors, (*SMALL, 3)).astype(np.float32)
     return vectors.copy(), np.full(SMALL, sigma, np.float32), np.ones(SMALL, np.uint8)
-
-
-def test_a_ridge_is_one_thin_line(device):
-    edges = engine.find_edges(*plain_roof(), device=device)
-    assert edges.dtype == np.uint8
-    inner = edges[1:-1]  # at the picture's end too few pairs are known
-    assert (inner[:, 15:17].sum(axis=1) == 1).all()
-    assert edges.sum() <= SMALL[0]
 
 
 def test_wrong_flags_of_contact_are_no_edges_and_true_ends_are(device):
@@ -205,11 +168,6 @@ def test_what_has_no_normal_makes_no_edge_of_its_own(device):
     edges = engine.find_edges(vectors, sigma, contact, device=device)
     assert not edges[:5].any()
     assert (edges[6:-1].sum(axis=1) == 1).all()
-
-
-def test_a_single_pixel_has_no_edge(device):
-    vectors, sigma, contact = plain_roof()
-    assert not engine.find_edges(vectors[:1, :1], sigma[:1, :1], contact[:1, :1], device=device).any()
 
 
 @pytest.mark.parametrize("wrong", ["vectors", "sigma", "empty"])

@@ -81,14 +81,6 @@ def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(devic
     assert found.contact.mean() > 0.98
 
 
-def test_the_noise_is_told_from_the_frames():
-    response = made(pivot=walls.PIVOT)
-    frames, _ = frames_of(response, 0.55, -1.0, noise=2.0)
-    frames[:, 0] = 10.0  # dark and still
-    found = estimate_normals(frames, PHASE, tilt=TILT, response=response)
-    assert found.noise == pytest.approx(2.0, rel=0.12)
-
-
 def test_dark_pixels_are_told_to_be_too_level():
     response = made()
     light = np.full(SHAPE, 0.5)

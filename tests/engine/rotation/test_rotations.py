@@ -51,24 +51,3 @@ def test_what_clipping_leaves_is_what_the_likelihood_tells(z):
     mirrored = replace(noisy, low=level - 2 * z)
     assert rotations.clipped_share(normal, mirrored)[0] == pytest.approx(expected, abs=1e-9)
     np.testing.assert_array_equal(rotations.clipped_share(normal, noisy), 1.0)
-
-
-def test_the_scorer_sees_a_bias_a_wrong_sigma_and_a_missing_answer():
-    stack = rotations.draw(SETUPS["uint8"], 4000, seed=6, bins=[(30, 30), (1, 1)])
-    right, up = rotations.tangents(stack.normals)
-    noise = np.random.default_rng(0).normal(0, 1e-3, (2, *stack.bound.shape, 1))
-    found = stack.normals + right * noise[0] + up * noise[1]
-    sigma = np.full(stack.bound.shape, 1e-3 * np.sqrt(2))
-    told = rotations.scores(found, sigma, stack)
-    np.testing.assert_allclose(told.rms, sigma[:, 0], rtol=0.03)
-    np.testing.assert_allclose(told.chi_square, 1, atol=0.06)
-    np.testing.assert_allclose(rotations.scores(found, 2 * sigma, stack).chi_square, told.chi_square / 4)
-    assert np.abs(rotations.mean_error(found, stack)).max() < 4
-    zenith, azimuth = rotations.angles(found)
-    for moved in (
-        rotations.direction(zenith + 2e-4, azimuth),
-        rotations.direction(zenith, azimuth + 2e-4 / np.sin(zenith)),
-    ):
-        assert np.all(np.abs(rotations.mean_error(moved, stack)).max(axis=1) > 4)
-    found[0, 7] = np.nan
-    assert np.isnan(rotations.scores(found, sigma, stack).ratio[0])
