@@ -228,8 +228,8 @@ class Device:
         --------
         >>> device = open_device()
         >>> words = device.given("words", np.arange(8), np.uint32)
-        >>> copy = device.kernel("limits", "copy_all", LANES=1, WORDS=4, STRIDE=1)
-        >>> copy(1, words=words, count=4, moved=32)
+        >>> copy = device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)
+        >>> copy(1, words=words, count=2, moved=32)
         >>> words.download().tolist()
         [0, 1, 2, 3, 0, 1, 2, 3]
         """

@@ -1,5 +1,6 @@
 """The device layer: the choice, arrays in both kinds of memory, builds that fail, profiles."""
 
+import doctest
 import threading
 from dataclasses import replace
 
@@ -198,3 +199,7 @@ def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
     monkeypatch.setattr(device, "_program", refuse)
     with pytest.raises(DeviceError, match="set XDG_CACHE_HOME"):
         device.kernel("limits", "copy_all", ANEW=1, **MACROS)
+
+
+def test_the_example_runs():
+    assert doctest.testmod(device_layer).failed == 0
