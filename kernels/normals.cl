@@ -404,9 +404,9 @@ Direction begin_at_wall(const F *lights, const F mean, __global const float *tur
 {
     F x = 0.0f, y = 0.0f, q = OF_INVERSE(INVERSE - 1);
     for (int k = 0; k < COUNT; ++k) {
-        const F apart = lights[k] == lights[k] ? lights[k] - mean : (F)0.0f;
-        x += IN_COSINE(k) * apart;
-        y += IN_SINE(k) * apart;
+        const F deviation = lights[k] == lights[k] ? lights[k] - mean : (F)0.0f;
+        x += IN_COSINE(k) * deviation;
+        y += IN_SINE(k) * deviation;
     }
     const F most = LESSER(mean, (F)LIGHTEST), light = GREATER(most, (F)DARKEST);
     for (int i = INVERSE - 2; i >= 0; --i) q = q * light + OF_INVERSE(i);
@@ -570,13 +570,13 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
 
 #if ENDS || WALL
 #define COUNT_WITHIN                                                                             \
-    I plain = 0;                                                                                 \
+    I usable = 0;                                                                                 \
     for (int k = 0; k < COUNT; ++k) {                                                            \
         const F margin = MARGIN * error_of_one * (1.0f / WEIGH(1.0f, k));                        \
-        plain -= (zeniths[k] > low + margin) & (zeniths[k] < high - margin) & WHOLE(LOAD(k));    \
+        usable -= (zeniths[k] > low + margin) & (zeniths[k] < high - margin) & WHOLE(LOAD(k));    \
     }
 #else
-#define COUNT_WITHIN const I plain = whole;
+#define COUNT_WITHIN const I usable = whole;
 #endif
 #if WALL
 #define READ_ENDS                                                                                \
@@ -603,21 +603,21 @@ Wave fit_wave(const F *zeniths, __global const float *turn)
     COUNT_WITHIN                                                                                 \
     const Wave wave = fit_wave(zeniths, turn);
 
-// With the tilt free as well, what is left of the residuals is noise, or a loss of contact.
-#define CONCLUDE(plain, at_rest, model)                                                          \
+// With the tilt free as well, what remains of the residuals is noise, or a loss of contact.
+#define CONCLUDE(usable, at_rest, model)                                                          \
     const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det;                \
     const F error = error_of_one * roots((sums.m11 + sums.m22) * GREATER(scaled, (F)0.0f));       \
-    const I answered = (plain >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f); \
+    const I answered = (usable >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.ct > 0.0f); \
     const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scaled;                             \
     const F d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scaled;                             \
     const F w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) * scaled;                           \
     const F w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) * scaled;                           \
-    const F told = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);                 \
-    const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / told;             \
-    const F left = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;                 \
-    const F doubt = 3.0f * error_of_one * inverse_roots(told);                                    \
-    const I apart = at_rest | (more_tilt + doubt < still_below) | (more_tilt - doubt > wild_above); \
-    KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(left, model) & ~apart)
+    const F information = GREATER(sums.m33 - sums.m13 * w1 - sums.m23 * w2, (F)1e-12f);                 \
+    const F pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2, more_tilt = pull / information;             \
+    const F remainder = sums.square - sums.b1 * d1 - sums.b2 * d2 - pull * more_tilt;                 \
+    const F uncertainty = 3.0f * error_of_one * inverse_roots(information);                                    \
+    const I off_tilt = at_rest | (more_tilt + uncertainty < still_below) | (more_tilt - uncertainty > wild_above); \
+    KEEP_ANSWER(answered, found.st * found.cp, found.st * found.sp, found.ct, error, LIKE_NOISE(remainder, model) & ~off_tilt)
 
 #if WALL
 // Where too few samples tell anything, there is no answer, however closely one looks.
@@ -632,23 +632,23 @@ __kernel void normals_wall(ARGUMENTS)
         Sums sums = look(found, zeniths, wave, turn, cos_tilt, sin_tilt HERE, 1);
         const F waves = sums.waves;
         found = step(found, sums);
-        const I odd = ((plain < COUNT) | (sums.within < COUNT)) & (plain >= LEAST);
-        if (ANY(odd)) {
+        const I irregular = ((usable < COUNT) | (sums.within < COUNT)) & (usable >= LEAST);
+        if (ANY(irregular)) {
             Direction at = begin;
             for (int more = 0; more < MORE; ++more) {
                 const Sums closer = look_closely(at, zeniths, frames, begins, each, p, turn, cos_tilt, sin_tilt,
                                                  offset, per_count, low, high, error_of_one HERE);
-                sums = blend_sums(sums, closer, odd);
+                sums = blend_sums(sums, closer, irregular);
                 const Direction before = at;
                 at = step(at, closer);
                 const F along = at.ct - before.ct, x = at.st * at.cp - before.st * before.cp;
                 const F y = at.st * at.sp - before.st * before.sp;
-                if (!ANY(odd & (along * along + x * x + y * y > SETTLED))) break;
+                if (!ANY(irregular & (along * along + x * x + y * y > SETTLED))) break;
             }
-            found = blend(found, at, odd);
+            found = blend(found, at, irregular);
         }
-        const I telling = LESSER(plain, sums.within);
-        CONCLUDE(telling, (found.st < rest_below), limit * (1.0f / COUNT) * sums.m11)
+        const I known = LESSER(usable, sums.within);
+        CONCLUDE(known, (found.st < rest_below), limit * (1.0f / COUNT) * sums.m11)
         KEEP_WAVE(waves)
     }
 }
@@ -664,18 +664,18 @@ __kernel void normals_exact(ARGUMENTS)
         const F waves = sums.waves;
         Direction found = step(nearer, sums);
         // Where too few samples tell anything, there is no answer, however closely one looks.
-        const I odd = (plain < COUNT) & (plain >= LEAST);
-        if (ANY(odd)) {
+        const I irregular = (usable < COUNT) & (usable >= LEAST);
+        if (ANY(irregular)) {
             Direction at = begin;
             for (int more = 0; more < MORE; ++more) {
                 const Sums closer = look_closely(at, zeniths, frames, begins, each, p, turn, cos_tilt, sin_tilt,
                                                  offset, per_count, low, high, error_of_one);
-                sums = blend_sums(sums, closer, odd);
+                sums = blend_sums(sums, closer, irregular);
                 at = step(at, closer);
             }
-            found = blend(found, at, odd);
+            found = blend(found, at, irregular);
         }
-        CONCLUDE(plain, AT_REST, limit)
+        CONCLUDE(usable, AT_REST, limit)
         KEEP_WAVE(waves)
     }
 }
@@ -701,9 +701,9 @@ __kernel void normals_paper(
         const F along = cp * cp * of_cosine + both + sp * sp * of_sine;
         const F error = error_of_one * roots(of_mean + slant * slant * across);
         const I answered = swings & (ct > 0.0f);
-        const F swung = swing * inverse, doubt = 3.0f * error_of_one * roots(along);
-        const I apart = AT_REST | (swung + doubt < still_below) | (swung - doubt > wild_above);
-        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves, limit) & ~apart)
+        const F swung = swing * inverse, uncertainty = 3.0f * error_of_one * roots(along);
+        const I off_tilt = AT_REST | (swung + uncertainty < still_below) | (swung - uncertainty > wild_above);
+        KEEP_ANSWER(answered, st * cp, st * sp, ct, error, LIKE_NOISE(waves, limit) & ~off_tilt)
         KEEP_WAVE(waves)
     }
 }

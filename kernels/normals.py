@@ -36,9 +36,7 @@ _MARGIN = 3.0  # standard deviations that a sample must be from the ends of a ra
 _MODEL = 0.2  # RMS of what the model may leave out in contact, as a share of the tilt
 _DOUBT = 2.0  # by which the variance of the noise may be wrong
 _REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
-_MOST = (
-    2.0  # tilts above which a pixel shows no wave of the body's: one that is constant looks level and tilted
-)
+_MOST = 2.0  # tilts above which a pixel shows no wave of the body's: a constant one looks level and tilted
 _STILL = 0.25  # share of the tilt below which a sheet does not follow the object
 
 
@@ -91,7 +89,7 @@ def contact_limits(freedom: int, tilt: float) -> Limits:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What is told of each pixel.
+    """The answer of each pixel.
 
     Attributes
     ----------
@@ -132,9 +130,9 @@ def normals_exact(
     sums = None
     for number in range(2 + MORE):
         # What is clipped, missing or out of range needs all steps, and only that is treated as such.
-        moves = samples.odd if number >= 2 else np.ones_like(samples.odd)
+        moves = samples.irregular if number >= 2 else np.ones_like(samples.irregular)
         if number == 2:
-            normal = np.where(samples.odd[:, np.newaxis], _start(samples, turn, tilt), normal)
+            normal = np.where(samples.irregular[:, np.newaxis], _start(samples, turn, tilt), normal)
         if not moves.any():
             break
         latest = _look(normal, samples, turn, tilt, closely=number >= 2)
@@ -143,7 +141,7 @@ def normals_exact(
     assert sums is not None
     with np.errstate(invalid="ignore"):
         rest = samples.mean < limits.rest
-    return conclude(normal, sums, samples, samples.plain, tilt, limits, limits.model, rest)
+    return conclude(normal, sums, samples, samples.usable, tilt, limits, limits.model, rest)
 
 
 def normals_paper(
@@ -164,11 +162,11 @@ def normals_paper(
         across = sp**2 * spread[1] - both + cp**2 * spread[3]
         along = cp**2 * spread[1] + both + sp**2 * spread[3]
         sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / swing) ** 2 * across)
-        doubt = 3 * samples.error * np.sqrt(along)
-        apart = (swing + doubt < limits.still) | (swing - doubt > limits.most)
+        uncertainty = 3 * samples.error * np.sqrt(along)
+        off_tilt = (swing + uncertainty < limits.still) | (swing - uncertainty > limits.most)
         touching = (
             _like_noise(samples.square, samples, limits.noise, limits.model)
-            & ~apart
+            & ~off_tilt
             & ~(zenith < limits.rest)
         )
     normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
@@ -220,30 +218,32 @@ class Samples:
             self.under, self.over = raw <= 0, raw >= self.top
         self.each = self.error / turn[2][:, np.newaxis]  # standard deviation of each sample
         margin = _MARGIN * self.each
-        plain = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
-        self.plain = (plain & ~self.under & ~self.over).sum(axis=0)
-        self.odd = self.plain < count
+        usable = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
+        self.usable = (usable & ~self.under & ~self.over).sum(axis=0)
+        self.irregular = self.usable < count
         self.mean, self.cosine, self.sine = turn[3:] @ self.zenith
         wave = self.mean + np.multiply.outer(turn[0], self.cosine) + np.multiply.outer(turn[1], self.sine)
         self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
 
-def conclude(normal: Doubles, sums: Sums, samples: Samples, plain: Array, tilt: float, limits: Limits,
+def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,
              model: float | Doubles, rest: NDArray[np.bool_]) -> Answer:  # fmt: skip
     """Say how certain a direction is, and whether it is one of a lasting contact.
 
-    The sums are those at the direction, or next to it; ``plain`` counts the samples that are whole and within
+    The sums are those at the direction, or next to it; ``usable`` counts the samples that are whole and within
     their range; ``model`` is the sum of squares that the model may leave out, in the unit of the samples,
     squared; ``rest`` is where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
-        more_tilt, told, left = _free_tilt(sums, det)
-        doubt = 3 * samples.error / np.sqrt(told)
-        apart = (tilt + more_tilt + doubt < limits.still) | (tilt + more_tilt - doubt > limits.most)
-        touching = _like_noise(left, samples, limits.noise, model) & ~apart & ~rest
-    unknown = (plain < _LEAST) | ~(sigma < _NO_ANSWER)
+        more_tilt, information, residual = _free_tilt(sums, det)
+        uncertainty = 3 * samples.error / np.sqrt(information)
+        off_tilt = (tilt + more_tilt + uncertainty < limits.still) | (
+            tilt + more_tilt - uncertainty > limits.most
+        )
+        touching = _like_noise(residual, samples, limits.noise, model) & ~off_tilt & ~rest
+    unknown = (usable < _LEAST) | ~(sigma < _NO_ANSWER)
     return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
 
 
@@ -310,14 +310,16 @@ def _look(normal: Doubles, samples: Samples, turn: Doubles, tilt: float, closely
     share, pull, misfit = np.ones_like(error), error, error**2
     if closely:
         inside = (zenith > samples.low) & (zenith < samples.high)
-        share, pull, misfit = tell(samples, np.clip(zenith, samples.low, samples.high), inside)
+        share, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
     return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit)
 
 
-def tell(samples: Samples, seen: Doubles, inside: NDArray[np.bool_]) -> tuple[Doubles, Doubles, Doubles]:
-    """Return what each sample tells: its share of information, its pull on the zenith, its squared misfit.
+def likelihood(
+    samples: Samples, seen: Doubles, inside: NDArray[np.bool_]
+) -> tuple[Doubles, Doubles, Doubles]:
+    """Return what each sample contributes: its share of information, its pull on the zenith, its squared misfit.
 
-    Expected is ``seen``; where that is not inside the range, a sample tells nothing.
+    Expected is ``seen``; where that is not inside the range, a sample contributes nothing.
 
     A clipped sample has the likelihood of being beyond its bound (Tobin 1958): with z the bound's distance
     in standard deviations and m the ratio of the normal distribution's density to its integral there, its
@@ -377,9 +379,9 @@ def _free_tilt(sums: Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     d1, d2 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det, (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
     w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) / det
     w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) / det
-    told = np.maximum(sums.m33 - sums.m13 * w1 - sums.m23 * w2, 1e-12)
+    information = np.maximum(sums.m33 - sums.m13 * w1 - sums.m23 * w2, 1e-12)
     pull = sums.b3 - sums.m13 * d1 - sums.m23 * d2
-    return pull / told, told, sums.square - sums.b1 * d1 - sums.b2 * d2 - pull**2 / told
+    return pull / information, information, sums.square - sums.b1 * d1 - sums.b2 * d2 - pull**2 / information
 
 
 def _like_noise(square: Doubles, samples: Samples, noise: float, model: float | Doubles) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ from mirrorskin.kernels.normals import (
     normalise,
     step,
     tangents,
-    tell,
+    likelihood,
 )
 from mirrorskin.kernels.response import light_slopes, wall_light
 
@@ -80,7 +80,7 @@ class Wall(NamedTuple):
 def normals_wall(
     frames: Array, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, noise: Variance, limits: Limits
 ) -> Answer:
-    """Find the most likely normals; samples that are expected out of range tell nothing of the direction.
+    """Find the most likely normals; samples that are expected out of range say nothing of the direction.
 
     The arguments are those of ``normals_exact``, but for ``scale``, (5, n): counts without light; light per
     count; x and y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. What the
@@ -89,24 +89,24 @@ def normals_wall(
     ends = np.broadcast_to(np.array(wall.ends)[:, np.newaxis], (2, scale.shape[1]))
     samples = Samples(frames, turn, np.concatenate([scale[:2], ends]), noise)
     beginning = _start(samples, scale, wall)
-    normal, odd = beginning, samples.odd
+    normal, irregular = beginning, samples.irregular
     sums, within = _look(normal, samples, turn, scale, wall, tilt, closely=False)
     for _ in range(1, STEPS):
         normal = step(normal, sums)
         sums, within = _look(normal, samples, turn, scale, wall, tilt, closely=False)
     normal = step(normal, sums)
-    odd = (odd | (within.sum(axis=0) < len(frames))) & (samples.plain >= _LEAST)
+    irregular = (irregular | (within.sum(axis=0) < len(frames))) & (samples.usable >= _LEAST)
     at = beginning
-    for _ in range(MORE if odd.any() else 0):
+    for _ in range(MORE if irregular.any() else 0):
         closer, there = _look(at, samples, turn, scale, wall, tilt, closely=True)
-        sums, within = closer.where(odd, sums), np.where(odd, there, within)
+        sums, within = closer.where(irregular, sums), np.where(irregular, there, within)
         at = step(at, closer)
-    normal = np.where(odd[:, np.newaxis], at, normal)
+    normal = np.where(irregular[:, np.newaxis], at, normal)
     whole = ~(samples.missing | samples.under | samples.over)
-    plain = np.minimum(samples.plain, (within & whole).sum(axis=0))
+    usable = np.minimum(samples.usable, (within & whole).sum(axis=0))
     steepness = sums.m11 / len(frames)
     rest = np.hypot(normal[:, 0], normal[:, 1]) < limits.rest
-    return conclude(normal, sums, samples, plain, tilt, limits, limits.model * steepness, rest)
+    return conclude(normal, sums, samples, usable, tilt, limits, limits.model * steepness, rest)
 
 
 def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
@@ -116,8 +116,8 @@ def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
     mean = zeniths.sum(axis=0) / known
     q = np.polynomial.polynomial.polyval(np.clip(mean, *wall.ends), wall.inverse)
     q = np.clip(q, *wall.reach)
-    apart = np.where(samples.missing, 0.0, samples.zenith - mean)
-    cosine, sine = wall.sense * (samples.turn[4:] @ apart)
+    deviation = np.where(samples.missing, 0.0, samples.zenith - mean)
+    cosine, sine = wall.sense * (samples.turn[4:] @ deviation)
     swing = np.hypot(cosine, sine)
     east, north = np.where(
         swing > 0, np.stack([cosine, sine]) / np.where(swing > 0, swing, 1), [[1.0], [0.0]]
@@ -136,7 +136,7 @@ def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
 def _look(
     normal: Doubles, samples: Samples, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, closely: bool
 ) -> tuple[Sums, NDArray[np.bool_]]:
-    """Form the normal equations at a direction, and tell which samples are expected within range."""
+    """Form the normal equations at a direction, and say which samples are expected within range."""
     turning, tilting = _rotations(turn, tilt)
     facing = np.einsum("kij,nj->kni", turning, normal)
     place = _places(scale, turning, wall)
@@ -150,7 +150,7 @@ def _look(
     error = samples.zenith - level
     share, pull, misfit = np.ones_like(error), error, error**2
     if closely:
-        share, pull, misfit = tell(samples, level, within)
+        share, pull, misfit = likelihood(samples, level, within)
         misfit = np.where(within, misfit, 0.0)
     return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit), within
 
