@@ -83,7 +83,7 @@ float saved(const float one, const float other, const float apart, const float s
     return apart < 0.5f ? 0.5f * (one + other) - series * inverse : least + (LN2 - logarithm) * inverse;
 }
 
-// How much of what a pixel asks along an axis goes to the link after it, and what it has to pay.
+// The share of a pixel's weight along an axis that goes to the link after it, and the pixel's cost.
 #define AXIS(there, slope, to_after, to_before, over, share, cost)                                              \
     const float rise_##there = (heights[to_after] - heights[p]) * over - slope[p];                              \
     const float fall_##there = (heights[p] - heights[to_before]) * over - slope[p];                             \

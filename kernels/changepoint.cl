@@ -1,4 +1,4 @@
-// The change-point of a pixel's brightness, and the height that it tells. Specification: changepoint.py.
+// The change-point of a pixel's brightness, and the height that follows. Specification: changepoint.py.
 //
 // FRAME   type of a sample
 // TOP     what a saturated sample holds; samples that can be NaN have none
@@ -113,7 +113,7 @@ __kernel void changepoint_sum(
     for (int t = 0; t < count; ++t) {
         __global const FRAME *restrict frame = frames + (size_t)t * pixels;
         for (int p = base; p < end; ++p) {
-            const Pair sum = settle(plus((Pair){total[p], total_rest[p]}, (Pair){(float)frame[p], 0}));
+            const Pair sum = normalised(plus((Pair){total[p], total_rest[p]}, (Pair){(float)frame[p], 0}));
             total[p] = sum.high;
             total_rest[p] = sum.rest;
         }
@@ -133,8 +133,8 @@ __kernel void changepoint_split(
         __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels;
         for (int p = base; p < end; ++p) {
             const FRAME sample = frame[p];
-            const Pair deviation = settle(minus((Pair){(float)sample, 0}, (Pair){mean[p], mean_rest[p]}));
-            const Pair sum = settle(plus((Pair){total[p], total_rest[p]}, deviation));
+            const Pair deviation = normalised(minus((Pair){(float)sample, 0}, (Pair){mean[p], mean_rest[p]}));
+            const Pair sum = normalised(plus((Pair){total[p], total_rest[p]}, deviation));
             total[p] = sum.high;
             total_rest[p] = sum.rest;
 
@@ -327,7 +327,7 @@ int is_flat(const samples_t *samples, const float noise)
     return light - dark < 6 * noise * sqrt(1.0f / before + 1.0f / after);
 }
 
-// Travel between frames, and beyond the ends as it was there, as the sum of two floats; the frame is told
+// Travel between frames, and beyond the ends as it was there, as the sum of two floats; the frame is given
 // from the start, which keeps its last bits.
 float2 travel_at(__global const float2 *restrict travel, const int count, const int start, const float crossing)
 {

@@ -3,7 +3,7 @@
 Brightness goes from a dark to a light level once, suddenly or along a ramp. Where both levels are known,
 `changepoint_scan` finds the change in one pass (Page, Biometrika 41, 1954). Where they are not,
 `changepoint_sum` and `changepoint_split` find it in two (Hinkley, Biometrika 57, 1970). Both keep the samples
-around the change, from which `changepoint_heights` tells when the level was crossed.
+around the change, from which `changepoint_heights` finds when the level was crossed.
 
 The way from light to dark is the same one with a gain below zero: what is said of dark and light here is then
 true of light and dark, and shares are of the way from light to dark.

@@ -1,6 +1,6 @@
 """Heights of a surface's connected pieces: what ``components.cl`` computes, in NumPy with float64 inside.
 
-A solver tells the relief: heights above a plane, up to an offset of each piece.
+A solver gives the relief: heights above a plane, up to an offset of each piece.
 """
 
 from __future__ import annotations

@@ -121,8 +121,8 @@ Pair pair_of(const Sum a)
 {
 #if WIDE
     const int top = (int)(a >> 44), middle = (int)(a >> 22) & 0x3fffff, low = (int)a & 0x3fffff;
-    const Pair most = settle((Pair){top * 17592186044416.0f, middle * 4194304.0f});  // times 2^44 and 2^22
-    return settle(plus(most, (Pair){low, 0}));
+    const Pair most = normalised((Pair){top * 17592186044416.0f, middle * 4194304.0f});  // times 2^44 and 2^22
+    return normalised(plus(most, (Pair){low, 0}));
 #else
     const float high = (float)a;
     return (Pair){high, (float)(a - (Sum)high)};
@@ -161,20 +161,20 @@ void add(
 {
     for (int p = 0; p < width; ++p) {
         const float sample = (float)frame[p] - sums->reference[p];
-        SET(sums, TOTAL, p, settle(plus(GET(sums, TOTAL, p), product_of(weight, sample))))
-        SET(sums, COSINE, p, settle(plus(GET(sums, COSINE, p), product_of(cosine, sample))))
-        SET(sums, SINE, p, settle(plus(GET(sums, SINE, p), product_of(sine, sample))))
+        SET(sums, TOTAL, p, normalised(plus(GET(sums, TOTAL, p), product_of(weight, sample))))
+        SET(sums, COSINE, p, normalised(plus(GET(sums, COSINE, p), product_of(cosine, sample))))
+        SET(sums, SINE, p, normalised(plus(GET(sums, SINE, p), product_of(sine, sample))))
         const Pair square = product_of(sample, sample);
         Pair part = product_of(weight, square.high);
         part.rest += weight * square.rest;
-        SET(sums, SQUARE, p, settle(plus(GET(sums, SQUARE, p), part)))
+        SET(sums, SQUARE, p, normalised(plus(GET(sums, SQUARE, p), part)))
     }
 }
 
 // --- The fit that sums tell ---------------------------------------------------------------------------------------
 
 #define FIT(i) ((Pair){fit[i], fit[9 + (i)]})
-#define ROW(i) settle(plus(plus(times(FIT(3 * i), a), times(FIT(3 * i + 1), b)), times(FIT(3 * i + 2), c)))
+#define ROW(i) normalised(plus(plus(times(FIT(3 * i), a), times(FIT(3 * i + 1), b)), times(FIT(3 * i + 2), c)))
 
 void solve(const Sums *restrict sums, const int width, MAP fit, OUT mean, OUT cosine, OUT sine, OUT residual)
 {
@@ -182,7 +182,7 @@ void solve(const Sums *restrict sums, const int width, MAP fit, OUT mean, OUT co
         const Pair a = GET(sums, TOTAL, p), b = GET(sums, COSINE, p), c = GET(sums, SINE, p);
         const Pair x = ROW(0), y = ROW(1), z = ROW(2);
         const Pair fitted = plus(plus(times(x, x), times(y, y)), times(z, z));
-        const float left = settle(minus(GET(sums, SQUARE, p), fitted)).high;
+        const float left = normalised(minus(GET(sums, SQUARE, p), fitted)).high;
         mean[p] = sums->reference[p] + (fit[18] * x.high + fit[19] * y.high + fit[20] * z.high);
         cosine[p] = fit[22] * y.high + fit[23] * z.high;
         sine[p] = fit[26] * z.high;

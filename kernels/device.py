@@ -38,7 +38,7 @@ _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What can be told of a device without opening it.
+    """What is known of a device without opening it.
 
     Attributes
     ----------

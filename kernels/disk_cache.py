@@ -13,7 +13,7 @@ _log = logging.getLogger("mirrorskin.kernels")
 
 
 def recall(topic: str, circumstances: object) -> str | None:
-    """Return what was kept of a topic under these circumstances, told apart by their ``repr``."""
+    """Return what was kept of a topic under these circumstances, which their ``repr`` distinguishes."""
     try:
         return _record(topic, circumstances).read_text(encoding="utf-8")
     except (OSError, ValueError):  # none, or damaged

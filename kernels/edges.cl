@@ -179,10 +179,10 @@ __kernel void edges_jumps(
             const int real = usable & (found >= PART * PART * mean) & (2 * both >= found);
 #endif
             const float noise = part * v[i] * per_n * (1.0f / (SPACING * SPACING)) + floor_ * floor_;
-            const float told = real ? found / noise : 0;
-            const int better = told > best[i];
+            const float contrast = real ? found / noise : 0;
+            const int better = contrast > best[i];
             least[i] = (usable & (noise < least[i])) ? noise : least[i];
-            best[i] = better ? told : best[i];
+            best[i] = better ? contrast : best[i];
             square[i] = better ? found : square[i];
             error[i] = better ? noise : error[i];
             way[i] = better ? w : way[i];

@@ -35,7 +35,7 @@ class Pass:
     spacing : int
         Pixels from place to place, and along the side of a cell.
     steps : int
-        Distances from the pixel at which there are pairs; of two, no bend is told.
+        Distances from the pixel at which there are pairs; of two, no bend is fitted.
     least : float
         Pairs that must be known, at each distance where there are two, else in all.
     reach : int
@@ -167,9 +167,9 @@ def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> t
     for number, (places, distances) in enumerate(zip(*pairs(chosen), strict=True)):
         fitted = _fit(cells, chosen, places, distances, limits.floor)
         least = np.fmin(least, fitted[1])
-        told = np.where(fitted[2], fitted[0] / fitted[1], 0)
-        better = told > strength
-        strength[better], way[better] = told[better], number
+        contrast = np.where(fitted[2], fitted[0] / fitted[1], 0)
+        better = contrast > strength
+        strength[better], way[better] = contrast[better], number
         jump[better], error[better] = fitted[0][better], fitted[1][better]
     unclear = (least > limits.quiet) | (chosen is NEAR)
     clear = (chosen is COARSE) | ~unclear
@@ -222,7 +222,7 @@ def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
 
 
 def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
-    """Return the jump of straight lines, its share of the variance, and where it is told and is no bend."""
+    """Return the jump of straight lines, its share of the variance, and where it is known and no bend."""
     n, u1, u2 = sums[:3]
     usable = n >= chosen.least
     spread = n * u2 - u1 * u1

@@ -54,7 +54,7 @@ def prepare() -> None:
             _processor, _patched = _ensure_name(library)
         except (OSError, importlib.metadata.PackageNotFoundError) as error:
             _processor = "generic"
-            _log.warning("PoCL's compiler does not know this processor, and was not told of it: %s", error)
+            _log.warning("PoCL's compiler does not know this processor, and was not patched: %s", error)
 
 
 def note(driver: str) -> str:

@@ -2,7 +2,7 @@
 
 
 class DeviceError(Exception):
-    """A device cannot do what was asked; the message is one line that says why and what to do."""
+    """A device cannot do its work; the message is one line that says why and what to do."""
 
     exit_code = 1
 

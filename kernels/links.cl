@@ -181,8 +181,8 @@ float link_slope(
     return (flags[before] & flags[here] & flags[next] & bit) ? four : 0.5f * near;
 }
 
-// Weight times what is asked of a link. It is reckoned everywhere and chosen afterwards: no branch, no call.
-float asked(const int linked, const float weight, const float size, const float slope, const float plane)
+// A link's weight times its required rise. It is computed everywhere and chosen afterwards: no branch, no call.
+float required(const int linked, const float weight, const float size, const float slope, const float plane)
 {
     const float all = weight * (size * (slope - plane));
     return linked ? all : 0.0f;
@@ -195,9 +195,9 @@ float chosen(const int linked, const float value)
 
 #define X_SLOPE(p, before, bit) link_slope(dz_dx, flags, before, p, (p) + 1, (p) + 2, bit)
 #define Y_SLOPE(p) link_slope(dz_dy, flags, (p) - before, p, (p) + next, (p) + after, line)
-#define X_ASKS(p, before, bit)                                                                         \
-    asked(flags[p] & RIGHT, X_WEIGHT(p, (p) + 1), size_x, X_SLOPE(p, before, bit), plane_x)
-#define Y_ASKS(p) asked(flags[p] & DOWN, Y_WEIGHT(p, (p) + next), -size_y, Y_SLOPE(p), plane_y)
+#define X_RISE(p, before, bit)                                                                         \
+    required(flags[p] & RIGHT, X_WEIGHT(p, (p) + 1), size_x, X_SLOPE(p, before, bit), plane_x)
+#define Y_RISE(p) required(flags[p] & DOWN, Y_WEIGHT(p, (p) + next), -size_y, Y_SLOPE(p), plane_y)
 
 // Where a row's neighbours are, and whether links downwards have pixels in line with them.
 #define NEIGHBOURS(row)                                                                                \
@@ -231,17 +231,17 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source)
     if (top > 0) {
         NEIGHBOURS(top - 1)
         const int first = (top - 1) * columns + begin;
-        for (int i = 0; i < width; ++i) above[i] = Y_ASKS(first + i);
+        for (int i = 0; i < width; ++i) above[i] = Y_RISE(first + i);
     }
     for (int row = top; row < bottom; ++row) {
         const int first = row * columns + begin;
         NEIGHBOURS(row)
-        beside[0] = begin > 0 ? X_ASKS(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
-        beside[1] = X_ASKS(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);
-        for (int i = 1; i < width; ++i) beside[i + 1] = X_ASKS(first + i, first + i - 1, RIGHT);
+        beside[0] = begin > 0 ? X_RISE(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
+        beside[1] = X_RISE(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);
+        for (int i = 1; i < width; ++i) beside[i + 1] = X_RISE(first + i, first + i - 1, RIGHT);
         for (int i = 0; i < width; ++i) {
             const int p = first + i;
-            const float below = Y_ASKS(p);
+            const float below = Y_RISE(p);
             float sum = beside[i] - beside[i + 1] + above[i] - below;
             above[i] = below;
 #if HEIGHTS

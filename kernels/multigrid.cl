@@ -64,7 +64,7 @@ typedef float reals;
 
 #define DIAGONAL ((to_right + to_left) + (to_below + to_above) WITH_ANCHOR(AT(anchor + i)))
 
-// What flows to nodes along their links, and to their anchors: -A x. X tells heights, of which those of the nodes,
+// What flows to nodes along their links, and to their anchors: -A x. X gives heights, of which those of the nodes,
 // above and below them lie at c, a and b.
 #define FLOW(X, a, c, b)                                                                                   \
     ((to_right * (X(c + 1) - X(c)) + to_left * (X(c - 1) - X(c))) + (to_below * (X(b) - X(c))              \

@@ -321,8 +321,8 @@ F mills(const F z)
     return z > -6.0f ? near : -z / (1.0f - far * (1.0f - far * (3.0f - 15.0f * far)));
 }
 
-// The same of any samples. A clipped one tells only on which side of its bound it was (a Tobit model); one that is
-// expected out of range tells nothing of the direction, and a missing one nothing at all.
+// The same of any samples. A clipped one shows only on which side of its bound it was (a Tobit model); one that is
+// expected out of range says nothing of the direction, and a missing one nothing at all.
 Sums look_closely(
     const Direction at, const F *zeniths, __global const FRAME *frames, const int begins, const int each, const int p,
     __global const float *turn, const float cos_tilt, const float sin_tilt, const F offset, const F per_count,
@@ -399,7 +399,7 @@ Direction blend(Direction mine, const Direction other, const I chosen)
 }
 
 #if WALL
-// The mean light is that of a place on the wall; the wave tells its azimuth, and so how far it is from here.
+// The mean light is that of a place on the wall; the wave gives its azimuth, and so how far it is from here.
 Direction begin_at_wall(const F *lights, const F mean, __global const float *turn SCENE)
 {
     F x = 0.0f, y = 0.0f, q = OF_INVERSE(INVERSE - 1);

@@ -122,7 +122,7 @@ def normals_exact(
         is that of being beyond. A NaN is a missing sample
     turn : (6, N), cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine
     scale : (4,) or (4, n), counts at zenith 0, radians per count, and the zeniths between which brightness is
-        linear. What is expected out of them tells nothing of the direction
+        linear. What is expected out of them says nothing of the direction
     tilt : radians
     """
     samples = Samples(frames, turn, scale, noise)
@@ -230,9 +230,9 @@ def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt:
              model: float | Doubles, rest: NDArray[np.bool_]) -> Answer:  # fmt: skip
     """Say how certain a direction is, and whether it is one of a lasting contact.
 
-    The sums are those at the direction, or next to it; ``usable`` counts the samples that are whole and within
-    their range; ``model`` is the sum of squares that the model may leave out, in the unit of the samples,
-    squared; ``rest`` is where the sheet is at rest.
+    The sums are those at the direction, or next to it; ``usable`` counts the samples that are whole and
+    within their range; ``model`` is the sum of squares that the model may leave out, in the unit of the
+    samples, squared; ``rest`` is where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -317,7 +317,7 @@ def _look(normal: Doubles, samples: Samples, turn: Doubles, tilt: float, closely
 def likelihood(
     samples: Samples, seen: Doubles, inside: NDArray[np.bool_]
 ) -> tuple[Doubles, Doubles, Doubles]:
-    """Return what each sample contributes: its share of information, its pull on the zenith, its squared misfit.
+    """Return of each sample its share of information, its pull on the zenith, and its squared misfit.
 
     Expected is ``seen``; where that is not inside the range, a sample contributes nothing.
 

@@ -25,10 +25,10 @@ from mirrorskin.kernels.normals import (
     Sums,
     Variance,
     conclude,
+    likelihood,
     normalise,
     step,
     tangents,
-    likelihood,
 )
 from mirrorskin.kernels.response import light_slopes, wall_light
 

@@ -133,7 +133,7 @@ float level_between(const float dark, const float bright, const float share, con
     return level.rest > 0 ? next_up(level.high) : level.high;
 }
 
-// Turns bright and dark, in the planes of `levels`, into level and dark, and tells what is light.
+// Turns bright and dark, in the planes of `levels`, into level and dark, and finds what is light.
 __kernel void onset_levels(
     const int pixels, const int stride, const float share, const float share_rest, OUT levels,
     __global FRAME *restrict marks, __global Bits *restrict closed)
@@ -163,7 +163,7 @@ __kernel void onset_levels(
     }
 }
 
-// Tells what is surely dark: samples that miss the level by `tolerance` counts.
+// Finds what is surely dark: samples that miss the level by `tolerance` counts.
 __kernel void onset_sure(const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * WORDS * PIXELS, size = min(WORDS * PIXELS, stride - base);

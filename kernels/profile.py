@@ -43,7 +43,7 @@ class Record:
 
 
 class Profile:
-    """The records of a device, told apart by kind and name."""
+    """The records of a device, by kind and name."""
 
     def __init__(self) -> None:
         self._records: dict[tuple[Kind, str], Record] = {}

@@ -10,7 +10,7 @@
 // backwards, its cosine modes are the parts of its Fourier transform, turned (Makhoul 1980).
 //
 // The Fourier transform stays in its place. `plan` has for each step its radix, the distance of the numbers that it adds, and
-// where its factors begin. Afterwards the modes are out of order: `place` tells where modes k and length - k are. Backwards, with
+// where its factors begin. Afterwards the modes are out of order: `place` says where modes k and length - k are. Backwards, with
 // real and imaginary parts exchanged, the same steps in reverse lead from there to the points.
 //
 // Lines are rows of the picture where `along` is 1, and its columns where it is 0.

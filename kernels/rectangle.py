@@ -13,7 +13,7 @@ modes that its difference from 1 is what is kept.
 The spectrum, (strips, padded, 16), has in the slots of strip s modes k = 8 s ... 8 s + 7, then length - k.
 Mode ``length`` is 0; what slots with k beyond half the length hold means nothing.
 
-The kernels are told sizes besides, and go about the Fourier transforms by the tables of
+The kernels take sizes besides, and go about the Fourier transforms by the tables of
 ``mirrorskin.engine.integration.rectangle``.
 """
 

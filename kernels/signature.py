@@ -86,8 +86,8 @@ def _expand(text: str, macros: Mapping[str, str]) -> str:
 
 def _holds(condition: str, macros: Mapping[str, str]) -> bool:
     """Evaluate the condition of an ``#if``; what is not defined is 0."""
-    asked = re.sub(r"defined\s*\(?\s*(\w+)\s*\)?", lambda name: str(int(name[1] in macros)), condition)
-    asked = re.sub(r"\b__has_builtin\s*\(\w+\)", "0", asked)
-    numbers = re.sub(r"\b[A-Za-z_]\w*\b", "0", _expand(asked, macros))
+    plain = re.sub(r"defined\s*\(?\s*(\w+)\s*\)?", lambda name: str(int(name[1] in macros)), condition)
+    plain = re.sub(r"\b__has_builtin\s*\(\w+\)", "0", plain)
+    numbers = re.sub(r"\b[A-Za-z_]\w*\b", "0", _expand(plain, macros))
     words = re.sub(r"!(?!=)", " not ", numbers).replace("&&", " and ").replace("||", " or ")
     return bool(eval(words, {"__builtins__": {}}))

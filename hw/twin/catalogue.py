@@ -27,7 +27,7 @@ _MADE_ALREADY: dict[str, Object] = {
 def make_object(
     name: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float], *, scale: float = DEFAULT_SCALE
 ) -> Object:
-    """Make the object that a user asked for, as it lies in a given field of view.
+    """Make an object by its name or file, as it lies in a field of view.
 
     Parameters
     ----------

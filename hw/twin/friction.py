@@ -91,7 +91,7 @@ class Friction:
             traction = traction + inner(residual, direction) / inner(direction, resistance) * direction
             traction *= _shrink(traction, self._limit)
         raise RuntimeError(
-            f"stick and slip did not settle in {ITERATIONS} iterations: the shift is wrong by"
+            f"stick and slip did not converge in {ITERATIONS} iterations: the shift is wrong by"
             f" {float(_length(residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
         )
 

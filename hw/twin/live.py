@@ -21,7 +21,7 @@ class Live(Closing):
     """A source that gives the twin's frames, from the first of them on, at a set rate from the first read on.
 
     A read waits for the next frame, and takes those with it that have come since the read before. A reader
-    that is late by more than 8 frames loses the oldest of them, and is told how many.
+    that is late by more than 8 frames loses the oldest of them; the block says how many.
 
     Parameters
     ----------

@@ -175,7 +175,7 @@ class Press:
         self._passed = _passed(travel, ends)
 
     def light(self, frame: int, /) -> Light:
-        """Return the mean light over a frame's exposure; it holds until the next is asked for."""
+        """Return the mean light over a frame's exposure; it holds until the next call."""
         return self._imprint.light(*map(float, self._passed[frame]))
 
 

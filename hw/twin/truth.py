@@ -96,7 +96,7 @@ def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_
     as the field, pressed until it stands at 46 degrees at the rim of its contact: every pixel meets every
     slope, and its third-brightest sample is the reference. That is some tenths of the noise above the mean of
     its bright samples, and includes what the pixel's own gain and place and the lamps do; of uneven lamps it
-    tells only roughly, as it stops at slopes some 15 degrees apart. Pixels that never get a tenth of the
+    it shows only roughly, as it stops at slopes some 15 degrees apart. Pixels that never get a tenth of the
     light of the others, as those beyond the body, have no references.
 
     The optics are those of the clear wall: a lab takes the printed sheet out.

@@ -137,7 +137,7 @@ class Twin(Closing):
 
     @functools.cached_property
     def header(self) -> Header:
-        """What holds for all frames; the references are taken when it is asked for."""
+        """What holds for all frames; the references are taken at the first access."""
         if self._references == "exact":
             dark, bright = exact_references(self._sensor)
         else:
@@ -159,7 +159,7 @@ class Twin(Closing):
     def truth(self) -> Truth:
         """The object as it is under the upright body, and what the movement does to the sheet.
 
-        Worked out when it is asked for; after the last frame most of it is known.
+        Worked out at the first access; after the last frame most of it is known.
         """
         film = self._scene if self.motion != "vertical" and isinstance(self._scene, CachedScene) else None
         touched = None if film is None else film.touched_throughout()
