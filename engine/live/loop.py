@@ -149,7 +149,7 @@ class Loop:
         used = (now - time <= self._latency) | (np.arange(count) == count - 1)
         used &= (block.index + np.arange(count)) % self._estimator.every == 0
         self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
-        self._monitor.time(WAITED, now - time)
+        self._monitor.time(WAITED, *(now - time).tolist())
         self._times.extend(time.tolist())
         with self._guard():
             for part in _runs(used):

@@ -120,71 +120,46 @@ class Status:
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
-class RecentTimes:
-    """The last few thousand of some numbers."""
-
-    def __init__(self) -> None:
-        self._values: NDArray[np.float64] = np.full(_KEPT, np.nan)
-        self._count = 0
-
-    def add(self, values: NDArray[np.float64]) -> None:
-        """Take in some more; of very many, the last."""
-        values = values[-_KEPT:]
-        places = (self._count + np.arange(len(values))) % _KEPT
-        self._values[places] = values
-        self._count += len(values)
-
-    def latency(self) -> Latency:
-        """Return the median and what 99 % of them stay below."""
-        if self._count == 0:
-            return Latency(math.nan, math.nan)
-        median, p99 = np.percentile(self._values[: min(self._count, _KEPT)], [50, 99])
-        return Latency(float(median), float(p99))
-
-
 class Monitor:
     """Counts frames and updates, and times stages."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(("frames", "used", "skipped", "dropped", "updates"), 0)
-        self._times = {stage: RecentTimes() for stage in STAGES}
+        self._times: dict[str, deque[float]] = {stage: deque(maxlen=_KEPT) for stage in STAGES}
         self._lately: deque[tuple[float, int]] = deque()
         self._begun = self._now = math.nan
         self._latency: dict[str, Latency] = {}
         self._computed = -math.inf
-
-    def took(self, now: float, frames: int, used: int, dropped: int) -> None:
-        """Count frames that were taken from the source."""
-        if math.isnan(self._begun):
-            self._begun = now
-        counts = self._counts
-        counts["frames"] += frames
-        counts["used"] += used
-        counts["skipped"] += frames - used
-        counts["dropped"] += dropped
-        self._now = now
-        self._lately.append((now, counts["frames"]))
-        while now - self._lately[0][0] > _LATELY:
-            self._lately.popleft()
 
     @property
     def used(self) -> int:
         """Frames that were pushed so far."""
         return self._counts["used"]
 
+    def took(self, now: float, frames: int, used: int, dropped: int) -> None:
+        """Count frames that were taken from the source."""
+        if math.isnan(self._begun):
+            self._begun = now
+        self._now = now
+        counts = {"frames": frames, "used": used, "skipped": frames - used, "dropped": dropped}
+        for name, count in counts.items():
+            self._counts[name] += count
+        self._lately.append((now, self._counts["frames"]))
+        while now - self._lately[0][0] > _LATELY:
+            self._lately.popleft()
+
     def updated(self) -> None:
         """Count an update."""
         self._counts["updates"] += 1
 
-    def time(self, stage: str, seconds: float | NDArray[np.float64]) -> None:
-        """Note how long a stage took, once or some times; what is no number is not noted."""
-        values = np.atleast_1d(np.asarray(seconds, np.float64))
-        self._times[stage].add(values[np.isfinite(values)])
+    def time(self, stage: str, *seconds: float) -> None:
+        """Note how long a stage took, once or some times; NaN is not noted."""
+        self._times[stage].extend(one for one in seconds if math.isfinite(one))
 
     def status(self, fresh: bool = False) -> Status:
         """Return counts and times so far; percentiles may be a quarter of a second old, unless ``fresh``."""
         if fresh or not self._now - self._computed < _FRESH:
-            self._latency = {stage: times.latency() for stage, times in self._times.items()}
+            self._latency = {stage: _latency(times) for stage, times in self._times.items()}
             self._computed = self._now
         seconds = 0.0 if math.isnan(self._begun) else self._now - self._begun
         return Status(**self._counts, seconds=seconds, rate=self._rate(), latency=dict(self._latency))
@@ -195,3 +170,10 @@ class Monitor:
             return 0.0
         (first, before), (last, after) = self._lately[0], self._lately[-1]
         return (after - before) / (last - first) if last > first else 0.0
+
+
+def _latency(times: deque[float]) -> Latency:
+    if not times:
+        return Latency(math.nan, math.nan)
+    median, p99 = np.percentile(np.array(times), [50, 99])
+    return Latency(float(median), float(p99))

@@ -8,7 +8,7 @@ import pytest
 from live_frames import Clock, paced, turn_header
 
 from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, run
-from mirrorskin.engine.live.status import RecentTimes
+from mirrorskin.engine.live.status import Monitor
 from mirrorskin.io import InputError
 
 COUNT, RATE = 40, 100.0
@@ -151,11 +151,11 @@ def test_a_latency_or_rate_that_cannot_be_is_refused(wrong):
         run(source, slow, **wrong)
 
 
-def test_a_reservoir_tells_of_the_last_few_thousand():
-    times = RecentTimes()
-    assert math.isnan(times.latency().median)
-    times.add(np.full(10_000, 5.0))
-    times.add(np.arange(1, 4097) / 4096)
-    told = times.latency()
-    assert told.median == pytest.approx(0.5, abs=1e-3)
-    assert told.p99 == pytest.approx(0.99, abs=1e-3)
+def test_latencies_are_of_the_last_few_thousand_times():
+    monitor = Monitor()
+    assert math.isnan(monitor.status().latency[PUSHED].median)
+    monitor.time(PUSHED, *[5.0] * 10_000, math.nan)
+    monitor.time(PUSHED, *(np.arange(1, 4097) / 4096).tolist())
+    latency = monitor.status(fresh=True).latency[PUSHED]
+    assert latency.median == pytest.approx(0.5, abs=1e-3)
+    assert latency.p99 == pytest.approx(0.99, abs=1e-3)
