@@ -157,7 +157,9 @@ class OnsetSearch:
         if not 1 <= hold <= _INT_MAX:
             raise InputError(f"hold {hold}: a number of frames from 1 to {_INT_MAX} is needed")
         if not 0 <= threshold <= 1:
-            raise InputError(f"threshold {threshold}: a share from 0 (dark) to 1 (bright) is needed")
+            raise InputError(
+                f"threshold {threshold}: a share from 0 (dark) to 1 (bright) is needed, such as 0.5"
+            )
         self._shape, self._dtype = shape, check_dtype(dtype)
         self._release, self._subframe = check_event(event) == "release", subframe
         self._noise = Noise(noise, self._dtype.kind == "u")
@@ -259,15 +261,15 @@ class OnsetSearch:
         if self._subframe:
             maps += " busy samples levels"
             known |= {"count": self._travel.count, **self._tolerances(noise)}
-        undo: list[dict[str, Any]] = [{"undo": 0}, {"undo": 1}] if self._subframe else [{}]
+            known["undo"] = 0
         planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
         with band.resident():
-            self._launch(band, "onset_heights", maps, **known, **undo[0])
+            self._launch(band, "onset_heights", maps, **known)
             for name in ("answers", "status", "times"):
                 band.maps[name].download()
             found = [band.plane(*plane).copy() for plane in planes]
-            for more in undo[1:]:  # what is not final is taken back
-                self._launch(band, "onset_heights", maps, **known, **more)
+            if self._subframe:  # what is not final is taken back
+                self._launch(band, "onset_heights", maps, **known | {"undo": 1})
         return found
 
     def reset(self) -> None:
@@ -291,7 +293,7 @@ class OnsetSearch:
     ) -> None:
         """Run a kernel over a band, or over staged frames of it; ``maps`` names those that it takes."""
         arguments |= {one: band.maps[one] for one in maps.split()}
-        if name != "onset_scan" or staged is None:
+        if staged is None:
             moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Operand))
         else:
             arguments |= {"frames": staged.array, "count": staged.count}
