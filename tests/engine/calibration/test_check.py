@@ -1,12 +1,16 @@
 import math
 from dataclasses import replace
 
+import calibration_scorer as scorer
 import numpy as np
 import pytest
+from calibration_scenes import Frames, Thing
 from stacks import MadeUp, ball
+from walls import response_of_twin
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.check import check_ball
+from mirrorskin.hw.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (71, 80), 0.08
 TRAVEL = np.arange(0, 1.3, 0.02)
@@ -109,3 +113,33 @@ def test_a_rotation_needs_a_zenith(press):
     source.rewindable = True
     with pytest.raises(io.InputError, match="calibrate zenith first"):
         check_ball(source, calibration(), 10.0)
+
+
+def test_a_rotation_about_a_ball_is_judged_with_the_wall_and_as_it_was_designed():
+    shape, pixel, body, distance = (64, 64), 0.12, Body(asymmetry=0.05, asymmetry_azimuth=1.0), 150.0
+    phase = np.arange(8) * np.pi / 4
+    twin = Twin(
+        object=Thing(scorer.ball(6.0, (0.5, -0.4))),
+        shape=shape,
+        pixel_size=pixel,
+        movement=Axial(phase, math.radians(2.5), 0.7),
+        optics="cylinder",
+        pattern="linear",
+        body=body,
+        camera=Camera(noise=1.0, seed=3, distance=distance),
+        references="exact",
+    )
+    frames = np.empty(twin.shape, twin.dtype)
+    twin.read(frames)
+    header, little = twin.header, np.full(shape, 0.1, np.float32)
+    references = io.References(header.dark, header.bright, little, little, np.zeros(shape, np.uint8))
+    zenith = response_of_twin(shape, pixel, body, distance)
+    known = io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references, zenith=zenith)
+    found = check_ball(Frames("turn", frames, header, phase=phase), known, 6.0, cells=4)
+    assert found.place == pytest.approx((0.5, -0.4), abs=0.03)
+    before, after = found.before, found.after
+    assert abs(float(after["zenith"].whole.bias)) < 0.2
+    assert float(after["normal"].whole.rms) < 1.0
+    assert float(before["zenith"].whole.rms) > 2 * float(after["zenith"].whole.rms)
+    assert float(after["height"].whole.rms) < float(before["height"].whole.rms)
+    assert [row[:2] for row in found.table()][:2] == [["zenith", "before"], ["zenith", "after"]]
