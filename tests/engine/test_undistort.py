@@ -73,16 +73,6 @@ def test_a_lens_that_does_nothing_changes_no_bit(shape, turns):
     assert same.offset_unknown is result.offset_unknown
 
 
-def test_a_constant_map_stays_constant():
-    shape = (41, 57)
-    result = Result(height=np.full(shape, 0.1, np.float32), mean=np.full(shape, 77.7, np.float32))
-    found = undistort(result, bent(shape))
-    for name, value in (("height", 0.1), ("mean", 77.7)):
-        values = found.maps()[name]
-        assert 0.5 < np.isfinite(values).mean() < 1
-        assert set(np.unique(values[np.isfinite(values)])) == {np.float32(value)}
-
-
 def test_a_smooth_map_comes_back_to_the_error_of_interpolation():
     view = boards.View((121, 157), 0.05, 110.0, tilt=10.0, towards=30.0, distortion=BENT)
     x, y = view.sheet(*np.meshgrid(np.arange(157.0), np.arange(121.0)))
@@ -95,14 +85,6 @@ def test_a_smooth_map_comes_back_to_the_error_of_interpolation():
     assert between.mean() > 0.8
     # An eighth of the second derivative along each axis, of pixels up to half as large again as the nominal.
     assert off[between].max() < (wave**2 + 1) / 8 * (1.5 * view.scale) ** 2
-
-
-def test_the_pixels_are_placed_on_the_sheet():
-    lens = bent((41, 57), 0.02)
-    found = undistort(maps_of((41, 57)), lens)
-    x, y = pixel_axes((41, 57), (0.02, 0.02))
-    np.testing.assert_array_equal(found.x, x)
-    np.testing.assert_array_equal(found.y, y)
 
 
 def by_hand(values, column, row, apart=None):
@@ -254,8 +236,3 @@ def test_maps_are_undistorted_once():
     found = undistort(maps_of((8, 9)), plain((8, 9)))
     with pytest.raises(InputError, match="undistorted before"):
         undistort(found, plain((8, 9)))
-
-
-def test_a_result_without_maps_is_refused():
-    with pytest.raises(InputError, match="no maps"):
-        undistort(Result(), plain((8, 9)))

@@ -71,19 +71,6 @@ def test_all_maps_of_references_are_drawn_with_their_units():
     assert told == ["sound: 95", "hot: 1", "dead: 1", "saturated: 1", "several: 1"]
 
 
-def test_a_picture_of_one_pixel_is_drawn():
-    known = references((9, 11))
-    names = ("dark", "bright", "dark_sigma", "bright_sigma", "defects")
-    draw_references(io.References(*(getattr(known, name)[-1:, -1:] for name in names)))
-
-
-def test_references_without_an_answer_anywhere_are_drawn():
-    nothing = np.full((4, 5), np.nan, np.float32)
-    dead = np.full((4, 5), 2, np.uint8)
-    axes = draw_references(io.References(nothing, nothing, nothing, nothing, dead)).axes
-    assert "no answer" in titled(axes, "dark").get_title()
-
-
 def test_lines_of_whole_millimetres_lie_where_opencv_has_them():
     lens = a_lens((50, 70))
     axes = draw_lens(lens).axes
@@ -131,12 +118,6 @@ def test_a_precession_is_drawn_through_its_phases():
     marks = next(line for line in path.lines if line.get_marker() == "o").get_xydata()
     np.testing.assert_allclose(marks, np.degrees(known.lean(np.arange(8) * math.pi / 4)))
     assert {text.get_text() for text in path.texts} >= {f"{45 * k}°" for k in range(8)}
-
-
-def test_an_even_turn_about_the_upright_pose_is_drawn():
-    axes = draw_precession(a_precession(ellipticity=0.0, centre=(0.0, 0.0))).axes
-    low, high = titled(axes, "half-angle").get_ylim()
-    assert 0.001 < high - low < 0.5
 
 
 @pytest.mark.parametrize("curvature", [0.0, 1 / 17.5])

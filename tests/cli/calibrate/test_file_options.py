@@ -108,18 +108,6 @@ def test_a_calibration_that_is_carried_is_used_unless_another_is_given():
     np.testing.assert_array_equal(from_a_result.height, found.height)
 
 
-def test_a_part_of_the_picture_has_its_part_of_the_references():
-    press()
-    references = flat_references()
-    references.dark[:, :4] = 90.0
-    save(references=references)
-    words = ("--calibration", "cal.h5")
-    whole, part = reconstruct("press.h5", *words), reconstruct("press.h5", "--region", "2,3,6x4", *words)
-    np.testing.assert_array_equal(part.height, whole.height[3:7, 2:8])
-    np.testing.assert_array_equal(part.calibration.references.dark, references.dark)
-    assert part.process["source_region"] == "2,3,6x4"
-
-
 def test_pixels_with_defects_have_no_height():
     press()
     references = flat_references()
@@ -140,16 +128,6 @@ def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precess
     assert np.degrees(np.median(between(without.normals, true))) > 5
     assert np.degrees(np.median(between(found.normals, true))) < 1
     assert found.process["calibration_parts"] == "tilt"
-
-
-def test_the_engine_takes_a_path_a_calibration_or_a_source_that_has_one():
-    press()
-    calibration = save(references=flat_references())
-    with io.open_recording("press.h5") as source:
-        sources = [(source, "cal.h5"), (source, Path("cal.h5")), (source, calibration)]
-        sources.append((io.Calibrated(source, calibration), None))
-        heights = [engine.reconstruct(one, known).height for one, known in sources]
-    assert all(np.array_equal(height, heights[0]) for height in heights)
 
 
 def test_a_batch_uses_what_recordings_carry():

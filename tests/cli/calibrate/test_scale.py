@@ -13,7 +13,7 @@ from commands import run
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate.scale import board_command, board_of, command
+from mirrorskin.cli.calibrate.scale import board_command, command
 from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
 from mirrorskin.engine.calibration.lens import calibrate_lens
 from mirrorskin.io.calibration.source import size_facts
@@ -120,24 +120,6 @@ def test_what_is_no_picture_of_the_board_is_refused(words, said, tmp_path):
     with pytest.raises(io.InputError, match=re.escape(said)):
         command(Path("to/cal.h5"), CHARUCO, [Path(word) for word in words])
     assert not (tmp_path / "to" / "cal.h5").exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("chess:7x5:2mm", "write e.g. charuco:7x5:2mm:1.5mm"),
-        ("charuco:7x5:2mm", "write e.g. charuco:7x5:2mm:1.5mm"),
-        ("dots:11x9", "or dots:11x9:1mm"),
-        ("dots:0x9:1mm", "or dots:11x9:1mm"),
-        ("dots:11x9:1", "a unit is needed"),
-        ("dots:11x9:-1mm", "above zero"),
-        ("charuco:7x5:1.5mm:2mm", "within its square"),
-        ("charuco:3x3:2mm:1mm", "too few corners"),
-    ],
-)
-def test_a_board_that_cannot_be_is_refused(text, said):
-    with pytest.raises(io.InputError, match=re.escape(said)):
-        board_of(text)
 
 
 def test_a_board_is_painted_in_its_true_size():

@@ -139,22 +139,6 @@ def test_a_live_source_tells_time_and_corrected_positions_and_can_be_left():
     assert feed.left
 
 
-def test_what_else_a_recording_has_is_there_and_what_it_has_not_is_not(tmp_path):
-    path = record(a_source(), tmp_path / "turn.h5")
-    with io.open_recording(path) as recording:
-        source = calibrated(None, recording)
-        assert (source.name, source.shape, source.dtype) == (str(path), SHAPE, np.dtype("uint8"))
-        assert (source.motion, source.rewindable) == ("axial", True)
-        assert source.fingerprint() == recording.fingerprint()
-        assert source.origin == (0, 0)
-        np.testing.assert_array_equal(source.phase, a_precession().phase(PHASE))
-        first = read_all(source, 3)
-        source.rewind()
-        np.testing.assert_array_equal(read_all(source, 5).phase, first.phase)
-        assert not hasattr(source, "nothing")
-    assert calibrated().phase is None
-
-
 # Parts of the picture.
 
 
