@@ -79,7 +79,14 @@ def measure(
     Raises
     ------
     InputError
-        Nothing can be measured, or not as it was asked for.
+        Nothing can be measured, or not with these options.
+
+    Examples
+    --------
+    >>> x, y = np.array([-0.1, 0.0, 0.1]), np.array([0.05, -0.05])
+    >>> result = Result(height=np.float32([[0, 1, 2], [0, 1, 2]]), x=x, y=y)
+    >>> round(measure(result, form="none").quantities["measured area"].value, 6)
+    0.06
     """
     patch, comparable = patch_of(result, region)
     quantities, notes = heights(patch), list(patch.notes)

@@ -75,6 +75,13 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     InputError
         No heights, one map for each turn, only one end, both ends in one point, ends where the pixel size
         is not known, or one further outside of the picture than that is large.
+
+    Examples
+    --------
+    >>> height = np.float32([[0, 1, 2], [0, 1, 2]])
+    >>> result = Result(height=height, x=np.array([-0.1, 0.0, 0.1]), y=np.array([0.05, -0.05]))
+    >>> section(result, (-0.1, 0.0), (0.1, 0.0)).height.round(6).tolist()
+    [0.0, 1.0, 2.0]
     """
     height = heights_of(result)
     known = result.x is not None and result.y is not None
@@ -213,6 +220,13 @@ def step_height(section: Section) -> Step:
     ------
     InputError
         Pixels of unknown size, too few measured samples, or a curve that fits better.
+
+    Examples
+    --------
+    >>> s = 0.1 * np.arange(16)
+    >>> stair = Section(s, s, 0 * s, 0.2 * (s > 0.75), 0 * s, s < 0)
+    >>> round(step_height(stair).height.value, 6)
+    0.2
     """
     known = _measured(section)
     distance, height = section.distance[known], section.height[known]

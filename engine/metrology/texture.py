@@ -87,6 +87,11 @@ def roughness(
     ------
     InputError
         No known pixel, a cutoff of less than two pixels, or none that counts.
+
+    Examples
+    --------
+    >>> roughness([[0.001, -0.001], [-0.001, 0.001]], pixel_size=(0.1, 0.1)).sq.value
+    1.0
     """
     height = np.asarray(residual, np.float64)
     known = np.isfinite(height)

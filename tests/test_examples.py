@@ -1,0 +1,24 @@
+"""The examples in docstrings run, and print what they say."""
+
+import doctest
+import importlib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = "kernels", "io", "engine", "hw", "view"
+FILES = [
+    file for name in FOLDERS for file in sorted((ROOT / name).rglob("*.py")) if ">>> " in file.read_text()
+]
+MODULES = [".".join(("mirrorskin", *file.relative_to(ROOT).with_suffix("").parts)) for file in FILES]
+
+
+@pytest.mark.parametrize("name", [name.removesuffix(".__init__") for name in MODULES])
+def test_examples_run(name, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    told = []
+    runner = doctest.DocTestRunner(verbose=False)
+    for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
+        runner.run(example, out=told.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(told)
