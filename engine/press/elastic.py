@@ -468,38 +468,31 @@ class Cells:
 
     def inside(self, values: NDArray[Any]) -> NDArray[Any]:
         """Cut off the cells beyond the picture."""
-        (rows, columns), (top, left) = self._inner, self.before
-        return values[top : top + rows, left : left + columns]
+        (top, bottom), (left, right) = self._margins
+        return values[top : self.shape[0] - bottom, left : self.shape[1] - right]
 
     def outward(self, mask: Mask) -> Mask:
         """Go on beyond the picture with what a map of the cells inside has at its border."""
-        margins = [
-            (ahead, whole - ahead - inner)
-            for ahead, whole, inner in zip(self.before, self.shape, self._inner, strict=True)
-        ]
-        return np.pad(mask, margins, "edge")
+        return np.pad(mask, self._margins, "edge")
 
     @property
-    def _inner(self) -> tuple[int, int]:
-        """Rows and columns of cells in the picture."""
-        rows, columns = (
-            (some.stop - some.start) // block for some, block in zip(self.box, self.block, strict=True)
-        )
-        return rows, columns
+    def _margins(self) -> list[tuple[int, int]]:
+        """Cells beyond the picture, before and behind it."""
+        return [
+            (ahead, count - ahead - (some.stop - some.start) // block)
+            for some, block, ahead, count in zip(self.box, self.block, self.before, self.shape, strict=True)
+        ]
 
     def _blocks(self, values: Doubles, beyond: float = np.nan) -> Doubles:
-        rows, columns = (some.stop - some.start for some in self.box)
+        """Return the box's pixels as (rows of cells, rows, columns of cells, columns)."""
+        (rows, columns), (down, across) = (some.stop - some.start for some in self.box), self.block
         part = values[self.box]
-        whole = np.full((rows, columns), beyond)
-        whole[: part.shape[0], : part.shape[1]] = part
-        down, across = self.block
-        return whole.reshape(rows // down, down, columns // across, across)
+        missing = (0, rows - part.shape[0]), (0, columns - part.shape[1])
+        full = np.pad(part, missing, constant_values=beyond)
+        return full.reshape(rows // down, down, columns // across, across)
 
     def _with_margin(self, values: Doubles) -> Doubles:
-        whole = np.full(self.shape, np.nan)
-        top, left = self.before
-        whole[top : top + values.shape[0], left : left + values.shape[1]] = values
-        return whole
+        return np.pad(values, self._margins, constant_values=np.nan)
 
 
 def cut_into_cells(known: Mask, pixel_size: tuple[float, float]) -> Cells:
