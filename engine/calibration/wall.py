@@ -38,187 +38,6 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.intp]
 
-_FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
-_TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # change of the sum of squares at which these end, as a share
-_COARSE = 0.1  # of full light: noise that the first fit reckons with, so that it finds its way
-_QUIET = 1e-3  # of full light, which the model may always be off
-_INNER = 0.7  # of the light's outline, within which the ball is surely touched
-_RING = 0.05  # of the outline: width of the rings by which that grows
-_AT_ONCE = 2  # rings that are tried at a time
-_USUAL = 1.2  # times the usual spread that a ring may show
-_BIASED = 0.3  # times the usual spread that its median may be off
-_CHANCE = 4.0  # over the root of the ring's samples, by which it may be more by chance
-_BAD = 2.0  # times the other presses' noise that one may show
-_STRAIN = 1.5  # standard deviations, root mean square, by which the sensor may be unlikely
-_TOUCHED = 0.02  # mm above the rest plane
-_MODEST = 0.01  # of full light: noise that such a fit reckons with
-_LEAST = 30  # samples that a ring is judged by
-_BINS = 6  # of brightness, in which noise is estimated
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Touch:
-    """A fit, the samples of touched places that went into it, and their noise, (n,), as shares of light."""
-
-    fit: WallFit
-    samples: LightSamples
-    noise: Doubles
-
-
-def fit_touch(samples: LightSamples, presses: Sequence[BallPress], prior: Prior) -> Touch:
-    """Fit the wall to samples where the sheet lies on the ball.
-
-    From well within the light's outline on, each press grows by rings as long as these can be fitted as well
-    as those within: a gel leaves the ball earlier than a sheet that takes any shape. Where a ring could not,
-    the one before it is left out as well.
-    """
-    rings = _Rings(samples, presses)
-    taken = np.full(len(presses), round(_INNER / _RING))
-    fit = _begin(samples[_some(rings.within(taken), _FEW)], prior)
-    prior = Prior(prior.mean, prior.sigma, fit.rising)
-    noise = _noise(samples, fit, rings.within(taken))
-    touch, off = _refit(samples, noise, rings.within(taken), prior, fit, _FEW)
-    noise = _noise(samples, touch.fit, rings.within(taken))
-    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
-    grows = np.ones(len(presses), bool)
-    while grows.any():
-        touch, off = _refit(samples, noise, rings.within(taken + _AT_ONCE * grows), prior, touch.fit, _FEW)
-        for press in np.flatnonzero(grows):
-            own = (rings.press == press) & np.isfinite(off)
-            taken[press], grows[press] = _grow(off[own], rings.number[own], int(taken[press]))
-    touch, off = _refit(samples, noise, rings.within(taken), prior, touch.fit, _MANY)
-    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
-    return touch
-
-
-class _Rings:
-    """In which ring about where its ball was found each sample lies, and of which press it is."""
-
-    def __init__(self, samples: LightSamples, presses: Sequence[BallPress]) -> None:
-        middle = np.concatenate([moved(press.centre, press.lean, press.pivot) for press in presses])
-        self.press: Numbers = samples.press[samples.pose]
-        outline = np.array([press.outline for press in presses])[self.press]
-        away = np.hypot(*(samples.place - middle[samples.pose, :2].T)) / outline
-        self.number: Numbers = np.floor(away / _RING).astype(np.intp)
-
-    def within(self, rings: Numbers) -> Mask:
-        """Return which samples lie within so many rings of their press."""
-        return np.asarray(self.number < rings[self.press])
-
-
-def _begin(samples: LightSamples, prior: Prior) -> WallFit:
-    """Return a first fit, from the nominal sensor and the curve that goes best with it."""
-    start, rising = prior.mean, prior.rising
-    if prior.sigma[STEPS].all():
-        start, rising = start_curve(samples, start)
-    return fit_wall(samples, Prior(prior.mean, prior.sigma, rising), start, _COARSE, 1e-4)
-
-
-def _refit(
-    samples: LightSamples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
-) -> tuple[Touch, Doubles]:
-    """Fit once more, to at most so many of the touched samples that are chosen.
-
-    Returns it, and by how many standard deviations all samples are off, NaN where the sheet does not touch.
-    """
-    named, _, centres = split(fit.parameters)
-    touched = meet_balls(samples, named, centres).z >= _TOUCHED
-    chosen = _some(inside & touched, count)
-    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _TOLERANCES[count])
-    off = (samples.light - predict(samples, fit.parameters, fit.rising)) / noise
-    return Touch(fit, samples[chosen], noise[chosen]), np.where(touched, off, np.nan)
-
-
-def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
-    """Return how many rings of a press can be fitted, and whether there may be more.
-
-    ``off`` is by how many standard deviations its samples are off, and ``ring`` their ring.
-    """
-    usual = max(1.0, _scale(off[ring < taken]))
-    if not np.isfinite(usual):
-        return taken, False
-    for number in range(taken, taken + _AT_ONCE):
-        own = off[ring == number]
-        if len(own) < _LEAST:
-            return number, False
-        chance = _CHANCE / np.sqrt(len(own))
-        if _scale(own) / usual > _USUAL + chance or abs(np.median(own)) / usual > _BIASED + chance:
-            return number - 1, False
-    return taken + _AT_ONCE, True
-
-
-def _noise(samples: LightSamples, fit: WallFit, inside: Mask) -> Doubles:
-    """Return the noise of all samples, (N,), from what is left of some: its square is linear in the light.
-
-    Estimated by the medians of some bins of brightness.
-    """
-    light = predict(samples, fit.parameters, fit.rising)
-    left = samples.light - light
-    order = np.flatnonzero(inside)[np.argsort(light[inside])]
-    bins = np.array_split(order, _BINS)
-    level = np.array([np.median(light[part]) for part in bins])
-    square = np.array([_scale(left[part]) ** 2 for part in bins])
-    slope, offset = np.polyfit(level, square, 1) if np.ptp(level) > 0 else (0.0, float(square.mean()))
-    least = 0.25 * float(np.median(square)) + _QUIET**2
-    return np.asarray(np.sqrt(np.maximum(offset + slope * light, least)))
-
-
-def _scale(off: Doubles) -> float:
-    """Return the root mean square of normal values, estimated by the median of their sizes; inf of none."""
-    return 1.4826 * float(np.median(np.abs(off))) if len(off) else np.inf
-
-
-def _some(mask: Mask, count: int) -> Numbers:
-    """Return the numbers of at most so many of the chosen samples, evenly spread."""
-    chosen = np.flatnonzero(mask)
-    return chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(np.intp)]
-
-
-def _check_presses(
-    touch: Touch, off: Doubles, rings: _Rings, presses: Sequence[BallPress], prior: Prior
-) -> None:
-    """Raise where a press does not fit to the others.
-
-    Its samples are off by more than those of the others; or all of them are explained, but by a sensor that
-    cannot be, and without it by a likely one.
-    """
-    known = np.isfinite(off)
-    scales = np.array([_scale(off[known & (rings.press == number)]) for number in range(len(presses))])
-    worst = int(np.argmax(scales))
-    if scales[worst] > _BAD * max(1.0, float(np.median(scales))):
-        raise InputError(_misfit(presses[worst].name))
-    if _strain(touch.fit, prior) > _STRAIN:
-        strains = [_strain(_without(touch, prior, number), prior) for number in range(len(presses))]
-        least = int(np.argmin(strains))
-        if strains[least] < _STRAIN:
-            raise InputError(_misfit(presses[least].name))
-        raise InputError(
-            "the presses go together with no likely sensor: check the ball's diameter, pixel size, and the"
-            " body's radius and height"
-        )
-
-
-def _without(touch: Touch, prior: Prior, press: int) -> WallFit:
-    """Return the fit without a press."""
-    samples = touch.samples
-    others = _some(samples.press[samples.pose] != press, _FEW)
-    start = prior.mean.copy()
-    start[STEPS] = touch.fit.parameters[STEPS]
-    return fit_wall(
-        samples[others], prior, start, np.maximum(touch.noise[others], _MODEST), _TOLERANCES[_FEW]
-    )
-
-
-def _strain(fit: WallFit, prior: Prior) -> float:
-    """Return by how many standard deviations a sensor is off what was known before, root mean square."""
-    off = (fit.parameters - prior.mean) / np.where(prior.sigma > 0, prior.sigma, np.inf)
-    return float(np.sqrt(np.mean(off[: STEPS.start] ** 2)))
-
-
-def _misfit(name: str) -> str:
-    return f"{name}: its ball does not fit to the other presses: leave it out or take it again"
-
-
 BODY_RADIUS, BODY_HEIGHT = 17.5, 40.0
 """Of the paper's body, mm."""
 
@@ -235,6 +54,23 @@ _KNOWN = {
     **dict.fromkeys((f"shade_{number}" for number in range(5)), (0.0, 0.02)),
 }
 """What is likely of a sensor: means and standard deviations of its parameters."""
+
+_FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
+_TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # change of the sum of squares at which these end, as a share
+_COARSE = 0.1  # of full light: noise assumed by the first fit, so that it converges
+_QUIET = 1e-3  # of full light, which the model may always be off
+_INNER = 0.7  # of the light's outline, within which the ball is surely touched
+_RING = 0.05  # of the outline: width of the rings by which that grows
+_AT_ONCE = 2  # rings that are tried at a time
+_USUAL = 1.2  # times the usual spread that a ring may show
+_BIASED = 0.3  # times the usual spread that its median may be off
+_CHANCE = 4.0  # over the root of the ring's samples, by which it may be more by chance
+_BAD = 2.0  # times the other presses' noise that one may show
+_UNLIKELY = 1.5  # standard deviations, root mean square, by which the sensor may be unlikely
+_TOUCHED = 0.02  # mm above the rest plane
+_MODEST = 0.01  # of full light: noise assumed by a fit without a press
+_FEWEST_IN_RING = 30  # samples that a ring is judged by
+_BINS = 6  # of brightness, in which noise is estimated
 
 
 def fit_zenith(
@@ -334,3 +170,169 @@ def _check(presses: Sequence[Source], ball: float, pattern: str, body: tuple[flo
         pixels = source.shape[1:], source.header.pixel_size
         if pixels != (first.shape[1:], first.header.pixel_size):
             raise InputError(f"{source.name} and {first.name} differ in pixels or their size: take all alike")
+
+
+# --- how far the sheet takes the ball's shape ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touch:
+    """A fit, the samples of touched places that went into it, and their noise, (n,), as shares of light."""
+
+    fit: WallFit
+    samples: LightSamples
+    noise: Doubles
+
+
+def fit_touch(samples: LightSamples, presses: Sequence[BallPress], prior: Prior) -> Touch:
+    """Fit the wall to samples where the sheet lies on the ball.
+
+    From well within the light's outline on, each press grows by rings as long as these can be fitted as well
+    as those within: a gel leaves the ball earlier than a sheet that takes any shape. Where a ring could not,
+    the one before it is left out as well.
+    """
+    rings = _Rings(samples, presses)
+    taken = np.full(len(presses), round(_INNER / _RING))
+    fit = _first_fit(samples[_evenly(rings.within(taken), _FEW)], prior)
+    prior = Prior(prior.mean, prior.sigma, fit.rising)
+    noise = _noise(samples, fit, rings.within(taken))
+    touch, off = _refit(samples, noise, rings.within(taken), prior, fit, _FEW)
+    noise = _noise(samples, touch.fit, rings.within(taken))
+    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
+    grows = np.ones(len(presses), bool)
+    while grows.any():
+        touch, off = _refit(samples, noise, rings.within(taken + _AT_ONCE * grows), prior, touch.fit, _FEW)
+        for press in np.flatnonzero(grows):
+            own = (rings.press == press) & np.isfinite(off)
+            taken[press], grows[press] = _grow(off[own], rings.number[own], int(taken[press]))
+    touch, off = _refit(samples, noise, rings.within(taken), prior, touch.fit, _MANY)
+    _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
+    return touch
+
+
+class _Rings:
+    """In which ring about where its ball was found each sample lies, and of which press it is."""
+
+    def __init__(self, samples: LightSamples, presses: Sequence[BallPress]) -> None:
+        middle = np.concatenate([moved(press.centre, press.lean, press.pivot) for press in presses])
+        self.press: Numbers = samples.press[samples.pose]
+        outline = np.array([press.outline for press in presses])[self.press]
+        away = np.hypot(*(samples.place - middle[samples.pose, :2].T)) / outline
+        self.number: Numbers = np.floor(away / _RING).astype(np.intp)
+
+    def within(self, rings: Numbers) -> Mask:
+        """Return which samples lie within so many rings of their press."""
+        return np.asarray(self.number < rings[self.press])
+
+
+def _first_fit(samples: LightSamples, prior: Prior) -> WallFit:
+    """Return a first fit, from the nominal sensor and the curve that goes best with it."""
+    start, rising = prior.mean, prior.rising
+    if prior.sigma[STEPS].all():
+        start, rising = start_curve(samples, start)
+    return fit_wall(samples, Prior(prior.mean, prior.sigma, rising), start, _COARSE, 1e-4)
+
+
+def _refit(
+    samples: LightSamples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
+) -> tuple[Touch, Doubles]:
+    """Fit once more, to at most so many of the touched samples that are chosen.
+
+    Returns it, and by how many standard deviations all samples are off, NaN where the sheet does not touch.
+    """
+    named, _, centres = split(fit.parameters)
+    touched = meet_balls(samples, named, centres).z >= _TOUCHED
+    chosen = _evenly(inside & touched, count)
+    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _TOLERANCES[count])
+    off = (samples.light - predict(samples, fit.parameters, fit.rising)) / noise
+    return Touch(fit, samples[chosen], noise[chosen]), np.where(touched, off, np.nan)
+
+
+def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
+    """Return how many rings of a press can be fitted, and whether there may be more.
+
+    ``off`` is by how many standard deviations its samples are off, and ``ring`` their ring.
+    """
+    usual = max(1.0, _scale(off[ring < taken]))
+    if not np.isfinite(usual):
+        return taken, False
+    for number in range(taken, taken + _AT_ONCE):
+        own = off[ring == number]
+        if len(own) < _FEWEST_IN_RING:
+            return number, False
+        chance = _CHANCE / np.sqrt(len(own))
+        if _scale(own) / usual > _USUAL + chance or abs(np.median(own)) / usual > _BIASED + chance:
+            return number - 1, False
+    return taken + _AT_ONCE, True
+
+
+def _noise(samples: LightSamples, fit: WallFit, inside: Mask) -> Doubles:
+    """Return the noise of all samples, (N,), from what is left of some: its square is linear in the light.
+
+    Estimated by the medians of some bins of brightness.
+    """
+    light = predict(samples, fit.parameters, fit.rising)
+    left = samples.light - light
+    order = np.flatnonzero(inside)[np.argsort(light[inside])]
+    bins = np.array_split(order, _BINS)
+    level = np.array([np.median(light[part]) for part in bins])
+    square = np.array([_scale(left[part]) ** 2 for part in bins])
+    slope, offset = np.polyfit(level, square, 1) if np.ptp(level) > 0 else (0.0, float(square.mean()))
+    least = 0.25 * float(np.median(square)) + _QUIET**2
+    return np.asarray(np.sqrt(np.maximum(offset + slope * light, least)))
+
+
+def _scale(off: Doubles) -> float:
+    """Return the root mean square of normal values, estimated by the median of their sizes; inf of none."""
+    return 1.4826 * float(np.median(np.abs(off))) if len(off) else np.inf
+
+
+def _evenly(mask: Mask, count: int) -> Numbers:
+    """Return the numbers of at most so many of the chosen samples, evenly spread."""
+    chosen = np.flatnonzero(mask)
+    return chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(np.intp)]
+
+
+def _check_presses(
+    touch: Touch, off: Doubles, rings: _Rings, presses: Sequence[BallPress], prior: Prior
+) -> None:
+    """Raise where a press does not fit to the others.
+
+    Its samples are off by more than those of the others; or all of them are explained, but by a sensor that
+    cannot be, and without it by a likely one.
+    """
+    known = np.isfinite(off)
+    scales = np.array([_scale(off[known & (rings.press == number)]) for number in range(len(presses))])
+    worst = int(np.argmax(scales))
+    if scales[worst] > _BAD * max(1.0, float(np.median(scales))):
+        raise InputError(_misfit(presses[worst].name))
+    if _prior_misfit(touch.fit, prior) > _UNLIKELY:
+        misfits = [_prior_misfit(_without(touch, prior, number), prior) for number in range(len(presses))]
+        least = int(np.argmin(misfits))
+        if misfits[least] < _UNLIKELY:
+            raise InputError(_misfit(presses[least].name))
+        raise InputError(
+            "the presses go together with no likely sensor: check the ball's diameter, pixel size, and the"
+            " body's radius and height"
+        )
+
+
+def _without(touch: Touch, prior: Prior, press: int) -> WallFit:
+    """Return the fit without a press."""
+    samples = touch.samples
+    others = _evenly(samples.press[samples.pose] != press, _FEW)
+    start = prior.mean.copy()
+    start[STEPS] = touch.fit.parameters[STEPS]
+    return fit_wall(
+        samples[others], prior, start, np.maximum(touch.noise[others], _MODEST), _TOLERANCES[_FEW]
+    )
+
+
+def _prior_misfit(fit: WallFit, prior: Prior) -> float:
+    """Return by how many standard deviations a sensor is off what was known before, root mean square."""
+    off = (fit.parameters - prior.mean) / np.where(prior.sigma > 0, prior.sigma, np.inf)
+    return float(np.sqrt(np.mean(off[: STEPS.start] ** 2)))
+
+
+def _misfit(name: str) -> str:
+    return f"{name}: its ball does not fit to the other presses: leave it out or take it again"
