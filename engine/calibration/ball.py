@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
@@ -168,9 +167,11 @@ class _Gradients(NamedTuple):
 
     def at(self, values: Doubles, places: Doubles) -> Doubles:
         """Read a map, (h, w), between its pixels at places, (2, ...), mm; 0 beyond its edges."""
+        from scipy.ndimage import map_coordinates
+
         way = (places.T - self.corner).T
         columns, rows = (way.T / self.step).T
-        return np.asarray(ndimage.map_coordinates(values, [rows, columns], order=1, cval=0.0))
+        return np.asarray(map_coordinates(values, [rows, columns], order=1, cval=0.0))
 
 
 def _outline(
@@ -192,6 +193,8 @@ def _downscale(
     frame: NDArray[Any], pixel_size: tuple[float, float], longest: int
 ) -> tuple[Doubles, Doubles, Doubles]:
     """Average blocks of pixels, and remove single outliers; see `_Gradients` for corner and step."""
+    from scipy.ndimage import median_filter
+
     block = -(-max(frame.shape) // longest)
     rows, columns = (size // block for size in frame.shape)
     values = np.asarray(frame[: rows * block, : columns * block], np.float64)
@@ -201,14 +204,16 @@ def _downscale(
     x, y = pixel_axes((frame.shape[0], frame.shape[1]), pixel_size)
     corner = np.array([x[:block].mean(), y[:block].mean()])
     step = np.array([pixel_size[0], -pixel_size[1]]) * block
-    return np.asarray(ndimage.median_filter(small, 3, mode="nearest")), corner, step
+    return np.asarray(median_filter(small, 3, mode="nearest")), corner, step
 
 
 def _gradients(small: Doubles, corner: Doubles, step: Doubles, blur: float) -> _Gradients:
     """Blur a picture, and take its slopes."""
+    from scipy.ndimage import gaussian_filter
+
     orders = zip(((0, 1), (1, 0)), step, strict=True)
     slope = np.stack(
-        [ndimage.gaussian_filter(small, blur, order=order, mode="nearest") / way for order, way in orders]
+        [gaussian_filter(small, blur, order=order, mode="nearest") / way for order, way in orders]
     )
     return _Gradients(slope, np.hypot(*slope), corner, step)
 
@@ -250,11 +255,13 @@ def _vote(picture: _Gradients, centres: Doubles, margin: int) -> Doubles:
 
     Returned is a map as large as the picture with a margin of so many pixels round it.
     """
+    from scipy.ndimage import gaussian_filter
+
     rows, columns = (size + 2 * margin for size in picture.steep.shape)
     column, row = np.rint(((centres.T - picture.corner) / picture.step).T).astype(np.intp) + margin
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     count = np.bincount((row * columns + column)[inside], minlength=rows * columns)
-    near = ndimage.gaussian_filter(
+    near = gaussian_filter(
         count.reshape(rows, columns).astype(np.float64), _BLUR, mode="constant", truncate=2.0
     )
     return np.asarray(near * (2 * np.pi * _BLUR**2))
