@@ -125,11 +125,11 @@ def run_reconstruct(name: str, counts: tuple[int, int], shape: Shape, device: De
 
 
 def run_import(_: Device, quick: bool) -> Case:
-    """Time processes that import the engine, and NumPy alone."""
+    """Time processes that import the engine, what a press or a turn needs of it, and NumPy alone."""
     rows = []
-    for what in ("mirrorskin.engine", "numpy"):
-        command = [sys.executable, "-c", f"import {what}"]
-        rows.append(Row(f"import {what}", _time_process(command, 1 if quick else _ROUNDS)))
+    for line in ("import mirrorskin.engine", "from mirrorskin.engine import reconstruct", "import numpy"):
+        measured = _time_process([sys.executable, "-c", line], 1 if quick else _ROUNDS)
+        rows.append(Row(line, measured))
     return Case("call-import", "a process that imports, from start to end", rows, {})
 
 

@@ -130,7 +130,7 @@ class Case:
     ----------
     name, title : str
     rows : list of Row
-        First the limit of which the others are a share. Empty where there are only `targets`.
+        First the limit of which the others are a share, if any. Empty where there are only `targets`.
     absent : dict of str
         Peers that were not run, and why.
     notes : tuple of str
@@ -147,13 +147,16 @@ class Case:
 
     def share(self, row: Row) -> float:
         """Return a work's bandwidth as a share of its limit's, by the host's clock; NaN without one."""
-        limit = (row.limit or self.rows[0]).bandwidth
-        return row.bandwidth / limit if limit else float("nan")
+        limit = self._limit_of(row)
+        return row.bandwidth / limit.bandwidth if limit and limit.bytes else float("nan")
 
     def kernel_share(self, row: Row) -> float:
         """Return the same share by the device's account of its kernels; NaN where none ran."""
-        limit = (row.limit or self.rows[0]).kernel_bandwidth
-        return row.kernel_bandwidth / limit if limit else float("nan")
+        limit = self._limit_of(row)
+        return row.kernel_bandwidth / limit.kernel_bandwidth if limit and limit.bytes else float("nan")
+
+    def _limit_of(self, row: Row) -> Row | None:
+        return row.limit or (self.rows[0] if "limit" in self.rows[0].name else None)
 
 
 Cases = dict[str, Callable[[Device, bool], Case]]

@@ -88,7 +88,7 @@ class OnsetCase:
 def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
     """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
     size = math.prod(case.shape)
-    check_memory(case.name, 3 * size + _MAPS * math.prod(case.shape[1:]))
+    check_memory(case.name, 2 * size + _MAPS * math.prod(case.shape[1:]))
     search = OnsetSearch(case.shape[1:], _BYTE, **case.options, device=device, memory_limit=2 * size)
     frames = search.room[: case.shape[0]]
     if len(frames) < case.shape[0]:

@@ -1,6 +1,8 @@
 """Each case runs at a tiny size, its works agree, and it returns what reports are made of."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -65,6 +67,14 @@ def test_a_call_says_which_share_its_kernels_take():
     (work,) = [row for row in case.rows if "limit" not in row.name]
     assert set(work.measured.kernels) == set(work.measured.moved) != set()
     assert "% in kernels" in case.notes[0]
+
+
+def test_importing_the_package_imports_no_case_peer_or_report():
+    loaded = (
+        "import sys, mirrorskin.bench; print([m for m in sys.modules if m.startswith('mirrorskin.bench.')])"
+    )
+    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True)
+    assert found.stdout.strip() == "[]"
 
 
 def test_patterns_choose_cases_in_their_order():
