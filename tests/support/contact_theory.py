@@ -194,11 +194,6 @@ def twisted(hertz: Pressed, friction: float, modulus: float, stick_radius: float
     return Twisted(float(angle), 8 / 3 * most * hertz.radius**3 * float(moment))
 
 
-def disc_push(radius: float, modulus: float, distance: float) -> float:
-    """Return the force that shifts a stuck disc: 8 G a d / (2 - 0.5), section 3.7."""
-    return 8 * modulus / 3 * radius * distance / 1.5
-
-
 def disc_torque(radius: float, modulus: float, angle: float) -> float:
     """Return the torque that twists a stuck disc: 16 / 3 G a^3 angle (Reissner and Sagoci 1944)."""
     return 16 / 3 * modulus / 3 * radius**3 * angle
