@@ -55,6 +55,7 @@ def run_local(
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> from mirrorskin.engine.batch.jobs import make_jobs
     >>> jobs = make_jobs(Path("data").glob("*.h5"), Path("results"))
     >>> [outcome.state for outcome in run_local(jobs, Plan(), default_devices())]  # doctest: +SKIP
