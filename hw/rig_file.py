@@ -334,7 +334,7 @@ def _beside(path: Path, name: str) -> str:
 
 TEMPLATE = """\
 # A rig for mirrorskin: what moves the sensor's body, and what looks at its skin (docs/rig.md).
-# Lines that begin with # show what may be said as well.
+# Lines that begin with # show what may be set as well.
 
 name = "bench"
 
@@ -343,7 +343,7 @@ port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://ho
 # baud = 115200
 home = true                     # the stage has switches, and must home before it moves
 # timeout = 2.0                 # s that an answer may take
-# report_rate = 20.0            # Hz: how often it is asked where it rests
+# report_rate = 20.0            # Hz: how often its position is asked for at rest
 press = 2.0                     # mm: greatest travel, whatever the axis could do
 # pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: what the body turns about
 
@@ -387,4 +387,4 @@ pixel_size = 0.03               # mm at the sheet
 # zenith_gain = 5.7             # counts per degree of zenith
 # zenith_offset = 10            # counts at zenith 0
 """
-"""Says every key; what is left out has its default."""
+"""A rig file to begin with, which has every key."""

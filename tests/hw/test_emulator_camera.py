@@ -76,15 +76,6 @@ def test_what_is_seen_at_a_place_is_the_frame_of_a_movement_there(name: str, sce
         np.testing.assert_array_equal(look(twin, number, lambda late, pose=pose: pose), frames[number])
 
 
-def test_a_position_is_the_lean_of_the_precession_there() -> None:
-    for phase in PHASES:
-        place = Position(PRESS, TILT * math.cos(phase), TILT * math.sin(phase))
-        expected = Axial([phase], TILT, PRESS, PIVOT).pose(np.asarray(phase))
-        found = lean_at(place)
-        np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-15)
-        np.testing.assert_allclose(found.shift, expected.shift, atol=1e-14)
-
-
 # As a camera.
 
 

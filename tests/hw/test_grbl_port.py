@@ -98,11 +98,6 @@ def test_a_port_in_use_is_refused(terminal):
         port.close()
 
 
-def test_a_baud_rate_that_cannot_be_is_refused(terminal):
-    with pytest.raises(InputError, match=r"^it: "):
-        open_port(terminal[1], -5, "it")
-
-
 def test_a_port_where_nothing_answers_is_refused(terminal):
     begun = time.monotonic()
     with pytest.raises(InputError, match=r"nothing answers within 0.25 s"):

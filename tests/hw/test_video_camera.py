@@ -67,48 +67,6 @@ def wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-class Y4mServer:
-    """Sends grey frames as YUV4MPEG2 over TCP, to one client after another, each the same from the start."""
-
-    def __init__(self, frames: np.ndarray, rate: float) -> None:
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self._listening.settimeout(SOON)
-        self.url = f"tcp://127.0.0.1:{self._listening.getsockname()[1]}"
-        rows, columns = frames.shape[1:]
-        kind = "mono" if frames.dtype == np.uint8 else "mono16"
-        self._header = f"YUV4MPEG2 W{columns} H{rows} F{rate:.0f}:1 Ip A1:1 C{kind}\n".encode()
-        self._frames, self._rate = frames, rate
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        with self._listening:
-            client, _ = self._listening.accept()
-        with client:
-            try:
-                client.sendall(self._header)
-                for frame in self._frames:
-                    client.sendall(b"FRAME\n" + frame.tobytes())
-                    time.sleep(1 / self._rate)
-            except OSError:
-                pass  # the client left
-
-    def close(self) -> None:
-        self._thread.join()
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_grey_stream_is_exact(dtype) -> None:
-    sent = noise(150, (96, 128), dtype)
-    server = Y4mServer(sent, rate=200.0)
-    opened = VideoCamera(settings(server.url, sent.shape[1:], dtype, rate=200.0), slots=200)
-    pixels, numbers = take(opened, 20)
-    opened.close()
-    server.close()
-    start = next(k for k, frame in enumerate(sent) if np.array_equal(frame, pixels[0]))
-    np.testing.assert_array_equal(pixels, sent[start + numbers - numbers[0]])
-
-
 def test_where_nobody_sends_there_is_no_camera() -> None:
     with pytest.raises(InputError, match=r"^camera tcp://127\.0\.0\.1:\d+ cannot be opened"):
         VideoCamera(settings(f"tcp://127.0.0.1:{free_port()}"))
