@@ -113,7 +113,7 @@ def _check_call(
 
 
 def _still(name: str, rig: Path, frames: int, number: int = 1) -> inputs.Place:
-    """Say how a level is taken: half of the frames at each of two places that are all but one."""
+    """Return how a level is taken: half of the frames at each of two places that nearly coincide."""
     file = name if number == 1 else f"{name}-{number}"
     return inputs.Place(file, _PROMPTS[name], inputs.still_plan(rig), max(1, -(-frames // 2)))
 

@@ -1,4 +1,4 @@
-"""How the gel gives way, found from presses of a ball of known size."""
+"""The elastomer's compliance and the threshold of light, found from presses of a ball of known size."""
 
 from __future__ import annotations
 

@@ -280,6 +280,13 @@ class Precession:
         -------
         ndarray, (n, 2), float64
             The lean vector l, radians along x and y: the body's axis is (-sin|l| l / |l|, cos|l|).
+
+        Examples
+        --------
+        >>> circle = Precession(0.04, 0.0, 1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 0.0))
+        >>> circle.lean(np.array([0.0, np.pi / 2])).round(3) + 0.0
+        array([[0.04, 0.  ],
+               [0.  , 0.04]])
         """
         along, across = self._ellipse(phase)
         cosine, sine = math.cos(self.major_axis), math.sin(self.major_axis)
@@ -313,7 +320,7 @@ class Precession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gel:
-    """How the sheet gives way around what it touches, and when that turns it light.
+    """The elastomer's compliance, and the slope of the sheet that turns a pixel light.
 
     A pixel is taken for light where the sheet's zenith passes the one that shows the rim of a round lit wall
     (see `threshold_at` of `mirrorskin.engine.press.elastic`).
@@ -328,8 +335,7 @@ class Gel:
     axis : (float, float)
         Where the wall's axis meets the picture, mm.
     compliance : float
-        Millimetres that the stage gives way by, for each N / (N/mm^2): its flexure times the gel's modulus,
-        1/mm.
+        Of the stage, mm for each N / (N/mm^2): its flexure times the gel's modulus, 1/mm.
     travel_zero : float
         Travel at which the sheet met the ball that it was learned from, mm: a check of the stage, not used.
     error : float

@@ -407,17 +407,6 @@ def _unit(vectors: Map) -> Map:
 # --- what can be known --------------------------------------------------------------------------------------
 
 
-def frames_of(rig: Rig, seen: Seen) -> Map:
-    """Return the light of every pixel at every phase, (T, H, W); NaN where something is out of range."""
-    good, point, zenith, azimuth = _points(rig, seen)
-    frames = np.full((len(rig.phase), *seen.x.shape), np.nan)
-    for frame, phase in zip(frames, rig.phase, strict=True):
-        light, inside = light_of(rig, stand(rig, point, phase), zenith, azimuth)
-        frame[good] = np.where(inside, light, np.nan)
-    frames[:, np.isnan(frames).any(axis=0)] = np.nan
-    return frames
-
-
 def bounds(rig: Rig, seen: Seen, away: float, edges: tuple[float, float] = (np.inf, np.inf)) -> Bound:
     """Return the bounds of zenith and azimuth where both can be known, each with the other unknown too.
 
