@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,42 +28,59 @@ class Pose:
         return bool(np.array_equal(self.rotation, np.eye(3)))
 
 
-class Movement(Protocol):
-    """What the body does, frame by frame.
+class Movement:
+    """What the body does, frame by frame: base of `Vertical`, `Axial`, `Horizontal` and `Twist`.
 
-    Positions are numbered by frames; one between two frames is passed between their exposures.
+    Positions are numbered by frames; one between two frames is passed between their exposures. Here the body
+    stays upright and its positions do not jump.
+
+    Attributes
+    ----------
+    motion : {"vertical", "axial", "horizontal", "twist"}
+    positions : ndarray, (T, ...), float64
+        Where the body is in each frame: what a recording says of it.
+    path : ndarray, (T, ...), float64
+        The same without jumps, for what lies between two frames.
+    deepest : float
+        Greatest travel, mm.
     """
 
-    @property
-    def motion(self) -> Motion:
-        """Which of the four it is."""
+    motion: Motion
+    _recorded_as: str
 
-    @property
-    def positions(self) -> Floats:
-        """Where the body is in each frame, (T, ...), float64: what a recording says of it."""
-
-    @property
-    def path(self) -> Floats:
-        """The same without jumps, to tell what lies between two frames."""
-
-    @property
-    def deepest(self) -> float:
-        """Greatest travel, mm."""
+    def __init__(self, positions: Floats, name: str, deepest: float) -> None:
+        if len(positions) == 0:
+            raise InputError(f"{name} is empty: give the position of at least one frame")
+        bad = ~np.isfinite(positions).reshape(len(positions), -1).all(axis=1)
+        if bad.any():
+            frame = int(np.argmax(bad))
+            raise InputError(f"{name} is not finite at frame {frame}: every frame needs a position")
+        if not math.isfinite(deepest):
+            raise InputError(f"press {deepest} mm cannot be: give how far the body is lowered")
+        self.positions = self.path = positions
+        self.deepest = float(deepest)
 
     def rise(self, radius: float, /) -> float:
         """Bound how far an object of a radius about the origin can rise above the rest plane, mm."""
+        return self.deepest
 
     def reduced(self, path: Floats, /) -> Floats:
         """Make places on the path equal where they are the same."""
+        return path
 
     def pose(self, place: Floats, /) -> Pose:
-        """Tell where the object is when the body is at a place, one item of the path."""
+        """Return where the object is when the body is at a place, one item of the path."""
+        raise NotImplementedError
 
     def header(self) -> Header:
-        """Tell what holds for the whole movement."""
+        """Return what holds for the whole movement."""
+        return Header(self.motion, press=self.deepest)
 
     def mark(self, block: Block, /) -> Block:
         """Add to a block where the body was in its frames."""
+        here = slice(block.index, block.index + len(block.frames))
+        positions: dict[str, Any] = {self._recorded_as: self.positions[here]}
+        return replace(block, **positions)
 
 
 def pose_at_press(travel: float) -> Pose:
@@ -85,27 +102,7 @@ def pose_at_lean(
     return Pose(rotation, rotation @ (np.array([0.0, 0.0, travel]) - centre) + centre)
 
 
-class _Upright:
-    """What all movements share that do not tilt the body."""
-
-    positions: Floats
-    deepest: float
-
-    @property
-    def path(self) -> Floats:
-        """The positions, which do not jump."""
-        return self.positions
-
-    def rise(self, radius: float, /) -> float:
-        """Return how far the body is lowered: nothing tilts."""
-        return self.deepest
-
-    def reduced(self, path: Floats, /) -> Floats:
-        """Return the places as they are."""
-        return path
-
-
-class Vertical(_Upright):
+class Vertical(Movement):
     """Press, release, or one after the other.
 
     Parameters
@@ -121,30 +118,26 @@ class Vertical(_Upright):
         The travel is empty, not finite, or goes down again after it came up; the compliance is negative.
     """
 
-    motion: Motion = "vertical"
+    motion = "vertical"
+    _recorded_as = "travel"
 
     def __init__(self, travel: ArrayLike, *, compliance: float = 0.0) -> None:
-        self.positions = check_stroke(travel, _count(travel), "travel")
-        _check_frames(self.positions, "travel")
+        positions = check_stroke(travel, _count(travel), "travel")
+        super().__init__(positions, "travel", positions.max(initial=-math.inf))
         if not (math.isfinite(compliance) and compliance >= 0):
             raise InputError(f"compliance {compliance} mm/N cannot be: give 0 or more")
         self.compliance = compliance
-        self.deepest = float(self.positions.max())
 
     def pose(self, place: Floats, /) -> Pose:
         """Lower the body to a travel, mm."""
         return pose_at_press(float(place))
 
     def header(self) -> Header:
-        """Tell the motion."""
+        """Return the motion: there is no one press."""
         return Header(self.motion)
 
-    def mark(self, block: Block, /) -> Block:
-        """Add the travel."""
-        return replace(block, travel=self.positions[_frames(block)])
 
-
-class Axial:
+class Axial(Movement):
     """Precession: the body's axis goes round on a cone of half-angle ``tilt``.
 
     At phase alpha the axis leans towards alpha + pi, and a vector x of the world is, in the body's frame ::
@@ -170,13 +163,13 @@ class Axial:
         A value cannot be.
     """
 
-    motion: Motion = "axial"
+    motion = "axial"
+    _recorded_as = "phase"
 
     def __init__(
         self, phase: ArrayLike, tilt: float, press: float, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
-        self.positions = check_phase(phase, _count(phase), "phase")
-        _check_frames(self.positions, "phase")
+        super().__init__(check_phase(phase, _count(phase), "phase"), "phase", press)
         self.path = np.unwrap(self.positions)
         if not (math.isfinite(tilt) and 0 < tilt <= TILT_MAX):
             raise InputError(
@@ -185,7 +178,6 @@ class Axial:
             )
         if np.shape(pivot) != (3,) or not np.isfinite(pivot).all():
             raise InputError(f"pivot {pivot} cannot be: give x, y and z in mm")
-        self.deepest = _check_press(press)
         self.tilt = tilt
         self.pivot = pivot
 
@@ -204,30 +196,12 @@ class Axial:
         return pose_at_lean(self.deepest, self.tilt, float(place), self.pivot)
 
     def header(self) -> Header:
-        """Tell motion, press, tilt and pivot."""
+        """Return motion, press, tilt and pivot."""
         x, y, z = map(float, self.pivot)
         return Header(self.motion, press=self.deepest, tilt=self.tilt, pivot=(x, y, z))
 
-    def mark(self, block: Block, /) -> Block:
-        """Add the phase."""
-        return replace(block, phase=self.positions[_frames(block)])
 
-
-class _Pressed(_Upright):
-    """What movements share that go on at one depth."""
-
-    motion: Motion
-
-    def __init__(self, positions: Floats, name: str, press: float) -> None:
-        _check_frames(positions, name)
-        self.positions, self.deepest = positions, _check_press(press)
-
-    def header(self) -> Header:
-        """Tell motion and press."""
-        return Header(self.motion, press=self.deepest)
-
-
-class Horizontal(_Pressed):
+class Horizontal(Movement):
     """Move the pressed body sideways.
 
     Parameters
@@ -243,7 +217,8 @@ class Horizontal(_Pressed):
         A value cannot be.
     """
 
-    motion: Motion = "horizontal"
+    motion = "horizontal"
+    _recorded_as = "displacement"
 
     def __init__(self, displacement: ArrayLike, press: float) -> None:
         positions = np.asarray(displacement, np.float64)
@@ -255,12 +230,8 @@ class Horizontal(_Pressed):
         """Move the body by x and y, mm: the object goes the other way in the picture."""
         return Pose(np.eye(3), np.array([-place[0], -place[1], self.deepest]))
 
-    def mark(self, block: Block, /) -> Block:
-        """Add the displacement."""
-        return replace(block, displacement=self.positions[_frames(block)])
 
-
-class Twist(_Pressed):
+class Twist(Movement):
     """Turn the pressed body about its axis.
 
     Parameters
@@ -276,7 +247,8 @@ class Twist(_Pressed):
         A value cannot be.
     """
 
-    motion: Motion = "twist"
+    motion = "twist"
+    _recorded_as = "twist"
 
     def __init__(self, twist: ArrayLike, press: float) -> None:
         positions = np.asarray(twist, np.float64)
@@ -288,32 +260,10 @@ class Twist(_Pressed):
         """Turn the body by an angle: the object goes the other way in the picture."""
         return Pose(_about_z(-float(place)), np.array([0.0, 0.0, self.deepest]))
 
-    def mark(self, block: Block, /) -> Block:
-        """Add the twist."""
-        return replace(block, twist=self.positions[_frames(block)])
-
-
-def _frames(block: Block) -> slice:
-    return slice(block.index, block.index + len(block.frames))
-
 
 def _count(values: ArrayLike) -> int:
     shape = np.shape(values)
     return shape[0] if len(shape) == 1 else -1
-
-
-def _check_frames(positions: Floats, name: str) -> None:
-    if len(positions) == 0:
-        raise InputError(f"{name} is empty: give the position of at least one frame")
-    bad = ~np.isfinite(positions).reshape(len(positions), -1).all(axis=1)
-    if bad.any():
-        raise InputError(f"{name} is not finite at frame {int(np.argmax(bad))}: every frame needs a position")
-
-
-def _check_press(press: float) -> float:
-    if not math.isfinite(press):
-        raise InputError(f"press {press} mm cannot be: give how far the body is lowered")
-    return float(press)
 
 
 def _about_y(angle: float) -> Floats:
