@@ -256,15 +256,6 @@ def terraced(step=0.1):
     return true, normals, terraces, np.full(true.shape, step / np.sqrt(12), np.float32)
 
 
-def test_late_heights_do_not_pull_a_surface_down():
-    true, normals, terraces, sigma = terraced()
-    random = np.random.default_rng(4)
-    late = random.choice(true.size, true.size // 25, replace=False)
-    terraces.flat[late] -= random.uniform(0.03, 0.15, late.size)
-    surface = engine.fuse(SimpleNamespace(height=terraces, sigma=sigma), directions(normals, sigma=1e-3), 0.1)
-    assert abs(np.mean(surface.height - true)) < 0.002
-
-
 def test_heights_beside_the_normals_do_not_say_where_the_surface_is():
     true, normals, terraces, sigma = terraced()
     contact = np.ones(true.shape)

@@ -105,16 +105,6 @@ def errors(height: NDArray[np.floating], case: Case, part: NDArray[np.intp]) -> 
     return error
 
 
-def smooth_links(case: Case, height: NDArray[np.floating]) -> tuple[Map, Map]:
-    """Return the errors of the links where the surface is smooth, along x and y, as a share of the step."""
-    found = []
-    for axis, joined in zip((1, 0), surfaces.joined(case.seen.side), strict=True):
-        ahead = np.diff(height, axis=axis) - np.diff(case.seen.height, axis=axis)
-        creased = np.abs(np.diff([case.seen.dz_dx, case.seen.dz_dy], axis=axis + 1)).max(axis=0) > 0.2
-        found.append(ahead[joined & ~creased & np.isfinite(ahead)] / case.step)
-    return found[0], found[1]
-
-
 def beside_steps(case: Case, below: float = np.inf) -> Mask:
     """Return the pixels on either side of a step that is less than so many pixels deep."""
     beside = np.zeros(case.mask.shape, bool)

@@ -54,20 +54,3 @@ def test_components_are_what_links_hold_together(shape, cut):
         known = {labels[place] for place in np.argwhere(flags & KNOWN).tolist() for place in [tuple(place)]}
         assert [n in known for n in range(count)] == (~found.offset_unknown).tolist()
         assert min(shape) == 1 or 10 < count < 400
-
-
-def test_a_spiral_is_one_piece():
-    answered = np.zeros((41, 41), bool)
-    y, x, dy, dx = 0, 0, 0, 1
-    answered[0, 0] = True
-    for length in [40, 40, 40, *np.repeat(np.arange(38, 0, -2), 2)]:
-        for _ in range(length):
-            y, x = y + dy, x + dx
-            answered[y, x] = True
-        dy, dx = dx, -dy
-    flags = np.where(answered, SLOPE, 0)
-    flags[:, :-1] |= RIGHT * (answered[:, :-1] & answered[:, 1:])
-    flags[:-1] |= DOWN * (answered[:-1] & answered[1:])
-    flags = flags.astype(np.uint8)
-    assert find_components(flags, False).count == find_components(flags, True).count == 1
-    assert answered.sum() > 800
