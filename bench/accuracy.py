@@ -35,8 +35,8 @@ _SHAPE, _SMALL = (240, 320), (48, 64)
 def run_press(device: Device, quick: bool) -> Case:
     """Hold onsets and change-points of sudden changes and ramps against their truth, in each type.
 
-    A sudden change lies anywhere in its interval: all that can be told is the interval, and the error is that
-    of a uniform number. Of a ramp, two samples on either side of the level tell when it was crossed, by a
+    A sudden change lies anywhere in its interval: no more can be known, and the error is that of a uniform
+    number. Of a ramp, two samples on either side of the level show when it was crossed, by a
     straight line; noise in them is all that is wrong with it.
     """
     shape = _SMALL if quick else _SHAPE
@@ -198,7 +198,7 @@ def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float)
 def _bound(normals: Doubles, sensor: Sensor) -> Doubles:
     """Return the least mean square error of an unbiased estimate, radians squared, (...).
 
-    Each frame tells the angle from an axis: the information is (gain / sigma)^2 times the sum of u u', with u
+    Each frame gives the angle from an axis: the information is (gain / sigma)^2 times the sum of u u', with u
     the tangent at the normal that points away from the axis. In the plane across the normal, its trace is N
     and its determinant follows from that of the sum of squares.
     """
@@ -207,7 +207,7 @@ def _bound(normals: Doubles, sensor: Sensor) -> Doubles:
         away = (normals @ axis)[..., np.newaxis] * normals - axis
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
         total += away[..., :, np.newaxis] * away[..., np.newaxis, :]
-    # u u' is nothing along the normal: of three eigenvalues one is 0, and two tell trace and determinant.
+    # u u' is nothing along the normal: one eigenvalue is 0, two follow from trace and determinant.
     trace = np.trace(total, axis1=-2, axis2=-1)
     product = (trace**2 - np.trace(total @ total, axis1=-2, axis2=-1)) / 2
     return np.asarray(trace / product * (sensor.spread / sensor.gain) ** 2)
@@ -327,8 +327,8 @@ def run_fusion(device: Device, quick: bool) -> Case:
     sensor = _SENSORS[1]
     normals = toward(np.where(there, zenith, 0.0), np.arctan2(y, x))
     frames = expose(normals, sensor, 10)
-    told = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    turn = replace(told, contact=(told.contact * there).astype(np.uint8))
+    turned = estimate_normals(frames, _PHASES, **sensor.known, device=device)
+    turn = replace(turned, contact=(turned.contact * there).astype(np.uint8))
     found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
     inner = zenith <= _LIT[1]
     error = (found.height - truth)[inner]

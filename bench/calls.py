@@ -197,13 +197,12 @@ def _stack(
 def _map(
     name: str, run: Callable[[str, Shape, Device, bool], Case], shape: Shape, small: Shape
 ) -> dict[str, Callable[[Device, bool], Case]]:
-    both = {name: shape, f"{name}-small": small}
-    return {
-        title: lambda device, quick, title=title, size=size: run(  # type: ignore[misc]
-            title, _TINY if quick else size, device, quick
-        )
-        for title, size in both.items()
-    }
+    """Return a call on maps of both sizes."""
+
+    def sized(title: str, shape: Shape, device: Device, quick: bool) -> Case:
+        return run(title, _TINY if quick else shape, device, quick)
+
+    return {title: partial(sized, title, size) for title, size in ((name, shape), (f"{name}-small", small))}
 
 
 def _commands(name: str, shape: Shape, device: Device, quick: bool) -> Case:

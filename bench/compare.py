@@ -68,7 +68,7 @@ class Comparison:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """How many works changed; limits, which tell of the machine, are counted by themselves."""
+        """How many works changed; limits, which are the machine's, are counted by themselves."""
         every = [one for rows in self.cases.values() for one in rows]
         limits, works = ([one for one in every if ("limit" in one.name) is kind] for kind in (True, False))
         return tuple(

@@ -293,7 +293,7 @@ def agree(
 
 
 def check_memory(name: str, needed: int) -> None:
-    """Raise InputError where the system tells how much memory is free, and a case needs more bytes."""
+    """Raise InputError where the system says how much memory is free, and a case needs more bytes."""
     free = free_memory()
     if free is not None and free < needed:
         raise InputError(
@@ -303,7 +303,7 @@ def check_memory(name: str, needed: int) -> None:
 
 
 def free_memory() -> int | None:
-    """Return the bytes that a new program can have; None where the system does not tell."""
+    """Return the bytes that a new program can have; None where the system does not say."""
     try:
         lines = _MEMINFO.read_text(encoding="ascii").splitlines()
     except OSError:

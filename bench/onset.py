@@ -1,7 +1,4 @@
-"""The onset of the light state: the engine, the limits and NumPy, OpenCV, PyTorch and Numba on one stack.
-
-Aim: at least 70 % of the read limit with one threshold, and the full default no slower than the best peer.
-"""
+"""The onset of the light state: the engine, the limits and NumPy, OpenCV, PyTorch and Numba on one stack."""
 
 from __future__ import annotations
 
@@ -47,7 +44,9 @@ _PLATEAU, _SURELY = (
     3.0,
     6.0,
 )  # sigmas a sample may be off its plateau, and below the level that are surely dark
-_TILE = 131_072  # pixels of a peer's tile: more leave the cache, fewer pay more for each call
+# Threads of ours, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
+# core, as most people use it; PyTorch has threads of its own.
+_TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
 _NUMBA_TILE = 16_384
 _COUNTABLE = 255  # frames that a byte counts
 
@@ -151,15 +150,15 @@ FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
 def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]) -> dict[str, Work]:
     known, absent = case.known, missing("torch", "numba")
     peers: dict[str, FirstLight] = {"NumPy": first_light, "OpenCV": _opencv}
-    if "torch" not in absent:
+    if "torch" not in absent and not case.full:  # heights would be NumPy's, as OpenCV's are
         peers["PyTorch"] = _torch
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
     works: dict[str, Work] = {}
     for name, find in peers.items():
         if case.full:
-            works[name] = functools.partial(_heights, find, frames, travel, known, noise)
+            works[name] = functools.partial(_heights, _TILES[name], find, frames, travel, known, noise)
         else:
-            works[name] = functools.partial(_onsets, find, frames, known, 1)
+            works[name] = functools.partial(_onsets, _TILES[name], find, frames, known, 1)
     if "numba" not in absent:
         works["Numba"] = (
             functools.partial(_numba_heights, frames, travel, known, noise)
@@ -169,25 +168,33 @@ def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float6
     return works
 
 
-def _in_tiles(frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
-    """Fill all rows in tiles, on all cores."""
-    count = max(1, min(_TILE // frames.shape[2], -(-frames.shape[1] // THREADS)))
-    with ThreadPoolExecutor(THREADS) as pool:
+def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
+    """Fill all rows in tiles of at most so many pixels, on so many cores."""
+    threads, pixels = tiles
+    count = max(1, min(pixels // frames.shape[2], -(-frames.shape[1] // threads)))
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, (slice(row, row + count) for row in range(0, frames.shape[1], count))))
 
 
-def _onsets(find: FirstLight, frames: NDArray[Any], known: References, hold: int) -> NDArray[np.int32]:
+def _onsets(
+    tiles: tuple[int, int], find: FirstLight, frames: NDArray[Any], known: References, hold: int
+) -> NDArray[np.int32]:
     onset = np.empty(frames.shape[1:], np.int32)
 
     def fill(rows: slice) -> None:
         onset[rows] = find(frames[:, rows], known.of(rows).light, hold)
 
-    _in_tiles(frames, fill)
+    _in_tiles(tiles, frames, fill)
     return onset
 
 
 def _heights(
-    find: FirstLight, frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
+    tiles: tuple[int, int],
+    find: FirstLight,
+    frames: NDArray[Any],
+    travel: NDArray[np.float64],
+    known: References,
+    noise: float,
 ) -> Maps:
     height, sigma = (np.full(frames.shape[1:], np.nan, np.float32) for _ in range(2))
     status = np.empty(height.shape, np.uint8)
@@ -197,7 +204,7 @@ def _heights(
         onset = find(part, mine.light, 2)
         height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
 
-    _in_tiles(frames, fill)
+    _in_tiles(tiles, frames, fill)
     return {"height": height, "sigma": sigma, "status": status}
 
 
@@ -242,6 +249,7 @@ def _torch(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
     """Do the same with PyTorch on the host."""
     import torch
 
+    torch.set_num_threads(THREADS)
     level: Any = torch.from_numpy(light) if light.ndim else light.item()
     shape = frames.shape[1:]
     undecided, few, onset = np.ones(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)

@@ -190,8 +190,8 @@ def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, qui
     share, rate = rows[PATH].bandwidth / known[binds], rows[PATH].bandwidth / 1e9
     least = "of read bandwidth, or of the arithmetic limit where that is less"
     bound = f"at least {100 * _LIMIT_SHARE:.0f} % {least}"
-    told = ", ".join(f"{one} {bandwidth / 1e9:.2f} GB/s" for one, bandwidth in known.items())
-    value = f"{100 * share:.0f} % of {binds} ({rate:.2f} GB/s; limits: {told})"
+    limits_said = ", ".join(f"{one} {bandwidth / 1e9:.2f} GB/s" for one, bandwidth in known.items())
+    value = f"{100 * share:.0f} % of {binds} ({rate:.2f} GB/s; limits: {limits_said})"
     target = Target(PATH, bound, value, share >= _LIMIT_SHARE)
     what = "exact method to normals" if wanted == "normals" else "mean, cosine, sine and residual"
     title = f"{what}, mean of {shape[0] // STEPS} turns, no heights; {_size(shape)}, contiguous"

@@ -185,13 +185,13 @@ def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
     machines = gather(runs.values())
     parts = ["# Benchmarks", _ABOUT, "## How to measure", _COMMANDS, _METHOD]
     parts += ["## Machine and runs", _runs(runs)]
-    for title, about, tell in (
+    for title, about, describe in (
         ("Aims", _AIMS, _aims),
         ("Calls", _CALLS, _calls),
         ("Kernels and paths beside peers", _BESIDE, _beside_peers),
         ("Sizes, types and cores", _SIZES, _sizes),
     ):
-        parts += _topic(title, about, machines, tell)
+        parts += _topic(title, about, machines, describe)
     if pictured:
         parts += ["## Roofline", f"![Roofline]({PICTURE.as_posix()})", _ROOF]
     parts += _topic("Cold and warm", _STARTS, machines, _starts)
@@ -214,12 +214,12 @@ def _runs(runs: Mapping[Path, Run]) -> str:
 
 
 def _topic(
-    title: str, about: str, machines: Sequence[Machine], tell: Callable[[Machine], list[str]]
+    title: str, about: str, machines: Sequence[Machine], describe: Callable[[Machine], list[str]]
 ) -> list[str]:
     """Return a heading and what there is to say of each machine; nothing where there is nothing."""
     parts = []
     for machine in machines:
-        if mine := tell(machine):
+        if mine := describe(machine):
             parts += [*([f"**{machine.title}**"] if len(machines) > 1 else []), *mine]
     return [f"## {title}", about, *parts] if parts else []
 

@@ -86,7 +86,7 @@ def run_cores(device: Device, quick: bool) -> Case:
     """Time the same works in processes whose device has 1, 2, 4, ... and all cores."""
     name, title = "scaling-cores", "press, correlation, turns and surface on ever more cores"
     if device.info.kind != "cpu" or device.info.platform != "Portable Computing Language":
-        note = f"{device.info.title}: only PoCL's CPU devices can be told how many cores to take"
+        note = f"{device.info.title}: only of PoCL's CPU devices can the number of cores be set"
         return Case(name, title, [], {}, (note,))
     counts = [*(2**n for n in range(THREADS.bit_length()) if 2**n < THREADS), THREADS]
     found: dict[int, list[list[Row]]] = {threads: [] for threads in counts}

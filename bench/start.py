@@ -1,4 +1,4 @@
-"""A process of its own that starts as a user's does, and tells what each step takes; run as a script.
+"""A process of its own that starts as a user's does, and measures what each step takes; run as a script.
 
 It imports nothing of the benchmarks, which take longer to import than the engine does.
 """
