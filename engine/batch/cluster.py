@@ -174,7 +174,8 @@ class _Batch:
             for folder in {job.target.parent for job, _ in self._running.values()}:
                 remove_leftovers(folder)
         self._present, self._looked = set(processing), now
-        if any(processing.values()) or (processing and not self._running):
+        working = any(processing.values()) or not self._ended.empty()
+        if working or (processing and not self._running):
             self._alive = now
         elif now - self._alive > PATIENCE:
             remedy = f"start some with 'dask worker {self._client.scheduler.address}'"
@@ -190,7 +191,7 @@ class _Batch:
             found: dict[str, Any] = run(callback_timeout=_CHECK)
         except (OSError, _closed()) as error:
             raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from error
-        return found
+        return {worker: one for worker, one in found.items() if not isinstance(one, OSError)}  # it was lost
 
     def _ask(self, question: Callable[..., Any], timeout: float, **values: Any) -> Any:
         """Ask the scheduler something."""
