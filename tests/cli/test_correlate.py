@@ -118,7 +118,7 @@ CASES = {
         [],
         "theirs.h5 does not say where the body was in each frame: give --phase-step or --ph",
     ),
-    "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "give one of them"),
+    "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "leave one out"),
     "seven phases": (theirs, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
     "no such phases": (theirs, ["--phases", "gone.txt"], "gone.txt cannot be read: No such file"),
     "a number": (theirs, ["--phases", "number.txt"], "number.txt, line 2: 45: a unit is needed"),
