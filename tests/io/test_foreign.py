@@ -178,14 +178,6 @@ def test_a_virtual_stack_that_is_not_whole_is_refused(path, tmp_path):
     refused(path, r"the virtual dataset /x leads to part2\.h5, which does not exist: copy it there")
 
 
-def test_a_virtual_stack_of_itself_is_refused(path):
-    layout = h5py.VirtualLayout(SHAPE, "u1")
-    layout[...] = h5py.VirtualSource("theirs.h5", "x", SHAPE)
-    with h5py.File(path, "w") as file:
-        file.create_virtual_dataset("x", layout)
-    refused(path, "virtual datasets are nested too deeply")
-
-
 @pytest.mark.parametrize("way", ["..", "absolute", "symlink", "by another"])
 @pytest.mark.parametrize("kind", ["link", "virtual", "raw"])
 def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
@@ -389,15 +381,3 @@ def test_a_file_that_is_being_written_is_refused(path, libver, monkeypatch):
         refused(path, r"theirs\.h5: another program is writing it: wait until it is done")
         writer.stdin.close()
     np.testing.assert_array_equal(read(path), STACK)
-
-
-def test_another_s_file_is_described(path):
-    with h5py.File(path, "w") as file:
-        file["b/x"], file["a"], file["flat"] = STACK, STACK.astype("f8"), STACK[0]
-        file["dead"], file["text"] = h5py.SoftLink("/x"), "text"
-    assert io.describe(path) == {
-        "kind": "HDF5 file of another layout",
-        "stacks": "2",
-        "/a": "8 x 5 x 7 float64",
-        "/b/x": "8 x 5 x 7 uint8",
-    }

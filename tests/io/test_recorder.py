@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -157,14 +156,6 @@ def test_raw_frames_begin_with_a_page(tmp_path, dtype):
     assert path.stat().st_size < stack.nbytes + header.dark.nbytes + 40_000
 
 
-def test_drain_goes_block_by_block_and_tells_how_far_it_is(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr("mirrorskin.io.recorder._BLOCK", 3 * math.prod(sphere().shape[1:]))
-    with io.Recorder(sphere(), tmp_path / "a.h5") as writer:
-        writer.drain(told.append)
-    assert told == [3, 6, 8]
-
-
 @pytest.mark.parametrize("compression", io.COMPRESSIONS)
 @pytest.mark.parametrize(
     "error", [io.InputError("frame 3 is gone"), OSError(5, "the camera is gone"), KeyboardInterrupt()]
@@ -186,15 +177,6 @@ def test_another_number_of_frames_than_announced_leaves_nothing(tmp_path, announ
     with pytest.raises(io.InputError, match=f"made up gave 8 frames and announced {announced}"):
         record(source, tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_output_that_cannot_be_is_refused_before_the_source_starts(tmp_path):
-    class Hardware(MadeUp):
-        def __enter__(self):
-            raise AssertionError("moved the stage")
-
-    with pytest.raises(io.InputError, match="there is no folder"):
-        record(Hardware(random_stack(), io.Header("vertical")), tmp_path / "missing" / "a.h5")
 
 
 FULL_DISK = """

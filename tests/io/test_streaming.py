@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 import weakref
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -112,15 +111,6 @@ def test_marks_reach_frames_that_are_written_and_frames_that_are_yet_to_come(tmp
         recorder.read()
         recorder.mark(11, np.zeros(5, bool))
     np.testing.assert_array_equal(held(tmp_path / "a.h5")["used"], [1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 0])
-
-
-def test_corrected_positions_replace_those_that_are_known(tmp_path):
-    class Partly(Feed):
-        def positions(self):
-            return {"travel": np.array([7.0, np.nan, 9.0]), "unheard of": np.zeros(3)}
-
-    stream(Partly(5), tmp_path / "a.h5")
-    np.testing.assert_array_equal(held(tmp_path / "a.h5")["travel"], [7.0, 0.01, 9.0, 0.03, 0.04])
 
 
 # What is there before and after.
@@ -266,22 +256,3 @@ def test_a_disk_that_promises_nothing_is_believed(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", unable)
     stream(Feed(20), tmp_path / "a.h5")
     assert len(held(tmp_path / "a.h5")["data"]) == 20
-
-
-def test_a_block_that_was_written_in_part_is_left_out(tmp_path):
-    class Half(np.ndarray):
-        def __iter__(self):
-            yield np.asarray(self[0])
-            raise OSError(errno.EIO, "dead")
-
-    class Dying(Feed):
-        def read(self, out=None, /):
-            block = super().read(out)
-            return replace(block, frames=block.frames.view(Half)) if block and block.index == 6 else block
-
-    with pytest.raises(io.InputError, match=r"a\.h5 could not be written: Input/output error; make room"):
-        stream(Dying(10**6, (3,)), tmp_path / "a.h5")
-    found = held(tmp_path / "a.h5")
-    assert found.pop("state").startswith("cut short: ")
-    assert {len(values) for values in found.values()} == {6}
-    np.testing.assert_array_equal(found["data"], frames_of(np.arange(6)))

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import socket
@@ -23,7 +22,6 @@ from mirrorskin.engine.batch.cluster import run_cluster
 from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
 from mirrorskin.engine.batch.local import default_devices, run_local
 from mirrorskin.engine.batch.work import Outcome
-from mirrorskin.io.atomic import remove_leftovers
 
 PLAN = Plan(press={"fill": False})
 
@@ -238,23 +236,6 @@ def test_a_worker_that_cannot_take_part_is_refused(recordings, address, tmp_path
     monkeypatch.setattr(cluster, "_one_of_each_folder", lambda _: {tmp_path / "elsewhere.h5": 10})
     message = refusal(jobs, address)
     assert f"does not see {tmp_path / 'elsewhere.h5'}: workers need the same folders" in message
-
-
-def test_a_folder_that_cannot_be_written_to_is_refused(recordings, address, tmp_path, monkeypatch):
-    def refuse(**_):
-        raise PermissionError(errno.EACCES, "no")
-
-    monkeypatch.setattr(cluster.tempfile, "NamedTemporaryFile", refuse)
-    message = refusal(make_jobs(recordings, tmp_path / "new" / "results"), address)
-    assert message == f"{tmp_path} cannot be written to: Permission denied; choose another folder with -o"
-
-
-def test_a_trace_is_no_leftover_and_leaves_none(tmp_path):
-    with cluster._trace(tmp_path) as trace:
-        assert trace.parent == tmp_path
-        assert remove_leftovers(tmp_path) == []
-        assert trace.exists()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_keeps_a_worker_from_taking_part(tmp_path, monkeypatch):

@@ -151,13 +151,3 @@ def test_a_recording_that_is_written_to_meanwhile_fails(job, change):
     assert outcome.state == "failed"
     assert outcome.message.startswith(f"{job.source} was changed while it was open")
     assert not job.target.exists()
-
-
-def test_a_result_s_folder_that_is_a_file_fails(job):
-    job.target.parent.write_text("mine")
-    outcome = run_job(job, Plan())
-    assert (outcome.state, outcome.message) == (
-        "failed",
-        f"{job.target.parent} cannot be made: File exists; choose another folder for results",
-    )
-    assert job.target.parent.read_text() == "mine"
