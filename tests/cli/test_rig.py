@@ -9,9 +9,11 @@ import time
 import numpy as np
 import pytest
 from commands import run
+from served_rig import allow_delays
 
 from mirrorskin.cli import rig as command
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
+from mirrorskin.hw.rig import check
 from mirrorskin.hw.rig.check import Finding
 from mirrorskin.hw.rig_file import load_rig
 
@@ -47,8 +49,8 @@ MACHINE = {24: 600.0, 25: 3000.0, 26: 10.0, 27: 0.3, 132: 10.0} | dict.fromkeys(
 def folder(tmp_path, monkeypatch):
     """Work in a folder with a film of 5 s, and look at things for a shorter time than a user does."""
     monkeypatch.chdir(tmp_path)
-    for module in ("check",):
-        monkeypatch.setattr(f"mirrorskin.hw.rig.{module}._PERIOD", 0.1)
+    monkeypatch.setattr(check, "_PERIOD", 0.1)
+    allow_delays(monkeypatch)
     picture = np.arange(0, 96, 2, dtype=np.uint8).tobytes()
     film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + picture) * 250
     (tmp_path / "film.y4m").write_bytes(film)

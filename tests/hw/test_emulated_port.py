@@ -24,7 +24,8 @@ def port() -> Iterator[GrblPort]:
 @pytest.fixture
 def line(port: GrblPort) -> Iterator[serial.Serial]:
     with serial.Serial(port.url, timeout=SOON) as line:
-        line.read_until(b"help]\r\n")
+        line.write(b"$X\n")  # the greeting may have come before the port was open
+        line.read_until(b"ok\r\n")
         yield line
 
 

@@ -6,11 +6,11 @@ import time
 import pytest
 from msgspec import structs
 from scripted_grbl import stage_settings
+from served_rig import allow_delays
 
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
@@ -20,8 +20,7 @@ QUICK = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 20
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    """Emulators are late where other programs have the processors; that is no fault here."""
-    monkeypatch.setattr(Link, "_limit", lambda link: link.patience or 1.0)
+    allow_delays(monkeypatch, 1.0)
 
 
 @pytest.fixture

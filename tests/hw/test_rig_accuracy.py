@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec import structs
+from served_rig import allow_delays
 
 from mirrorskin import engine
 from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig import calibration
-from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
@@ -103,12 +102,10 @@ def errors(source, truth):
 def compared():
     """RMS errors of heights and normals, captured and rendered; captures run together: they mostly wait."""
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(len(PLANS)) as pool:
-        # Emulators are late where other programs have the processors; that is no fault here.
-        patch.setattr(rigs, "_STALL", 3.0)
+        allow_delays(patch)
         patch.setattr(calibration, "_SECONDS", 1.0)
         patch.setattr(calibration, "_FRAMES", 20)
         patch.setattr(calibration, "_LONGEST_DELAY", 0.1)
-        patch.setattr(Link, "_limit", lambda link: 3.0)
         tasks = {name: pool.submit(capture, plan, seed) for seed, (name, plan) in enumerate(PLANS.items())}
         captures = {name: task.result() for name, task in tasks.items()}
     found = {}

@@ -53,8 +53,7 @@ class Clock:
 def clock(monkeypatch):
     """Wait without waiting."""
     clock = Clock()
-    for module in ("check",):
-        monkeypatch.setattr(f"mirrorskin.hw.rig.{module}.time", clock)
+    monkeypatch.setattr("mirrorskin.hw.rig.check.time", clock)
     monkeypatch.setattr(Stage, "clock", clock)
     monkeypatch.setattr(Camera, "clock", clock)
     return clock

@@ -13,6 +13,12 @@ from mirrorskin.hw.grbl.link import Link
 from mirrorskin.hw.rig import rig as rigs
 
 
+def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
+    """Let emulators be late, where other programs have the processors; that is no fault of the rig."""
+    patch.setattr(rigs, "_STALL", seconds)
+    patch.setattr(Link, "_limit", lambda link: link.patience or seconds)
+
+
 @contextmanager
 def served_rig(
     folder: Path, shape: tuple[int, int], rate: float, delay: float
@@ -23,9 +29,7 @@ def served_rig(
         EmulatedRig(shape=shape, pixel_size=0.2, rate=rate, delay=delay) as rig,
         rig.serve() as server,
     ):
-        # Emulators are late where other programs have the processors; that is no fault here.
-        patch.setattr(rigs, "_STALL", 5.0)
-        patch.setattr(Link, "_limit", lambda link: 5.0)
+        allow_delays(patch)
         file = rig.write(folder, server.url)
         text = file.read_text().replace("[camera]", f"[camera]\ndelay = {delay}\ndark = 16")
         file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
