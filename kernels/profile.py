@@ -15,19 +15,7 @@ _PENDING_LIMIT = 1024  # events held before they are read, so that an endless ru
 
 @dataclass(slots=True)
 class Record:
-    """All runs of one piece of work.
-
-    Attributes
-    ----------
-    kind : {"compile", "upload", "kernel", "download"}
-    name : str
-        Kernel, program or array.
-    runs : int
-    seconds, fastest : float
-        Of all runs together, and of the fastest one.
-    bytes : int
-        Moved between device memory and the work, all runs together.
-    """
+    """All runs of one kernel, program or array: seconds and bytes moved are those of all of them together."""
 
     kind: Kind
     name: str
@@ -50,10 +38,10 @@ class Profile:
         self._pending: list[tuple[Kind, str, cl.Event, int]] = []
         self._lock = threading.Lock()
 
-    def add(self, kind: Kind, name: str, seconds: float, nbytes: int = 0) -> None:
+    def add(self, kind: Kind, name: str, seconds: float) -> None:
         """Count one run that took ``seconds``."""
         with self._lock:
-            self._add(kind, name, seconds, nbytes)
+            self._add(kind, name, seconds, 0)
 
     def wait(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         """Wait for the run that ``event`` ends, and count it; a pending copy would keep its array alive."""
@@ -65,18 +53,18 @@ class Profile:
         with self._lock:
             self._pending.append((kind, name, event, nbytes))
             if len(self._pending) >= _PENDING_LIMIT:
-                self._settle()
+                self._read_pending()
 
     def records(self) -> list[Record]:
         """Wait for what is under way and return all records, longest first."""
         with self._lock:
-            self._settle()
+            self._read_pending()
             return sorted(self._records.values(), key=lambda record: -record.seconds)
 
     def clear(self) -> None:
         """Forget everything so far."""
         with self._lock:
-            self._settle()
+            self._read_pending()
             self._records.clear()
 
     def _settle(self) -> None:
