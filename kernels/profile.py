@@ -67,7 +67,7 @@ class Profile:
             self._read_pending()
             self._records.clear()
 
-    def _settle(self) -> None:
+    def _read_pending(self) -> None:
         for kind, name, event, nbytes in self._pending:
             self._finish(kind, name, event, nbytes)
         self._pending.clear()
