@@ -30,13 +30,18 @@ QUICK = (
     "sliding",
     "normals-uint8",
     "call-onset",
-    "call-correlate-8-small",
+    "integrate-mask",
     "integrate-live",
+    "twin",
     "sweep-onset",
+    "sweep-changepoint-unknown",
     "file-press",
+    "file-turns",
     "file-lab",
+    "batch-small",
     "live-vertical-vga",
-    "accuracy-fusion",
+    "scaling-frames",
+    "accuracy-surfaces",
 )
 
 
