@@ -52,6 +52,7 @@ from mirrorskin.bench.harness import (
     take_turns,
 )
 from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.onset import numba_onsets
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, Floats, references
 from mirrorskin.engine import Correlator, NormalEstimator, Onset, OnsetSearch
 from mirrorskin.engine.streaming import push_block
@@ -229,7 +230,7 @@ def run_lab(device: Device, quick: bool) -> Case:
     size, extra = math.prod(shape), MAPS * math.prod(shape[1:])
     check_memory("file-lab", 4 * size + extra)
     absent, labs = missing("numba"), {"h5py and NumPy argmax": _lab_argmax}
-    labs |= {} if absent else {"h5py and Numba": _lab_numba}
+    labs |= {} if absent else {"h5py and Numba": _lab_numba, "h5py and Numba in tiles": _lab_tiles}
     with new_folder("file-lab", size + 10 * extra) as folder:
         press, path = make_press(shape), folder / "press.h5"
         record(press, path)
@@ -300,6 +301,15 @@ def _lab_numba(path: Path, dataset: str, dark: Floats, bright: Floats, target: P
             look(frame.reshape(-1), level.reshape(-1), number, was_light.reshape(-1), onset.reshape(-1))
     onset[(onset < 0) & was_light] = len(travel) - 1
     return _save(onset, travel, target)
+
+
+def _lab_tiles(path: Path, dataset: str, dark: Floats, bright: Floats, target: Path) -> Floats:
+    """Do it as one who knows Numba well, with as much memory as the frames take."""
+    import h5py
+
+    with h5py.File(path) as file:
+        frames, travel = file[dataset][()], _travel_in(file)
+    return _save(numba_onsets(frames, _light_level(dark, bright), 2), travel, target)
 
 
 def _travel_in(file: Any) -> NDArray[np.float64]:

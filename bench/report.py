@@ -209,8 +209,13 @@ def _runs(runs: Mapping[Path, Run]) -> str:
                 quick = "; made with `--quick`: the times mean nothing" if run["quick"] else ""
                 code = (run["commit"] or str(run["versions"].get("mirrorskin")))[:12]
                 lines.append(f"    - {path.name}: {run['date'][:10]}, mirrorskin {code}{quick}")
-    versions = dict.fromkeys(as_versions(run) for run in list(runs.values())[-1:])
-    return "\n".join([*lines, f"- The last of them with {next(iter(versions), '')}."])
+    versions: dict[str, list[str]] = {}
+    for run in runs.values():
+        for name, version in run["versions"].items():
+            known = versions.setdefault(name, [])
+            known += [version] if version and version not in known else []
+    used = ", ".join(f"{name} {' and '.join(known)}" for name, known in versions.items() if known)
+    return "\n".join([*lines, f"- With {used}."])
 
 
 def _topic(
@@ -259,7 +264,9 @@ def _beside_peers(machine: Machine) -> list[str]:
             if alone or row["name"] in wanted
         ]
     head = ("case", "work", "ms", "GB/s", "of limit", "quickest peer", "ms", "times as fast")
-    return [as_table(head, cells)] if cells else []
+    titles = {name: case["title"] for name, case in machine.cases.items()}
+    about = [f"- {name}: {titles[name]}" for name in dict.fromkeys(row[0] for row in cells)]
+    return [as_table(head, cells), "\n".join(about)] if cells else []
 
 
 def is_ours(row: Data) -> bool:
