@@ -9,6 +9,7 @@ import functools
 import importlib.util
 import re
 from collections.abc import Callable, Iterable
+from types import ModuleType
 from typing import Any
 
 import command_pages
@@ -90,7 +91,8 @@ def _api_pages() -> dict[str, str]:
 def _api_page(package: str) -> str:
     """Return the page of a package; what is called as the module it comes from must be asked for there."""
     found = importlib.import_module(package)
-    beside = [getattr(found, name) for name in getattr(found, "__all__", []) if _is_module(package, name)]
+    named = [getattr(found, name) for name in getattr(found, "__all__", []) if _is_module(package, name)]
+    beside = [one for one in named if not isinstance(one, ModuleType)]
     asked = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in beside)
     return f"# {package}\n\n::: {package}\n{asked}"
 
