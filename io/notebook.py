@@ -50,7 +50,7 @@ def as_xarray(result: Result) -> xarray.Dataset:
         for name, values in maps.items()
     }
     if result.offset_unknown is not None:
-        data["offset_unknown"] = ("piece", result.offset_unknown)
+        data["offset_unknown"] = ("components", result.offset_unknown)
     coordinates: dict[str, Any] = {
         name: (name, values, {"units": "mm"})
         for name, values in (("x", result.x), ("y", result.y))
