@@ -12,13 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.undistort import distorted
 from mirrorskin.io import Calibration, InputError
-from mirrorskin.io.calibration.types import (
-    BITS,
-    GROUPS,
-    Lens,
-    Precession,
-    References,
-)
+from mirrorskin.io.calibration.types import BITS, GROUPS, Lens, Precession, References
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import (
     check_drawing,

@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Calibration
-from mirrorskin.io.calibration.types import (
-    BITS,
-    GROUPS,
-    Gel,
-    Lens,
-    Precession,
-    References,
-    WallResponse,
-)
+from mirrorskin.io.calibration.types import BITS, GROUPS, Gel, Lens, Precession, References, WallResponse
 
 _DEGREE = math.degrees(1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -34,11 +33,8 @@ def command(
     travel_start: options.TravelStart = None,
     pixel_size: options.PixelSize = None,
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")] = 1,
-    press: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {_PRESS}."),
-    ] = None,
+    places: inputs.Places = 1,
+    press: Annotated[str | None, inputs.press_option(_PRESS)] = None,
     settle: inputs.Settle = None,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -51,11 +47,9 @@ def command(
 
     paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
-    inputs.check_call(paths, rig, press=press, settle=settle)
     if thickness < 0:
         raise io.InputError(f"--sheet {sheet} cannot be: give a thickness of 0 or more")
-    io.check_output(output, *paths, rig)
-    known = inputs.open_known(output)
+    known = inputs.check_call(output, paths, rig, press=press, settle=settle)
     if rig is not None:
         from mirrorskin.hw.rig.plans import VerticalPlan
 
@@ -68,9 +62,7 @@ def command(
         paths = inputs.take(rig, output, inputs.at_each("elastic", prompt, places, plan), settle)
         travel_step = travel_start = None
     given = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
-    with ExitStack() as opening:
-        sources = inputs.open_all(opening, paths, inputs.with_scale(given, known))
-        camera = inputs.one_camera(sources, known, output)
+    with inputs.open_all(paths, given, known, output) as (sources, camera):
         fit = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
         process = inputs.process_of(
             sources[0],

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 TILT, _PHASE_STEP = "2.5deg", "45deg"
 BALL = "put the ball at place {} of {}, all over the field"
 _BLOCK = 16  # frames that are read at a time, at most
-_STILL = (
-    0.05  # mm that the body moves in a recording in which it stands still: a press has two steps at least
-)
+_STILL = 0.05  # mm that the body moves in a recording of it at rest: a press has two steps at least
 
 OptionalRig = Annotated[
     Path | None,
@@ -32,48 +30,58 @@ OptionalRig = Annotated[
     ),
 ]
 Settle = scans.Settle
+Places = Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")]
 
 
-def check_call(paths: Sequence[Path], rig: Path | None, **rig_options: str | None) -> None:
-    """Refuse presses that are neither named nor taken, or both, and options of a rig without one."""
-    from mirrorskin.io import InputError
-
-    if rig is None and not paths:
-        raise InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
-    if rig is not None and paths:
-        raise InputError("recordings and --rig both give the presses: leave one of them out")
-    for name, value in rig_options.items():
-        if rig is None and value is not None:
-            raise InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
+def press_option(example: str) -> Any:
+    """Return the option of how deep a rig presses."""
+    return typer.Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {example}.")
 
 
-def open_known(output: Path) -> Calibration | None:
-    """Return the calibration that is to be added to, if there is one."""
+def check_call(
+    output: Path,
+    presses: Sequence[Path],
+    rig: Path | None,
+    plates: Sequence[Path] = (),
+    **options: str | None,
+) -> Calibration | None:
+    """Check where recordings come from and where the calibration goes; return the one that is added to.
+
+    Recordings of presses are named or taken on a rig, not both; ``options`` need a rig.
+    """
     from mirrorskin import io
 
+    if rig is None and not (presses or plates):
+        raise io.InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
+    if rig is not None and presses:
+        raise io.InputError("recordings and --rig both give the presses: leave one of them out")
+    for name, value in options.items():
+        if rig is None and value is not None:
+            raise io.InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
+    io.check_output(output, *presses, *plates, rig)
     return io.open_calibration(output) if output.exists() else None
 
 
-def open_all(opening: ExitStack, paths: Sequence[Path], options: StackOptions) -> list[Source]:
-    """Open recordings; ``opening`` closes them."""
+@contextmanager
+def open_all(
+    paths: Sequence[Path], options: StackOptions, known: Calibration | None, output: Path
+) -> Iterator[tuple[list[Source], CameraId]]:
+    """Open recordings with the pixel size of the known scale, and find which camera all are of."""
     from mirrorskin import io
-
-    return [opening.enter_context(io.open_recording(path, **options)) for path in paths]
-
-
-def with_scale(options: StackOptions, known: Calibration | None) -> StackOptions:
-    """Return what recordings are opened with, and the pixel size of the calibration's scale, if any."""
-    from mirrorskin.io import InputError
     from mirrorskin.io.calibration.source import differ
 
-    if known is None or known.lens is None:
-        return options
-    size, given = known.lens.pixel_size, options.get("pixel_size", known.lens.pixel_size)
-    if differ(given, size):
-        raise InputError(
-            f"--pixel-size says {given[0]:.5g} mm, the scale of {known.name} {size[0]:.5g} mm: leave it out"
-        )
-    return options | {"pixel_size": size}
+    if known is not None and known.lens is not None:
+        size = known.lens.pixel_size
+        given = options.get("pixel_size", size)
+        if differ(given, size):
+            raise io.InputError(
+                f"--pixel-size says {given[0]:.5g} mm, the scale of {known.name} {size[0]:.5g} mm:"
+                " leave it out"
+            )
+        options = options | {"pixel_size": size}
+    with ExitStack() as opening:
+        sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
+        yield sources, _one_camera(sources, known, output)
 
 
 def camera_name(names: Sequence[str]) -> str:
@@ -86,13 +94,14 @@ def camera_name(names: Sequence[str]) -> str:
     return "".join(known)
 
 
-def one_camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
-    """Return the camera that all recordings are of, if it is that of the calibration in the output file."""
+def _one_camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
+    """Return the camera of all recordings, which is that of the known calibration."""
     from mirrorskin import io
 
     name = camera_name([source.header.camera for source in sources])
-    first, *others = [io.CameraId(source.header.camera, source.shape[1:], source.dtype) for source in sources]
-    for source, camera in zip(sources[1:], others, strict=True):
+    cameras = [io.CameraId(source.header.camera, source.shape[1:], source.dtype) for source in sources]
+    first = cameras[0]
+    for source, camera in zip(sources, cameras, strict=True):
         if (camera.shape, camera.dtype) != (first.shape, first.dtype):
             raise io.InputError(
                 f"{source.name} is of {camera}, {sources[0].name} of {first}: take all with one camera"

@@ -47,8 +47,7 @@ def command(
         ),
     ] = False,
     noise: Annotated[
-        float | None,
-        typer.Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1."),
+        float | None, typer.Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1.")
     ] = None,
     rig: inputs.OptionalRig = None,
     frames: Annotated[

@@ -160,18 +160,10 @@ def _report(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) ->
             {"source": str(path), "marks": marks, "error": error}
             for path, marks, error in zip(paths, fit.marks, fit.errors, strict=True)
         ]
-        print_json(
-            {
-                "output": str(output),
-                "pixel_size": size,
-                "pixel_size_sigma": size * lens.scale_sigma,
-                "error": lens.error,
-                "worst": fit.worst,
-                "corner_sigma": fit.corner_sigma,
-                "distortion": lens.distortion.tolist(),
-                "pictures": each,
-            }
-        )
+        sizes = {"pixel_size": size, "pixel_size_sigma": size * lens.scale_sigma}
+        errors = {"error": lens.error, "worst": fit.worst, "corner_sigma": fit.corner_sigma}
+        rest = {"distortion": lens.distortion.tolist(), "pictures": each}
+        print_json({"output": str(output), **sizes, **errors, **rest})
         return
     typer.echo(
         f"{output}: {1000 * size:.4f} +- {1000 * size * lens.scale_sigma:.2g} um a pixel"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,10 +43,8 @@ def command(
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")] = 5,
-    press: Annotated[
-        str | None, typer.Option(metavar="LENGTH", help="With --rig: how far the body is lowered: 0.5mm.")
-    ] = None,
+    places: inputs.Places = 5,
+    press: Annotated[str | None, inputs.press_option("0.5mm")] = None,
     tilt: Annotated[
         str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {inputs.TILT}.")
     ] = None,
@@ -64,28 +61,22 @@ def command(
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
     radius = length(ball, "--ball") / 2
-    inputs.check_call(paths if rig else [*paths, *flats, *wedges], rig, press=press, tilt=tilt, settle=settle)
-    io.check_output(output, *paths, *flats, *wedges, rig)
-    known = inputs.open_known(output)
+    known = inputs.check_call(output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle)
     given = stack_options(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
         plan = inputs.turn_plan(press, tilt, phase_step, "0.5mm")
         paths = inputs.take(rig, output, inputs.at_each("tilt", inputs.BALL, places, plan), settle)
         given = {}
-    with ExitStack() as opening:
-        sources = inputs.open_all(opening, [*paths, *flats, *wedges], inputs.with_scale(given, known))
-        camera = inputs.one_camera(sources, known, output)
+    with inputs.open_all([*paths, *flats, *wedges], given, known, output) as (sources, camera):
         light = _brightness(sources[0], known, zenith_gain, zenith_offset)
-        levels = [True] * len(flats) + [False] * len(wedges)
+        tracks, plates = [], []
         with progress("looking", len(sources)) as show:
-            plates = []
-            for level, source in zip(levels, sources[len(paths) :], strict=True):
-                plates.append(track_plate(source, level, light))
-                show(len(plates))
-            tracks = []
-            for source in sources[: len(paths)]:
-                tracks.append(track_ball(source, radius, light))
-                show(len(plates) + len(tracks))
+            for number, source in enumerate(sources, 1):
+                if number <= len(paths):
+                    tracks.append(track_ball(source, radius, light))
+                else:
+                    plates.append(track_plate(source, number <= len(paths) + len(flats), light))
+                show(number)
         fit = fit_precession(tracks, plates, depth_sigma=light.depth_sigma)
         named = {"sources": paths, "flats": flats, "wedges": wedges}
         process = inputs.process_of(
@@ -148,15 +139,8 @@ def _report(output: Path, fit: PrecessionFit, as_json: bool) -> None:
     notes = [*fit.notes, *warnings(found)]
     if as_json:
         each = {name: {"value": value, "sigma": errors.get(name)} for name, value in values.items()}
-        print_json(
-            {
-                "output": str(output),
-                "direction": found.direction,
-                **each,
-                "left": fit.residual,
-                "notes": notes,
-            }
-        )
+        head = {"output": str(output), "direction": found.direction}
+        print_json({**head, **each, "left": fit.residual, "notes": notes})
         return
 
     def words(name: str, digits: int, unit: str = "") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +14,7 @@ from mirrorskin.cli.calibrate import inputs
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
 
+_PRINTED = "radius", "rim", "axis_x", "axis_y", "sight_0", "lamp_x", "lamp_y", "scatter"
 _DOUBTFUL = 0.1  # degrees by which zeniths of the median pixel may be off without a warning
 
 
@@ -49,10 +49,7 @@ def command(
     pixel_size: options.PixelSize = None,
     rig: inputs.OptionalRig = None,
     places: Annotated[int, typer.Option(min=5, help="With --rig: of the ball.")] = 9,
-    press: Annotated[
-        str | None,
-        typer.Option(metavar="LENGTH", help="With --rig: how far the body is lowered: 0.4mm for 4 mm."),
-    ] = None,
+    press: Annotated[str | None, inputs.press_option("0.4mm for 4 mm")] = None,
     settle: inputs.Settle = None,
     as_json: options.Json = False,
 ) -> None:
@@ -66,17 +63,13 @@ def command(
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    inputs.check_call(paths, rig, press=press, settle=settle)
-    io.check_output(output, *paths, rig)
-    known = inputs.open_known(output)
+    known = inputs.check_call(output, paths, rig, press=press, settle=settle)
     if rig is not None:
         plan = inputs.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
         balls = inputs.at_each("zenith", inputs.BALL, places, plan)
         paths, tilt, phase_step = inputs.take(rig, output, balls, settle), None, None
     given = stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size)
-    with ExitStack() as opening:
-        sources = inputs.open_all(opening, paths, inputs.with_scale(given, known))
-        camera = inputs.one_camera(sources, known, output)
+    with inputs.open_all(paths, given, known, output) as (sources, camera):
         with progress("fitting", len(sources)) as show:
             response = fit_zenith(
                 sources,
@@ -87,13 +80,8 @@ def command(
                 body=body,
                 progress=show,
             )
-        process = inputs.process_of(
-            sources[0],
-            sources=inputs.names_of(paths),
-            ball=ball,
-            body_radius=body[0],
-            body_height=body[1],
-        )
+        facts = {"ball": ball, "body_radius": body[0], "body_height": body[1]}
+        process = inputs.process_of(sources[0], sources=inputs.names_of(paths), **facts)
     io.update_calibration(output, response, camera, process)
     _report(output, response, as_json)
 
@@ -128,19 +116,10 @@ def _report(output: Path, response: WallResponse, as_json: bool) -> None:
             err=True,
         )
     if as_json:
-        found = {
-            name: {"value": value, "sigma": errors[name]}
-            for name, value in (
-                ("radius", response.radius),
-                ("rim", response.rim),
-                ("axis_x", response.axis[0]),
-                ("axis_y", response.axis[1]),
-                ("sight_0", response.sight[0]),
-                ("lamp_x", response.lamps[0]),
-                ("lamp_y", response.lamps[1]),
-                ("scatter", response.scatter),
-            )
-        }
+        place = *response.axis, response.sight[0], *response.lamps
+        values = response.radius, response.rim, *place, response.scatter
+        each = zip(_PRINTED, values, strict=True)
+        found = {name: {"value": value, "sigma": errors[name]} for name, value in each}
         degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "left_on_balls": most}
         print_json({"output": str(output), "pattern": response.pattern, "found": found, "degrees": degrees})
         return

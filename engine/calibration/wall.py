@@ -132,12 +132,7 @@ def fit_zenith(
     return make_response(touch.fit, touch.samples, touch.noise, pattern, presses[0])
 
 
-def _prior(
-    presses: Sequence[BallPress],
-    pivot: Pivot,
-    pattern: str,
-    body: tuple[float, float],
-) -> Prior:
+def _prior(presses: Sequence[BallPress], pivot: Pivot, pattern: str, body: tuple[float, float]) -> Prior:
     """Return what is known before."""
     radius, rim = body
     known = dict(_KNOWN, radius=(radius, 0.1 * radius), rim=(rim, 0.1 * rim))

@@ -64,11 +64,7 @@ class Pivot:
 
 
 def read_press(
-    source: Source,
-    ball: float,
-    references: References | None,
-    precession: Precession | None,
-    count: int,
+    source: Source, ball: float, references: References | None, precession: Precession | None, count: int
 ) -> BallPress:
     """Read a recording once, find the ball, and keep some samples of its neighbourhood."""
     levels, pixel_size = _levels(source, references), _pixel_size(source)

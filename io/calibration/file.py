@@ -78,10 +78,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
 
 
 def update_calibration(
-    path: str | Path,
-    part: Part,
-    camera: CameraId,
-    process: Mapping[str, ProcessValue] | None = None,
+    path: str | Path, part: Part, camera: CameraId, process: Mapping[str, ProcessValue] | None = None
 ) -> Calibration:
     """Add a part to a calibration file, or replace that part in it; without such a file, make one.
 

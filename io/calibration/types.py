@@ -70,8 +70,8 @@ BITS = {"hot": HOT, "dead": DEAD, "saturated": SATURATED}
 PATTERNS = ("graded", "uniform")
 
 
-def _above_zero(values: tuple[float, ...]) -> bool:
-    return all(0 < value < math.inf for value in values)
+def _above_zero(values: float | tuple[float, ...]) -> bool:
+    return all(0 < value < math.inf for value in np.ravel(values))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,25 +146,9 @@ class Lens:
     """
 
     pixel_size: tuple[float, float] = field(metadata=kept("numbers", "mm", shape=(2,), valid=_above_zero))
-    camera: Floats = field(
-        metadata=kept(
-            "array",
-            shape=(
-                3,
-                3,
-            ),
-        )
-    )
+    camera: Floats = field(metadata=kept("array", shape=(3, 3)))
     distortion: Floats = field(metadata=kept("array", shape=(5,)))
-    matrix: Floats = field(
-        metadata=kept(
-            "array",
-            shape=(
-                3,
-                3,
-            ),
-        )
-    )
+    matrix: Floats = field(metadata=kept("array", shape=(3, 3)))
     shape: tuple[int, int] = field(metadata=kept("integers", shape=(2,), valid=_above_zero))
     error: float = field(metadata=kept("number", "pixel"))
     scale_sigma: float = field(default=math.nan, metadata=kept("number"))
@@ -210,8 +194,8 @@ class WallResponse:
         Upper end, by one standard error, of what is left of the zenith on the balls, radians RMS.
     """
 
-    radius: float = field(metadata=kept("number", "mm", valid=lambda value: 0 < value < math.inf))
-    rim: float = field(metadata=kept("number", "mm", valid=lambda value: 0 < value < math.inf))
+    radius: float = field(metadata=kept("number", "mm", valid=_above_zero))
+    rim: float = field(metadata=kept("number", "mm", valid=_above_zero))
     axis: tuple[float, float] = field(metadata=kept("numbers", "mm", shape=(2,), place=True))
     sight: tuple[float, float] = field(metadata=kept("numbers", shape=(2,)))
     lamps: tuple[float, float] = field(metadata=kept("numbers", shape=(2,)))
@@ -223,15 +207,7 @@ class WallResponse:
     zenith_sigma: NDArray[np.float32] = field(metadata=kept("map", "rad", dtype=np.float32))
     azimuth_sigma: NDArray[np.float32] = field(metadata=kept("map", "rad", dtype=np.float32))
     parameters: tuple[str, ...] = field(metadata=kept("names", shape=("p",)))
-    covariance: Floats = field(
-        metadata=kept(
-            "array",
-            shape=(
-                "p",
-                "p",
-            ),
-        )
-    )
+    covariance: Floats = field(metadata=kept("array", shape=("p", "p")))
     error: float = field(metadata=kept("number", "rad"))
 
 

@@ -17,14 +17,7 @@ from typing import Any
 
 import calibration_scorer as scorer
 import numpy as np
-from calibration_scenes import (
-    BALL,
-    Frames,
-    Lab,
-    balls,
-    held_out,
-    nine_balls,
-)
+from calibration_scenes import BALL, Frames, Lab, balls, held_out, nine_balls
 from calibration_scorer import Judge, Score, Surface
 
 from mirrorskin import engine, io

@@ -8,12 +8,7 @@ import pytest
 from calibrations import a_calibration, a_lens, a_precession, a_response
 
 from mirrorskin import io
-from mirrorskin.view.calibration import (
-    calibration_figures,
-    draw_lens,
-    draw_precession,
-    draw_references,
-)
+from mirrorskin.view.calibration import calibration_figures, draw_lens, draw_precession, draw_references
 from mirrorskin.view.calibration_table import Row, calibration_table
 from mirrorskin.view.calibration_wall import draw_gel, draw_response
 

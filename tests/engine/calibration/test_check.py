@@ -80,10 +80,7 @@ def test_what_the_table_has_no_number_for_is_explained(press):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [
-        ({"rewindable": False}, "cannot be read twice"),
-        ({"motion": "twist"}, "twist motion"),
-    ],
+    [({"rewindable": False}, "cannot be read twice"), ({"motion": "twist"}, "twist motion")],
 )
 def test_what_cannot_be_checked_is_refused(press, change, message):
     source = MadeUp(np.zeros((3, *SHAPE), np.uint8), press.header, travel=np.arange(3.0))

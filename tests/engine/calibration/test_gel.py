@@ -7,13 +7,7 @@ import pytest
 from contact_theory import sphere
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.gel import (
-    BallOnset,
-    ball_onset,
-    fit_gel,
-    sphere_slope,
-    sphere_travel,
-)
+from mirrorskin.engine.calibration.gel import BallOnset, ball_onset, fit_gel, sphere_slope, sphere_travel
 from mirrorskin.engine.press.elastic import correct_onset
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical, visible_zenith

@@ -196,10 +196,7 @@ def painted(board, pixels_per_mm=14):
         (np.zeros((99, 99), np.uint8), "all of one brightness"),
         (np.zeros((1, 1), np.uint8), "all of one brightness"),
         (np.full((50, 50), np.nan, np.float32), "no numbers"),
-        (
-            np.random.default_rng(0).integers(0, 99, (40, 41)).astype(np.uint16),
-            "shows no board charuco:7x5",
-        ),
+        (np.random.default_rng(0).integers(0, 99, (40, 41)).astype(np.uint16), "shows no board charuco:7x5"),
         (np.clip(painted(CHARUCO) * 9.0, 0, 255).astype(np.uint8), "are saturated: expose it less"),
         (painted(CHARUCO)[:, ::-1], "in a mirror"),
         (painted(Charuco(8, 6, 2.0, 1.5)), "another board than charuco:7x5:2mm:1.5mm: count"),

@@ -54,13 +54,7 @@ def ball_turn(truth, x=0.0, y=0.0, *, shape=SHAPE, depth=DEPTH, told=DEPTH, **op
 
 def plate_turn(truth, *, thing=None, press=0.5, **options):
     frames = pictures(
-        thing or Flat(),
-        truth.lean(EIGHTHS),
-        press,
-        truth.pivot,
-        shape=SHAPE,
-        pattern="linear",
-        **options,
+        thing or Flat(), truth.lean(EIGHTHS), press, truth.pivot, shape=SHAPE, pattern="linear", **options
     )
     return recording("plate", frames)
 

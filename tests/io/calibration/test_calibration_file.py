@@ -6,13 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from calibrations import (
-    SHAPE,
-    a_calibration,
-    a_precession,
-    assert_same,
-    some_references,
-)
+from calibrations import SHAPE, a_calibration, a_precession, assert_same, some_references
 from stacks import record, sphere
 
 from mirrorskin import io
