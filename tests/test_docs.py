@@ -102,7 +102,8 @@ def understood(words):
         context = command.make_context(command.name, list(words), parent=above)
         if not hasattr(command, "resolve_command"):
             return
-        _, command, words = command.resolve_command(
-            context, [*getattr(context, "_protected_args", []), *context.args]
-        )
+        rest = [*getattr(context, "_protected_args", []), *context.args]
+        if not rest and command.invoke_without_command:
+            return
+        _, command, words = command.resolve_command(context, rest)
         above = context
