@@ -35,23 +35,9 @@ class TwinCamera(ThreadedCamera):
     camera's clock: what a busy machine is late with adds nothing to it. A frame that cannot be worked out
     until a period after its arrival is lost and counted, as in a camera that cannot keep up.
 
-    Parameters
-    ----------
-    twin : Twin
-        Sensor and object; its movement only bounds how far the body may go.
-    where : callable
-        Tells the body's `Position` at a time of `time.monotonic`, which is past.
-    delay, jitter : float
-        Of the arrival after the exposure's middle, mean and standard deviation, seconds.
-    seed : int
-        Of the jitter.
-    pivot : (float, float, float)
-        What the body turns about, from the rest sheet's centre, mm.
-
-    Raises
-    ------
-    InputError
-        Delay or jitter cannot be.
+    `where` gives the body's `Position` at a past time of `time.monotonic`; the twin's movement only bounds
+    how far it may go. `delay` and `jitter` are seconds; the body turns about `pivot`, mm from the centre of
+    the undeformed sheet.
     """
 
     def __init__(

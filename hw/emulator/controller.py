@@ -16,8 +16,8 @@ import re
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
 
-from mirrorskin.hw.emulator.gcode import Drive, GrblError, Interpreter
-from mirrorskin.hw.emulator.motion import BLOCKS, Line, Move, Place, Planner, shifted, stays_inside
+from mirrorskin.hw.emulator.gcode import GrblError, Interpreter
+from mirrorskin.hw.emulator.motion import BLOCKS, Line, Move, Path, Place, Planner, shifted, stays_inside
 
 BANNER = "Grbl 1.1h ['$' for help]"
 BUILD = "[VER:1.1h.20190825:]"
@@ -44,22 +44,8 @@ _Steps = Generator[_Wait, None, None]
 class Controller:
     """A GRBL 1.1 controller; times must not run backwards from call to call.
 
-    Parameters
-    ----------
-    axes : str
-        The axes' letters.
-    settings : mapping of int to float
-        The ``$`` settings that differ from the defaults, by their numbers.
-    place : tuple of float
-        Where the axes truly are. The controller does not know it: until it has homed it counts from there.
-    now : float
-    memory : float
-        See `Planner`.
-
-    Attributes
-    ----------
-    planner : Planner
-        The motion, in true coordinates.
+    `settings` are the ``$`` settings that differ from the defaults, and `place` is where the axes truly are:
+    the controller counts from there until it has homed. Its `planner` is in true coordinates.
     """
 
     def __init__(
@@ -261,25 +247,25 @@ class Controller:
                 if self._locked:
                     raise GrblError(9)
                 if (drive := self._program.run(line)) is not None:
-                    yield from self._drive(drive)
+                    yield from self._drive(*drive)
         except GrblError as error:
             self._say(str(error))
         else:
             self._say("ok")
 
-    def _drive(self, drive: Drive) -> _Steps:
+    def _drive(self, path: Path, feed: float) -> _Steps:
         """Wait for room in the planner, and put a move there; not beyond the soft limits, if they are on."""
         low = tuple(-travel for travel in self._per_axis(130))
-        if self._settings[20] and not stays_inside(drive.path, low, (0.0,) * self._axes):
+        if self._settings[20] and not stays_inside(path, low, (0.0,) * self._axes):
             self._beyond = True
             self.planner.hold(self._now)
             if self.planner.held(self._now):
                 self._stop_for_reset(SOFT_LIMIT)
             yield lambda: False
         yield lambda: self.planner.free > 0
-        path = shifted(drive.path, self._error)
+        path = shifted(path, self._error)
         rates = [rate / 60 for rate in self._per_axis(110)]
-        self.planner.add(Move(path, *path.limits(drive.feed, rates, self._per_axis(120))), self._now)
+        self.planner.add(Move(path, *path.limits(feed, rates, self._per_axis(120))), self._now)
 
     def _command(self, text: str) -> _Steps:
         """Obey what stands behind a ``$``."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 
 from mirrorskin.hw.emulator.motion import Arc, Line, Path, Place
 
@@ -25,6 +24,9 @@ _PLANES = {"G17": (0, 1), "G18": (2, 0), "G19": (1, 2)}
 _TURN_EPSILON = 5e-7  # radians below which an arc is a whole turn
 _NO_WAY = 1e-9  # axis units below which there is nothing to drive
 
+Drive = tuple[Path, float]
+"""A path, and the feed along it in units a second, infinite for as fast as the axes go."""
+
 
 class GrblError(Exception):
     """A line is refused with ``error:N``; see ``doc/csv/error_codes_en_US.csv`` of GRBL 1.1."""
@@ -33,24 +35,8 @@ class GrblError(Exception):
         super().__init__(f"error:{code}")
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
-    """Go along a path, at a feed in units a second, or as fast as may be (infinite)."""
-
-    path: Path
-    feed: float
-
-
 class Interpreter:
-    """The modes, and the place that the program has come to; work and machine coordinates are the same.
-
-    Parameters
-    ----------
-    axes : str
-        The axes' letters; the first three take part in arcs.
-    place : tuple of float
-        Where they are.
-    """
+    """The modes, and the place that the program has come to; work and machine coordinates are the same."""
 
     def __init__(self, axes: str, place: Place) -> None:
         self.axes = axes
@@ -63,13 +49,7 @@ class Interpreter:
         self._feed = 0.0  # a minute
 
     def run(self, line: str) -> Drive | None:
-        """Take a line without spaces, and return what it drives.
-
-        Raises
-        ------
-        GrblError
-            The line is refused, and nothing is changed.
-        """
+        """Take a line without spaces, and return what it drives; a `GrblError` changes nothing."""
         codes, values = self._words(line)
         modes = self._modes | {group: code for group, code in codes.items() if group in self._modes}
         feed = values.get("F", self._feed)
@@ -78,7 +58,7 @@ class Interpreter:
             drive = self._drive(modes, values, "machine" in codes, feed)
         self._modes, self._feed = modes, feed
         if drive is not None:
-            self.place = drive.path.end
+            self.place = drive[0].end
         return drive
 
     def _words(self, line: str) -> tuple[dict[str, str], dict[str, float]]:
@@ -125,10 +105,10 @@ class Interpreter:
                 raise GrblError(26)
             if not named <= set(plane):  # the firmware would go along a helix
                 raise GrblError(20)
-            return Drive(self._arc(plane, values, end, motion == "G2"), feed / 60)
+            return self._arc(plane, values, end, motion == "G2"), feed / 60
         if math.dist(self.place, end) < _NO_WAY:
             return None
-        return Drive(Line(self.place, end), math.inf if motion == "G0" else feed / 60)
+        return Line(self.place, end), math.inf if motion == "G0" else feed / 60
 
     def _arc(self, plane: tuple[int, int], values: dict[str, float], end: Place, clockwise: bool) -> Arc:
         """Return the arc about the centre that I, J and K give, as seen from its begin."""

@@ -16,6 +16,7 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 Place = tuple[float, ...]
 
@@ -194,25 +195,21 @@ class _Span:
         return max(0.0, self.speed + time * self.acceleration)
 
 
+_start = attrgetter("start")
+
+
 class Planner:
     """A queue of moves, and where it has led and will lead.
 
     Times are seconds of any steady clock, and must not run backwards from call to call, except where a place
-    or a speed is asked for. ``advance`` must be called at every time that ``next_event`` names.
-
-    Parameters
-    ----------
-    place : tuple of float
-        Where the axes stand.
-    memory : float
-        For how many seconds what has been is kept.
+    or a speed is asked for. ``advance`` must be called at every time that ``next_event`` names. The history
+    of the last ``memory`` seconds is kept.
     """
 
     def __init__(self, place: Place, memory: float = 600.0) -> None:
         self._first = place
         self._memory = memory
         self._spans: list[_Span] = []
-        self._starts: list[float] = []
         self._moves: list[Move] = []
         self._corners: list[float] = []  # the greatest speed at the begin of each queued move
         self._ends: list[float] = []  # when the queued moves end, as far as is planned
@@ -307,17 +304,16 @@ class Planner:
         self._stop = None
 
     def _span(self, at: float) -> _Span | None:
-        index = bisect_right(self._starts, at) - 1
+        index = bisect_right(self._spans, at, key=_start) - 1
         return self._spans[max(index, 0)] if self._spans else None
 
     def _cut(self, now: float) -> tuple[float, float]:
         """Forget what was planned beyond now; return the distance gone on the first move, and the speed."""
-        kept = bisect_right(self._starts, now)
-        del self._spans[kept:], self._starts[kept:]
+        del self._spans[bisect_right(self._spans, now, key=_start) :]
         self._ends.clear()
-        old = bisect_left(self._starts, now - self._memory) - 1
+        old = bisect_left(self._spans, now - self._memory, key=_start) - 1
         if old >= _FORGET:
-            del self._spans[:old], self._starts[:old]
+            del self._spans[:old]
         if not self._spans:
             return 0.0, 0.0
         last = self._spans[-1]
@@ -367,7 +363,6 @@ class Planner:
     ) -> float:
         if duration > 0:
             self._spans.append(_Span(time, time + duration, move, distance, speed, acceleration))
-            self._starts.append(time)
         return time + duration
 
 

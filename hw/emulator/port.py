@@ -25,21 +25,10 @@ class GrblMachine:
     """A controller by a clock: bytes go in, replies come out, and the axes move meanwhile.
 
     Nothing runs in the background: whenever something is asked for, all that has become due is done first,
-    each at its own time. Every method may be called from any thread.
-
-    Parameters
-    ----------
-    settings : mapping of int to float, optional
-        The ``$`` settings that differ from the defaults, by their numbers.
-    axes : str
-        The axes' letters; the first three take part in arcs, and there must be three or more.
-    start : mapping of str to float, optional
-        Where the axes truly are at power-on, in the coordinates that homing brings about; 0 otherwise. The
-        controller does not know it: it begins at 0 there.
-    clock : callable
-        Tells the seconds.
-    memory : float
-        For how many seconds ``position`` remembers.
+    each at its own time. Every method may be called from any thread. `settings` are the ``$`` settings that
+    differ from the defaults; `start` is where the axes truly are, in the coordinates that homing brings about
+    (0 where it says nothing), which the controller takes for 0; `memory` is how many seconds ``position``
+    goes back.
     """
 
     def __init__(
@@ -73,14 +62,7 @@ class GrblMachine:
             return self._catch_up().next_event()
 
     def position(self, at: float | None = None) -> dict[str, float]:
-        """Return where the axes truly are: mm or degrees in the coordinates that homing brings about.
-
-        Parameters
-        ----------
-        at : float, optional
-            A time on the clock, by default now. What was longer ago than the memory is not known: the oldest
-            place is returned. What is to come is as planned by now.
-        """
+        """Return where the axes truly are at a time on the clock, by default now: mm or degrees, as homed."""
         with self._lock:
             planner = self._catch_up().planner
             place = planner.place(self._clock() if at is None else at)
@@ -126,19 +108,7 @@ class GrblPort(Closing):
     something to say. The port stays there when a host closes it, and there is no reset when one opens it, as
     on boards without that line. The machine's clock must be ``time.monotonic``.
 
-    Every fault may be called from any thread, also in the middle of a move.
-
-    Parameters
-    ----------
-    machine : GrblMachine
-        It outlives the port, so that one can ask where the axes were.
-
-    Attributes
-    ----------
-    machine
-        As given.
-    url : str
-        The terminal's path.
+    Every fault may be called from any thread, also in the middle of a move. The machine outlives the port.
     """
 
     def __init__(self, machine: GrblMachine) -> None:

@@ -43,13 +43,7 @@ _REMEDIES = {
 
 
 def open_port(url: str, baud: int, name: str) -> serial.Serial:
-    """Open a serial port, or what a URL of pyserial names, for us alone; reads wait `SLICE` at most.
-
-    Raises
-    ------
-    InputError
-        There is no such port, it is in use, or it cannot be opened.
-    """
+    """Open a serial port, or what a URL of pyserial names, for us alone; reads wait `SLICE` at most."""
     try:
         port = serial.serial_for_url(url, baud, timeout=SLICE, do_not_open=True)
         if os.name == "posix":

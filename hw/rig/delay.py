@@ -1,18 +1,34 @@
-"""How late a camera's frames come: from a move there and back, which must look the same both ways."""
+"""How late a camera's frames come: measured by a move there and back, which must look the same both ways."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.moves import SLOWEST
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
+from mirrorskin.hw.rig.rig import Move, Rig
+from mirrorskin.hw.rig.track import Track, even_times
+from mirrorskin.hw.rig_file import Axis
+from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Floats
 
+# The move
+_SECONDS = 1.5  # one way, or more
+_FRAMES, _MOST_FRAMES = 60, 150  # one way, at least and at most
+_PRESSED = 0.5  # share of a press that comes before the move
+_LONGEST_DELAY = 0.6  # seconds that late frames are waited for
+_BLOCK = 8  # frames
+_STEADY = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
+_SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
+
+# The estimate
 _REMEDY = "measure it otherwise and write it into the rig file as 'delay' of the camera"
 _BLOCKS = 16  # along either side of the picture
 _COMPONENTS = 6  # of the picture's change that count
@@ -33,6 +49,121 @@ class Delay:
     error: float  # standard deviation that is expected of it, seconds
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """From one place to another, and how far along it a place is."""
+
+    begin: Position
+    end: Position
+    length: float
+    along: Callable[[Position], float]
+    fastest: float
+    slowest: float
+
+
+def measure_delay(rig: Rig, plan: Plan) -> Delay:
+    """Move there and back in contact, and find out how late the camera's frames come.
+
+    A press goes over the deeper half of its way; a rotation leans from phase 0 to the opposite one. Each way
+    takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
+    against the stage's reports: what these are late by themselves is part of it, as it should be.
+    """
+    way = _way(rig, plan)
+    rests = rig.go(way.begin).time
+    seconds = max(_SECONDS, _FRAMES * rig.period)
+    speed = min(max(way.length / seconds, way.slowest), way.fastest)
+    seconds = way.length / speed
+    every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
+    _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
+    log = _FrameLog(rig, every)
+    there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed)))
+    back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed)))
+    log.until(back.ended + _LONGEST_DELAY)
+
+    path = Trapezoid.planned(way.length, speed)
+    turned = (there.ended + back.began) / 2
+    down = _track(rig, way.along, path, there.began, turned)
+    up = _track(rig, lambda place: way.length - way.along(place), path, back.began, back.ended)
+
+    def place(times: Floats) -> Floats:
+        return np.where(times < turned, down.at(times), way.length - up.at(times))
+
+    clock, unsure = log.clock()
+    delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
+    rig.go(plan.first)
+    of_reports = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
+    return replace(delay, error=math.hypot(delay.error, unsure, *of_reports))
+
+
+def _way(rig: Rig, plan: Plan) -> _Way:
+    stage = rig.settings.stage
+    if isinstance(plan, AxialPlan):
+        begin, end = plan.place(0.0), plan.place(math.pi)
+        return _Way(begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch))
+    length = (1 - _PRESSED) * (plan.stop - plan.start)
+    first, end = plan.stop - length, Position(plan.stop)
+    return _Way(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
+
+
+def _speeds(axis: Axis | None) -> tuple[float, float]:
+    """Return how fast and how slowly an axis may go, mm/s or rad/s."""
+    if axis is None:  # cannot be: what does not lean does not go round
+        return math.inf, 0.0
+    return _SPEED_MARGIN * axis.top_speed, SLOWEST / 60 / axis.scale / _SPEED_MARGIN
+
+
+def _track(
+    rig: Rig, along: Callable[[Position], float], path: Trapezoid, since: float, until: float
+) -> Track:
+    reports = [report for report in rig.stage.history(since) if report.time <= until]
+    return Track([report.time for report in reports], [along(report.position) for report in reports], path)
+
+
+class _FrameLog:
+    """Frames of the move, of which only block means are kept."""
+
+    def __init__(self, rig: Rig, every: int) -> None:
+        self._rig, self._every = rig, every
+        self._times: list[Floats] = []
+        self._numbers: list[NDArray[np.int64]] = []
+        self.pictures: list[Floats] = []
+
+    def clock(self) -> tuple[Floats, float]:
+        """Return when the frames arrived, (n,), seconds, and the standard error of all of them together.
+
+        If the camera keeps time, that is taken from a straight line through all of them.
+        """
+        number, time = np.concatenate(self._numbers), np.concatenate(self._times)
+        line = even_times(number, time, len(time))
+        off, near_off = (np.std(time - even) for even in (line, even_times(number, time)))
+        if off > _STEADY * near_off:
+            return time, 0.0
+        return line, float(off / math.sqrt(len(time)))
+
+    def follow(self, move: Move) -> Move:
+        """Watch until a move is over."""
+        while not move.over:
+            self._take()
+        self._rig.end(move)
+        return move
+
+    def until(self, time: float) -> None:
+        """Watch until frames arrive later than a time."""
+        while self._take() < time:
+            pass
+
+    def _take(self) -> float:
+        frames = self._rig.take(_BLOCK)
+        some = frames.number % self._every == 0
+        self._times.append(frames.time[some])
+        self._numbers.append(frames.number[some])
+        self.pictures.append(block_means(frames.pixels[some]))
+        return float(frames.time[-1])
+
+
+# The estimate from frames and places
+
+
 def block_means(frames: NDArray[Any], blocks: int = _BLOCKS) -> Floats:
     """Return the mean counts of a grid of blocks in each frame, (n, blocks x blocks), float64."""
     rows, columns = (np.linspace(0, size, min(blocks, size) + 1).astype(np.intp) for size in frames.shape[1:])
@@ -46,25 +177,10 @@ def estimate_delay(
 ) -> Delay:
     """Find the delay at which the picture is one function of the place, on the way there and back.
 
-    The function is a broken line through some twenty places, fitted together with a steady drift to the
-    principal components of the picture's change; the delay leaves the least sum of squares. Its standard
-    error follows from the residual of each frame as an error in time.
-
-    Parameters
-    ----------
-    arrival : array_like, (n,)
-        When the frames arrived, seconds.
-    pictures : array_like, (n, k)
-        What each frame shows: its ``block_means``.
-    place : callable
-        Tells where the body was at some times, (n,): the same number at the same place, there and back.
-    name : str
-        What to call the camera in messages.
-
-    Raises
-    ------
-    HardwareError
-        The picture changes too little.
+    `arrival`, (n,), seconds, and `pictures`, (n, k), block means, are of the frames; `place` gives the
+    position, (n,), at given times. The function is a broken line through some twenty places, fitted together
+    with a linear drift to the principal components of the picture's change; the delay minimises the sum of
+    squares. Its standard error follows from the residual of each frame as an error in time.
     """
     from scipy.optimize import minimize_scalar
 
@@ -73,7 +189,7 @@ def estimate_delay(
     total = float(np.sum(change**2))
 
     def cost(delay: float) -> float:
-        return float(np.sum(_fit(place(time - delay), time, change).residual ** 2))
+        return float(np.sum(_fit(place(time - delay), time, change)[0] ** 2))
 
     trials = np.linspace(*_RANGE, _TRIALS)
     costs = [cost(float(delay)) for delay in trials]
@@ -94,15 +210,6 @@ def estimate_delay(
     return Delay(float(found.x), error)
 
 
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    """A broken line through the picture's components: its residual and its slope at each frame, (n, c)."""
-
-    residual: Floats
-    slope: Floats
-    freedom: int
-
-
 def _components(pictures: Floats) -> Floats:
     """Return the largest principal components of the pictures' change, (n, c)."""
     change = pictures - pictures.mean(axis=0)
@@ -110,8 +217,11 @@ def _components(pictures: Floats) -> Floats:
     return np.asarray((left * size)[:, :_COMPONENTS])
 
 
-def _fit(place: Floats, time: Floats, change: Floats) -> _Fit:
-    """Fit a broken line over the places, and a drift with the time, to each component."""
+def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, int]:
+    """Fit a broken line over the places, and a drift with the time, to each component.
+
+    Return the residual and the line's slope at each frame, (n, c), and the number of parameters.
+    """
     count = int(np.clip(len(place) // _FRAMES_A_KNOT, *_KNOTS))
     low, high = float(place.min()), float(place.max())
     width = (high - low) / (count - 1) or 1.0
@@ -125,14 +235,11 @@ def _fit(place: Floats, time: Floats, change: Floats) -> _Fit:
     drift = np.sum(bent * change, axis=0) / max(float(np.sum(bent * since)), 1e-300)
     line = of_change - of_since * drift
     slope = (line[knot + 1] - line[knot]) / width
-    return _Fit(change - hats.at(line) - since * drift, slope, count + 1)
+    return change - hats.at(line) - since * drift, slope, count + 1
 
 
 class _BrokenLines:
-    """Least squares of broken lines: by bands, as threads of a matrix library take longer than the work.
-
-    Of each frame, (n,), it is given the knot before it, and its share of the way to the next.
-    """
+    """Least squares of broken lines; each frame, (n,), has the knot before it and its share to the next."""
 
     def __init__(self, knot: NDArray[np.intp], share: Floats, count: int) -> None:
         self._knot, self._near, self._next, self._count = knot, 1 - share, share, count
@@ -161,10 +268,10 @@ class _BrokenLines:
 def _error(delay: float, time: Floats, change: Floats, place: Callable[[Floats], Floats]) -> float:
     """Return the standard error of a delay: a frame counts by how its picture depends on time."""
     step = 1e-3
-    fit = _fit(place(time - delay), time, change)
+    residual, slope, parameters = _fit(place(time - delay), time, change)
     speed = (place(time - delay + step) - place(time - delay - step)) / (2 * step)
-    pace = fit.slope * speed[:, None]
+    pace = slope * speed[:, None]
     weight = np.sum(pace**2, axis=1)
-    late = np.sum(pace * fit.residual, axis=1)  # the frame's error in time, times its weight
-    free = max(1, len(time) - fit.freedom) / len(time)
+    late = np.sum(pace * residual, axis=1)  # the frame's error in time, times its weight
+    free = max(1, len(time) - parameters) / len(time)
     return math.sqrt(float(np.sum(late**2)) / free) / max(float(weight.sum()), 1e-300)

@@ -24,13 +24,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 def read_reference(
     camera: CameraSettings, name: Literal["dark", "bright"], rig_file: str | Path
 ) -> NDArray[np.float32] | None:
-    """Read a reference, (H, W), NaN where a pixel has none; None if the rig file gives none.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, does not fit the camera, or holds counts that the camera cannot give.
-    """
+    """Read a reference, (H, W), NaN where a pixel has none; None if the rig file gives none."""
     given = camera.dark if name == "dark" else camera.bright
     if given is None:
         return None

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Frames
-from mirrorskin.hw.rig.calibration import measure_delay
-from mirrorskin.hw.rig.delay import Delay
+from mirrorskin.hw.rig.delay import Delay, measure_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.scan import Scan

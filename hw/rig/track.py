@@ -106,13 +106,6 @@ class Track:
     together, so that the uneven times of single ones hardly count. Where the reports show that it went
     otherwise, what they agree on is added.
 
-    Parameters
-    ----------
-    times, ways : array_like, (n,)
-        Of the reports: seconds, and how far the body had come, mm or radians.
-    path : Trapezoid
-        The planned way.
-
     Attributes
     ----------
     began : float

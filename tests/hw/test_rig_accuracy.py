@@ -13,7 +13,7 @@ from served_rig import allow_delays
 from mirrorskin import engine
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig import calibration
+from mirrorskin.hw.rig import delay as delays
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
@@ -103,9 +103,9 @@ def compared():
     """RMS errors of heights and normals, captured and rendered; captures run together: they mostly wait."""
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(len(PLANS)) as pool:
         allow_delays(patch)
-        patch.setattr(calibration, "_SECONDS", 1.0)
-        patch.setattr(calibration, "_FRAMES", 20)
-        patch.setattr(calibration, "_LONGEST_DELAY", 0.1)
+        patch.setattr(delays, "_SECONDS", 1.0)
+        patch.setattr(delays, "_FRAMES", 20)
+        patch.setattr(delays, "_LONGEST_DELAY", 0.1)
         tasks = {name: pool.submit(capture, plan, seed) for seed, (name, plan) in enumerate(PLANS.items())}
         captures = {name: task.result() for name, task in tasks.items()}
     found = {}

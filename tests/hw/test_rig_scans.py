@@ -8,7 +8,7 @@ import pytest
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig import calibration
+from mirrorskin.hw.rig import delay as delays
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
@@ -135,9 +135,9 @@ def test_of_many_frames_a_turn_only_some_are_given():
 @pytest.fixture
 def hurry(monkeypatch):
     """Less time for the calibration move than a rig takes."""
-    monkeypatch.setattr(calibration, "_SECONDS", 0.5)
-    monkeypatch.setattr(calibration, "_FRAMES", 40)
-    monkeypatch.setattr(calibration, "_LONGEST_DELAY", 0.1)
+    monkeypatch.setattr(delays, "_SECONDS", 0.5)
+    monkeypatch.setattr(delays, "_FRAMES", 40)
+    monkeypatch.setattr(delays, "_LONGEST_DELAY", 0.1)
 
 
 @pytest.mark.usefixtures("hurry")
