@@ -51,7 +51,7 @@ _BESIDE = (
 )
 _SIZES = (
     "GB/s by the host's clock, and the share of the limit of memory that took turns with it: by size of "
-    "picture and type of frames, number of frames, or cores."
+    "picture and type of frames, or number of frames."
 )
 _ROOF = (
     "Each number is a kernel on its largest pictures, its dots are other sizes and types: how many "
@@ -59,7 +59,6 @@ _ROOF = (
     "account. Below a slope memory binds, below the level line arithmetic does; what is above a slope has "
     "its bytes in a cache."
 )
-_STARTS = "Milliseconds of the steps of a process, with an empty cache of kernels and with a full one."
 _ACCURACY = "Answers on this device against truths that are known, each a number and its bound."
 
 
@@ -189,12 +188,11 @@ def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
         ("Aims", _AIMS, _aims),
         ("Calls", _CALLS, _calls),
         ("Kernels and paths beside peers", _BESIDE, _beside_peers),
-        ("Sizes, types and cores", _SIZES, _sizes),
+        ("Sizes and types", _SIZES, _sizes),
     ):
         parts += _topic(title, about, machines, describe)
     if pictured:
         parts += ["## Roofline", f"![Roofline]({PICTURE.as_posix()})", _ROOF]
-    parts += _topic("Cold and warm", _STARTS, machines, _starts)
     parts += _topic("Accuracy", _ACCURACY, machines, _accuracy)
     return "\n\n".join(parts) + "\n"
 
@@ -251,7 +249,7 @@ def _beside_peers(machine: Machine) -> list[str]:
     """Return each work of ours that a peer does too, or that an aim is about, beside the quickest peer."""
     cells = []
     for case in machine.cases.values():
-        if _is(case, "sweep-", "scaling-", "accuracy-", "call-", "cold-"):
+        if _is(case, "sweep-", "scaling-", "accuracy-", "call-"):
             continue
         works = [row for row in case["rows"] if not is_limit(row)]
         ours, others = ([row for row in works if is_ours(row) is kind] for kind in (True, False))
@@ -310,7 +308,7 @@ def _sizes(machine: Machine) -> list[str]:
 
 
 def as_sweep(case: Data) -> tuple[tuple[str, ...], list[list[str]]]:
-    """Return what a sweep goes through, sizes, types or cores, and its works: names, and cells under those.
+    """Return what a sweep goes through, sizes or types, and its works: names, and cells under those.
 
     Both are empty where a case is no sweep.
     """
@@ -325,16 +323,6 @@ def as_sweep(case: Data) -> tuple[tuple[str, ...], list[list[str]]]:
         lines.setdefault(_head(row), {})[_part(row)] = f"{rate:.{1 if rate >= 1 else 2}f}{share}"
     cells = ([name, *(found.get(label, "") for label in labels)] for name, found in lines.items())
     return labels, [[case["name"], *line] for line in cells]
-
-
-def _starts(machine: Machine) -> list[str]:
-    steps: dict[str, dict[str, str]] = {}
-    for case in machine.cases.values():
-        for row in case["rows"]:
-            if _head(row) in ("cold", "warm"):
-                steps.setdefault(_part(row), {})[_head(row)] = as_ms(row["wall"]["median"])
-    cells = [[step, *(found.get(kind, "") for kind in ("cold", "warm"))] for step, found in steps.items()]
-    return [as_table(("step", "cold, ms", "warm, ms"), cells)] if cells else []
 
 
 def _accuracy(machine: Machine) -> list[str]:

@@ -10,7 +10,6 @@ from mirrorskin.bench import (
     accuracy,
     batch,
     calls,
-    cold,
     correlation,
     integration,
     live,
@@ -37,7 +36,6 @@ _RUNS: Cases = {
     **batch.CASES,
     **live.CASES,
     **scaling.CASES,
-    **cold.CASES,
     **accuracy.CASES,
 }
 NAMES = tuple(_RUNS)

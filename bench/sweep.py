@@ -48,8 +48,7 @@ from mirrorskin.engine import (
     integrate,
 )
 from mirrorskin.engine.integration.rectangle import Rectangle
-from mirrorskin.kernels.device import C_TYPES, Device
-from mirrorskin.kernels.registration import BORDER
+from mirrorskin.kernels.device import Device
 
 SIZES: dict[str, Shape] = {"VGA": (480, 640), "1080p": (1080, 1920), "20 Mpx": (3648, 5472)}
 _QUICK: dict[str, Shape] = {"37 x 61": (37, 61)}
@@ -64,8 +63,6 @@ _CUTS = 50
 _SCAN, _CUSUM, _SPLIT, _WAVE = 2, 10, 9, 4
 _NORMAL = 3 * 37 + 12  # three looks at each sample, and what goes before
 _EDGES = 24 * 4 * 14  # pairs of places in three passes, directions, and operations of a pair
-_TAPS = 4 * 4 + 4 + 3 * 8 + 16  # of a resampled pixel: sums, weights, place, noise
-_SHIFT = np.array([[1.3, 1e-4, -2e-4, 2.1], [-0.6, -2e-4, 1e-4, -1.4]], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,53 +203,6 @@ def _edges(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Job]:
     return {"edges": Job(work, pixels * (12 + 4 + 1 + 1), 0, pixels * _EDGES)}
 
 
-def _registration(device: Device, shape: Shape, kind: str, _: int) -> dict[str, Job]:
-    """Return the resampling of one frame, and OpenCV's with weights of its own."""
-    import cv2
-
-    rows, columns = shape
-    row, column = (np.arange(size, dtype=np.float32) for size in shape)
-    smooth = 100 + 40 * np.sin(column / 9) * np.cos(row / 7)[:, np.newaxis]
-    height = -0.5 + 0.4 * np.cos(column / 31) * np.cos(row / 37)[:, np.newaxis]
-    frame, wide = smooth.astype(kind), np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
-    scale = {
-        "offset": device.given("offset", np.zeros((1, 1))),
-        "gain": device.given("gain", np.ones((1, 1))),
-    }
-    padded = device.given("padded", wide)
-    admit: dict[str, Any] = {"frame": device.given("frame", frame, frame.dtype), **scale, "padded": padded}
-    resample: dict[str, Any] = {
-        "padded": padded,
-        "height": device.given("height", height),
-        "shift": device.given("shift", _SHIFT),
-    }
-    resample |= scale | {"registered": device.given("registered", np.zeros(shape))}
-    resample["noise"] = device.given("noise", np.zeros((2, *shape)))
-    top = {"TOP": int(np.iinfo(kind).max)} if frame.dtype.kind == "u" else {}
-    macros: dict[str, Any] = {"FRAME": C_TYPES[frame.dtype.name], "LEVELS": 0, **top}
-    items = rows * -(-columns // device.layout.tile)
-
-    def ours() -> None:
-        for name, known, each in (("admit", admit, frame.itemsize + 4), ("resample", resample, 28)):
-            kernel = device.kernel("registration", f"registration_{name}", **macros)
-            kernel(items, rows=rows, columns=columns, **known, moved=each * frame.size)
-        device.finish()
-
-    ways = (
-        _SHIFT[:, 0, None, None] + _SHIFT[:, 1, None, None] * column + _SHIFT[:, 2, None, None] * row[:, None]
-    )
-    ways = ways + _SHIFT[:, 3, None, None] * height
-    across, down = (ways[0] + column).astype(np.float32), (ways[1] + row[:, None]).astype(np.float32)
-    out = np.empty_like(frame)
-
-    def peer() -> None:
-        cv2.remap(frame, across, down, cv2.INTER_CUBIC, out, cv2.BORDER_REPLICATE)
-
-    moved, plain = frame.size * (frame.itemsize + 24), frame.size * (2 * frame.itemsize + 8)
-    name = "registration_admit and registration_resample"
-    return {name: Job(ours, moved, 1, frame.size * _TAPS), "OpenCV": Job(peer, plain, 1)}
-
-
 def _rectangle(device: Device, shape: Shape, _kind: str, _: int) -> dict[str, Job]:
     """Return the direct solver of a full picture, and SciPy's: two transforms of 1.25 log2 of a side."""
     source = link(noisy_slopes(shape)).source.astype(np.float32)
@@ -345,9 +295,6 @@ FAMILIES = {
     ),
     "sweep-normals": Family(f"normals.cl: exact normals of {STEPS} frames", _normals, _TYPES, "triad", 80),
     "sweep-edges": Family("edges.cl: edges of a roof, half of it noisy", _edges, _MAPS_ONLY, "triad", 110),
-    "sweep-registration": Family(
-        "registration.cl: one frame resampled along its heights", _registration, _TYPES, "triad", 110
-    ),
     "sweep-rectangle": Family("rectangle.cl: heights of a full picture", _rectangle, _MAPS_ONLY, "triad", 60),
     "sweep-surface": Family(
         "links.cl, components.cl, multigrid.cl: heights within a mask", _surfaces, _MAPS_ONLY, "triad", 400

@@ -78,7 +78,7 @@ def test_a_page_has_runs_aims_calls_and_the_quickest_peer():
 def test_without_aims_or_sweeps_a_page_has_no_such_part():
     found = page_of(run(case("press", LIMIT, OURS)))
     assert "## Kernels" in found
-    assert not any(f"## {title}" in found for title in ("Aims", "Sizes", "Cold", "Accuracy", "Calls"))
+    assert not any(f"## {title}" in found for title in ("Aims", "Sizes", "Accuracy", "Calls"))
 
 
 def test_a_sweep_is_a_table_of_sizes():
@@ -90,11 +90,6 @@ def test_a_sweep_is_a_table_of_sizes():
         ["sweep-onset", "other", "0.01", ""],
     ]
     assert as_sweep(case("press", *works)) == ((), [])
-
-
-def test_cold_and_warm_starts_are_a_table():
-    found = page_of(run(case("cold-start", LIMIT, row("cold, import", 0.5), row("warm, import", 0.25))))
-    assert "| import | 500.0 | 250.0 |" in found
 
 
 def test_a_page_that_cannot_be_written_is_refused(tmp_path):
