@@ -18,6 +18,7 @@ from mirrorskin import io
 from mirrorskin.bench.harness import OURS, Work
 from mirrorskin.bench.scenes import STEPS, TILT, fill_press, fill_turns, phases, references
 from mirrorskin.engine import reconstruct
+from mirrorskin.io.recorder import Compression
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
 
@@ -116,7 +117,7 @@ def new_folder(name: str, needed: int) -> Iterator[Path]:
         yield Path(made)
 
 
-def record(source: Frames, path: Path, compression: io.Compression = "raw") -> None:
+def record(source: Frames, path: Path, compression: Compression = "raw") -> None:
     """Write a recording, and wait until the disk has it: nothing is left to write while others are timed."""
     source.rewind()
     with io.Recorder(source, path, compression) as recorder:

@@ -36,6 +36,7 @@ def command(
     """Write a result as meshes, points, pictures, tables or arrays."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import segment
+    from mirrorskin.io.export import check_export
 
     suffixes = {path.suffix.lower() for path in output}
     for given, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
@@ -48,7 +49,7 @@ def command(
         io.check_output(path, result)
     found = io.select_turn(io.open_result(result), turn)
     for path in output:
-        io.check_export(found, path)
+        check_export(found, path)
     columns = _section(found, ends) if ".csv" in suffixes else None
     for path in output:
         typer.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")

@@ -115,12 +115,13 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
     import numpy as np
 
     from mirrorskin import io
+    from mirrorskin.io.calibration.source import check_camera
 
     if path is None:
         return None
     calibration, camera = io.open_calibration(path), settings.camera
     known = io.CameraId(camera.name, camera.shape, np.dtype(camera.dtype))
-    io.check_camera(calibration, known, settings.name)
+    check_camera(calibration, known, settings.name)
     return calibration
 
 

@@ -18,9 +18,10 @@ def command(
 ) -> None:
     """Compare a result with a simulation's truth."""
     from mirrorskin import engine, io
+    from mirrorskin.io.selection import source_region
 
     found = io.open_result(result)
-    part = io.source_region(found.process)
+    part = source_region(found.process)
     with io.open_recording(truth) as whole:
         if part is not None and not io.Region.whole(whole.shape[1:]).holds(part):
             part = None  # of another stack

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, TypedDict
 from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Motion, Positions, Region
+    from mirrorskin.io import Motion, Region
+    from mirrorskin.io.positions import Positions
     from mirrorskin.io.types import Floats
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.io import FRAME_DTYPES, InputError
+from mirrorskin.io import InputError
+from mirrorskin.io.types import FRAME_DTYPES
 
 SAMPLES = 65536
 """Pixels of a frame that its noise is estimated from, at least, if it has as many."""

@@ -22,7 +22,8 @@ from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, estimate_rotation, rotation_maps
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, Motion, ProcessValue, Result, Source
+from mirrorskin.io import InputError, Motion, Result, Source
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
 Mask = NDArray[np.bool_]

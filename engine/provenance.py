@@ -17,7 +17,8 @@ from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
 
 if TYPE_CHECKING:
-    from mirrorskin.io import ProcessValue, Result, Source
+    from mirrorskin.io import Result, Source
+    from mirrorskin.io.types import ProcessValue
     from mirrorskin.kernels.device import Device
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mirrorskin.io import UNDISTORTED, InputError, Result, Truth
+from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io.types import UNDISTORTED
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import SamplePoints
-from mirrorskin.io import UNDISTORTED, InputError, Lens, Result, pixel_axes, source_region
+from mirrorskin.io import InputError, Lens, Result, pixel_axes
+from mirrorskin.io.selection import source_region
+from mirrorskin.io.types import UNDISTORTED
 
 Doubles = NDArray[np.float64]
 

@@ -1,28 +1,23 @@
 from .atomic import check_output
 from .calibration.file import open_calibration, save_calibration, update_calibration
-from .calibration.source import Calibrated, check_camera
+from .calibration.source import Calibrated
 from .calibration.types import Calibration, CameraId, Gel, Lens, Precession, References, WallResponse
 from .description import describe
-from .export import check_export, export_result, save_table
+from .export import export_result, save_table
 from .frames import open_frames
-from .heights import open_heights
 from .mesh import Mesh, surface_mesh
-from .positions import Positions, check_phase, check_stroke, check_travel
-from .recorder import COMPRESSIONS, Compression, Recorder
-from .recording import Recording, Steps, open_recording
+from .positions import Steps
+from .recorder import Recorder
+from .recording import Recording, open_heights, open_recording
 from .result import open_result, save_result, select_turn
-from .selection import Region, source_region
+from .selection import Region
 from .streaming import StreamRecorder
 from .types import (
-    FRAME_DTYPES,
-    MOTIONS,
-    UNDISTORTED,
     Block,
     Header,
     InputError,
     LiveSource,
     Motion,
-    ProcessValue,
     Result,
     Source,
     Truth,
@@ -30,15 +25,10 @@ from .types import (
 )
 
 __all__ = [
-    "COMPRESSIONS",
-    "FRAME_DTYPES",
-    "MOTIONS",
-    "UNDISTORTED",
     "Block",
     "Calibrated",
     "Calibration",
     "CameraId",
-    "Compression",
     "Gel",
     "Header",
     "InputError",
@@ -46,9 +36,7 @@ __all__ = [
     "LiveSource",
     "Mesh",
     "Motion",
-    "Positions",
     "Precession",
-    "ProcessValue",
     "Recorder",
     "Recording",
     "References",
@@ -59,12 +47,7 @@ __all__ = [
     "StreamRecorder",
     "Truth",
     "WallResponse",
-    "check_camera",
-    "check_export",
     "check_output",
-    "check_phase",
-    "check_stroke",
-    "check_travel",
     "describe",
     "export_result",
     "open_calibration",
@@ -77,7 +60,6 @@ __all__ = [
     "save_result",
     "save_table",
     "select_turn",
-    "source_region",
     "surface_mesh",
     "update_calibration",
 ]

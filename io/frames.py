@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.positions import Positions, check_phase, check_stroke
-from mirrorskin.io.recording import Steps
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
+from mirrorskin.io.positions import Positions, Steps, check_phase, check_stroke
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
 
 
 def open_frames(
@@ -97,12 +96,7 @@ class FrameSequence(Closing, ABC):
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the next frames."""
-        if out is None:
-            out = np.empty((1, *self.shape[1:]), self.dtype)
-        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
-            raise ValueError(
-                f"out is {out.shape} {out.dtype}; needed is (n, H, W) = (n, *{self.shape[1:]}) {self.dtype}"
-            )
+        out = block_memory(out, self.shape, self.dtype)
         start = self._next
         if start == self.shape[0]:
             return None

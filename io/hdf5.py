@@ -1,19 +1,20 @@
-"""HDF5 files of unknown hands: open them, follow their links, and read nothing that is not there."""
+"""HDF5 files: of unknown hands, whose links are followed and claims checked; and datasets to write."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.os_errors import as_input_error, is_flagged
-from mirrorskin.io.types import Closing, InputError
+from mirrorskin.io.os_errors import as_input_error, is_flagged, legible
+from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
 
 Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
@@ -355,3 +356,37 @@ def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int
     _, last = selected.get_select_bounds()
     reaches = all(end < count for end, count in zip(last, source.shape, strict=True))
     return int(part.vspace.get_select_npoints()) if reaches else 0
+
+
+class DatasetSpec(NamedTuple):
+    """A dataset to write: its name, what it holds, and its attributes."""
+
+    name: str
+    values: NDArray[Any]
+    attributes: Mapping[str, str]
+
+
+def write_dataset(root: h5py.Group, spec: DatasetSpec) -> None:
+    """Write one in a piece, so that it lies there as it is in memory."""
+    root.create_dataset(spec.name, data=spec.values).attrs.update(spec.attributes)
+
+
+def fixed_text(text: str) -> NDArray[Any]:
+    """Return a text as UTF-8 of a fixed length, so that it lies in the file in one piece."""
+    encoded = legible(text).encode() or b"\0"
+    return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
+
+
+def process_specs(place: str, process: Mapping[str, ProcessValue]) -> Iterator[DatasetSpec]:
+    """Yield what says how something came about."""
+    for name, value in process.items():
+        values = fixed_text(value) if isinstance(value, str) else np.asarray(value)
+        yield DatasetSpec(f"{place}/{name}", values, {})
+
+
+def read_process(file: Hdf5File, place: str, names: Iterable[str] | None = None) -> dict[str, ProcessValue]:
+    """Read how something came about, or only some of that; what is not there is missing."""
+    group = file.find(place)
+    wanted = file.names(place) if names is None else names
+    found = {} if group is None else {name: file.walk(group, name) for name in wanted}
+    return {name: file.value(node) for name, node in found.items() if node is not None}

@@ -53,9 +53,8 @@ def surface_mesh(
 
     Examples
     --------
-    >>> surface_mesh([[0, 0], [0, 1]], x=[0, 1], y=[1, 0]).faces
-    array([[0, 2, 1],
-           [1, 2, 3]], dtype=int32)
+    >>> surface_mesh([[0, 0], [0, 1]], x=[0, 1], y=[1, 0]).faces.tolist()
+    [[0, 2, 1], [1, 2, 3]]
     """
     heights = np.asarray(height, np.float64)
     pieces = np.zeros(heights.shape, np.int32) if component is None else np.asarray(component)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,6 +18,25 @@ class Positions(Protocol):
 
     def positions(self, count: int, /) -> Floats:
         """Return the positions of so many frames, mm or radians; InputError if they are of another number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians.
+
+    Examples
+    --------
+    >>> Steps(0.1, start=1.0).positions(3)
+    array([1. , 1.1, 1.2])
+    """
+
+    step: float
+    start: float = 0.0
+
+    def positions(self, count: int) -> Floats:
+        """Return the positions of ``count`` frames."""
+        with np.errstate(invalid="ignore", over="ignore"):  # who takes them refuses what is not finite
+            return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
 
 def check_travel(

@@ -1,11 +1,10 @@
-"""Recordings: frame stacks in HDF5, our own NeXus layout or anyone's."""
+"""Recordings: frame stacks in HDF5, our own NeXus layout or anyone's; and heights known from a file."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,28 +20,22 @@ from mirrorskin.io.layout import MARK, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.selection import Region, Selection
+from mirrorskin.io.result import open_result
+from mirrorskin.io.selection import Region, Selection, source_region
 from mirrorskin.io.stack import FrameSubset, Stack, open_stack
-from mirrorskin.io.types import FRAME_DTYPES, Block, Closing, Floats, Header, InputError, Motion, Truth
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians.
-
-    Examples
-    --------
-    >>> Steps(0.1, start=1.0).positions(3)
-    array([1. , 1.1, 1.2])
-    """
-
-    step: float
-    start: float = 0.0
-
-    def positions(self, count: int) -> Floats:
-        """Return the positions of ``count`` frames."""
-        with np.errstate(invalid="ignore", over="ignore"):  # who takes them refuses what is not finite
-            return np.asarray(self.start + self.step * np.arange(count), np.float64)
+from mirrorskin.io.types import (
+    FRAME_DTYPES,
+    UNDISTORTED,
+    Block,
+    Closing,
+    Floats,
+    Header,
+    InputError,
+    Motion,
+    Result,
+    Truth,
+    block_memory,
+)
 
 
 class Recording(Closing):
@@ -123,10 +116,7 @@ class Recording(Closing):
         InputError
             The file is damaged there.
         """
-        if out is None:
-            out = np.empty((1, *self.shape[1:]), self.dtype)
-        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
-            raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{self.shape[1:]}) {self.dtype}")
+        out = block_memory(out, self.shape, self.dtype)
         start = self._next
         if start >= self.shape[0]:
             return None
@@ -341,3 +331,74 @@ def _only_stack(file: Hdf5File) -> str:
             f"{file.path} holds {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
         )
     return names[0]
+
+
+def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[np.float32]:
+    """Read the heights of a result, or the true ones of a simulated recording.
+
+    Parameters
+    ----------
+    path : str or Path
+    source : Recording, optional
+        What they are wanted for: of a larger part of the picture, its part is cut out.
+
+    Returns
+    -------
+    ndarray, (H, W), float32
+        Millimetres; NaN where none is known.
+
+    Raises
+    ------
+    InputError
+        There is no such file, it holds no heights or those of other pixels, or it is damaged.
+
+    Examples
+    --------
+    >>> open_heights("press-result.h5").shape  # doctest: +SKIP
+    (480, 640)
+    """
+    path = Path(path)
+    with Hdf5File(path) as file:
+        ours = file.marked(MARK)
+    if ours:
+        with open_recording(path) as recording:
+            height, part = None if recording.truth is None else recording.truth.height, None
+    else:
+        result = open_result(path)
+        if result.process.get(UNDISTORTED):
+            remedy = "give one that was made without a scale in its calibration"
+            raise InputError(
+                f"{path} holds undistorted heights, and frames are as the camera saw them: {remedy}"
+            )
+        height = _absolute(result)
+        part = source_region(result.process)
+    if height is None:
+        raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
+    if source is not None:
+        height = _cut_heights(height, part or Region.whole(height.shape), source, str(path))
+    if not np.isfinite(height).any():
+        raise InputError(
+            f"{path} holds no heights whose offset is known: give a result of a press, or of 'fuse'"
+        )
+    return height
+
+
+def _cut_heights(
+    height: NDArray[np.float32], own: Region, source: Recording, name: str
+) -> NDArray[np.float32]:
+    """Cut out what belongs to the pixels of a recording."""
+    wanted = source.region
+    if not (own.holds(wanted) and Region.whole(source.full_shape[1:]).holds(own)):
+        raise InputError(
+            f"{name} holds the heights of {own}, where {source.name} needs those of {wanted}: "
+            "give some of all these pixels"
+        )
+    return np.ascontiguousarray(height[wanted.within(own)])
+
+
+def _absolute(result: Result) -> NDArray[np.float32] | None:
+    """Return the heights of a result without the pieces whose offset nobody knows."""
+    height, piece, unknown = result.height, result.component, result.offset_unknown
+    if height is None or piece is None or unknown is None or not unknown.any():
+        return height
+    return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, carried_by, write_calibration
-from mirrorskin.io.dataset_specs import DatasetSpec, process_specs, read_process, write_dataset
-from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
+from mirrorskin.io.hdf5 import DatasetSpec, Hdf5File, Node, Shape, process_specs, read_process, write_dataset
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
 
 MARK = "mirrorskin_result"

@@ -124,6 +124,15 @@ class Closing:
         self.close()
 
 
+def block_memory(out: NDArray[Any] | None, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return what a source reads into: ``out``, if frames of the stack fit into it, or room for one frame."""
+    if out is None:
+        return np.empty((1, *shape[1:]), dtype)
+    if out.dtype != dtype or out.shape[1:] != shape[1:] or not len(out):
+        raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{shape[1:]}) {dtype}")
+    return out
+
+
 class Source(Protocol):
     """Anything frames come from: a recording, a rig of camera and stage, the digital twin.
 
@@ -332,6 +341,11 @@ def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple
         Increases to the right.
     y : ndarray, (H,), float64
         Runs up the picture: decreases with the row.
+
+    Examples
+    --------
+    >>> pixel_axes((2, 3), (0.1, 0.2))
+    (array([-0.1,  0. ,  0.1]), array([ 0.1, -0.1]))
     """
     rows, columns = shape
     x = (np.arange(columns) - (columns - 1) / 2) * pixel_size[0]

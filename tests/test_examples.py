@@ -2,9 +2,12 @@
 
 import doctest
 import importlib
+import inspect
 from pathlib import Path
 
 import pytest
+
+from mirrorskin import engine, io
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = "kernels", "io", "engine", "hw", "view"
@@ -22,3 +25,10 @@ def test_examples_run(name, monkeypatch, tmp_path):
     for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
         runner.run(example, out=told.append)
     assert runner.summarize(verbose=False).failed == 0, "".join(told)
+
+
+@pytest.mark.parametrize("package", [engine, io], ids=["engine", "io"])
+def test_every_public_function_has_an_example(package):
+    functions = {name: getattr(package, name) for name in package.__all__}
+    lacking = [name for name, it in functions.items() if inspect.isfunction(it) and ">>> " not in it.__doc__]
+    assert lacking == []

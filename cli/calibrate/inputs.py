@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
-    from mirrorskin.io import Calibration, CameraId, ProcessValue, Source
+    from mirrorskin.io import Calibration, CameraId, Source
+    from mirrorskin.io.types import ProcessValue
 
 TILT, _PHASE_STEP = "2.5deg", "45deg"
 BALL = "put the ball at place {} of {}, all over the field"
@@ -97,6 +98,7 @@ def camera_name(names: Sequence[str]) -> str:
 def _one_camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
     """Return the camera of all recordings, which is that of the known calibration."""
     from mirrorskin import io
+    from mirrorskin.io.calibration.source import check_camera
 
     name = camera_name([source.header.camera for source in sources])
     cameras = [io.CameraId(source.header.camera, source.shape[1:], source.dtype) for source in sources]
@@ -108,7 +110,7 @@ def _one_camera(sources: Sequence[Source], known: Calibration | None, output: Pa
             )
     camera = io.CameraId(name, first.shape, first.dtype)
     if known is not None:
-        io.check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
+        check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
     return camera
 
 

@@ -15,9 +15,10 @@ from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
-from mirrorskin.io import InputError, ProcessValue, Recording
+from mirrorskin.io import InputError, Recording
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.result import open_process
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
 

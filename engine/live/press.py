@@ -13,7 +13,8 @@ from mirrorskin.engine.press.onset import OnsetSearch
 from mirrorskin.engine.press.press import finish_press
 from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
-from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
+from mirrorskin.io import InputError, LiveSource, Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
 
 _ROOM = 64  # frames that may wait to be taken at once

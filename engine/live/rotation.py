@@ -27,7 +27,8 @@ from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, integrate
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.response import initial_response, wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
-from mirrorskin.io import InputError, LiveSource, ProcessValue, Result
+from mirrorskin.io import InputError, LiveSource, Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
 
 _FEWEST = 3  # frames that determine a wave

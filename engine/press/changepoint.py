@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair
 from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
-from mirrorskin.io import InputError, check_travel
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Device, Kernel, open_device

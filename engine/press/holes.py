@@ -106,6 +106,14 @@ def fill_holes(
     step and the fall of its flank over a pixel. The tip of a cone is cut off at its hole. What was light from
     the start makes holes larger: begin to press well above the object. A pit with upright walls that nothing
     touched looks like a flat top, and is filled.
+
+    Examples
+    --------
+    >>> height = np.zeros((9, 9))
+    >>> height[3:6, 3:6] = np.nan
+    >>> height, filled = fill_holes(height, sigma=0.01, pixel_size=0.1)
+    >>> float(height[4, 4]), int(filled.sum())
+    (0.0, 9)
     """
     field = _field_of(height, sigma, pixel_size, above)
     _check_limits(steepest, deepest)

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.autotune import choose_layout
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
-from mirrorskin.io import InputError, check_travel
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement

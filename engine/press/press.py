@@ -18,7 +18,8 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
 
 if TYPE_CHECKING:
-    from mirrorskin.io import ProcessValue, Source
+    from mirrorskin.io import Source
+    from mirrorskin.io.types import ProcessValue
     from mirrorskin.kernels.device import Device
 
 PressMethod = Literal["threshold", "change-point"]

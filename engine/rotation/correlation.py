@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands
-from mirrorskin.io import InputError, check_phase
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device

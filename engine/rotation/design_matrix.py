@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io import InputError, check_phase
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase
 
 Doubles = NDArray[np.float64]
 

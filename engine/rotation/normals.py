@@ -29,7 +29,8 @@ from mirrorskin.engine.rotation.normals_kernel import (
 )
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows
-from mirrorskin.io import InputError, check_phase
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.device import Device
 
 

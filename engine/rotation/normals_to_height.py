@@ -15,7 +15,8 @@ from mirrorskin.engine.frames import SAMPLES
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import Surface, explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
-from mirrorskin.io import ProcessValue, Result
+from mirrorskin.io import Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 

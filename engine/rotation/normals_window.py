@@ -13,7 +13,8 @@ from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import MAPS, NormalKernel, NormalOptions, Samples, TurnModel
 from mirrorskin.engine.tiling import Band, join_rows
-from mirrorskin.io import InputError, check_phase
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array import Array
 
 _ROOM = 16  # frames that may be pushed at once without a copy

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype
-from mirrorskin.io import Block, Header, InputError, Motion, Source, check_phase, pixel_axes
+from mirrorskin.io import Block, Header, InputError, Motion, Source, pixel_axes
+from mirrorskin.io.positions import check_phase
+from mirrorskin.io.types import block_memory
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.registration import BORDER
@@ -163,10 +165,7 @@ class Registered:
         InputError
             The phase of a frame is missing, or the source cannot be read.
         """
-        if out is None:
-            out = np.empty((1, *self.shape[1:]), self.dtype)
-        if out.dtype != self.dtype or out.shape[1:] != self.shape[1:] or not len(out):
-            raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{self.shape[1:]}) {self.dtype}")
+        out = block_memory(out, self.shape, self.dtype)
         block = self._source.read(self._room[: len(out)])
         if block is None:
             return None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.io import check_phase, check_stroke
+from mirrorskin.io.positions import check_phase, check_stroke
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion
 
 TILT_MAX = math.radians(30.0)

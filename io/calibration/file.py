@@ -27,8 +27,15 @@ from mirrorskin.io.calibration.types import (
     stored,
     unit_of,
 )
-from mirrorskin.io.dataset_specs import DatasetSpec, fixed_text, process_specs, read_process, write_dataset
-from mirrorskin.io.hdf5 import Hdf5File, Node
+from mirrorskin.io.hdf5 import (
+    DatasetSpec,
+    Hdf5File,
+    Node,
+    fixed_text,
+    process_specs,
+    read_process,
+    write_dataset,
+)
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
 
 MARK, VERSION = "mirrorskin_calibration", 1
@@ -49,6 +56,11 @@ def open_calibration(path: str | Path) -> Calibration:
     ------
     InputError
         There is no such file, it holds no calibration, one of another version, or it is damaged.
+
+    Examples
+    --------
+    >>> open_calibration("left.h5").lens.pixel_size  # doctest: +SKIP
+    (0.03, 0.03)
     """
     with Hdf5File(Path(path)) as file:
         if file.marked(MARK):
@@ -71,6 +83,12 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     ------
     InputError
         It cannot be written there.
+
+    Examples
+    --------
+    >>> save_calibration(Calibration(CameraId("left", (480, 640), np.dtype(np.uint8))), "left.h5")
+    >>> print(open_calibration("left.h5").camera)
+    'left', 640 x 480, uint8
     """
     with new_hdf5(Path(path)) as new:
         new.root.attrs.update(NX_class="NXroot", default="entry")
@@ -100,6 +118,13 @@ def update_calibration(
     ------
     InputError
         The file is no calibration, one of another camera, or cannot be written.
+
+    Examples
+    --------
+    >>> from mirrorskin.io import Gel
+    >>> camera = CameraId("left", (480, 640), np.dtype(np.uint8))
+    >>> update_calibration("left.h5", Gel(threshold=0.3, compliance=0.1), camera).gel.threshold
+    0.3
     """
     path = Path(path)
     before = Calibration(camera)

@@ -16,11 +16,11 @@ from stacks import read_all
 
 from mirrorskin import hw, io
 from mirrorskin.hw.twin import OBJECT_NAMES, Body, Camera
+from mirrorskin.io.types import MOTIONS
 
 SMALL = ["--size", "24x18", "--pixel-size", "0.4mm"]
 SHAPE, PIXEL = (18, 24), 0.4
 EXACT = ["--references", "exact"]
-MOTIONS = io.MOTIONS
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ from rotations import direction
 
 from mirrorskin import engine, io
 from mirrorskin.engine.summary import summarise
+from mirrorskin.io.types import UNDISTORTED
 
 NAN = np.float32(np.nan)
 
@@ -281,6 +282,6 @@ def test_a_result_in_one_line(maps, line):
 
 
 def test_undistorted_maps_are_not_of_the_truth_s_pixels():
-    result = io.Result(height=np.zeros((2, 3), np.float32), process={io.UNDISTORTED: True})
+    result = io.Result(height=np.zeros((2, 3), np.float32), process={UNDISTORTED: True})
     with pytest.raises(io.InputError, match="the result is undistorted"):
         engine.score(result, truth_of(np.zeros((2, 3), np.float32)))

@@ -8,6 +8,7 @@ import pytest
 from stacks import random_stack, record, sphere
 
 from mirrorskin import io
+from mirrorskin.io.types import UNDISTORTED
 
 
 def heights():
@@ -34,7 +35,7 @@ def stack(path):
         ),
         (lambda path: record(sphere(), path), "holds no heights: give a result of a press, or a simulation"),
         (
-            lambda path: io.save_result(io.Result(height=heights(), process={io.UNDISTORTED: True}), path),
+            lambda path: io.save_result(io.Result(height=heights(), process={UNDISTORTED: True}), path),
             "holds undistorted heights, and frames are as the camera saw them",
         ),
         (stack, "is no result: 'mirrorskin reconstruct' makes one from a recording"),

@@ -6,7 +6,6 @@ import pytest
 from stacks import record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.heights import open_heights
 
 
 def later(path, mark):
@@ -28,13 +27,13 @@ def result(tmp_path):
     return later(tmp_path / "res.h5", "mirrorskin_result")
 
 
-@pytest.mark.parametrize("read", [io.open_recording, io.describe, open_heights])
+@pytest.mark.parametrize("read", [io.open_recording, io.describe, io.open_heights])
 def test_a_later_recording_is_refused(recording, read):
     with pytest.raises(io.InputError, match="layout 2, where 1 is read: update the program"):
         read(recording)
 
 
-@pytest.mark.parametrize("read", [io.open_result, io.describe, open_heights])
+@pytest.mark.parametrize("read", [io.open_result, io.describe, io.open_heights])
 def test_a_later_result_is_refused(result, read):
     with pytest.raises(io.InputError, match="layout 2, where 1 is read: update the program"):
         read(result)

@@ -11,6 +11,7 @@ import pytest
 from stacks import SHAPE, TRAVEL, MadeUp, assert_same, random_stack, read_all, record
 
 from mirrorskin import hw, io
+from mirrorskin.io.types import MOTIONS
 
 DETECTOR, STAGE, TRUTH = "entry/instrument/detector", "entry/instrument/stage", "entry/truth"
 TIME = np.arange(8) / 30
@@ -31,7 +32,7 @@ HEADERS = {
     "horizontal": io.Header("horizontal", start_time="now", press=1.25),
     "twist": io.Header("twist", start_time="now", press=1.25),
 }
-EACH = pytest.mark.parametrize("motion", io.MOTIONS)
+EACH = pytest.mark.parametrize("motion", MOTIONS)
 
 
 def make(path, motion, truth=None, **changes):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.io import InputError, check_phase, check_stroke, check_travel
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase, check_stroke, check_travel
 
 
 @pytest.mark.parametrize(

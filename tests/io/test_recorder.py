@@ -12,6 +12,7 @@ import pytest
 from stacks import TRAVEL, MadeUp, assert_same, random_stack, read_all, record, sphere
 
 from mirrorskin import io
+from mirrorskin.io.recorder import COMPRESSIONS
 
 PHASE = np.arange(8) * np.pi / 4
 
@@ -114,7 +115,7 @@ def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
 
 @pytest.mark.parametrize("block", [1, 3, 8])
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("compression", io.COMPRESSIONS)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
     frames, header = random_stack(dtype), full_header()
     path = record(MadeUp(frames, header, time=TRAVEL, phase=PHASE), tmp_path / "turn.h5", compression, block)
@@ -156,7 +157,7 @@ def test_raw_frames_begin_with_a_page(tmp_path, dtype):
     assert path.stat().st_size < stack.nbytes + header.dark.nbytes + 40_000
 
 
-@pytest.mark.parametrize("compression", io.COMPRESSIONS)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize(
     "error", [io.InputError("frame 3 is gone"), OSError(5, "the camera is gone"), KeyboardInterrupt()]
 )
@@ -185,14 +186,15 @@ sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 import numpy as np
 from mirrorskin import io
+from mirrorskin.io.recorder import COMPRESSIONS
 from stacks import MadeUp, random_stack, record
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 folder = Path(sys.argv[1])
 (folder / "old.h5").write_bytes(b"as it was")
-source = [MadeUp(random_stack("uint8", (60, 40, 50)), io.Header("vertical")) for _ in io.COMPRESSIONS]
+source = [MadeUp(random_stack("uint8", (60, 40, 50)), io.Header("vertical")) for _ in COMPRESSIONS]
 big = io.Result(height=np.random.default_rng(0).normal(size=(200, 200)).astype("f4"))
-work = [lambda s=s, c=c: record(s, folder / "old.h5", c) for s, c in zip(source, io.COMPRESSIONS)]
+work = [lambda s=s, c=c: record(s, folder / "old.h5", c) for s, c in zip(source, COMPRESSIONS)]
 for write in [*work, lambda: io.save_result(big, folder / "old.h5")]:
     try:
         write()
@@ -209,5 +211,5 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     why = "could not be written: File too large; make room, or choose another place with -o"
-    assert done.stdout.splitlines() == [f"{tmp_path}/old.h5 {why}"] * (len(io.COMPRESSIONS) + 1)
+    assert done.stdout.splitlines() == [f"{tmp_path}/old.h5 {why}"] * (len(COMPRESSIONS) + 1)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"old.h5": b"as it was"}

@@ -20,6 +20,8 @@ from stacks import plot_of, read_all
 
 from mirrorskin import io
 from mirrorskin.io import growing, streaming
+from mirrorskin.io.recorder import COMPRESSIONS
+from mirrorskin.io.types import MOTIONS
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -38,7 +40,7 @@ def held(path):
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
-@pytest.mark.parametrize("packing", io.COMPRESSIONS)
+@pytest.mark.parametrize("packing", COMPRESSIONS)
 def test_what_comes_is_what_is_in_the_file(tmp_path, packing, dtype):
     blocks = stream(Feed(20, (1, 4, 3), dtype=dtype), tmp_path / "a.h5", packing)
     numbers = np.arange(20)
@@ -74,7 +76,7 @@ def test_raw_frames_lie_in_one_piece_behind_little_else(tmp_path):
     assert (tmp_path / "a.h5").stat().st_size < 3000 * 16 * 32 + (1 << 18)
 
 
-@pytest.mark.parametrize("motion", io.MOTIONS)
+@pytest.mark.parametrize("motion", MOTIONS)
 def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
     stream(Feed(8, motion=motion), tmp_path / "a.h5")
     _, signal, axes = plot_of(tmp_path / "a.h5")

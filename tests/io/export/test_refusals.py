@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
+from mirrorskin.io.export import check_export
 
 PICTURES = ["out.png", "out.tif", "out.tiff"]
 IN_MILLIMETRES = ["out.ply", "out.stl", "out.xyz", "out.csv", *PICTURES]
@@ -46,8 +47,8 @@ def test_what_needs_millimetres_is_not_made_without(slope, tmp_path, name, chang
     lacking = replace(slope, **change)
     assert line in refused(lacking, tmp_path / name)
     with pytest.raises(io.InputError, match=r"as \.npz"):
-        io.check_export(lacking, tmp_path / name)
-    io.check_export(lacking, tmp_path / "out.npz")
+        check_export(lacking, tmp_path / name)
+    check_export(lacking, tmp_path / "out.npz")
     assert not list(tmp_path.iterdir())
 
 
