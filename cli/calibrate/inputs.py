@@ -82,7 +82,7 @@ def open_all(
         options = options | {"pixel_size": size}
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
-        yield sources, _one_camera(sources, known, output)
+        yield [*sources], _one_camera(sources, known, output)
 
 
 def camera_name(names: Sequence[str]) -> str:

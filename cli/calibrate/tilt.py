@@ -99,6 +99,7 @@ def _brightness(
     import numpy as np
 
     from mirrorskin.cli.quantity import per_angle
+    from mirrorskin.engine.calibration.ball import pixel_size_of
     from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
     from mirrorskin.io import InputError
     from mirrorskin.io.calibration.source import check_sizes
@@ -112,11 +113,8 @@ def _brightness(
         header = replace(header, zenith_offset=np.asarray(offset, np.float64))
     if known is not None and known.zenith is not None and gain is None and offset is None:
         check_sizes(known, header.pixel_size, source.name, ["zenith"])
-        if header.pixel_size is None:
-            raise InputError(
-                f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm"
-            )
-        return WallBrightness.of_pixels(known.zenith, header.dark, header.bright, shape, header.pixel_size)
+        pixel_size = pixel_size_of(source)
+        return WallBrightness.of_pixels(known.zenith, header.dark, header.bright, shape, pixel_size)
     try:
         return LinearBrightness.of_header(header, shape)
     except InputError as error:

@@ -80,8 +80,10 @@ def command(
                 body=body,
                 progress=show,
             )
-        facts = {"ball": ball, "body_radius": body[0], "body_height": body[1]}
-        process = inputs.process_of(sources[0], sources=inputs.names_of(paths), **facts)
+        names, (radius, height) = inputs.names_of(paths), body
+        process = inputs.process_of(
+            sources[0], sources=names, ball=ball, body_radius=radius, body_height=height
+        )
     io.update_calibration(output, response, camera, process)
     _report(output, response, as_json)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases
-from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.io import InputError, Source, pixel_axes
 
 Doubles = NDArray[np.float64]
 
@@ -87,6 +87,7 @@ _CONVERGED = 3e-3  # pixels that do not matter
 _ROUND = 1.5  # pixels by which an outline may miss the circle
 _STRAY = 3.0  # times the median distance from the rest beyond which a frame's ball is a mistake
 _ROUNDS = 8
+_BLOCK = 16  # frames that are read at a time
 
 
 class BallCentres(NamedTuple):
@@ -94,6 +95,33 @@ class BallCentres(NamedTuple):
 
     centres: Doubles
     sigma: Doubles  # standard errors, from the outline's own unevenness
+
+
+def pixel_size_of(source: Source) -> tuple[float, float]:
+    """Return the size of a recording's pixels along x and y, mm."""
+    if source.header.pixel_size is None:
+        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
+    return source.header.pixel_size
+
+
+def read_turn(source: Source, most: int | None = None) -> tuple[NDArray[Any], Doubles]:
+    """Return the frames of an axial recording, (T, H, W), and phases; at most so many, evenly spread."""
+    if source.motion != "axial":
+        raise InputError(f"{source.name} is of {source.motion} motion: an axial recording is needed")
+    if source.rewindable:
+        source.rewind()
+    total = source.shape[0]
+    wanted = np.unique(np.linspace(0, total - 1, min(total, most or total)).round().astype(np.intp))
+    frames, phase = np.empty((len(wanted), *source.shape[1:]), source.dtype), np.zeros(len(wanted))
+    room, kept = np.empty((min(total, _BLOCK), *source.shape[1:]), source.dtype), 0
+    while (block := source.read(room)) is not None:
+        if block.phase is None:
+            raise InputError(f"{source.name} has no phases: give them, as in --phase-step 45deg")
+        for number in range(len(block.frames)):
+            if kept < len(wanted) and block.index + number >= wanted[kept]:
+                frames[kept], phase[kept] = block.frames[number], block.phase[number]
+                kept += 1
+    return frames[:kept], phase[:kept]
 
 
 def find_ball(

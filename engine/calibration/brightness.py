@@ -127,9 +127,7 @@ class WallBrightness:
 
     def sight(self, pixels: Pixels) -> Doubles:
         """Return the slopes of the lines of sight."""
-        x, y = self.place[:, pixels]
-        towards = -(self.wall.sight[0] + self.wall.sight[1] * (x**2 + y**2))
-        return np.stack([towards * x, towards * y])
+        return self.wall.sight_slopes(self.place[:, pixels])
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
         """Return light, as a share."""

@@ -219,10 +219,9 @@ class _Truth(NamedTuple):
 
 def _sight_of(response: WallResponse, found: Result) -> Doubles:
     """Return the lines of sight of all pixels, (4, H, W): x, y, and how they move with z."""
-    x, y = np.meshgrid(*_axes(found))
-    across, up = x - response.axis[0], y - response.axis[1]
-    towards = -(response.sight[0] + response.sight[1] * (across**2 + up**2))
-    return np.stack([x, y, towards * across, towards * up])
+    place = np.stack(np.meshgrid(*_axes(found)))
+    slopes = response.sight_slopes(place - np.reshape(response.axis, (2, 1, 1)))
+    return np.concatenate([place, slopes])
 
 
 def _centre_by_normals(found: Result, sight: Doubles, radius: float, press: float | None) -> Doubles:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,19 +39,19 @@ class Moments:
         self.frames = 0
         self.count, self.at_lowest, self.at_highest = np.zeros((3, *shape), np.int32)
         self.lowest, self.highest = np.full(shape, np.inf), np.full(shape, -np.inf)
-        self._sum, self._squares = np.zeros((2, *shape))
+        self.sum, self._squares = np.zeros((2, *shape))
         self._first: Floats | None = None
 
     @property
     def mean(self) -> Floats:
         """Means, counts; NaN without a sample."""
         first = 0.0 if self._first is None else self._first
-        return np.asarray(np.where(self.count > 0, first + self._sum / np.maximum(self.count, 1), np.nan))
+        return np.asarray(np.where(self.count > 0, first + self.sum / np.maximum(self.count, 1), np.nan))
 
     @property
     def variance(self) -> Floats:
         """Unbiased variances of a sample, counts^2; NaN of fewer than two samples."""
-        squares = np.maximum(self._squares - self._sum**2 / np.maximum(self.count, 1), 0)
+        squares = np.maximum(self._squares - self.sum**2 / np.maximum(self.count, 1), 0)
         return np.asarray(np.where(self.count > 1, squares / np.maximum(self.count - 1, 1), np.nan))
 
     def push(self, frames: NDArray[Any]) -> None:
@@ -62,33 +62,15 @@ class Moments:
             if self._first is None:
                 self._first = counts
             difference = np.where(known, counts - self._first, 0.0)
-            self._sum += difference
+            self.sum += difference
             self._squares += difference * difference
-            once = known.astype(np.int32)
-            self._push_extremes(np.where(known, counts, np.inf), np.where(known, counts, -np.inf), once, once)
-            self.count += once
+            self.count += known
+            low, high = np.where(known, counts, np.inf), np.where(known, counts, -np.inf)
+            self.at_lowest = self.at_lowest * (self.lowest <= low) + known * (low <= self.lowest)
+            self.at_highest = self.at_highest * (self.highest >= high) + known * (high >= self.highest)
+            np.minimum(self.lowest, low, out=self.lowest)
+            np.maximum(self.highest, high, out=self.highest)
         self.frames += len(frames)
-
-    def join(self, other: Self) -> None:
-        """Take in what another has taken in."""
-        if other._first is None:
-            return
-        if self._first is None:
-            self._first = other._first
-        step = other._first - self._first
-        self._squares += other._squares + 2 * step * other._sum + other.count * step**2
-        self._sum += other._sum + other.count * step
-        self._push_extremes(other.lowest, other.highest, other.at_lowest, other.at_highest)
-        self.count += other.count
-        self.frames += other.frames
-
-    def _push_extremes(
-        self, low: Floats, high: Floats, at_low: NDArray[np.int32], at_high: NDArray[np.int32]
-    ) -> None:
-        self.at_lowest = self.at_lowest * (self.lowest <= low) + at_low * (low <= self.lowest)
-        self.at_highest = self.at_highest * (self.highest >= high) + at_high * (high >= self.highest)
-        np.minimum(self.lowest, low, out=self.lowest)
-        np.maximum(self.highest, high, out=self.highest)
 
 
 class Level(NamedTuple):

@@ -206,21 +206,21 @@ class _Reader:
 
     def moments(self, sources: Sequence[Source]) -> tuple[Moments, float]:
         """Return the moments of all frames, and by how much the last half is above the first."""
-        first, last = (Moments(sources[0].shape[1:], sources[0].dtype) for _ in range(2))
-        half, done = _length(sources) // 2, 0
+        moments, half = Moments(sources[0].shape[1:], sources[0].dtype), _length(sources) // 2
+        early, count = np.zeros_like(moments.sum), np.zeros_like(moments.count)  # of the first half
         for block in self.blocks(sources):
-            early = min(max(half - done, 0), len(block.frames))
-            first.push(block.frames[:early])
-            last.push(block.frames[early:])
-            done += len(block.frames)
-        change = last.mean - first.mean
-        first.join(last)
-        if not first.frames:
+            for frame in block.frames:
+                if moments.frames == half:
+                    early, count = moments.sum.copy(), moments.count.copy()
+                moments.push(frame[np.newaxis])
+        if not moments.frames:
             raise InputError(f"{sources[0].name} holds no frames: take some")
+        with np.errstate(invalid="ignore"):
+            change = (moments.sum - early) / (moments.count - count) - early / count
         # The mean of the middle half is as robust as a median, and not as coarse.
         known = np.sort(change[np.isfinite(change)])
         middle = known[known.size // 4 : known.size - known.size // 4]
-        return first, float(middle.mean()) if middle.size else math.nan
+        return moments, float(middle.mean()) if middle.size else math.nan
 
 
 def _length(sources: Sequence[Source]) -> int:

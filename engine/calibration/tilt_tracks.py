@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.calibration.ball import follow_ball, see_ball
+from mirrorskin.engine.calibration.ball import follow_ball, pixel_size_of, read_turn, see_ball
 from mirrorskin.engine.calibration.brightness import Brightness, LinearBrightness
 from mirrorskin.engine.rotation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
@@ -68,9 +68,7 @@ def track_ball(source: Source, radius: float, light: Brightness) -> BallTrack:
     but unknown, where what lies within does not show the ball up to the rim (the wall ends before the contact
     does), and where the stage's press is another (the gel gives way, or the stage's zero is wrong).
     """
-    pixel_size = source.header.pixel_size
-    if pixel_size is None:
-        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
+    pixel_size = pixel_size_of(source)
     if not radius > 0:
         raise InputError(f"a ball of {2 * radius:g} mm cannot be: give its diameter")
     frames, phase = _read_turn(source)
@@ -121,24 +119,15 @@ def track_plate(source: Source, level: bool, light: Brightness) -> PlateTrack:
 
 def _read_turn(source: Source) -> tuple[NDArray[Any], Doubles]:
     """Return all frames and their phases, if these determine an ellipse."""
-    if source.motion != "axial":
-        raise InputError(f"{source.name} is of {source.motion} motion: an axial recording is needed")
     size = int(np.prod(source.shape)) * source.dtype.itemsize
     if size > _MOST_BYTES:
         raise InputError(f"{source.name}: {size / 1e9:.1f} GB of frames are too much: take a turn or two")
-    frames, phase = np.empty(source.shape, source.dtype), np.empty(source.shape[0])
-    count = 0
-    while count < len(frames) and (block := source.read(frames[count:])) is not None:
-        if block.phase is None:
-            raise InputError(f"{source.name} has no phases: give them, as in --phase-step 45deg")
-        part = slice(count, count + len(block.frames))
-        frames[part], phase[part] = block.frames, block.phase
-        count = part.stop
-    known = check_phases(phase[:count])
+    frames, phase = read_turn(source)
+    known = check_phases(phase)
     different = len(np.unique(np.round(np.mod(known, math.tau) / _SAME_PHASE)))
     if different < _PHASES:
         raise InputError(f"{source.name}: {different} different phases, at least {_PHASES} are needed")
-    return frames[:count], known
+    return frames, known
 
 
 def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Doubles) -> None:

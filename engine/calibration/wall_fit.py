@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.calibration.ball import find_ball, moved
+from mirrorskin.engine.calibration.ball import find_ball, moved, pixel_size_of, read_turn
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
     SENSOR,
@@ -67,9 +67,9 @@ def read_press(
     source: Source, ball: float, references: References | None, precession: Precession | None, count: int
 ) -> BallPress:
     """Read a recording once, find the ball, and keep some samples of its neighbourhood."""
-    levels, pixel_size = _levels(source, references), _pixel_size(source)
+    levels, pixel_size = _levels(source, references), pixel_size_of(source)
     pivot = pivot_of(source, precession).place
-    frames, phase = _read(source)
+    frames, phase = read_turn(source, _FRAMES)
     lean = _circle(source, phase) if precession is None else precession.lean(phase)
     try:
         centre, sigma = find_ball(frames, phase, pixel_size, ball), np.full(3, _PLACE)
@@ -170,38 +170,12 @@ def _levels(source: Source, references: References | None) -> tuple[Doubles, Dou
     return np.asarray(dark, np.float64), np.asarray(bright, np.float64)
 
 
-def _pixel_size(source: Source) -> tuple[float, float]:
-    if source.header.pixel_size is None:
-        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
-    return source.header.pixel_size
-
-
 def _circle(source: Source, phase: Doubles) -> Doubles:
     if source.header.tilt is None:
         raise InputError(
             f"{source.name}: the tilt of its rotation is not known: give it, as in --tilt 2.5deg"
         )
     return source.header.tilt * np.stack([np.cos(phase), np.sin(phase)], axis=1)
-
-
-def _read(source: Source) -> tuple[NDArray[Any], Doubles]:
-    """Return the frames and their phases; evenly spread ones of a recording of many."""
-    if source.motion != "axial":
-        raise InputError(f"{source.name}: its motion is {source.motion}: take an axial one of the ball")
-    if source.rewindable:
-        source.rewind()
-    total = source.shape[0]
-    wanted = np.unique(np.linspace(0, total - 1, min(total, _FRAMES)).round().astype(np.intp))
-    frames, phase = np.empty((len(wanted), *source.shape[1:]), source.dtype), np.zeros(len(wanted))
-    room, kept = np.empty((min(total, _FRAMES), *source.shape[1:]), source.dtype), 0
-    while (block := source.read(room)) is not None:
-        if block.phase is None:
-            raise InputError(f"{source.name}: its phases are not known: give --phase-step, as in 45deg")
-        for number in range(len(block.frames)):
-            if kept < len(wanted) and block.index + number >= wanted[kept]:
-                frames[kept], phase[kept] = block.frames[number], block.phase[number]
-                kept += 1
-    return frames[:kept], phase[:kept]
 
 
 def _ends(frames: NDArray[Any]) -> NDArray[Any]:

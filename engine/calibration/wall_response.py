@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.calibration.ball import rotations
+from mirrorskin.engine.calibration.ball import pixel_size_of, rotations
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
@@ -105,9 +105,8 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     of its normal. Beyond what is known of the wall it is as bright as at the end of that.
     """
     z, radius = places[2], response.radius
-    (axis_x, axis_y), (near, far) = response.axis, response.sight
-    named = {"axis_x": axis_x, "axis_y": axis_y, "sight_0": near, "sight_2": far}
-    from_axis, lean = look(places[:2], named)
+    from_axis = places[:2] - np.reshape(response.axis, (2, 1))
+    lean = response.sight_slopes(from_axis)
     ray = reflect(down(lean), _normals(zenith, azimuth))
     at = from_axis + z * lean
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
@@ -215,9 +214,7 @@ def _error_maps(
     """
     from scipy.ndimage import map_coordinates
 
-    pixel_size, shape = source.header.pixel_size, source.shape[1:]
-    if pixel_size is None:
-        raise InputError(f"{source.name}: its pixel size is not known: give it, as in --pixel-size 0.03mm")
+    pixel_size, shape = pixel_size_of(source), source.shape[1:]
     axes = (np.linspace(axis[0], axis[-1], _SIDE) for axis in pixel_axes(shape, pixel_size))
     places = np.repeat(np.stack([axis.ravel() for axis in np.meshgrid(*axes)]), _TURN, axis=1)
     azimuth = np.tile(np.arange(_TURN) * 2 * np.pi / _TURN, _SIDE * _SIDE)
