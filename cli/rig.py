@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,13 +49,15 @@ def check(
 ) -> None:
     """Open a rig and tell whether it is as its file says; nothing moves without --move."""
     from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.hw.rig.check import check_rig
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     findings: list[Finding] = []
     complete = False
     try:
-        _look(settings, move, findings.append)
+        with closing(check_rig(settings, move=move)) as found:
+            findings.extend(found)  # keeps what was found before an error
         complete = True
     finally:
         if findings:
@@ -64,17 +67,6 @@ def check(
         more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
         first = failed[0]
         raise HardwareError(f"{rig}: {first.part}, {first.what}: {first.found}: {first.remedy}{more}")
-
-
-def _look(settings: RigSettings, move: bool, show: Callable[[Finding], object]) -> None:
-    """Show what is found, until all was looked at or something cannot be."""
-    from contextlib import closing
-
-    from mirrorskin.hw.rig.check import check_rig
-
-    with closing(check_rig(settings, move=move)) as findings:
-        for finding in findings:
-            show(finding)
 
 
 def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, as_json: bool) -> None:

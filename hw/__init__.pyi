@@ -9,7 +9,7 @@ from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
 from .rig_file import load_rig
-from .stage import Limits, Position, Stage
+from .stage import Limits, Position
 from .twin import Live, Twin
 from .video import VideoCamera
 
@@ -23,7 +23,6 @@ __all__ = [
     "Live",
     "Position",
     "Rig",
-    "Stage",
     "StepScan",
     "SweepScan",
     "ThreadedCamera",

@@ -16,48 +16,25 @@ from mirrorskin.hw.errors import HardwareError
 class Frames:
     """Some consecutive frames of a camera.
 
-    Attributes
-    ----------
-    pixels : ndarray, (n, H, W), uint8, uint16 or float32
-        Raw counts in C order. The memory is lent: nobody writes to it as long as this array or a view of
-        it is referred to, and 64 bytes beyond it may be read (``mirrorskin.io.Block.lent``).
-    number : ndarray, (n,), int64
-        Numbers of the frames since the camera was opened, from 0 in steps of 1; those lost are counted.
-    time : ndarray, (n,), float64
-        Seconds on ``time.monotonic``'s scale at which each frame arrived; never decreasing.
-    dropped : int
-        Frames lost between those taken before (or forgotten by ``flush``) and these.
+    The pixels are raw counts in C order. Their memory is lent: nobody writes to it as long as this array or a
+    view of it is referred to, and 64 bytes beyond it may be read (``mirrorskin.io.Block.lent``).
     """
 
-    pixels: NDArray[Any]
-    number: NDArray[np.int64]
-    time: NDArray[np.float64]
-    dropped: int = 0
+    pixels: NDArray[Any]  # (n, H, W), uint8, uint16 or float32
+    number: NDArray[np.int64]  # (n,), since the camera was opened, from 0 in steps of 1; lost ones count
+    time: NDArray[np.float64]  # (n,), arrival, seconds on time.monotonic's scale; never decreasing
+    dropped: int = 0  # frames lost between those taken before (or forgotten by flush) and these
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a camera did since it was opened.
+    """What a camera did since it was opened."""
 
-    Attributes
-    ----------
-    frames : int
-        Frames that arrived.
-    dropped : int
-        Frames lost: overwritten before anyone took them, or missing already when they arrived.
-    late : int
-        Frames that came more than 1.5 periods after the one before.
-    rate : float
-        Frames a second that arrived of late, as measured; NaN before the second.
-    reconnects : int
-        Times that the camera was lost and came back.
-    """
-
-    frames: int = 0
-    dropped: int = 0
-    late: int = 0
-    rate: float = math.nan
-    reconnects: int = 0
+    frames: int = 0  # that arrived
+    dropped: int = 0  # overwritten before anyone took them, or missing already when they arrived
+    late: int = 0  # that came more than 1.5 periods after the one before
+    rate: float = math.nan  # frames a second that arrived of late, as measured; NaN before the second
+    reconnects: int = 0  # times that the camera was lost and came back
 
 
 class Camera(Protocol):

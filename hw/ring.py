@@ -37,17 +37,7 @@ class Ring:
     never stop the camera.
 
     The memory begins on a page, and 64 bytes beyond each frame may be read. Frames that were put one after
-    the other lie one after the other, up to the last place.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-    slots : int
-        Frames that may wait, at least 1.
-    name : str
-        What messages call the camera.
+    the other lie one after the other, up to the last place. `slots` frames, of `shape` (H, W), may wait.
     """
 
     def __init__(

@@ -1,12 +1,10 @@
-"""What a stage is: where the body can stand, how far it may go, and what every stage can do."""
+"""Where a stage can place the body, how far it may go, and what it reports."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
-from mirrorskin.hw.errors import HardwareError
 from mirrorskin.io import InputError
 
 _ROUNDING = 1e-9  # by which a place may lie beyond a limit, mm and rad
@@ -76,22 +74,7 @@ class Limits:
 
     def check(self, position: Position, name: str) -> None:
         """Refuse a place beyond the limits: an InputError names the limit, and the stage by `name`."""
-        self._check_travel(position.travel, name)
-        self._check_tilt(position.tilt, name)
-
-    def check_precession(self, travel: float, tilt: float, name: str) -> None:
-        """Refuse a precession beyond the limits: turns at half-angle `tilt`, rad, pressed by `travel`, mm."""
-        self._check_travel(travel, name)
-        self._check_tilt(tilt, name)
-
-    def excess(self, position: Position) -> float:
-        """Return how far a place lies beyond the limits: mm or degrees, whichever are more; 0 within."""
-        low, high = self.travel
-        lean = math.degrees(position.tilt - self.tilt)
-        return max(0.0, low - position.travel, position.travel - min(high, self.press), lean)
-
-    def _check_travel(self, travel: float, name: str) -> None:
-        low, high = self.travel
+        travel, tilt, (low, high) = position.travel, position.tilt, self.travel
         if not math.isfinite(travel):
             raise InputError(
                 f"{name}: a travel of {travel} mm is no place; give a finite number of millimetres"
@@ -106,99 +89,16 @@ class Limits:
                 f"{name}: a travel of {travel:.9g} mm presses deeper than the {self.press:.9g} mm that "
                 "the rig file allows; press less, or raise its press"
             )
-
-    def _check_tilt(self, tilt: float, name: str) -> None:
         if not math.isfinite(tilt):
             raise InputError(f"{name}: a tilt of {tilt} is no angle; give a finite one")
-        if abs(tilt) > self.tilt + _ROUNDING:
+        if tilt > self.tilt + _ROUNDING:
             raise InputError(
-                f"{name}: a tilt of {math.degrees(abs(tilt)):.9g} degrees is beyond the greatest, "
+                f"{name}: a tilt of {math.degrees(tilt):.9g} degrees is beyond the greatest, "
                 f"{math.degrees(self.tilt):.9g}; tilt less, or correct the rig file's pitch and roll"
             )
 
-
-class Stage(Protocol):
-    """What moves the body.
-
-    A place or a precession beyond the limits is an `InputError`, raised before anything is sent. What goes
-    wrong afterwards is a `HardwareError`. Whatever interrupts a call that waits (Ctrl-C too) stops the stage.
-    """
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages."""
-
-    @property
-    def limits(self) -> Limits:
-        """How far the body may go."""
-
-    @property
-    def error(self) -> HardwareError | None:
-        """What is wrong with the stage; None while all is well. To be asked at any time, from any thread."""
-
-    def home(self) -> None:
-        """Find the axes' switches; returns when they are found."""
-
-    def move(self, place: Position, speed: float | None = None) -> None:
-        """Begin to go to `place` in a straight line; returns when the controller has taken the command.
-
-        Parameters
-        ----------
-        place : Position
-            Where to go.
-        speed : float, optional
-            Millimetres a second; radians a second if only the lean changes. If not given, as fast as the
-            axes go.
-        """
-
-    def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
-        """Begin to go round at half-angle `tilt`, from phase `start`, where the body must stand.
-
-        Parameters
-        ----------
-        tilt : float
-            Half-angle, radians.
-        turns : float
-            How often to go round; counter-clockwise if positive.
-        rate : float
-            Turns a second, positive.
-        start : float
-            Phase to begin at, radians.
-        """
-
-    def wait(self, timeout: float | None = None) -> Report:
-        """Wait until the body rests and every command is done.
-
-        Parameters
-        ----------
-        timeout : float, optional
-            Seconds; by default what the commands should take, and a margin.
-
-        Returns
-        -------
-        Report
-            Where the body rests.
-
-        Raises
-        ------
-        HardwareError
-            On an alarm, when the stage is lost or was stopped, or when the time is up.
-        """
-
-    def report(self) -> Report:
-        """Return what the stage said last; it is asked all the time.
-
-        Raises
-        ------
-        HardwareError
-            When the stage is lost, stopped or in alarm.
-        """
-
-    def history(self, since: float = -math.inf) -> list[Report]:
-        """Return the reports later than `since`, oldest first; the newest of an hour or so are kept."""
-
-    def stop(self) -> None:
-        """Stop the body at once. To be called from any thread, as often as wished; raises nothing."""
-
-    def close(self) -> None:
-        """Stop the body if it moves, and let the stage go."""
+    def excess(self, position: Position) -> float:
+        """Return how far a place lies beyond the limits: mm or degrees, whichever are more; 0 within."""
+        low, high = self.travel
+        lean = math.degrees(position.tilt - self.tilt)
+        return max(0.0, low - position.travel, position.travel - min(high, self.press), lean)

@@ -70,12 +70,7 @@ class EmulatedRig:
     **scene
         Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
 
-    Attributes
-    ----------
-    machine : GrblMachine
-    port : GrblPort
-    camera : TwinCamera
-        Both from the entering on. Their faults can be asked for.
+    The ``machine``, and inside ``with`` its ``port`` and the ``camera``, can be commanded to fail.
 
     Examples
     --------
@@ -160,11 +155,6 @@ class EmulatedRig:
         """Write ``rig.toml`` with a stream's URL as camera, and the bright reference beside it.
 
         The folder is made where it is missing; files of an emulated rig that was there before are replaced.
-
-        Raises
-        ------
-        InputError
-            The folder cannot be written to, or has a rig file of someone else's.
         """
         path, picture = folder / "rig.toml", folder / "bright.npy"
         camera = msgspec.structs.replace(self._camera_settings(), source=source, bright=picture.name)

@@ -47,9 +47,11 @@ class Controller:
 
 
 class GrblStage(Closing):
-    """A stage that a GRBL controller moves; see `hw.stage.Stage`.
+    """A stage that a GRBL controller moves.
 
-    A stage that was stopped, or that failed, says so in `error` and to every call; open it again to go on.
+    A place or a precession beyond ``limits`` is an `InputError`, raised before anything is sent. What goes
+    wrong afterwards is a `HardwareError`. Whatever interrupts a call that waits (Ctrl-C too) stops the stage.
+    A stage that was stopped, or that failed, says so in ``error`` and to every call; open it again to go on.
 
     Parameters
     ----------
@@ -57,13 +59,6 @@ class GrblStage(Closing):
         Where it is plugged in, its axes and limits.
     port : serial.Serial, optional
         What to speak through instead of opening ``settings.port``; it is closed with the stage.
-
-    Attributes
-    ----------
-    name : str
-        What to call it in messages.
-    limits : Limits
-        What may be asked of it.
 
     Raises
     ------
@@ -102,7 +97,7 @@ class GrblStage(Closing):
 
     @property
     def error(self) -> HardwareError | None:
-        """What is wrong with the stage; None while all is well."""
+        """What is wrong with the stage; None while all is well. Any thread may ask at any time."""
         return self._link.error
 
     @property
@@ -126,7 +121,7 @@ class GrblStage(Closing):
         return self._link.round_trip
 
     def home(self) -> None:
-        """Find the axes' switches; see `Stage.home`."""
+        """Find the axes' switches; returns when they are found."""
         if not self.homes:
             raise InputError(
                 f"{self.name}: homing is switched off; set $22=1, or home = false in the rig file"
@@ -144,7 +139,16 @@ class GrblStage(Closing):
             self._target = self.wait().position
 
     def move(self, place: Position, speed: float | None = None) -> None:
-        """Begin to go to `place` in a straight line; see `Stage.move`."""
+        """Begin to go to `place` in a straight line; returns when the controller has taken the command.
+
+        Parameters
+        ----------
+        place : Position
+            Where to go.
+        speed : float, optional
+            Millimetres a second; radians a second if only the lean changes. If not given, as fast as the
+            axes go.
+        """
         self.limits.check(place, self.name)
         command = self._axes.straight(self._destination(), place, speed)
         if command is None:
@@ -153,9 +157,21 @@ class GrblStage(Closing):
             self._send([command], place)
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
-        """Begin to go round; see `Stage.precess`."""
+        """Begin to go round at half-angle `tilt`, from phase `start`, where the body must stand.
+
+        Parameters
+        ----------
+        tilt : float
+            Half-angle, radians.
+        turns : float
+            How often to go round; counter-clockwise if positive.
+        rate : float
+            Turns a second, positive.
+        start : float
+            Phase to begin at, radians.
+        """
         before = self._destination()
-        self.limits.check_precession(before.travel, tilt, self.name)
+        self.limits.check(Position(before.travel, tilt), self.name)
         assert self._offset is not None  # it is open only when this is known
         commands = self._axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
@@ -167,7 +183,10 @@ class GrblStage(Closing):
         self._send(commands, end)
 
     def wait(self, timeout: float | None = None) -> Report:
-        """Wait until the body rests and every command is done; see `Stage.wait`."""
+        """Wait until the body rests and every command is done, and return the report of it.
+
+        The timeout, seconds, is by default what the commands should take, and a margin.
+        """
         self._destination()
         if timeout is None:
             timeout = 1.25 * max(0.0, self._due - time.monotonic()) + self._settings.timeout
@@ -175,14 +194,14 @@ class GrblStage(Closing):
             return self._link.until(self._arrived, timeout, "come to rest")
 
     def report(self) -> Report:
-        """Return what the stage said last; see `Stage.report`."""
+        """Return what the stage said last; it is asked all the time."""
         if self._link.error is not None:
             raise self._link.error.with_traceback(None)
         assert self._latest is not None  # it is open only after a report
         return self._latest
 
     def history(self, since: float = -math.inf) -> list[Report]:
-        """Return the reports later than `since`; see `Stage.history`."""
+        """Return the reports later than `since`, oldest first; the newest of an hour or so are kept."""
         found = []
         with self._link.lock:
             for report in reversed(self._reports):
@@ -192,7 +211,7 @@ class GrblStage(Closing):
         return found[::-1]
 
     def stop(self) -> None:
-        """Stop the body at once; see `Stage.stop`."""
+        """Stop the body at once. Any thread may call it, as often as it likes; raises nothing."""
         self._link.halt("the stage was stopped; open it again to go on")
 
     def close(self) -> None:

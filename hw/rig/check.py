@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mirrorskin.hw.camera import Camera, Counts
 from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
-from mirrorskin.hw.stage import Limits, Position, Report, Stage
+from mirrorskin.hw.stage import Limits, Position, Report
 from mirrorskin.hw.video import VideoCamera
 from mirrorskin.io import InputError
 
@@ -61,28 +61,10 @@ def check_rig(
 ) -> Generator[Finding, None, None]:
     """Open the stage and the camera, and yield what is found, one thing at a time.
 
-    However it ends, the stage is stopped and both are closed.
-
-    Parameters
-    ----------
-    settings : RigSettings
-        What the rig file says.
-    move : bool
-        Home the stage if the file says so, and move each axis a little, there and back, unless something
-        failed before. Without it nothing moves.
-    open_stage, open_camera : callable
-        What opens them.
-
-    Yields
-    ------
-    Finding
-
-    Raises
-    ------
-    InputError
-        One of them cannot be opened as the file says.
-    HardwareError
-        One of them was lost, or raised an alarm.
+    With `move` the stage is homed if the file says so, and each axis moves a little, there and back, unless
+    something failed before; without it nothing moves. However it ends, the stage is stopped and both are
+    closed. InputError if one of them cannot be opened as the file says, HardwareError if one is lost or the
+    stage raises an alarm.
     """
     sound = True
     with closing(open_stage(settings.stage)) as stage:
@@ -153,7 +135,7 @@ def _state(report: Report, settings: StageSettings) -> Finding:
     return Finding("stage", "state", report.state, "failed", f"it cannot move from this; {remedy}")
 
 
-def _position(report: Report, stage: Stage, settings: StageSettings) -> Finding:
+def _position(report: Report, stage: GrblStage, settings: StageSettings) -> Finding:
     found = _in_words(report.position, settings)
     if settings.home:
         return Finding("stage", "position", f"{found} (before homing)")
@@ -235,7 +217,7 @@ def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
 
 
-def _listen(stage: Stage, settings: StageSettings) -> list[float]:
+def _listen(stage: GrblStage, settings: StageSettings) -> list[float]:
     """Return the times of the reports of a second, or of the first two."""
     begun = time.monotonic()
     time.sleep(_PERIOD)
@@ -304,7 +286,7 @@ def _brightness(picture: NDArray[Any]) -> Finding:
 # Moves: each axis a little, there and back
 
 
-def check_moves(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
+def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     """Home the stage if the file says so, set it upright within its limits, and move each axis from there."""
     if settings.home:
         stage.home()
@@ -326,7 +308,7 @@ def _step(limits: Limits, name: str, unit: str, value: float) -> float:
     return step if value - step < low else -step
 
 
-def _there_and_back(stage: Stage, settings: StageSettings, name: str, home: Position) -> Finding:
+def _there_and_back(stage: GrblStage, settings: StageSettings, name: str, home: Position) -> Finding:
     axis, value = settings.axes[name], getattr(home, name)
     step, off = _step(stage.limits, name, axis.unit, value), 0.0
     for place in (value + step, value):

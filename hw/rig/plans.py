@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.hw.rig_file import StageSettings
-from mirrorskin.hw.stage import Limits, Position
+from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats
 
@@ -131,11 +131,6 @@ class VerticalPlan:
         assert self.speed is not None
         return Trapezoid.planned(self.stop - self.start, self.speed)
 
-    def check(self, limits: Limits, name: str) -> None:
-        """Refuse to go beyond a stage's limits, before anything moves; InputError."""
-        for travel in (self.start, self.stop):
-            limits.check(Position(travel=travel), name)
-
 
 @dataclass(frozen=True, slots=True)
 class AxialPlan:
@@ -230,10 +225,6 @@ class AxialPlan:
         """Return where the body stands at a phase, radians."""
         return Position(self.press, self.tilt * math.cos(phase), self.tilt * math.sin(phase))
 
-    def check(self, limits: Limits, name: str) -> None:
-        """Refuse to go beyond a stage's limits, before anything moves; InputError."""
-        limits.check_precession(self.press, self.tilt, name)
-
 
 Plan = VerticalPlan | AxialPlan
 
@@ -270,16 +261,11 @@ def _check_steps(count: float, least: int) -> None:
 
 
 def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
-    """Refuse a plan that a stage cannot do: places beyond its limits, too fast, too slow, no axes for arcs.
-
-    Raises
-    ------
-    InputError
-        Naming what cannot be done, and the remedy.
-    """
+    """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs."""
     from mirrorskin.hw.grbl.moves import Axes
 
-    plan.check(stage.limits, name)
+    for place in (plan.first,) if isinstance(plan, AxialPlan) else (plan.first, Position(plan.stop)):
+        stage.limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
     axes = Axes(stage, name)

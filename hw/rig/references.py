@@ -49,13 +49,7 @@ def read_reference(
 
 
 def check_references(camera: CameraSettings, rig_file: str | Path) -> None:
-    """Refuse references that the camera cannot have, or a bright one that is not above the dark one.
-
-    Raises
-    ------
-    InputError
-        As `read_reference`, and if they are out of order at most pixels.
-    """
+    """Refuse references that the camera cannot have, or a bright one below the dark one at most pixels."""
     dark, bright = (read_reference(camera, name, rig_file) for name in ("dark", "bright"))
     if dark is None or bright is None:
         return

@@ -8,13 +8,17 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import RigSettings
-from mirrorskin.hw.stage import Position, Report, Stage
+from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.grbl.stage import GrblStage
 
 _TICK = 0.02  # seconds from one look of the guard to the next
 _STALL, _STALL_PERIODS = 0.1, 3  # seconds, and frame periods, without a frame that a move bears
@@ -26,7 +30,7 @@ _JOIN = 5.0
 class Move:
     """A move of the stage that is under way, begun at a time; a thread waits for its end."""
 
-    def __init__(self, stage: Stage, began: float) -> None:
+    def __init__(self, stage: GrblStage, began: float) -> None:
         self._stage = stage
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
         self.error: Exception | None = None  # why it did not come to its end
@@ -68,17 +72,10 @@ class Rig(Closing):
 
     Parameters
     ----------
-    stage : Stage
+    stage : GrblStage
         To move it, use the rig: only then is the move guarded.
     camera : Camera
     settings : RigSettings
-
-    Attributes
-    ----------
-    stage, camera, settings
-        As given.
-    name : str
-        What to call it in messages.
 
     Examples
     --------
@@ -86,7 +83,7 @@ class Rig(Closing):
     ...     rig.go(Position(travel=1.0))
     """
 
-    def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
+    def __init__(self, stage: GrblStage, camera: Camera, settings: RigSettings) -> None:
         self.stage, self.camera, self.settings = stage, camera, settings
         self.name = settings.name
         self._stall = _STALL
@@ -135,13 +132,7 @@ class Rig(Closing):
         return self._move
 
     def end(self, move: Move) -> Report:
-        """Wait until a move is over, and return where the body rests.
-
-        Raises
-        ------
-        HardwareError
-            Stage or camera failed; the stage was stopped.
-        """
+        """Wait until a move is over, and return where the body rests; HardwareError if the rig failed."""
         while not move.join(_SLICE):
             self.check()
         self.check()
@@ -154,13 +145,7 @@ class Rig(Closing):
         return self.end(self.begin(lambda: self.stage.move(place, speed)))
 
     def take(self, most: int) -> Frames:
-        """Take the frames that wait, or wait for one; see ``Camera.take``.
-
-        Raises
-        ------
-        HardwareError
-            None came, or stage or camera failed.
-        """
+        """Take the frames that wait, or wait for one, as ``Camera.take``; HardwareError if the rig failed."""
         until = time.monotonic() + _PATIENCE
         while True:
             self.check()
@@ -170,10 +155,6 @@ class Rig(Closing):
                 self.check()
                 if self.camera.error is not None or time.monotonic() > until:
                     raise
-
-    def stop(self) -> None:
-        """Stop the stage at once; raises nothing."""
-        self.stage.stop()
 
     def close(self) -> None:
         """Stop the stage if it moves, and let go of everything."""
@@ -190,7 +171,7 @@ class Rig(Closing):
             leaving.callback(self.stage.close)
             leaving.callback(self._end_threads)
             if stop:
-                self.stop()
+                self.stage.stop()
 
     def _end_threads(self) -> None:
         self._closing.set()
@@ -214,7 +195,7 @@ class Rig(Closing):
             fault = self._find(without)
             if fault is not None:
                 self._fault = self._fault or fault  # first, or the stop would pass for the cause
-                self.stop()
+                self.stage.stop()
                 return
 
     def _find(self, without: float) -> HardwareError | None:
@@ -234,14 +215,8 @@ def open_rig(settings: RigSettings) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
     A stage that has switches, and does not know where it is, is homed. One that the file says to have
-    switches, and that does not home, is refused: nobody would know where it is.
-
-    Raises
-    ------
-    InputError
-        One of them is missing, busy, or not what the file says.
-    HardwareError
-        No frame came.
+    switches, and that does not home, is refused: nobody would know where it is. InputError if one of them is
+    missing, busy, or not what the file says; HardwareError if no frame came.
     """
     from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.video import VideoCamera
@@ -253,7 +228,7 @@ def open_rig(settings: RigSettings) -> Rig:
         stage = GrblStage(settings.stage)
         opening.callback(stage.close)
         if settings.stage.home:
-            if not stage.homes:  # nobody would know where it is
+            if not stage.homes:
                 raise InputError(
                     f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or "
                     "home = false"

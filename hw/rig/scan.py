@@ -32,27 +32,7 @@ class Scan(Closing):
 
     When the header is asked for, or the scan is entered, it lifts the body clear, takes the references and
     goes to where the scan begins. Left without an error, it lifts the body again; left in the middle of a
-    move, or by an error, it stops the stage.
-
-    Parameters
-    ----------
-    rig : Rig
-        Open; whoever opened it closes it.
-    plan : VerticalPlan or AxialPlan
-
-    Attributes
-    ----------
-    rig, plan
-        As given.
-    name, header, shape, dtype, motion, rewindable
-        As of every source; of ``shape``, the first is the number of frames expected.
-    count, dropped : int
-        Frames given so far, and lost between them.
-
-    Raises
-    ------
-    InputError
-        The plan goes beyond the stage's limits, or is too fast or too slow for it.
+    move, or by an error, it stops the stage. Whoever opened the rig closes it.
     """
 
     rewindable = False
@@ -61,7 +41,7 @@ class Scan(Closing):
         self.rig, self.plan = rig, plan
         self.name, self.motion = rig.name, plan.motion
         self.dtype = rig.camera.dtype
-        self.count = self.dropped = 0
+        self.count = self.dropped = 0  # frames given so far, and lost between them
         self._origin: float | None = None
         self._complete = False
         self._live: list[Floats] = []
@@ -109,13 +89,7 @@ class Scan(Closing):
         raise RuntimeError("a live source cannot be rewound")
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Return the next frames, at most ``len(out)``, as lent memory; None when the plan is done.
-
-        Raises
-        ------
-        HardwareError
-            Stage or camera failed; the stage was stopped.
-        """
+        """Return the next frames, at most ``len(out)``, as lent memory; None when the plan is done."""
         if self._complete:
             return None
         if self._origin is None:
@@ -142,7 +116,7 @@ class Scan(Closing):
     def close(self) -> None:
         """Lift the body; stop the stage, if it is under way."""
         if self.rig.moving:
-            self.rig.stop()
+            self.rig.stage.stop()
         elif "header" in self.__dict__:  # otherwise it has not moved yet
             self.lift()
 
@@ -156,7 +130,7 @@ class Scan(Closing):
         if kind is None:
             self.close()
         else:
-            self.rig.stop()
+            self.rig.stage.stop()
 
     @property
     def _what(self) -> str:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid, VerticalPlan
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.rig.plans import Plan, Trapezoid, VerticalPlan
+from mirrorskin.hw.stage import Report
 from mirrorskin.io.types import Floats
 
 _LOCK = 8  # of the latest reports, that show how far the way has come
@@ -36,22 +36,13 @@ class Progress:
             return min(
                 max(report.position.travel - self._plan.start, 0.0), self._plan.stop - self._plan.start
             )
-        now = self._near(report.position, self._expected(report.time, self._plan))
+        expected, phase = 0.0, report.position.phase
+        if self._last is not None:  # as planned, but half as far: the body may have rested meanwhile
+            before, way = self._last
+            expected = way + min(self._plan.path.speed * (report.time - before) / 2, math.pi)
+        now = phase + math.tau * round((expected - phase) / math.tau)
         self._last = report.time, now
         return now
-
-    def _expected(self, time: float, plan: AxialPlan) -> float:
-        """Go on as planned from the last report, half as far: the body may have rested meanwhile."""
-        if self._last is None:
-            return 0.0
-        before, way = self._last
-        ahead = min(plan.path.speed * (time - before) / 2, math.pi)
-        return way + ahead
-
-    @staticmethod
-    def _near(position: Position, expected: float) -> float:
-        turns = round((expected - position.phase) / math.tau)
-        return position.phase + math.tau * turns
 
 
 class LiveTrack:
@@ -104,17 +95,9 @@ class Track:
 
     A stage speeds up, keeps its speed and slows down; when, how fast and how quickly comes from all reports
     together, so that the uneven times of single ones hardly count. Where the reports show that it went
-    otherwise, what they agree on is added.
-
-    Attributes
-    ----------
-    began : float
-        When the body began to move, seconds.
-    path : Trapezoid
-        The way as it was gone.
-    reports : int
-    spread : float
-        Standard deviation of the reports about the result, mm or radians.
+    otherwise, what they agree on is added. `times`, (n,), seconds, and `ways`, (n,), mm or radians so far,
+    are of the reports; `path` is the planned way. ``began`` and ``path`` are as fitted; ``spread`` is the
+    standard deviation of the reports about the result, mm or radians.
     """
 
     def __init__(self, times: ArrayLike, ways: ArrayLike, path: Trapezoid) -> None:

@@ -6,10 +6,10 @@ from msgspec import structs
 from rig_fakes import settings
 
 from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan, check_plan
-from mirrorskin.hw.stage import Limits, Position
+from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
-LIMITS = Limits((-5.0, 3.0), math.radians(5), 2.0)
+STAGE = settings().stage  # -5 to 3 mm, press 2 mm, 0.1 rad; 20 mm/s, 20 rad/s, pitch and roll on X and Y
 NAN, INF = math.nan, math.inf
 
 ways = pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_a_rotation_leans_by_its_tilt_towards_each_phase():
 )
 def test_a_plan_beyond_the_limits_is_refused(plan, limit):
     with pytest.raises(InputError, match=limit):
-        plan.check(LIMITS, "stage")
+        check_plan(plan, STAGE, "stage")
 
 
 @pytest.mark.parametrize(
@@ -108,9 +108,6 @@ def test_a_press_that_cannot_be_is_refused(values):
 def test_a_rotation_that_cannot_be_is_refused(values):
     with pytest.raises(InputError):
         AxialPlan(*values)
-
-
-STAGE = settings().stage  # 20 mm/s, 20 rad/s, pitch and roll on X and Y
 
 
 @pytest.mark.parametrize(

@@ -49,13 +49,6 @@ def test_what_lies_beyond_a_limit_is_refused_by_its_name(place, limit):
         LIMITS.check(place, "rig")
 
 
-@pytest.mark.parametrize(("travel", "tilt"), [(5, 0.01), (1, 0.06), (1, -0.06), (-3, 0), (1, math.nan)])
-def test_a_precession_beyond_a_limit_is_refused(travel, tilt):
-    LIMITS.check_precession(1, 0.01, "rig")
-    with pytest.raises(InputError, match=r"^rig: "):
-        LIMITS.check_precession(travel, tilt, "rig")
-
-
 @pytest.mark.parametrize(
     ("place", "excess"),
     [
