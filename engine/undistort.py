@@ -18,18 +18,9 @@ Doubles = NDArray[np.float64]
 
 
 def picture_places(lens: Lens, x: ArrayLike, y: ArrayLike) -> tuple[Doubles, Doubles]:
-    """Return the columns and rows of the picture at which points of the sheet are seen.
+    """Return the columns and rows of the picture, 0 in the first, at which points of the sheet are seen.
 
-    Parameters
-    ----------
-    lens : Lens
-    x, y : array_like, of one shape
-        Millimetres from the middle of the undistorted map, y up.
-
-    Returns
-    -------
-    column, row : ndarray, float64
-        In pixels of the full picture, 0 in the first; NaN where no line of sight leads there.
+    Points are in mm from the middle of the undistorted map, y up; NaN where no line of sight leads there.
     """
     across, up = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     rays = _rays(lens, np.stack([across.ravel(), up.ravel(), np.ones(across.size)]))

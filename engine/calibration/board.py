@@ -28,20 +28,12 @@ _BLOCK = 16  # frames
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """A ChArUco board: a chessboard, black in its upper left corner, with markers in its white squares.
+    """A ChArUco board: a chessboard, black in its upper left corner, with markers in its white squares."""
 
-    Attributes
-    ----------
-    columns, rows : int
-        Squares.
-    square, marker : float
-        Millimetres along an edge.
-    """
-
-    columns: int
+    columns: int  # squares
     rows: int
-    square: float
-    marker: float
+    square: float  # mm along an edge
+    marker: float  # mm
 
     def __post_init__(self) -> None:
         _check(self, min(self.square, self.marker), (self.columns - 1) * (self.rows - 1), "corners")
@@ -128,22 +120,8 @@ def _grid(columns: int, rows: int, pitch: float) -> Doubles:
 def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
     """Paint a board for printing, black on white, with a margin as wide as a square or the pitch.
 
-    Parameters
-    ----------
-    board : Charuco or Dots
-        Markers are those of the family 4X4; dots are half as wide as the pitch.
-    dots_per_inch : float
-        Of the printer.
-
-    Returns
-    -------
-    ndarray, (H, W), uint8
-        Edges lie where they belong to half a pixel.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The details are finer than the pixels.
+    Edges lie where they belong to half a pixel; InputError where details are finer than that. Markers are of
+    the family 4X4; dots are half as wide as the pitch.
 
     Examples
     --------
@@ -209,11 +187,6 @@ def mean_of_still(source: Source) -> NDArray[Any]:
     """Return the mean frame of a recording in which nothing moves, (H, W), uint16 or float32.
 
     What was of 8 bits has 16, and so fractions of a count.
-
-    Raises
-    ------
-    InputError
-        There are no frames, or the picture changes from the first to the last.
     """
     if source.rewindable:
         source.rewind()

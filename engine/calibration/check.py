@@ -57,23 +57,14 @@ class Errors:
 class Check:
     """The errors left on a ball.
 
-    Attributes
-    ----------
-    ball : float
-        Diameter, mm.
-    place : (float, float)
-        Where it was found, mm from the picture's centre.
-    x, y : ndarray, (W,) and (H,), float64
-        Millimetres of the pixel centres.
-    after, before : mapping of str to Errors
-        With the calibration, and with its references and its precession alone: zenith, azimuth, normal (the
-        whole angle) and height of a rotation, height of a press. Before is empty where it is unknown.
+    Of a rotation there are zenith, azimuth, normal (the whole angle) and height, of a press height. Before is
+    with the references and the precession alone, and empty where that is unknown.
     """
 
-    ball: float
-    place: tuple[float, float]
-    x: Doubles
-    y: Doubles
+    ball: float  # diameter, mm
+    place: tuple[float, float]  # where it was found, mm from the picture's centre
+    x: Doubles  # (W,): mm
+    y: Doubles  # (H,): mm
     after: dict[str, Errors]
     before: dict[str, Errors] = field(default_factory=dict)
 
@@ -127,24 +118,8 @@ def check_ball(
     maps differ from a ball of that size. Heights of a rotation are relative: their mean difference is taken
     off. Those of a press have the bias of the top, which is that of the travel's zero as well.
 
-    Parameters
-    ----------
-    source : Source
-        A press on the ball, or a rotation; rewindable.
-    calibration : Calibration
-        With a zenith for a rotation.
-    ball : float
-        Diameter, mm.
-    cells : int
-        Into how many parts a side the field is cut.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The recording cannot be read twice or shows too little of a ball, or the calibration lacks what is to
-        be checked.
+    The ``source`` is rewindable, ``ball`` a diameter, mm; the field is cut into ``cells`` parts a side.
+    InputError where too little of the ball is seen, or the calibration lacks what is to be checked.
     """
     if source.motion not in ("axial", "vertical"):
         raise InputError(f"{source.name} is of {source.motion} motion: check with a press or a rotation")

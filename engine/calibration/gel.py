@@ -105,21 +105,9 @@ class BallOnset:
 
 
 def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
-    """Return when pixels turned light in the uncorrected reconstruction of a ball's press.
+    """Return when pixels turned light in the uncorrected reconstruction of a ball's press; radius in mm.
 
-    Parameters
-    ----------
-    result : Result
-        With height, its sigma and status.
-    source : Source
-        Which has the pixels' size.
-    radius : float
-        Of the ball, mm.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        It is no press, has no pixel size, or less than 50 pixels turned light.
+    InputError where it is no press, has no pixel size, or less than 50 pixels turned light.
     """
     from scipy import ndimage
 
@@ -181,21 +169,9 @@ def fit_gel(
     known in closed form of a ball (`sphere_slope`). Found are the threshold on the wall's axis, the wall's
     curvature, the stage's compliance, and of each press the ball's place and the travel at which it was met,
     by robust least squares over all pixels. Compliance and curvature that are not determined are 0. The
-    ball's height over the stage's zero and that zero are one number.
-
-    Parameters
-    ----------
-    presses : sequence of BallOnset
-        One or more; different balls, or places, determine more.
-    axis : (float, float)
-        Where the wall's axis meets the picture, mm.
-    sheet : float
-        Thickness of what lies between the mirror and the ball, mm.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There is no press, or the presses do not determine the threshold.
+    ball's height over the stage's zero and that zero are one number. ``axis`` is the wall's in the picture,
+    and ``sheet`` the thickness of what lies between mirror and ball, mm. More presses, of different balls or
+    places, determine more; InputError where they do not determine the threshold.
     """
     if not presses:
         raise InputError("a gel is learned from a ball: give at least one press")

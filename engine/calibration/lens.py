@@ -37,48 +37,20 @@ _RIM = 8  # directions in which a dot's rim is looked at
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """A lens, and how well it is known.
-
-    Attributes
-    ----------
-    lens : Lens
-    marks : tuple of int
-        How many marks were found in each picture.
-    errors : tuple of float
-        RMS distance, pixels, of each picture's marks from where the fit has them.
-    worst : float
-        The largest distance of all, pixels.
-    corner_sigma : float
-        Standard error, pixels, of where the map is seen nine tenths of the way to its corners; NaN where that
-        is not seen. Pictures with the board near the corners make it less.
-    """
+    """A lens, and how well it is known."""
 
     lens: Lens
-    marks: tuple[int, ...]
-    errors: tuple[float, ...]
-    worst: float
-    corner_sigma: float
+    marks: tuple[int, ...]  # found in each picture
+    errors: tuple[float, ...]  # RMS distance of each picture's marks from where the fit has them, pixels
+    worst: float  # largest distance of all, pixels
+    corner_sigma: float  # standard error of the map 9/10 of the way to its corners, pixels; NaN if not seen
 
 
 def calibrate_lens(pictures: Sequence[tuple[str, NDArray[Any]]], board: Board) -> LensFit:
     """Find a camera's scale and distortion from pictures of one board on the sheet.
 
-    Parameters
-    ----------
-    pictures : sequence of (str, ndarray)
-        Names for messages, and pictures, (H, W), uint8, uint16 or float32, all of one size. In each the board
-        lies flat on the sheet, anywhere and turned in any way.
-    board : Charuco or Dots
-
-    Returns
-    -------
-    LensFit
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The board is not found in a picture, or too little of it; it is of another kind, or does not lie on
-        one plane; pictures of different sizes.
+    The named ``pictures``, (H, W), uint8, uint16 or float32, are of one size; in each the board lies flat on
+    the sheet, anywhere and turned in any way. InputError where it is not found, or of another kind.
     """
     if not pictures:
         raise InputError("there is no picture of a board: give at least one")

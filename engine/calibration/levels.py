@@ -74,25 +74,13 @@ class Moments:
 
 
 class Level(NamedTuple):
-    """A level of each pixel; all (H, W), float64.
+    """A level of each pixel; all (H, W), float64."""
 
-    Attributes
-    ----------
-    value, sigma : ndarray
-        Counts, and the standard error; NaN without an answer.
-    noise : ndarray
-        Usual standard deviation of a sample at this level, before clipping, counts.
-    excess : ndarray
-        The pixel's own variance in units of the usual one at its level.
-    clipped : ndarray
-        Share of the samples at the end of the scale.
-    """
-
-    value: Floats
-    sigma: Floats
-    noise: Floats
-    excess: Floats
-    clipped: Floats
+    value: Floats  # counts; NaN without an answer
+    sigma: Floats  # standard error of the value, counts
+    noise: Floats  # usual standard deviation of a sample at this level, before clipping, counts
+    excess: Floats  # the pixel's own variance in units of the usual one at its level
+    clipped: Floats  # share of the samples at the end of the scale
 
 
 def level_above(moments: Moments, floor: float | None) -> Level:

@@ -31,27 +31,13 @@ _FAINT = 3.0  # counts, of a contrast of 255: the least standard deviation near 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marks:
-    """Marks of a board that were found in a picture.
+    """Marks of a board that were found in a picture."""
 
-    Attributes
-    ----------
-    name : str
-        Of the picture, for messages.
-    shape : (int, int)
-        Its rows and columns.
-    board : ndarray, (n, 2), float64
-        Where they are on the board, mm from its middle, y up.
-    places : ndarray, (n, 2), float64
-        Where they are seen: column and row, 0 in the first.
-    radius : float
-        Of dots, mm; 0 of corners.
-    """
-
-    name: str
-    shape: tuple[int, int]
-    board: Doubles
-    places: Doubles
-    radius: float = 0.0
+    name: str  # of the picture, for messages
+    shape: tuple[int, int]  # its rows and columns
+    board: Doubles  # (n, 2): where they are on the board, mm from its middle, y up
+    places: Doubles  # (n, 2): where they are seen, column and row, 0 in the first
+    radius: float = 0.0  # of dots, mm; 0 of corners
 
 
 def stretch_contrast(picture: NDArray[Any], name: str) -> Doubles:

@@ -46,29 +46,14 @@ _FULL = 0.1  # share of clipped samples of a saturated pixel
 
 @dataclass(frozen=True, slots=True)
 class LevelReport:
-    """How well a level was measured.
+    """How well a level was measured, counts; noise and sigma are those of the median pixel."""
 
-    Attributes
-    ----------
-    frames : int
-        Of all recordings together.
-    noise, sigma : float
-        Standard deviation of a sample and standard error of the reference, counts; of the median pixel.
-    rounding : float
-        The part of the error that no number of frames averages out, counts.
-    drift : float
-        Mean of the last half of the frames minus that of the first half, counts, of the middle half of the
-        pixels. NaN where pixels are in full light only now and then.
-    clipped : int
-        Pixels with samples on the end of the camera's scale, whose mean had to be corrected.
-    """
-
-    frames: int
-    noise: float
-    sigma: float
-    rounding: float
-    drift: float
-    clipped: int
+    frames: int  # of all recordings together
+    noise: float  # standard deviation of a sample
+    sigma: float  # standard error of the reference
+    rounding: float  # the part of that which no number of frames averages out
+    drift: float  # mean of the second half of the frames less that of the first; NaN for a rolled ball
+    clipped: int  # pixels with samples on the end of the camera's scale, whose mean was corrected
 
     def missing(self, noise: float) -> int | None:
         """Return how many more frames a standard error of so many counts needs; None if no number does."""
@@ -98,26 +83,10 @@ def measure_references(
 ) -> Measured:
     """Measure the dark and bright references of a camera, their errors, and its defective pixels.
 
-    Parameters
-    ----------
-    dark : sequence of Source
-        Frames of a sheet that touches nothing.
-    bright : sequence of Source
-        Frames in full light.
-    rolled : bool
-        Whether each pixel is in full light in some of the bright frames only, as a ball was rolled about.
-        The frames are then read once for every 256 MB of them.
-    progress : callable, optional
-        Called with the number of frames so far.
-
-    Returns
-    -------
-    Measured
-
-    Raises
-    ------
-    InputError
-        The frames are of different cameras, too few, not of steady light, or not brighter than the dark ones.
+    ``dark`` frames are of a sheet that touches nothing, ``bright`` ones of full light, where ``rolled`` says
+    that a ball was rolled about and each pixel is in full light in some of them only: they are then read once
+    for every 256 MB. ``progress`` is called with the number of frames so far. InputError where the frames are
+    of different cameras, too few, not of steady light, or not brighter than the dark ones.
     """
     _check_alike([*dark, *bright])
     reader = _Reader(progress)

@@ -46,20 +46,11 @@ _STILL = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrecessionFit:
-    """A precession, and how it was found.
-
-    Attributes
-    ----------
-    precession : Precession
-    residual : mapping of str to float
-        RMS residuals: ``place`` and ``depth`` of balls, mm, and ``zenith`` of plates, radians.
-    notes : tuple of str
-        Assumptions that were made, and what is not determined; sentences.
-    """
+    """A precession, and how it was found."""
 
     precession: Precession
-    residual: dict[str, float]
-    notes: tuple[str, ...]
+    residual: dict[str, float]  # RMS: ``place`` and ``depth`` of balls, mm; ``zenith`` of plates, radians
+    notes: tuple[str, ...]  # assumptions that were made, and what is not determined; sentences
 
 
 def fit_precession(
@@ -77,18 +68,8 @@ def fit_precession(
     the mean pose is taken for upright.
 
     Weighted least squares; standard errors are those of the residuals, never below the tracks' own.
-
-    Parameters
-    ----------
-    balls, plates
-        See `track_ball` and `track_plate`; one ball at least.
-    depth_sigma : float
-        Common error of all depths, mm, which adds to that of the pivot's height.
-
-    Raises
-    ------
-    InputError
-        Tilt or phase are not determined. A pivot that is not determined is NaN.
+    ``depth_sigma``, mm, is a common error of all depths, which adds to that of the pivot's height. InputError
+    where tilt or phase are not determined; a pivot that is not determined is NaN.
     """
     if not balls:
         swing = max((_swing(track) for track in plates), default=math.nan)

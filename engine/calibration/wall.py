@@ -99,27 +99,19 @@ def fit_zenith(
         At least five, better nine, spread over the field; read one after the other, once.
     ball : float
         Radius of the ball, mm.
-    references : References, optional
-        Dark and bright; by default each recording's own.
-    precession : Precession, optional
-        The calibrated rotation; by default the tilt and the pivot of the recordings.
+    references, precession : optional
+        Calibrated ones; by default the levels, tilt and pivot of each recording.
     pattern : {"graded", "uniform"}
         Whether the wall's brightness changes with its height.
     body : (float, float)
-        Nominal radius of the body and height of the wall, mm: the fit begins with them, and they count as
-        known within a tenth.
+        Nominal radius of the body and height of the wall, mm, known within a tenth: the fit begins there.
     progress : callable, optional
         Called with the number of presses read so far.
-
-    Returns
-    -------
-    WallResponse
 
     Raises
     ------
     InputError
-        There are too few presses, one lacks what is needed or shows no ball, or one does not fit to the
-        others; the message names it.
+        There are too few presses, or the one that is named shows no ball or does not fit to the others.
     """
     _check(presses, ball, pattern, body)
     read = []

@@ -64,24 +64,10 @@ def threshold_zenith(
     *,
     z: ArrayLike = 0.0,
 ) -> Doubles:
-    """Return the least zenith at which a pixel gets so much light, radians.
+    """Return the least zenith at which pixels get so much light, radians; NaN where none up to 45 deg does.
 
-    Parameters
-    ----------
-    response : WallResponse
-    x, y : array_like
-        Where the pixel looks on the rest plane, mm.
-    azimuth : array_like
-        Of the mirror's normal, radians.
-    threshold : float
-        Share of the pixel's own full light.
-    z : array_like
-        Height of the mirror above the rest plane, mm.
-
-    Returns
-    -------
-    ndarray, float64
-        Shaped as the arguments broadcast; NaN where no zenith up to 45 degrees gets so much light.
+    Pixels look at ``x`` and ``y`` on the rest plane, mm, at mirrors of this height ``z``, mm, whose normals
+    have this ``azimuth``; ``threshold`` is a share of their own full light. All arguments broadcast.
     """
     given = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z, azimuth)))
     *place, turn = (value.ravel() for value in given)

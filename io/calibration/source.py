@@ -69,22 +69,9 @@ def check_camera(
     what: str,
     remedy: str = "calibrate again, or give that camera's",
 ) -> None:
-    """Refuse a calibration of another camera.
+    """Refuse a calibration of another camera: by name (empty: any), size of the picture or type of sample.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    camera : CameraId
-        That it is to be used for; one without a name may be any.
-    what : str
-        What to call that in the message.
-    remedy : str, optional
-        The end of the message.
-
-    Raises
-    ------
-    InputError
-        Name, size of the picture or type of its samples differ.
+    ``what`` the camera is of, and the ``remedy``, go into the message.
     """
     mine, differences = calibration.camera, []
     if mine.name and camera.name and mine.name != camera.name:
