@@ -2,7 +2,6 @@
 //
 // TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 // ONE      1 where all that is answered hangs together: labels are then not read
-// HEIGHTS  0 none known, 1 known with the same weight everywhere, 2 with a map of weights
 //
 // PoCL makes vector code of loops without branches.
 
@@ -31,20 +30,9 @@ float chosen(const int which, const float one, const float other)
 }
 
 // What is averaged: heights, or by how much they are above those that are known.
-#if HEIGHTS == 0
-#define HEIGHT_MAPS
-#define SHARE(p) (ANSWERED(p) ? 1.0f : 0.0f)
-#define VALUE(p, column) RISEN(p, column)
-#else
-#define VALUE(p, column) (RISEN(p, column) - heights[p])
-#if HEIGHTS == 1
-#define HEIGHT_MAPS MAP heights,
-#define SHARE(p) ((flags[p] & KNOWN) ? 1.0f : 0.0f)
-#else
-#define HEIGHT_MAPS MAP heights, MAP height_weights,
-#define SHARE(p) chosen(flags[p] & KNOWN, height_weights[p], 0.0f)
-#endif
-#endif
+#define SHARE(p) (heights ? chosen(flags[p] & KNOWN, height_weights ? height_weights[p] : 1.0f, 0.0f) \
+                          : chosen(ANSWERED(p), 1.0f, 0.0f))
+#define VALUE(p, column) (heights ? RISEN(p, column) - heights[p] : RISEN(p, column))
 
 #define ADD(sum, total, p, column) {                                                                   \
     const float share = SHARE(p), value = share * VALUE(p, column);                                    \
@@ -55,8 +43,8 @@ float chosen(const int which, const float one, const float other)
 // Each item sums over its rows, into its own row of the sums.
 __kernel void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    MAP relief, const float plane_x, const float plane_y, const float plane_z, HEIGHT_MAPS const int strip,
-    const int pieces, OUT sums, OUT totals)
+    MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
+    const int strip, const int pieces, OUT sums, OUT totals)
 {
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;

@@ -281,7 +281,7 @@ class Levelling:
         sizes = {"live sums": strips * count, "live totals": strips * count, "live offsets": count}
         sums, totals, offsets = (self._array(name, (size,), or_more=True) for name, size in sizes.items())
         self._sum(relief, plane, {}, sums, totals)
-        kernel, moved = self._device.kernel("components", "components_level"), 8 * strips * count
+        kernel, moved = self._device.kernel("components", "components_level", ONE=0), 8 * strips * count
         kernel(count, strips=strips, count=count, sums=sums, totals=totals, offsets=offsets, moved=moved)
         height = self._array("live heights", self._graph.shape)
         self._add(relief, plane, offsets, height)
@@ -298,7 +298,8 @@ class Levelling:
     def _sum(self, relief: Array, plane: Plane, maps: dict[str, Array], sums: Array, totals: Array) -> None:
         strip, strips = self._strips()
         outputs = {"strip": strip, "pieces": self._of.count, "sums": sums, "totals": totals}
-        self._run("components_sum", strips, relief, plane, {"HEIGHTS": len(maps)}, **maps, **outputs)
+        given = {"heights": None, "height_weights": None, **maps}
+        self._run("components_sum", strips, relief, plane, **given, **outputs)
 
     def _strips(self) -> tuple[int, int]:
         """Return the rows of a strip of the picture that is summed on its own, and how many there are."""
@@ -309,8 +310,7 @@ class Levelling:
     def _add(self, relief: Array, plane: Plane, offsets: Array, height: Array) -> None:
         rows, columns = self._graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
-        macros = {"HEIGHTS": 0}
-        self._run("components_settle", items, relief, plane, macros, offsets=offsets, height=height)
+        self._run("components_settle", items, relief, plane, offsets=offsets, height=height)
 
     @property
     def _of(self) -> Components:
@@ -326,13 +326,11 @@ class Levelling:
         self._arrays[name].upload()
         return self._arrays[name]
 
-    def _run(
-        self, name: str, items: int, relief: Array, plane: Plane, macros: dict[str, int], **arguments: Any
-    ) -> None:
+    def _run(self, name: str, items: int, relief: Array, plane: Plane, **arguments: Any) -> None:
         one = self._of.count == 1
         labels = self._graph.flags if one or self._labels is None else self._labels
         (rows, columns), steps = self._graph.shape, self._graph.steps(plane)
-        kernel = self._device.kernel("components", name, ONE=int(one), **macros)
+        kernel = self._device.kernel("components", name, ONE=int(one))
         arguments |= dict(zip(("plane_x", "plane_y", "plane_z"), steps, strict=True))
         arguments |= {"flags": self._graph.flags, "labels": labels, "relief": relief}
         kernel(items, rows=rows, columns=columns, **arguments, moved=2 * relief.host.nbytes)

@@ -80,7 +80,7 @@ def test_offsets_bring_means_to_0(device, pieces):
     totals[:, -1] = 0
     offsets = device.given("offsets", np.full(pieces, 9.0))
     given = [device.given(name, values) for name, values in (("sums", sums), ("totals", totals))]
-    kernel = device.kernel("components", "components_level", ONE=0, HEIGHTS=0)
+    kernel = device.kernel("components", "components_level", ONE=0)
     launch(kernel, pieces, 9, pieces, *given, offsets)
     expected = components.components_level(sums, totals)
     np.testing.assert_allclose(offsets.download(), expected, rtol=1e-5, atol=1e-6)
