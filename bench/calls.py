@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin import engine
 from mirrorskin.bench.files import make_press, make_turns, new_folder, record
@@ -25,8 +26,8 @@ from mirrorskin.bench.limits import Limits
 from mirrorskin.bench.scenes import (
     PIXEL,
     SCALES,
+    STEPS,
     TILT,
-    Shape,
     blob_mask,
     fill_press,
     fill_turns,
@@ -39,46 +40,47 @@ from mirrorskin.bench.scenes import (
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 
-_HD, _VGA, _TINY = (1080, 1920), (480, 640), (48, 64)
+Shape = tuple[int, int, int]
+Run = Callable[[Device, bool], Case]
+
+_HD, _VGA, _TINY = (1080, 1920), (480, 640), (8, 48, 64)
+_PRESS = 30  # frames of a press that is reconstructed
 _ROUNDS = 7
 _ROOM = 200  # bytes of a pixel for maps and what is kept
 _BYTE = np.dtype(np.uint8)
 
 
-def run_onset(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+def run_onset(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     """Time `find_onset` with references of each pixel."""
-    frames = np.empty((count, *shape), np.uint8)
-    fill_press(frames)
-    dark, bright = references(shape, _BYTE)
-    travel = travel_of(count)
-    call = partial(engine.find_onset, frames, travel, dark=dark, bright=bright, device=device)
-    works = {"find_onset": call}
-    return _run(name, f"onset of {_size(frames.shape)}, references", works, frames.nbytes, device, quick)
+    frames = _frames(name, shape, fill_press)
+    dark, bright = references(shape[1:], _BYTE)
+    call = partial(engine.find_onset, frames, travel_of(shape[0]), dark=dark, bright=bright, device=device)
+    title = f"onset of {_size(shape)}, references"
+    return _run(name, title, {"find_onset": call}, frames.nbytes, device, quick)
 
 
-def run_normals(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+def run_normals(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     """Time `estimate_normals` of one turn."""
-    frames = np.empty((count, *shape), np.uint8)
-    fill_turns(frames)
+    frames = _frames(name, shape, fill_turns)
     offset, gain, _ = SCALES["uint8"]
     known: dict[str, Any] = {"tilt": TILT, "gain": gain, "offset": offset, "noise": turn_noise(_BYTE)}
-    call = partial(engine.estimate_normals, frames, phases(count), device=device, **known)
-    works = {"estimate_normals": call}
-    return _run(name, f"normals of {_size(frames.shape)}", works, frames.nbytes, device, quick)
+    call = partial(engine.estimate_normals, frames, phases(shape[0]), device=device, **known)
+    title = f"normals of {_size(shape)}"
+    return _run(name, title, {"estimate_normals": call}, frames.nbytes, device, quick)
 
 
-def run_correlate(name: str, count: int, shape: Shape, device: Device, quick: bool) -> Case:
+def run_correlate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     """Time `correlate`."""
-    frames = np.empty((count, *shape), np.uint8)
-    fill_turns(frames)
-    works = {"correlate": partial(engine.correlate, frames, phases(count), device=device)}
-    return _run(name, f"wave of {_size(frames.shape)}", works, frames.nbytes, device, quick)
+    frames = _frames(name, shape, fill_turns)
+    call = partial(engine.correlate, frames, phases(shape[0]), device=device)
+    return _run(name, f"wave of {_size(shape)}", {"correlate": call}, frames.nbytes, device, quick)
 
 
 def run_integrate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     """Time `integrate` of a full picture and within a mask, with standard deviations and without."""
-    dz_dx, dz_dy = noisy_slopes(shape)
-    mask = blob_mask(shape)
+    picture = shape[1:]
+    dz_dx, dz_dy = noisy_slopes(picture)
+    mask = blob_mask(picture)
     call = partial(engine.integrate, dz_dx, dz_dy, PIXEL, device=device)
     works = {
         "integrate": partial(call, sigma=False),
@@ -86,8 +88,15 @@ def run_integrate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
         "integrate within a mask": partial(call, mask=mask, sigma=False),
         "integrate within a mask, sigma": partial(call, mask=mask, sigma=True),
     }
-    title = f"heights of slopes of {shape[0]} x {shape[1]}"
+    title = f"heights of slopes of {picture[0]} x {picture[1]}"
     return _run(name, title, works, 3 * dz_dx.nbytes, device, quick)
+
+
+def _frames(name: str, shape: Shape, fill: Callable[[NDArray[Any]], None]) -> NDArray[np.uint8]:
+    check_memory(name, (4 * shape[0] + _ROOM) * math.prod(shape[1:]))
+    frames = np.empty(shape, np.uint8)
+    fill(frames)
+    return frames
 
 
 def _run(
@@ -100,16 +109,16 @@ def _run(
     return Case(name, title, [*limits.rows(measured), *rows], {}, tuple(map(_parts, rows)))
 
 
-def run_reconstruct(name: str, counts: tuple[int, int], shape: Shape, device: Device, quick: bool) -> Case:
+def run_reconstruct(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     """Time the command ``mirrorskin reconstruct`` of a press and of a turn, from process start to end."""
     offset, gain, _ = SCALES["uint8"]
     known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "pixel_size": (0.03, 0.03)}
     sources = {
-        f"press of {counts[0]}": make_press((counts[0], *shape), pixels=True),
-        f"turn of {counts[1]}": make_turns((counts[1], *shape), **known),
+        f"press of {_PRESS}": make_press((_PRESS, *shape[1:]), pixels=True),
+        f"turn of {STEPS}": make_turns((STEPS, *shape[1:]), **known),
     }
     rows = []
-    with new_folder(name, 4 * sum(counts) * math.prod(shape)) as folder:
+    with new_folder(name, 4 * (_PRESS + STEPS) * math.prod(shape[1:])) as folder:
         for number, (what, source) in enumerate(sources.items()):
             path = folder / f"{number}.h5"
             record(source, path)
@@ -120,7 +129,7 @@ def run_reconstruct(name: str, counts: tuple[int, int], shape: Shape, device: De
             rows.append(
                 Row(f"{OURS}, reconstruct, {what}", measured, math.prod(source.shape), source.shape[0])
             )
-    title = f"the command reconstruct on {shape[0]} x {shape[1]} uint8, caches of kernels full"
+    title = f"the command reconstruct on {shape[1]} x {shape[2]} uint8, caches of kernels full"
     return Case(name, title, rows, {}, tuple(map(_parts, rows)))
 
 
@@ -180,41 +189,21 @@ def _size(shape: tuple[int, ...]) -> str:
     return f"{' x '.join(map(str, shape))} uint8"
 
 
-def _stack(
-    name: str, run: Callable[[str, int, Shape, Device, bool], Case], count: int, small: int
-) -> dict[str, Callable[[Device, bool], Case]]:
-    """Return a call on frames of both sizes."""
-
-    def sized(title: str, frames: int, shape: Shape, device: Device, quick: bool) -> Case:
-        shape, frames = (_TINY, 8) if quick else (shape, frames)
-        check_memory(title, (4 * frames + _ROOM) * math.prod(shape))
-        return run(title, frames, shape, device, quick)
-
-    both = {name: (count, _HD), f"{name}-small": (small, _VGA)}
-    return {title: partial(sized, title, frames, shape) for title, (frames, shape) in both.items()}
+def _case(name: str, run: Callable[[str, Shape, Device, bool], Case], shape: Shape) -> Run:
+    return lambda device, quick: run(name, _TINY if quick else shape, device, quick)
 
 
-def _map(
-    name: str, run: Callable[[str, Shape, Device, bool], Case], shape: Shape, small: Shape
-) -> dict[str, Callable[[Device, bool], Case]]:
-    """Return a call on maps of both sizes."""
-
-    def sized(title: str, shape: Shape, device: Device, quick: bool) -> Case:
-        return run(title, _TINY if quick else shape, device, quick)
-
-    return {title: partial(sized, title, size) for title, size in ((name, shape), (f"{name}-small", small))}
-
-
-def _commands(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    return run_reconstruct(name, (30, 8), shape, device, quick)
-
-
+_CALLS: tuple[tuple[str, Callable[[str, Shape, Device, bool], Case], Shape, Shape], ...] = (
+    ("call-onset", run_onset, (64, *_HD), (16, *_VGA)),
+    ("call-normals", run_normals, (8, *_HD), (8, *_VGA)),
+    ("call-correlate-8", run_correlate, (8, *_HD), (8, *_VGA)),
+    ("call-correlate-64", run_correlate, (64, *_HD), (64, *_VGA)),
+    ("call-integrate", run_integrate, (1, 1024, 1024), (1, 256, 256)),
+    ("call-reconstruct", run_reconstruct, (1, 480, 480), (1, 120, 120)),
+)
 CASES: Cases = {
-    **_stack("call-onset", run_onset, 64, 16),
-    **_stack("call-normals", run_normals, 8, 8),
-    **_stack("call-correlate-8", run_correlate, 8, 8),
-    **_stack("call-correlate-64", run_correlate, 64, 64),
-    **_map("call-integrate", run_integrate, (1024, 1024), (256, 256)),
-    **_map("call-reconstruct", _commands, (480, 480), (120, 120)),
-    "call-import": run_import,
+    name + size: _case(name + size, run, shape)
+    for name, run, *shapes in _CALLS
+    for size, shape in zip(("", "-small"), shapes, strict=True)
 }
+CASES["call-import"] = run_import

@@ -182,16 +182,6 @@ def take_turns(
     """Time several works, each once a round, after one warm-up that does not count.
 
     A work that has taken 10 s in all and had three turns leaves the remaining rounds to the others.
-
-    Parameters
-    ----------
-    works : mapping of str to callable
-        Each does its whole work and waits for it.
-    rounds : int
-    profile : Profile
-        Of the device that the works use; it is cleared.
-    check : callable
-        Takes what each work returned in the warm-up, and raises where that is wrong; nothing is timed before.
     """
     firsts = {name: _turn(work, profile) for name, work in works.items()}
     check({name: first.result for name, first in firsts.items()})
@@ -262,20 +252,7 @@ def agree(
     spared: int = 0,
     whose: str = OURS,
 ) -> None:
-    """Raise DisagreementError unless maps are the expected ones, NaN where those are NaN.
-
-    Parameters
-    ----------
-    name : str
-        Of the work that is checked.
-    found, expected : mapping of str to ndarray
-    tolerance : mapping of str to float or ndarray, optional
-        By how much each map may differ; by nothing where it is not named.
-    spared : int
-        Pixels that may differ by more: where rounding decides between two answers.
-    whose : str
-        Whose maps are expected.
-    """
+    """Raise DisagreementError unless maps are the expected ones, NaN where those are NaN."""
     for word, right in expected.items():
         if word not in found:
             raise DisagreementError(f"{name}: there is no {word}; nothing was timed")

@@ -39,22 +39,6 @@ class Paced(Closing):
     A read waits for the next frame, and takes those with it that have come since the read before. They are
     copied to a ring, as a camera does it, and lent. A reader that is late by more than the ring holds loses
     the oldest of them, and `Block.dropped` says how many.
-
-    Parameters
-    ----------
-    frames : ndarray, (n, H, W)
-    order : callable
-        Returns which of them frames of the source show: of numbers, (k,), numbers from 0 to n - 1.
-    header : Header
-    places : callable
-        Returns where the body is in frames, (k,) float64: travel, or phase.
-    rate : float
-        Frames a second.
-    count : int
-    slots : int
-        Of the ring.
-    clock, sleep : callable
-        Return the seconds, and let some pass.
     """
 
     name, rewindable = "memory", False

@@ -31,9 +31,10 @@ from mirrorskin.engine import OnsetSearch
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.onset import onset_levels
+from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels
 
 Maps = dict[str, NDArray[Any]]
+Flags = NDArray[np.uint8]
 Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
 
 _HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
@@ -43,7 +44,7 @@ _MAPS = 64  # bytes a pixel for all maps
 _PLATEAU, _SURELY = (
     3.0,
     6.0,
-)  # sigmas a sample may be off its plateau, and below the level that are surely dark
+)  # sigmas off its plateau, and below the level, at which a sample is dark
 # Threads of ours, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
 # core, as most people use it; PyTorch has threads of its own.
 _TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
@@ -149,12 +150,13 @@ FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
 
 def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]) -> dict[str, Work]:
     known, absent = case.known, missing("torch", "numba")
-    peers: dict[str, FirstLight] = {"NumPy": first_light, "OpenCV": _opencv}
+    peers: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
     if "torch" not in absent and not case.full:  # heights would be NumPy's, as OpenCV's are
         peers["PyTorch"] = _torch
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
     works: dict[str, Work] = {}
-    for name, find in peers.items():
+    for name, library in peers.items():
+        find = functools.partial(_first_light, library)
         if case.full:
             works[name] = functools.partial(_heights, _TILES[name], find, frames, travel, known, noise)
         else:
@@ -208,78 +210,73 @@ def _heights(
     return {"height": height, "sigma": sigma, "status": status}
 
 
-def first_light(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Count with NumPy the frames that leave a pixel undecided; see `FirstLight`."""
+def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Count with a library the frames that leave a pixel undecided; see `FirstLight`."""
     shape = frames.shape[1:]
-    undecided, few, onset = np.ones(shape, bool), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
-    for number, dark in enumerate(_dark_frames(frames, hold, lambda f, out: np.less(f, light, out=out)), 1):
-        np.logical_and(undecided, dark, out=undecided)
-        np.add(few, undecided.view(np.uint8), out=few)
-        if number % _COUNTABLE == 0 or number == len(frames):
-            onset += few
-            few[:] = 0
-    onset[undecided] = -1
-    return onset
-
-
-def _opencv(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Do the same with OpenCV."""
-    import cv2
-
-    shape = frames.shape[1:]
-    level: Any = light if light.ndim else float(light)
+    less, count = library(light)
     undecided, few = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
     onset = np.zeros(shape, np.int32)
-    ones = np.ones(shape, np.uint8)
-
-    def less(frame: NDArray[Any], out: NDArray[Any]) -> None:
-        cv2.compare(frame, level, cv2.CMP_LT, dst=out.view(np.uint8))
-
     for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
-        cv2.bitwise_and(undecided, dark.view(np.uint8), dst=undecided)
-        cv2.add(few, cv2.bitwise_and(undecided, ones), dst=few)
+        count(undecided, dark, few)
         if number % _COUNTABLE == 0 or number == len(frames):
             onset += few
             few[:] = 0
-    onset[undecided != 0] = -1
+    onset[undecided != 0] = DARK
     return onset
 
 
-def _torch(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Do the same with PyTorch on the host."""
-    import torch
-
-    torch.set_num_threads(THREADS)
-    level: Any = torch.from_numpy(light) if light.ndim else light.item()
-    shape = frames.shape[1:]
-    undecided, few, onset = np.ones(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
-
-    def less(frame: NDArray[Any], out: NDArray[Any]) -> None:
-        torch.lt(torch.from_numpy(frame), level, out=torch.from_numpy(out.view(np.uint8)))
-
-    for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
-        torch.from_numpy(undecided).bitwise_and_(torch.from_numpy(dark.view(np.uint8)))
-        torch.from_numpy(few).add_(torch.from_numpy(undecided))
-        if number % _COUNTABLE == 0 or number == len(frames):
-            onset += few
-            few[:] = 0
-    onset[undecided != 0] = -1
-    return onset
-
-
-def _dark_frames(
-    frames: NDArray[Any], hold: int, less: Callable[[NDArray[Any], NDArray[Any]], object]
-) -> Iterator[NDArray[np.bool_]]:
+def _dark_frames(frames: NDArray[Any], hold: int, less: Less) -> Iterator[Flags]:
     """Yield for each frame where no run of `hold` light frames begins, in a mask that is used again."""
-    dark, after = np.empty(frames.shape[1:], bool), np.empty(frames.shape[1:], bool)
+    dark, after = np.empty((2, *frames.shape[1:]), np.uint8)
     less(frames[0], dark)
     for frame in frames[1:]:
         less(frame, after)
         if hold == 2:
-            np.bitwise_or(dark.view(np.uint8), after.view(np.uint8), out=dark.view(np.uint8))
+            np.bitwise_or(dark, after, out=dark)
         yield dark
         dark, after = after, dark
     yield dark
+
+
+Less = Callable[[NDArray[Any], Flags], object]
+Count = Callable[[Flags, Flags, Flags], None]
+Library = Callable[[Levels], tuple[Less, Count]]
+"""Levels to two functions that work in place: `less` makes a mask of where a frame is below them, 1 or 255,
+and `count` takes what is not in a mask from the undecided pixels, and adds 1 to the counts of the rest."""
+
+
+def _numpy(light: Levels) -> tuple[Less, Count]:
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        np.bitwise_and(undecided, dark, out=undecided)
+        np.add(few, undecided, out=few)
+
+    return lambda frame, out: np.less(frame, light, out=out.view(bool)), count
+
+
+def _opencv(light: Levels) -> tuple[Less, Count]:
+    import cv2
+
+    level: Any = light if light.ndim else float(light)
+
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        cv2.bitwise_and(undecided, dark, dst=undecided)
+        cv2.add(few, cv2.min(undecided, 1.0), dst=few)  # type: ignore[call-overload]
+
+    return lambda frame, out: cv2.compare(frame, level, cv2.CMP_LT, dst=out), count
+
+
+def _torch(light: Levels) -> tuple[Less, Count]:
+    import torch
+
+    torch.set_num_threads(THREADS)
+    tensor = torch.from_numpy
+    level: Any = tensor(light) if light.ndim else light.item()
+
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        tensor(undecided).bitwise_and_(tensor(dark))
+        tensor(few).add_(tensor(undecided))
+
+    return lambda frame, out: torch.lt(tensor(frame), level, out=tensor(out)), count
 
 
 def _answer(
@@ -290,35 +287,22 @@ def _answer(
     noise: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return height, sigma and status of onsets in NumPy: the full default, decision 2."""
-    dead = np.isnan(known.level)
-    status = np.select([dead, onset == -1, onset == 0], [0, 2, 3], 1).astype(np.uint8)
+    status = np.select([np.isnan(known.level), onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
     row, column = found = np.nonzero(status == 1)
-    start = onset[found].astype(np.intp)
-    level, light = known.level[found], known.light[found]
-
+    start, level, light = onset[found].astype(np.intp), known.level[found], known.light[found]
     surely = level - np.float32(_SURELY * noise)
     below, todo = start - 1, np.arange(len(start))  # back to the last frame that was surely dark
     while len(todo := todo[below[todo] > 0]):
         sample = frames[below[todo], row[todo], column[todo]]
         todo = todo[~((sample < light[todo]) & (sample <= surely[todo]))]
         below[todo] -= 1
-
-    low, high = (frames[start - 1 + k, row, column].astype(np.float64) for k in (0, 1))
-    last = len(frames) - 1
-    after = np.fmin(*(frames[np.minimum(start + k, last), row, column] for k in (1, 2)))
-    sudden_step = _PLATEAU * noise * np.sqrt(2)
-    step = high - low
-    share = (np.minimum(level, high) - low) / step
-    width = travel[start] - travel[start - 1]
-    from_dark, to_light = low <= known.dark[found] + _PLATEAU * noise, high >= after - sudden_step
-    hovers = (step <= sudden_step) | ((start - 2 - below) * step > 2.5 * sudden_step)
-    interval = np.where(hovers, travel[start] - travel[below], width) / np.sqrt(12)
-    line = width * noise * np.hypot(share, 1 - share) / step
-
-    either, both = from_dark | to_light, from_dark & to_light
-    height[found] = -(travel[start - 1] + width * np.where(both, 0.5, share))
-    sigma[found] = np.where(both | hovers, interval, np.where(either, np.hypot(line, interval), line))
+    last, slack = len(frames) - 1, _PLATEAU * noise
+    before, at, *later = (frames[np.minimum(start + k, last), row, column] for k in (-1, 0, 1, 2))
+    height[found], sigma[found], _ = onset_heights(
+        start, below, before, at, np.fmin(*later), level, known.dark[found], travel, noise, slack,
+        slack * np.sqrt(2), True,
+    )  # fmt: skip
     return height, sigma, status
 
 

@@ -16,7 +16,6 @@ from mirrorskin.bench import (
     normals,
     onset,
     paths,
-    scaling,
     sweep,
     twin,
 )
@@ -35,7 +34,6 @@ _RUNS: Cases = {
     **paths.CASES,
     **batch.CASES,
     **live.CASES,
-    **scaling.CASES,
     **accuracy.CASES,
 }
 NAMES = tuple(_RUNS)
@@ -63,27 +61,7 @@ def run_suite(
     quick: bool = False,
     done: Callable[[Case], None] = lambda case: None,
 ) -> list[Case]:
-    """Run cases in their order.
-
-    Parameters
-    ----------
-    device : Device
-    names : iterable of str
-        Names or patterns; see `choose`.
-    quick : bool
-        Small stacks and one round: that all works agree is checked, the times mean nothing.
-    done : callable
-        Called with each case as soon as it is done.
-
-    Raises
-    ------
-    InputError
-        No case has such a name, or there is not enough memory or disk for one.
-    DisagreementError
-        Works that should return the same maps do not.
-    DeviceError
-        The device has no room for a stack, or a process of a case failed.
-    """
+    """Run cases in their order."""
     cases = []
     for name in choose(names):
         cases.append(_RUNS[name](device, quick))
