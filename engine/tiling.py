@@ -113,7 +113,7 @@ class Band:
         found: NDArray[Any] = self.maps[name].host[plane, : self.pixels].reshape(self._shape)
         return found
 
-    def hand_over(self, name: str) -> NDArray[Any]:
+    def detach(self, name: str) -> NDArray[Any]:
         """Give away what a map holds, (count, stride) or (rows, W), without a copy, and make a new one."""
         given = self.maps[name].detach()
         self.maps[name] = self._make(name)

@@ -21,6 +21,8 @@ _HEAVIEST = 1e4  # weight of a pixel in units of the typical one's
 _SETTLED = 0.01  # half-widths that the surface may still move
 _LARGEST = 2.0  # half-widths that one pixel counts for in the misfit
 _FAR, _PATIENCE = 1.0, 3  # a misfit that is not mended any more after so many steps
+_SPLINES = 8  # along a side, were it square
+_FEWEST_PIECES = 3
 _RIDGE = 1e-13  # of the diagonal, so that rounding leaves no matrix singular
 
 
@@ -92,6 +94,64 @@ class Spline:
         solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         factors = solver.solve(np.ravel(self._y.T @ (values @ self._x)))
         return np.asarray((self._y @ factors.reshape(self._y.shape[1], -1)) @ self._x.T)
+
+
+class CellSplines:
+    """Cubic splines over cells, from the first one's centre to the last one's.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of cells, 2 or more of each.
+    spacing : (float, float)
+        Distance of rows, and of columns, mm.
+
+    Attributes
+    ----------
+    basis : csr_matrix, (H W, m)
+        The splines at the cells.
+    slopes : (csr_matrix, csr_matrix)
+        Their derivatives down the picture and across it, 1/mm.
+    """
+
+    def __init__(self, shape: tuple[int, int], spacing: tuple[float, float]) -> None:
+        self._shape = shape
+        self._spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
+        size = math.sqrt(self._spans[0] * self._spans[1]) / _SPLINES
+        self._pieces = [
+            max(_FEWEST_PIECES, min(round(span / size), count // 2))
+            for span, count in zip(self._spans, shape, strict=True)
+        ]
+        (y, down), (x, across) = (
+            [self._values(np.arange(float(count)), axis, order) for order in (0, 1)]
+            for axis, count in enumerate(shape)
+        )
+        self.basis = sparse.csr_matrix(sparse.kron(y, x))
+        self.slopes = sparse.csr_matrix(sparse.kron(down, x)), sparse.csr_matrix(sparse.kron(y, across))
+
+    def surface(self, factors: Doubles) -> Doubles:
+        """Return a surface at the cells, (H, W), mm."""
+        return np.asarray((self.basis @ factors).reshape(self._shape))
+
+    def at(self, factors: Doubles, rows: Doubles, columns: Doubles) -> Doubles:
+        """Return a surface on rows and columns that lie at places between the cells."""
+        grid = factors.reshape(self._pieces[0] + 3, -1)
+        return np.asarray((self._values(rows, 0) @ grid) @ self._values(columns, 1).T)
+
+    def roughness(self) -> Doubles:
+        """Return the form of the mean squared third derivatives, in all directions alike, 1/mm^4."""
+        along = [
+            [spline_products(count, order) * (count / span) ** (2 * order - 1) for order in range(4)]
+            for count, span in zip(self._pieces, self._spans, strict=True)
+        ]
+        parts = [math.comb(3, order) * np.kron(along[0][order], along[1][3 - order]) for order in range(4)]
+        return np.asarray(np.sum(parts, axis=0) / (self._spans[0] * self._spans[1]))
+
+    def _values(self, places: Doubles, axis: int, order: int = 0) -> sparse.csr_matrix:
+        """Return an axis' splines, or their derivatives, 1/mm, at places in cells."""
+        count, pieces = self._shape[axis], self._pieces[axis]
+        values = spline_values(places * pieces / (count - 1), pieces, order)
+        return sparse.csr_matrix(values * (pieces / self._spans[axis]) ** order)
 
 
 def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) -> Fit:

@@ -415,7 +415,7 @@ class NormalEstimator:
         parts = []
         for band in self._bands:
             with band.resident():
-                vectors, *others = (band.hand_over(name).reshape(-1) for name in MAPS)
+                vectors, *others = (band.detach(name).reshape(-1) for name in MAPS)
             rows = (-1, self._shape[1])
             flat = [one[: band.pixels].reshape(rows) for one in others]
             parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])

@@ -314,18 +314,11 @@ def test_results_on_the_way_change_nothing_and_a_search_can_be_used_again(device
     ("change", "words"),
     [
         ({"frames": np.zeros((1, 3, 3), np.uint8), "travel": [0.0]}, "at least 2 frames"),
-        ({"frames": np.zeros((5, 3, 3), np.int32)}, "uint8, uint16 or float32"),
-        ({"travel": [0.0, 1.0]}, "5 frames"),
-        ({"travel": [0.0, 1.0, 0.5, 2.0, 3.0]}, "runs back at frame 2"),
         ({"event": "release"}, "runs back at frame 1: a release only goes up"),
-        ({"event": "slip"}, "unknown event 'slip'; known are onset, release"),
-        ({"dark": np.zeros((2, 3))}, "the frames are 3 x 3"),
-        ({"dark": 220, "bright": 20}, "bright is not above dark"),
         ({"threshold": 0.0}, "threshold 0.0"),
         ({"threshold": np.nan}, "threshold nan"),
         ({"hold": 0}, "hold 0"),
         ({"hold": 13}, "hold 13"),
-        ({"noise": -1.0}, "noise -1.0"),
     ],
 )
 def test_bad_input_is_refused(change, words):
