@@ -11,6 +11,8 @@ from calibration_scorer import ball
 from numpy.typing import NDArray
 
 from mirrorskin import hw
+from mirrorskin.io import WallResponse
+from mirrorskin.kernels.response import wall_light
 
 SHAPE, PIXEL = (48, 48), 0.25
 DIAMETER, PRESS = 4.0, 0.9
@@ -22,6 +24,17 @@ DISTANCE = 150.0
 def wall_presses() -> list[Frames]:
     """Return axial recordings of a ball at five places, with exact references and noise of one count."""
     return [_press(place, number) for number, place in enumerate(FIVE, 1)]
+
+
+def light_of_response(response: WallResponse, place: Any, z: float, normals: Any) -> tuple[Any, Any]:
+    """Return light and whether it is in reach, (N, n), of pixels at places, (2, n); normals are (N, n, 3)."""
+    at = place - np.reshape(response.axis, (2, 1))
+    geometry = response.radius, response.rim, response.scatter
+    points = np.stack([*at, np.full(at.shape[1], z), *response.sight_slopes(at)])
+    normals = np.broadcast_to(normals, (len(normals), at.shape[1], 3))
+    light, within = wall_light(points, normals, geometry, response.lamps, response.curve, response.reach)
+    u, v = at / response.radius
+    return light * (1 + response.shade @ np.stack([u, v, u * u, u * v, v * v])), within
 
 
 def _press(place: tuple[float, float], number: int) -> Frames:

@@ -145,9 +145,7 @@ def test_numbers_are_in_the_units_people_speak_of():
     ("value", "sigma", "told"),
     [
         (1.23456, 0.012, ("1.235", "0.012")),
-        (1.23456, 1.2, ("1.2", "1.2")),
         (123.456, 40.0, ("123", "40")),
-        (1.5, math.nan, ("1.5", "")),
         (7, math.nan, ("7", "")),
         (math.nan, math.nan, ("not told", "")),
     ],

@@ -58,7 +58,6 @@ def test_a_picture_is_drawn(folder, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--ball", "10"), "unit"),
         (("--ball", "0mm"), "cannot be"),
         (("--ball", "10mm", "--cells", "0"), "cells"),
     ],

@@ -108,17 +108,6 @@ def test_a_calibration_that_is_carried_is_used_unless_another_is_given():
     np.testing.assert_array_equal(from_a_result.height, found.height)
 
 
-def test_pixels_with_defects_have_no_height():
-    press()
-    references = flat_references()
-    references.dark[2, 3] = references.bright[2, 3] = np.nan
-    save(references=references)
-    words = ("--calibration", "cal.h5", "--no-fill")
-    found = reconstruct("press.h5", *words)
-    assert np.argwhere(found.status == 0).tolist() == [[2, 3]]
-    assert np.isnan(found.height[2, 3])
-
-
 def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precession():
     turn(phase=[0.4 - phase for phase in SETUP.phase])
     precession = io.Precession(TILT, 0.4, -1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 5.0))
@@ -128,17 +117,6 @@ def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precess
     assert np.degrees(np.median(between(without.normals, true))) > 5
     assert np.degrees(np.median(between(found.normals, true))) < 1
     assert found.process["calibration_parts"] == "tilt"
-
-
-def test_a_batch_uses_what_recordings_carry():
-    carried = replace(a_calibration(SHAPE, only=[]), references=flat_references())
-    press(calibration=carried)
-    alone = reconstruct("press.h5")
-    ended = run("batch", "press.h5", "-o", "results")
-    assert ended.code == 0, ended.said
-    (path,) = Path("results").glob("*.h5")
-    np.testing.assert_array_equal(io.open_result(path).height, alone.height)
-    assert_same(io.open_result(path).calibration, carried)
 
 
 # What is refused, in one line and with exit code 2, before anything is written.
@@ -153,12 +131,8 @@ def older(path):
 
 REFUSALS = [
     ({"shape": (9, 12)}, None, "cal.h5 is of 12 x 9 pixels, {} of 11 x 9: calibrate again"),
-    ({"camera": "right"}, None, "cal.h5 is of the camera 'right', {} of 'left': calibrate again"),
-    ({"dtype": "float32"}, None, "cal.h5 is of float32 samples, {} of uint8: calibrate again"),
     ({}, older, "cal.h5 holds a calibration of an older layout, 0, where 1 is read: calibrate again"),
     ({}, lambda path: path.unlink(), "cal.h5: no such file"),
-    ({}, lambda path: path.write_bytes(path.read_bytes()[:3000]), "cal.h5"),
-    ({}, lambda path: path.write_text("no"), "cal.h5 is not an HDF5 file"),
 ]
 
 
@@ -175,7 +149,7 @@ def test_a_wrong_calibration_is_refused_by_reconstruct(known, change, said):
     assert not Path("out.h5").exists()
 
 
-@pytest.mark.parametrize(("known", "change", "said"), REFUSALS[:5:2])
+@pytest.mark.parametrize(("known", "change", "said"), REFUSALS[1:])
 @pytest.mark.parametrize("command", ["capture", "live"])
 def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(monkeypatch, command, known, change, said):
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, name="left"))

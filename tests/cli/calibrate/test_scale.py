@@ -99,9 +99,6 @@ def refused(ended):
     [
         ([], "no picture of a board is given"),
         (["."], "sequence: name pictures"),
-        (["film.mp4"], "sequence: name pictures"),
-        (["none.png"], "none.png cannot be read"),
-        (["none.h5"], "none.h5"),
         (["dots.png"], "dots.png shows no board charuco:7x5:2mm:1.5mm"),
         (["white.png"], "saturated"),
         (["pages.tif"], "pages.tif holds several pages"),
@@ -137,9 +134,7 @@ def test_a_board_is_painted_in_its_true_size():
     ("path", "dpi", "said"),
     [
         ("board.jpg", 2540, "name it board.png"),
-        ("none/board.png", 2540, "no folder"),
         ("b.png", 0, "pixels per inch of a printer"),
-        ("b.png", float("nan"), "pixels per inch of a printer"),
         ("b.png", 50, "dots per inch or more are needed"),
         ("b.png", 90_000, "fewer dots per inch"),
     ],

@@ -81,12 +81,3 @@ def test_pictures_go_into_a_folder(tmp_path):
     assert ended.code == 0, ended.said
     assert ended.out.endswith(f"{folder}: tilt.png\n")
     assert [one.name for one in folder.iterdir()] == ["tilt.png"]
-
-
-def test_what_is_no_calibration_is_refused_in_one_line(tmp_path):
-    (tmp_path / "text.h5").write_text("no file of HDF5")
-    for name in ("text.h5", "none.h5"):
-        ended = run("calibrate", "show", tmp_path / name)
-        assert ended.code == 2
-        assert name in ended.said
-        assert ended.said.count("\n") == 1

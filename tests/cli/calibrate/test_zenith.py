@@ -96,8 +96,6 @@ def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
     [
         (("--press", "1mm"), "--press says how a rig is to press"),
         (("--rig", "rig.toml", "--press", "1mm"), "both give the presses"),
-        (("--ball", "4"), "--ball"),
-        (("--body-radius", "much"), "--body-radius"),
     ],
 )
 def test_a_call_that_cannot_be_is_refused(folder, fitted, words, said):
@@ -115,14 +113,6 @@ def test_a_calibration_of_another_camera_is_refused_before_the_fit(folder, fitte
     assert ended.said.count("\n") == 1
     assert "right" in ended.said
     assert not fitted
-
-
-def test_recordings_of_two_cameras_are_refused(folder, fitted):
-    header = io.Header("axial", pixel_size=(0.1, 0.1), press=1.0, tilt=TILT, camera="right")
-    record(MadeUp(np.zeros((8, *SHAPE), np.uint8), header, phase=PHASE), folder / "place-2.h5")
-    ended = calibrate()
-    assert ended.code == 2
-    assert "left and right" in ended.said
 
 
 def known(**parts):

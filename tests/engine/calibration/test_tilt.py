@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import Frames
-from leaning_turns import EIGHTHS, Ball, Flat, circle, pictures
+from leaning_turns import EIGHTHS, Ball, Flat, pictures
 from poses import leaning
 
 from mirrorskin.engine.calibration.ball import moved
@@ -313,7 +313,3 @@ def test_the_line_is_trusted_within_the_references_alone():
     assert zenith[0, 0] == pytest.approx(0.12)
     assert not within[0, 0]
     assert light.of_normals(high, nothing, np.array([1]))[1][0, 0]
-
-
-def test_a_circle_is_a_precession():
-    assert precession().lean(EIGHTHS) == pytest.approx(circle(2.53 * DEGREE, EIGHTHS + 0.05))

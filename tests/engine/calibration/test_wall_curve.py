@@ -33,9 +33,7 @@ def test_a_curve_of_steps_from_0_up_never_turns_back(rising):
         assert light.min() >= 0
 
 
-@pytest.mark.parametrize(
-    ("low", "high"), [(0.2, 0.3), (-0.2, 0.1), (0.93, 1.4), (-1, 2), (1.1, 1.2), (0.5, 0.51)]
-)
+@pytest.mark.parametrize(("low", "high"), [(0.2, 0.3), (-0.2, 0.1), (0.93, 1.4), (1.1, 1.2)])
 def test_means_over_intervals_are_those_of_quadrature(low, high):
     coefficients = np.random.default_rng(5).random(CURVE_COEFFICIENTS)
     inside = sorted(

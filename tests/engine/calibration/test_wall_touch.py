@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from calibration_scenes import Frames
+from wall_presses import light_of_response
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.wall import fit_touch
@@ -21,7 +22,6 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
 )
 from mirrorskin.engine.calibration.wall_response import make_response, threshold_zenith
-from mirrorskin.kernels.response import wall_light
 
 NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
 NOMINAL |= {"radius": (17.5, 1.75), "rim": (40.0, 4.0), "axis_x": (0.0, 1.0), "axis_y": (0.0, 1.0)}
@@ -109,20 +109,8 @@ def bias(response, coefficients, highest):
         return light_of(met, TRUE, coefficients), normal
 
     (light, normal), (more, _) = true(zenith), true(zenith + 1e-4)
-    (axis_x, axis_y), (near, far) = response.axis, response.sight
-    at, lean = look(place, {"axis_x": axis_x, "axis_y": axis_y, "sight_0": near, "sight_2": far})
-    geometry = response.radius, response.rim, response.scatter
-    told, within = wall_light(
-        np.stack([*at, z, *lean]),
-        normal.T[np.newaxis],
-        geometry,
-        response.lamps,
-        response.curve,
-        response.reach,
-    )
-    u, v = at / response.radius
-    told = told[0] * (1 + response.shade @ np.stack([u, v, u * u, u * v, v * v]))
-    return np.where(within[0], np.degrees((told - light) * 1e-4 / (more - light)), np.nan)
+    told, within = light_of_response(response, place, 0.5, normal.T[np.newaxis])
+    return np.where(within[0], np.degrees((told[0] - light) * 1e-4 / (more - light)), np.nan)
 
 
 def test_a_printed_gamma_is_found():

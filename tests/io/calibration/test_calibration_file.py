@@ -26,8 +26,7 @@ def saved(path):
     return path
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("shape", [SHAPE, (1, 1), (1, 9), (13, 1)])
+@pytest.mark.parametrize(("shape", "dtype"), [(SHAPE, "uint8"), ((1, 9), "uint16"), ((13, 1), "float32")])
 def test_a_calibration_comes_back_as_it_was(path, shape, dtype):
     calibration = a_calibration(shape, dtype, "münze 五")
     io.save_calibration(calibration, path)
@@ -172,33 +171,21 @@ def without(name):
     ("change", "said"),
     [
         (a_version(0), "older layout, 0, where 1 is read: calibrate again"),
-        (a_version("one"), "older layout, one, where 1 is read: calibrate again"),
         (a_version(2), "newer layout, 2, where 1 is read: update the program, or calibrate again"),
         (without("camera"), "there is no /entry/camera/name: calibrate again"),
-        (without("camera/shape"), "there is no /entry/camera/shape: calibrate again"),
         (a_value("camera/shape", [5, 0]), "which no picture has: calibrate again"),
-        (a_value("camera/shape", [5.5, 7]), "which no picture has: calibrate again"),
         (a_value("camera/shape", [5, 8]), r"\(5, 7\) where \(5, 8\) is needed: calibrate again"),
         (a_value("camera/dtype", "int64"), "'int64', which no camera here gives: calibrate again"),
         (without("references/dark"), "references has no dark: calibrate again"),
-        (a_value("references/dark", np.zeros(35)), r"\(35,\) where \(5, 7\) is needed: calibrate again"),
         (a_value("references/dark", "grey"), "holds no numbers: calibrate again"),
-        (a_value("references", 1.0), "/entry/references has no dark: calibrate again"),
         (a_value("scale/pixel_size", [0.1, 0.0]), r"\(0.1, 0.0\), which cannot be: calibrate again"),
-        (a_value("scale/pixel_size", [0.1, np.nan]), "which cannot be: calibrate again"),
         (a_value("scale/shape", [5.0, np.inf]), "whole numbers are needed: calibrate again"),
-        (a_value("scale/camera", np.eye(2)), r"\(2, 2\) where \(3, 3\) is needed: calibrate again"),
-        (a_value("zenith/radius", -1.0), "which cannot be: calibrate again"),
         (a_value("zenith/pattern", "striped"), "striped, which cannot be: calibrate again"),
         (a_value("zenith/pattern", [1, 2]), "does not hold one value"),
-        (a_value("zenith/curve", 1.0), r"\(\) where \(0,\) is needed: calibrate again"),
         (a_value("zenith/curve", [0.9, np.nan]), "curve has numbers that are not finite: calibrate again"),
-        (a_value("scale/camera", np.full((3, 3), np.inf)), "numbers that are not finite: calibrate again"),
         (a_value("zenith/parameters", [1.0, 2.0]), "no list of texts: calibrate again"),
         (a_value("zenith/parameters", ["radius"]), r"\(2, 2\) where \(1, 1\) is needed: calibrate again"),
-        (a_value("tilt/tilt", np.nan), "is nan, which cannot be: calibrate again"),
         (a_value("tilt/direction", 2), "is 2, which cannot be: calibrate again"),
-        (a_value("tilt/direction", np.nan), "whole numbers are needed: calibrate again"),
         (a_value("tilt/sigma/tilt", "much"), "holds no numbers: calibrate again"),
     ],
 )
