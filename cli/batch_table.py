@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -24,16 +24,6 @@ _ROWS = 12  # of files that have ended
 _OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
 
 
-class Show(Protocol):
-    """Shows how a batch goes."""
-
-    def under_way(self, job: Job, frames: int, /) -> None:
-        """Take note, from any thread, that so many frames of a job were read."""
-
-    def ended(self, outcome: Outcome, /) -> None:
-        """Take note of what became of a job."""
-
-
 @contextmanager
 def show_batch(total: int, as_json: bool) -> Iterator[Show]:
     """Show how a batch of so many files goes."""
@@ -46,7 +36,7 @@ def show_batch(total: int, as_json: bool) -> Iterator[Show]:
         with Live(get_renderable=table.render, console=console, transient=True, refresh_per_second=4):
             yield table
     else:
-        yield _Lines(not as_json)
+        yield Show(not as_json)
 
 
 def problem(outcome: Outcome) -> str:
@@ -63,16 +53,17 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in known)
 
 
-class _Lines:
-    """A line for each file."""
+class Show:
+    """Shows how a batch goes: a line for each file, if wanted."""
 
     def __init__(self, wanted: bool) -> None:
         self._wanted = wanted
 
     def under_way(self, job: Job, frames: int, /) -> None:
-        pass
+        """Take note, from any thread, that so many frames of a job were read."""
 
     def ended(self, outcome: Outcome, /) -> None:
+        """Take note of what became of a job."""
         if not self._wanted:
             return
         line = f"{outcome.state}: {printable(str(outcome.job.source))}"
@@ -83,7 +74,7 @@ class _Lines:
         typer.echo(line)
 
 
-class _Table:
+class _Table(Show):
     """The files under way, the last that ended, and a bar of all."""
 
     def __init__(self, total: int) -> None:

@@ -97,14 +97,7 @@ def export_result(
 
 
 def check_export(result: Result, path: str | Path) -> None:
-    """Refuse what cannot be exported, before any work is done for it.
-
-    Raises
-    ------
-    InputError
-        No format has that suffix, a package that it takes is not installed, or the result lacks what the
-        format needs: heights, and how large its pixels are.
-    """
+    """Refuse what cannot be exported, before any work is done for it."""
     suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION)
     if suffix not in known:
         wrong = f"{suffix} is no format" if suffix else "its name does not say a format"

@@ -57,21 +57,6 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
 
     Of a file that is being written, or was when its writer died, only so many frames count, in their order,
     and the values of all other datasets.
-
-    Parameters
-    ----------
-    file : Hdf5File
-    dataset : h5py.Dataset
-        The frames.
-    origins : mapping
-        What ``origins`` returned when the file was opened.
-    frames : int
-        How many frames there were then.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, or is another than was opened.
     """
     if file.root.swmr_mode:
         with as_input_error(f"{file.path}: {dataset.name}"):

@@ -15,15 +15,13 @@ _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeE
 _LONGEST = 100
 
 
-def as_input_error(what: str | Callable[[], str], remedy: str = "") -> AbstractContextManager[None]:
-    """Turn what goes wrong with a file into an InputError of one line."""
-    return _AsInputError(what, remedy)
+class as_input_error(AbstractContextManager[None]):  # noqa: N801  # as contextlib names its own
+    """Turn what goes wrong with a file into an InputError of one line.
 
+    A class, because files are opened with many of these and a generator takes several times as long.
+    """
 
-class _AsInputError(AbstractContextManager[None]):
-    """A class, because files are opened with many of these and a generator takes several times as long."""
-
-    def __init__(self, what: str | Callable[[], str], remedy: str) -> None:
+    def __init__(self, what: str | Callable[[], str], remedy: str = "") -> None:
         self._what, self._remedy = what, remedy
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any, /) -> None:

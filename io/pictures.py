@@ -35,28 +35,10 @@ _UNDECODABLE = "cannot be decoded: it is damaged, or of a kind that OpenCV does 
 
 
 def read_picture(path: Path) -> NDArray[Any]:
-    """Read the only picture of a file.
+    """Read the only picture of a PNG or TIFF, (H, W), uint8, uint16 or float32.
 
-    Parameters
-    ----------
-    path : Path
-        PNG or TIFF.
-
-    Returns
-    -------
-    ndarray, (H, W), uint8, uint16 or float32
-        Colour becomes grey: where the channels are equal, their common value; else the luma of ITU-R BT.601,
-        0.299 R + 0.587 G + 0.114 B, as OpenCV computes it. Opacity is ignored.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, neither PNG nor TIFF, of several pages, or of another type of sample.
-
-    Examples
-    --------
-    >>> read_picture(Path("dark.png")).shape  # doctest: +SKIP
-    (480, 640)
+    Colour becomes grey: where the channels are equal, their common value; else the luma of ITU-R BT.601,
+    0.299 R + 0.587 G + 0.114 B, as OpenCV computes it. Opacity is ignored.
     """
     contents = _contents(path)
     encoded: bytes | mmap = contents
@@ -139,7 +121,7 @@ class Pictures(FrameSequence):
     In a folder, the frames are the pictures whose names are alike but for one number, the last that differs,
     and they come in its order: ``image2.png`` before ``image10.png``. Numbers may start anywhere; one that is
     missing is a frame that was lost, so the block after it says ``dropped``. A TIFF's pages are in order.
-    Colour becomes grey as in ``picture_files.read_picture``.
+    Colour becomes grey as in ``read_picture``.
     """
 
     def __init__(

@@ -42,25 +42,10 @@ class Steps:
 def check_travel(
     travel: ArrayLike | None, count: int, name: str, after: Sequence[float] = (), falls: bool = False
 ) -> NDArray[np.float64]:
-    """Return the travel of a vertical press, or of a release, as float64 if it can be used.
+    """Return the travel of a press, mm, or of a release if it ``falls``, as float64 (T,).
 
-    Parameters
-    ----------
-    travel : array_like, (count,), or None
-        Millimetres, one a frame.
-    count : int
-        Frames.
-    name : str
-        What to call it in messages.
-    after : sequence of float
-        Travel of the frame before, if any.
-    falls : bool
-        Whether the body is lifted, as for a release.
-
-    Raises
-    ------
-    InputError
-        It is missing, of another length, not a finite number throughout, or runs back.
+    InputError, which calls it ``name``: it is missing, of another length, not finite, or runs back; ``after``
+    is the travel of the frame before, if any.
 
     Examples
     --------
@@ -80,11 +65,10 @@ def check_travel(
 def check_stroke(
     travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
 ) -> NDArray[np.float64]:
-    """Return the travel of a press, of a release, or of one after the other, as float64 if it can be used.
+    """Return the travel of a press, of a release, or of one after the other, mm, as float64.
 
     It rises to its greatest value, where it may rest, and falls from there on; either way may be missing.
-    Parameters and errors are those of ``check_travel``; ``within`` are the first and the end of the frames
-    that are meant, of which alone the travel is checked and returned.
+    Only that of the frames from the first to the end of ``within`` is checked and returned, if it is given.
 
     Examples
     --------
@@ -107,14 +91,7 @@ def check_stroke(
 def check_phase(
     phase: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
 ) -> NDArray[np.float64]:
-    """Return the phases of an axial rotation, radians, as float64 if they can be used.
-
-    Of the frames from the first to the end of ``within`` alone, if it is given.
-
-    Raises
-    ------
-    InputError
-        They are missing, of another length, or not finite numbers throughout.
+    """Return the phases of an axial rotation, radians, as float64; ``within`` as for ``check_stroke``.
 
     Examples
     --------

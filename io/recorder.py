@@ -193,13 +193,7 @@ class Recorder(TeeSource[Source]):
         return self
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the source's next frames and write them; see ``Source.read``.
-
-        Raises
-        ------
-        InputError
-            The disk is full, or the source gives more frames than it announced.
-        """
+        """Read the source's next frames and write them; see ``Source.read``."""
         block = self.source.read(out)
         if block is not None:
             part = slice(self._count, self._count + len(block.frames))

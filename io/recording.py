@@ -107,15 +107,7 @@ class Recording(Closing):
         self._next = 0
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``.
-
-        Raises
-        ------
-        ValueError
-            ``out`` does not fit the frames.
-        InputError
-            The file is damaged there.
-        """
+        """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``."""
         out = block_memory(out, self.shape, self.dtype)
         start = self._next
         if start >= self.shape[0]:
@@ -144,13 +136,7 @@ class Recording(Closing):
         self._next = 0
 
     def fingerprint(self) -> str:
-        """Return what tells the file from others; see ``mirrorskin.io.fingerprint``.
-
-        Raises
-        ------
-        InputError
-            The file was changed, or another took its name, after it was opened.
-        """
+        """Return what tells the file from others; see ``mirrorskin.io.fingerprint``."""
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
 
     @functools.cached_property

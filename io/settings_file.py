@@ -19,31 +19,12 @@ _LONGEST = 40  # letters of a value that a message quotes
 
 
 def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
-    """Read a file of TOML.
+    """Read a file of TOML, which ``page`` describes (``"docs/batch.md"``), as its model.
 
     A table is a field whose type is a `msgspec.Struct`. What a key may be is its type: a number with bounds,
     a text, a choice (`Literal`), a list; ``msgspec.Meta`` gives the bounds, says in words what is needed
     (``description``) and how it may look (``examples``). A ``__post_init__`` that raises ValueError checks
     what belongs together. Numbers are finite.
-
-    Parameters
-    ----------
-    path : str or Path
-    model : type
-        Of the whole file.
-    page : str
-        What describes the file, for messages: ``"docs/batch.md"``.
-
-    Returns
-    -------
-    model
-        What is not in the file has its default.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is no TOML, or has a key or a value that the model does not allow; the
-        message names the file, the key and the remedy.
 
     Examples
     --------

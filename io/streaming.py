@@ -8,10 +8,9 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +27,14 @@ _LOOK = 0.5  # seconds from one look whether the program is still there to the n
 _BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
 
 
-@dataclass(frozen=True, slots=True)
-class _Mark:
+class _Mark(NamedTuple):
     """Whether some frames were used."""
 
-    index: int
+    start: int
     used: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class _End:
+class _End(NamedTuple):
     """What is known after the last frame."""
 
     positions: Mapping[str, Floats]
@@ -121,13 +118,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         return self
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the source's next frames, and hand them to the thread that writes them.
-
-        Raises
-        ------
-        InputError
-            The disk is full, or too slow by more than 256 MB; this may concern frames before.
-        """
+        """Read the source's next frames, and hand them to the thread that writes them."""
         self._check()
         block = self.source.read(out)
         self._check()
@@ -235,7 +226,7 @@ class StreamRecorder(TeeSource[LiveSource]):
             if isinstance(item, _End):
                 return item
             if isinstance(item, _Mark):
-                file.mark(item.index, item.used)
+                file.mark(item.start, item.used)
             elif item is not None:
                 self._append(file, item)
             del item  # what a source lends, it has back at once

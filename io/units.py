@@ -38,19 +38,7 @@ _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given s
 
 
 def in_base(symbol: str, kind: Kind) -> float:
-    """Return how many base units one unit is.
-
-    Parameters
-    ----------
-    symbol : str
-        Such as ``um``.
-    kind : {"length", "angle", "time", "memory"}
-        What it must measure; the base units are `BASE`.
-
-    Raises
-    ------
-    ValueError
-        The unit is unknown, or measures something else; the message says which.
+    """Return how many base units one unit is; ValueError if it is unknown, or measures something else.
 
     Examples
     --------
@@ -62,20 +50,7 @@ def in_base(symbol: str, kind: Kind) -> float:
 
 
 def conversion_factor(unit: str, wanted: str, where: str) -> float:
-    """Return the number that converts a value of a file from its unit.
-
-    Parameters
-    ----------
-    unit, wanted : str
-        Units, as in ``um`` or ``1/deg``; the wanted one is a base unit, or one over it.
-    where : str
-        What holds the value, for messages.
-
-    Raises
-    ------
-    InputError
-        The unit is unknown or of another kind.
-    """
+    """Return the number that converts a value of a file from its unit to a base unit, or one over it."""
     if unit == wanted:
         return 1.0
     over, _, base = wanted.rpartition("/")

@@ -42,29 +42,10 @@ def run_cluster(
 ) -> Iterator[Outcome]:
     """Run a batch on a Dask cluster, each worker with a device of its own and one job at a time.
 
-    A job whose worker is lost goes to another one. Closing the iterator ends the batch: jobs that run on
-    workers of others are then finished by them, all else is dropped.
-
-    Parameters
-    ----------
-    jobs : iterable of Job
-        Workers must see their files under the same names.
-    plan : Plan
-    address : str, optional
-        Of a scheduler that runs already, such as ``"tcp://node1:8786"``.
-    workers : int, optional
-        How many worker processes to start on this machine, for this batch, instead.
-
-    Yields
-    ------
-    Outcome
-        Of each job, as it is done.
-
-    Raises
-    ------
-    InputError
-        Dask is not installed, the scheduler cannot be reached or is lost, there are no workers, or one of
-        them has another version of mirrorskin, does not see the files or has no device.
+    The cluster is that of a scheduler that runs already, at ``address``, such as ``"tcp://node1:8786"``, or
+    consists of so many ``workers``, processes of this machine that are started for this batch. All workers
+    must see the files under the same names. A job whose worker is lost goes to another one. Closing the
+    iterator ends the batch: jobs that run on workers of others are finished by them, all else is dropped.
     """
     jobs = list(jobs)
     if not jobs:

@@ -25,12 +25,7 @@ from mirrorskin.io import InputError, Motion, Result
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A recording, and the result to make of it.
-
-    Attributes
-    ----------
-    source, target : Path
-    """
+    """A recording, and the result to make of it."""
 
     source: Path
     target: Path
@@ -41,23 +36,6 @@ def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
 
     ``NAME.h5`` becomes ``NAME-result.h5``. Recordings of one name keep their folders below the one that they
     have in common, and their endings where only those differ.
-
-    Parameters
-    ----------
-    paths : iterable of Path
-        Recordings; one that is named twice is one job.
-    folder : Path
-        Where the results go. It need not exist yet.
-
-    Returns
-    -------
-    list of Job
-        In the order of the paths.
-
-    Raises
-    ------
-    InputError
-        A result would overwrite a recording, or another result.
 
     Examples
     --------
@@ -146,15 +124,6 @@ class Plan:
         """Write down, always in the same words, everything of the plan that changes a motion's results.
 
         Defaults are included: a parameter that is given with its default's value changes nothing.
-
-        Parameters
-        ----------
-        motion : {"vertical", "axial", "horizontal", "twist"}
-
-        Returns
-        -------
-        str
-            JSON.
         """
         opening = {
             name: value

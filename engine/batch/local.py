@@ -34,24 +34,12 @@ def default_devices() -> list[Device]:
 def run_local(
     jobs: Sequence[Job], plan: Plan, devices: Sequence[Device], watch: Watch | None = None
 ) -> Iterator[Outcome]:
-    """Do jobs on devices of this machine.
+    """Do jobs on devices of this machine, one at a time on each; yield what became of each, as it is done.
+
+    ``watch`` is called by the devices' threads with the job under way and how many frames of it were read.
 
     Leaving the iterator early, by an exception as well, ends the batch: each device gives up its job at the
     next block of frames, or finishes it where all frames are read. Nothing half-written stays behind.
-
-    Parameters
-    ----------
-    jobs : sequence of Job
-    plan : Plan
-    devices : sequence of Device
-        At least one; each does one job at a time.
-    watch : callable, optional
-        Called by the devices' threads with the job under way and how many frames of it were read.
-
-    Yields
-    ------
-    Outcome
-        Of each job, as they are completed.
 
     Examples
     --------

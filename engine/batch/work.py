@@ -60,19 +60,6 @@ def run_job(
     """Make a job's result, unless it is there already.
 
     Whatever goes wrong with one recording is in the outcome, not raised, so that the others go on.
-
-    Parameters
-    ----------
-    job : Job
-    plan : Plan
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-    progress : callable, optional
-        Called with the number of frames so far.
-
-    Returns
-    -------
-    Outcome
     """
     start = time.perf_counter()
     outcome = Outcome(job, "failed", "", 0.0)

@@ -39,8 +39,10 @@ def held(path):
         return series | {"state": file["/entry/state"].asstr()[()]}
 
 
-@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
-@pytest.mark.parametrize("packing", COMPRESSIONS)
+@pytest.mark.parametrize(
+    ("packing", "dtype"),
+    [(packing, "u2") for packing in COMPRESSIONS] + [("raw", "u1"), ("bitshuffle", "f4")],
+)
 def test_what_comes_is_what_is_in_the_file(tmp_path, packing, dtype):
     blocks = stream(Feed(20, (1, 4, 3), dtype=dtype), tmp_path / "a.h5", packing)
     numbers = np.arange(20)
@@ -57,8 +59,7 @@ def test_what_comes_is_what_is_in_the_file(tmp_path, packing, dtype):
     assert found["data"].dtype == np.dtype(dtype)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (13, 1), (64, 64)])
-@pytest.mark.parametrize("cuts", [(20,), (2, 5)])
+@pytest.mark.parametrize(("shape", "cuts"), [((1, 1), (20,)), ((13, 1), (2, 5)), ((64, 64), (2, 5))])
 def test_frames_of_any_size_in_blocks_of_any_cut_read_back(tmp_path, shape, cuts):
     stream(Feed(20, cuts, shape=shape, dtype="u2"), tmp_path / "a.h5")
     with io.open_recording(tmp_path / "a.h5") as recording:
@@ -140,7 +141,6 @@ def test_an_older_file_is_replaced_when_the_first_frame_has_come(tmp_path):
     [
         (KeyboardInterrupt(), "stopped by the user"),
         (SystemExit(1), "the program was ended"),
-        (GeneratorExit(), "the program was ended"),
         (io.InputError("the camera is lost: plug it in\nagain"), "the camera is lost: plug it in"),
         (RuntimeError(), "RuntimeError"),
         (ValueError("ä" * 300), "ä" * 114),

@@ -286,7 +286,7 @@ def test_workers_take_a_machines_gpus_in_turn(machine, monkeypatch):
     assert worker.take_share(5).device is None
 
 
-@pytest.mark.parametrize(("workers", "expected"), [(2, [4, 3]), (3, [3, 2, 2]), (9, [1] * 9)])
+@pytest.mark.parametrize(("workers", "expected"), [(3, [3, 2, 2]), (9, [1] * 9)])
 def test_the_cores_of_a_machine_are_divided(workers, expected, machine, monkeypatch):
     machine("cpu")
     shares = []
