@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +44,6 @@ _TILE = 1024  # pixels of Numba
 _SAMPLES = 65_536  # of a tile of NumPy: more leave the cache, fewer pay for calls
 
 
-class Wave(NamedTuple):
-    """The least-squares fit of mean, cosine and sine, and what it leaves, (H, W) each."""
-
-    mean: Floats
-    cosine: Floats
-    sine: Floats
-    residual: Floats
-
-
 def run_stack(device: Device, quick: bool) -> Case:
     """Time the fit of a wave to a stack, the limits and the peers; their maps must be the same first.
 
@@ -79,7 +70,7 @@ def run_stack(device: Device, quick: bool) -> Case:
         return correlator.result()
 
     absent = missing("numba")
-    peers: dict[str, Callable[[Counts, Doubles], Wave]] = {"NumPy": _numpy}
+    peers: dict[str, Callable[[Counts, Doubles], Floats]] = {"NumPy": _numpy}
     peers |= {} if "numba" in absent else {"Numba": _numba}
     theirs: dict[str, Work] = {name: functools.partial(fit, frames, phase) for name, fit in peers.items()}
 
@@ -116,16 +107,16 @@ def run_sliding(device: Device, quick: bool) -> Case:
         device.finish()
 
     absent = missing("numba")
-    peers: dict[str, _Slide] = {"NumPy": _numpy_slide}
-    peers |= {} if "numba" in absent else {"Numba": _numba_slide}
-    windows = {name: _Window(slide, frames, phase) for name, slide in peers.items()}
+    peer = None if absent else _Window(frames, phase)
 
     def check(_: dict[str, Any]) -> None:
-        for name, window in windows.items():
-            _check(name, window.wave(), correlator.result())
+        if peer is not None:
+            _check("Numba", peer.wave(), correlator.result())
 
     limits = Limits(device, a_frame)
-    works: dict[str, Work] = {OURS: push_all, **{name: one.push_all for name, one in windows.items()}}
+    works: dict[str, Work] = {OURS: push_all}
+    if peer is not None:
+        works["Numba"] = peer.push_all
     measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
     rows = [Row(name, measured[name], len(frames) * a_frame, len(frames)) for name in works]
     title = f"one new frame into a window of {STEPS}; {' x '.join(map(str, shape))} uint8"
@@ -135,22 +126,18 @@ def run_sliding(device: Device, quick: bool) -> Case:
 CASES: Cases = {"correlate-uint8": run_stack, "sliding": run_sliding}
 
 
-def _check(name: str, theirs: Wave, ours: Any) -> None:
-    expected = {word: getattr(ours, word) for word in Wave._fields}
-    agree(name, theirs._asdict(), expected, dict.fromkeys(expected, 1e-5 * np.abs(ours.mean)))
-
-
-_Slide = Callable[[Sums, Counts, Counts, Sums], None]
-"""``(sums, now, gone, rows)``: take a frame into a window's sums, and out the one that it replaces. Sums are
-(4, H, W): of the samples, of their products with cosine and sine and of their squares; ``rows``, (6,), is 1,
-cosine and sine of the new frame and of the old one, in units."""
+def _check(name: str, theirs: Floats, ours: Any) -> None:
+    """Compare a peer's fit, (4, H, W), map by map."""
+    expected = {word: getattr(ours, word) for word in ("mean", "cosine", "sine", "residual")}
+    near = dict.fromkeys(expected, 1e-5 * np.abs(ours.mean))
+    agree(name, dict(zip(expected, theirs, strict=True)), expected, near)
 
 
 class _Window:
-    """A peer's window: the last frames in a ring, and their sums."""
+    """Numba's window: a ring of frames, and sums of samples, their products with a wave, and squares."""
 
-    def __init__(self, slide: _Slide, frames: Counts, phase: Doubles) -> None:
-        self._slide, self._frames = slide, frames
+    def __init__(self, frames: Counts, phase: Doubles) -> None:
+        self._frames = frames
         self._ring = np.zeros((STEPS, *frames.shape[1:]), np.uint8)
         self._sums = np.zeros((4, *frames.shape[1:]), np.int32)
         self._phase = phase[-STEPS:]
@@ -159,12 +146,13 @@ class _Window:
 
     def push_all(self) -> None:
         """Push a whole stack."""
+        slide, sums = _numba_kernels()[1], self._sums.reshape(4, -1)
         for number, (frame, row) in enumerate(zip(self._frames, self._rows, strict=True)):
             gone = self._ring[number % STEPS]
-            self._slide(self._sums, frame, gone, row)
+            slide(sums, frame.reshape(-1), gone.reshape(-1), row)
             gone[:] = frame
 
-    def wave(self) -> Wave:
+    def wave(self) -> Floats:
         """Return the fit that the sums give."""
         total, cosine, sine, square = self._sums.astype(np.float64)
         model, rounded = basis(self._phase), self._rows[-STEPS:, :3] / [1, _UNITS, _UNITS]
@@ -172,18 +160,14 @@ class _Window:
         wave = np.tensordot(np.linalg.inv(rounded.T @ model), sums, 1)
         explained = np.sum(wave * np.tensordot(model.T @ model, wave, 1), axis=0)
         left = np.maximum(square - explained, 0)
-        return Wave(*np.stack([*wave, np.sqrt(left / (STEPS - 3))]).astype(np.float32))
+        return np.stack([*wave, np.sqrt(left / (STEPS - 3))]).astype(np.float32)
 
 
-def _numpy(frames: Counts, phase: Doubles) -> Wave:
+def _numpy(frames: Counts, phase: Doubles) -> Floats:
     """Fit tiles that stay in the cache, in single precision and in place."""
-    maps, raw, size = (
-        np.empty((4, frames[0].size), np.float32),
-        frames.reshape(len(frames), -1),
-        _SAMPLES,
-    )
+    maps, raw = np.empty((4, frames[0].size), np.float32), frames.reshape(len(frames), -1)
     fit, model = fit_matrix(phase).astype(np.float32), basis(phase)
-    gram, size = (model.T @ model).astype(np.float32), size // len(frames)
+    gram, size = (model.T @ model).astype(np.float32), _SAMPLES // len(frames)
     room = np.empty((len(frames), size), np.float32)
     for first in range(0, raw.shape[1], size):
         pixels = slice(first, first + size)
@@ -195,34 +179,15 @@ def _numpy(frames: Counts, phase: Doubles) -> Wave:
         np.add(wave[0], reference, out=maps[0, pixels])
         maps[1:3, pixels] = wave[1:]
         np.sqrt(np.maximum(left, 0) / np.float32(len(frames) - 3), out=maps[3, pixels])
-    return Wave(*maps.reshape(4, *frames.shape[1:]))
+    return maps.reshape(4, *frames.shape[1:])
 
 
-def _numpy_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
-    flat, new, old, size = sums.reshape(4, -1), now.reshape(-1), gone.reshape(-1), 16_384
-    room = np.empty((3, size), np.int32)
-    for first in range(0, len(new), size):
-        pixels = slice(first, first + size)
-        come, go, spare = room[:, : len(new[pixels])]
-        np.copyto(come, new[pixels])
-        np.copyto(go, old[pixels])
-        for total, more, less in zip(flat[:3, pixels], rows[:3], rows[3:], strict=True):
-            np.add(total, np.multiply(come, more, out=spare), out=total)
-            np.subtract(total, np.multiply(go, less, out=spare), out=total)
-        np.add(flat[3, pixels], np.multiply(come, come, out=come), out=flat[3, pixels])
-        np.subtract(flat[3, pixels], np.multiply(go, go, out=go), out=flat[3, pixels])
-
-
-def _numba(frames: Counts, phase: Doubles) -> Wave:
+def _numba(frames: Counts, phase: Doubles) -> Floats:
     maps = np.empty((4, frames[0].size), np.float32)
     model = basis(phase)
     solve = np.linalg.inv(model.T @ model).astype(np.float32)
     _numba_kernels()[0](frames.reshape(len(frames), -1), model.T.astype(np.float32), solve, maps)
-    return Wave(*maps.reshape(4, *frames.shape[1:]))
-
-
-def _numba_slide(sums: Sums, now: Counts, gone: Counts, rows: Sums) -> None:
-    _numba_kernels()[1](sums.reshape(4, -1), now.reshape(-1), gone.reshape(-1), rows)
+    return maps.reshape(4, *frames.shape[1:])
 
 
 @functools.cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from mirrorskin.bench.harness import OURS
@@ -62,12 +61,7 @@ _ROOF = (
 _ACCURACY = "Answers on this device against truths that are known, each a number and its bound."
 
 
-@dataclass(slots=True)
-class Machine:
-    """The cases of all runs of one device, by name; of a case that several runs have, the last one counts."""
-
-    title: str
-    cases: dict[str, Data] = field(default_factory=dict)
+Machine = Mapping[str, Data]  # cases by name
 
 
 def as_rows(case: Data) -> list[list[str]]:
@@ -148,8 +142,8 @@ def write_page(runs: Mapping[Path, Run], page: Path) -> None:
     """
     from mirrorskin.bench.roofline import draw_rooflines, roofline_of
 
-    machines = gather(runs.values())
-    rooflines = {one.title: roof for one in machines if (roof := roofline_of(one.cases.values()))}
+    machines = gather(runs.values()).items()
+    rooflines = {title: roof for title, cases in machines if (roof := roofline_of(cases.values()))}
     if rooflines:
         picture = page.parent / PICTURE
         try:
@@ -170,13 +164,12 @@ def write_text(path: Path, content: str) -> None:
         raise InputError(f"{path} could not be written: {error.strerror}; make room") from error
 
 
-def gather(runs: Iterable[Run]) -> list[Machine]:
-    """Return the cases of some runs by the machine that they ran on."""
-    machines: dict[str, Machine] = {}
+def gather(runs: Iterable[Run]) -> dict[str, Machine]:
+    """Return cases by machine; of a case that several runs of one machine have, the last one counts."""
+    machines: dict[str, dict[str, Data]] = {}
     for run in runs:
-        machine = machines.setdefault(as_machine(run), Machine(as_machine(run)))
-        machine.cases.update({case["name"]: case for case in run["cases"]})
-    return list(machines.values())
+        machines.setdefault(as_machine(run), {}).update({case["name"]: case for case in run["cases"]})
+    return dict(machines)
 
 
 def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
@@ -217,18 +210,18 @@ def _runs(runs: Mapping[Path, Run]) -> str:
 
 
 def _topic(
-    title: str, about: str, machines: Sequence[Machine], describe: Callable[[Machine], list[str]]
+    title: str, about: str, machines: Mapping[str, Machine], describe: Callable[[Machine], list[str]]
 ) -> list[str]:
     """Return a heading and what there is to say of each machine; nothing where there is nothing."""
     parts = []
-    for machine in machines:
+    for name, machine in machines.items():
         if mine := describe(machine):
-            parts += [*([f"**{machine.title}**"] if len(machines) > 1 else []), *mine]
+            parts += [*([f"**{name}**"] if len(machines) > 1 else []), *mine]
     return [f"## {title}", about, *parts] if parts else []
 
 
 def _aims(machine: Machine) -> list[str]:
-    cases = [case for case in machine.cases.values() if not _is(case, "accuracy-")]
+    cases = [case for case in machine.values() if not _is(case, "accuracy-")]
     cells = [[case["name"], *row] for case in cases for row in as_targets(case)]
     return [as_table(("case", *TARGET_HEAD), cells, numbers=False)] if cells else []
 
@@ -236,7 +229,7 @@ def _aims(machine: Machine) -> list[str]:
 def _calls(machine: Machine) -> list[str]:
     """Return the calls with the share that their kernels take."""
     cells = []
-    for case in machine.cases.values():
+    for case in machine.values():
         if _is(case, "call-"):
             for row in (row for row in case["rows"] if not is_limit(row)):
                 wall, kernel = row["wall"]["median"], row["device"].get("kernel", {}).get("median")
@@ -248,7 +241,7 @@ def _calls(machine: Machine) -> list[str]:
 def _beside_peers(machine: Machine) -> list[str]:
     """Return each work of ours that a peer does too, or that an aim is about, beside the quickest peer."""
     cells = []
-    for case in machine.cases.values():
+    for case in machine.values():
         if _is(case, "sweep-", "scaling-", "accuracy-", "call-"):
             continue
         works = [row for row in case["rows"] if not is_limit(row)]
@@ -262,7 +255,7 @@ def _beside_peers(machine: Machine) -> list[str]:
             if alone or row["name"] in wanted
         ]
     head = ("case", "work", "ms", "GB/s", "of limit", "quickest peer", "ms", "times as fast")
-    titles = {name: case["title"] for name, case in machine.cases.items()}
+    titles = {name: case["title"] for name, case in machine.items()}
     about = [f"- {name}: {titles[name]}" for name in dict.fromkeys(row[0] for row in cells)]
     return [as_table(head, cells), "\n".join(about)] if cells else []
 
@@ -300,7 +293,7 @@ def _beside(row: Data, rival: Data | None) -> list[str]:
 def _sizes(machine: Machine) -> list[str]:
     """Return a table for each set of sizes and types, with a line for each work of ours."""
     tables: dict[tuple[str, ...], list[list[str]]] = {}
-    for case in machine.cases.values():
+    for case in machine.values():
         labels, rows = as_sweep(case)
         if rows:
             tables.setdefault(labels, []).extend(rows)
@@ -328,7 +321,7 @@ def as_sweep(case: Data) -> tuple[tuple[str, ...], list[list[str]]]:
 def _accuracy(machine: Machine) -> list[str]:
     """Return how many bounds each case of accuracy keeps, and which it does not."""
     cells = []
-    for case in machine.cases.values():
+    for case in machine.values():
         if _is(case, "accuracy-"):
             missed = [f"{one['what']}: {one['measured']}" for one in case["targets"] if not one["met"]]
             kept = f"{len(case['targets']) - len(missed)} of {len(case['targets'])}"
