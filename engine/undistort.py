@@ -95,11 +95,6 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         Row and column of the maps' first pixel in the full picture; by default those of the part that the
         result says it is of. The same part of the undistorted map comes back.
 
-    Returns
-    -------
-    Result
-        Of the same size, with ``x`` and ``y`` on the sheet, and ``undistorted`` in its process.
-
     Raises
     ------
     mirrorskin.io.InputError

@@ -235,7 +235,7 @@ def draw_precession(precession: Precession) -> Figure:
 
 
 def _draw_path(axes: Axes, precession: Precession) -> None:
-    """Draw where the axis leans, with the phases written beside it."""
+    """Draw where the axis leans, with the phases written beside it, and which way it goes round."""
     centre = np.degrees(precession.centre)
     tilt = math.degrees(precession.tilt)
     path, marks = (np.degrees(precession.lean(phases)) for phases in (_TURN, _MARKS))
@@ -260,7 +260,11 @@ def _draw_path(axes: Axes, precession: Precession) -> None:
     )
     axes.plot(*centre, "x", color="tab:red", ms=9, mew=2, label="mean lean")
     axes.plot(0, 0, "+", color="black", ms=12, label="upright")
-    _draw_direction(axes, centre, precession)
+    angles = precession.phase_offset + precession.direction * np.radians(np.linspace(5, 75, 30))
+    arc = centre[:, None] + 0.6 * tilt * np.array([np.cos(angles), np.sin(angles)])
+    axes.plot(*arc[:, :-1], color="tab:green", lw=2)
+    arrow = {"arrowstyle": "-|>", "color": "tab:green", "lw": 2}
+    axes.annotate("", tuple(arc[:, -1]), tuple(arc[:, -3]), arrowprops=arrow)
     reach = 1.35 * max(tilt * (1 + abs(precession.ellipticity)), 1e-6)
     axes.set(
         xlim=(min(centre[0] - reach, -reach / 9), max(centre[0] + reach, reach / 9)),
@@ -279,15 +283,6 @@ def _draw_path(axes: Axes, precession: Precession) -> None:
         columnspacing=1.2,
         handlelength=1.5,
     )
-
-
-def _draw_direction(axes: Axes, centre: Floats, precession: Precession) -> None:
-    """Draw an arrow that goes round as the body does."""
-    angles = precession.phase_offset + precession.direction * np.radians(np.linspace(5, 75, 30))
-    arc = centre[:, None] + 0.6 * math.degrees(precession.tilt) * np.array([np.cos(angles), np.sin(angles)])
-    (x0, y0), (x1, y1) = arc[:, -3], arc[:, -1]
-    axes.plot(*arc[:, :-1], color="tab:green", lw=2)
-    axes.annotate("", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "-|>", "color": "tab:green", "lw": 2})
 
 
 _WORST = 98  # per cent of the errors that the colours tell apart

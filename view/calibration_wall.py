@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -21,30 +21,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.projections.polar import PolarAxes
 
-AZIMUTHS = np.linspace(0, math.tau, 181)
-"""Of the normal, radians."""
+AZIMUTHS = np.linspace(0, math.tau, 181)  # of the normal, radians
 
 
-def draw_azimuths(axes: PolarAxes, zeniths: Mapping[str, Floats], title: str) -> None:
-    """Draw zeniths over all azimuths of the normal."""
-    for name, values in zeniths.items():
-        axes.plot(AZIMUTHS, np.degrees(values), lw=1.8, label=name)
+def _draw_by_azimuth(
+    axes: PolarAxes, zenith_at: Callable[[float, float], Floats], axis: Sequence[float], away: float
+) -> None:
+    """Draw zeniths, radians, over the normal's azimuth: on the wall's axis and so far away from it, mm."""
+    x0, y0 = axis
+    for name, x, y in (
+        ("on the axis", 0.0, 0.0),
+        (f"{away:.2g} mm to the right", away, 0.0),
+        (f"{away:.2g} mm up", 0.0, away),
+        (f"{away:.2g} mm to the left", -away, 0.0),
+    ):
+        axes.plot(AZIMUTHS, np.degrees(zenith_at(x0 + x, y0 + y)), lw=1.8, label=name)
     axes.set_rmin(0)
     axes.set_yticks([tick for tick in axes.get_yticks() if tick > 0][1::2])
     axes.set_rlabel_position(22)
     axes.yaxis.set_major_formatter("{x:g}°")
-    axes.set_title(title)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), frameon=False, ncols=2)
-
-
-def places_about(reach: float) -> dict[str, tuple[float, float]]:
-    """Return the axis and places so far from it, x and y in mm, by their names."""
-    return {
-        "on the axis": (0.0, 0.0),
-        f"{reach:.2g} mm to the right": (reach, 0.0),
-        f"{reach:.2g} mm up": (0.0, reach),
-        f"{reach:.2g} mm to the left": (-reach, 0.0),
-    }
 
 
 _FINE = 300
@@ -63,7 +59,15 @@ def draw_response(response: WallResponse) -> Figure:
     figure = new_sheet(17, 10)
     grid = figure.add_gridspec(2, 3)
     (_draw_curve if response.pattern == "graded" else _draw_section)(figure.add_subplot(grid[0, 0]), response)
-    _draw_half_light(cast("PolarAxes", figure.add_subplot(grid[0, 1], projection="polar")), response)
+    polar = cast("PolarAxes", figure.add_subplot(grid[0, 1], projection="polar"))
+    half = _HALF * (1.0 if response.pattern == "graded" else float(response.curve[0]))
+    _draw_by_azimuth(
+        polar,
+        lambda x, y: threshold_zenith(response, x, y, AZIMUTHS, half),
+        response.axis,
+        _OFF_AXIS * response.radius,
+    )
+    polar.set_title("zenith of half light, by azimuth")
     _draw_shade(figure.add_subplot(grid[0, 2]), response)
     zenith, azimuth = (figure.add_subplot(grid[1, column]) for column in range(2))
     draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", "magma")
@@ -121,17 +125,6 @@ def _draw_section(axes: Axes, response: WallResponse) -> None:
         title=f"wall: radius {radius:.2f} mm, height {rim:.2f} mm\n"
         "angles: zenith of a mirror on the axis that shows this",
     )
-
-
-def _draw_half_light(axes: PolarAxes, response: WallResponse) -> None:
-    """Draw by azimuth the zenith at which half of the light is reached, on the axis and off it."""
-    x0, y0 = response.axis
-    full = 1.0 if response.pattern == "graded" else float(response.curve[0])
-    zeniths = {
-        name: threshold_zenith(response, x0 + x, y0 + y, AZIMUTHS, _HALF * full)
-        for name, (x, y) in places_about(_OFF_AXIS * response.radius).items()
-    }
-    draw_azimuths(axes, zeniths, "zenith of half light, by azimuth")
 
 
 def _draw_shade(axes: Axes, response: WallResponse) -> None:
@@ -196,12 +189,9 @@ def draw_gel(gel: Gel) -> Figure:
     grid = figure.add_gridspec(1, 3)
     _draw_threshold(figure.add_subplot(grid[0]), gel)
     polar = cast("PolarAxes", figure.add_subplot(grid[1], projection="polar"))
-    x0, y0 = gel.axis
-    zeniths = {
-        name: threshold_at(gel, x0 + x, y0 + y, AZIMUTHS)
-        for name, (x, y) in places_about(_OFF_AXIS / gel.curvature if gel.curvature else _NEAR).items()
-    }
-    draw_azimuths(polar, zeniths, "zenith at which light begins, by azimuth")
+    away = _OFF_AXIS / gel.curvature if gel.curvature else _NEAR
+    _draw_by_azimuth(polar, lambda x, y: threshold_at(gel, x, y, AZIMUTHS), gel.axis, away)
+    polar.set_title("zenith at which light begins, by azimuth")
     _draw_give(figure.add_subplot(grid[2]), gel)
     return figure
 

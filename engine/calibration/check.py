@@ -204,11 +204,7 @@ def _centre_by_normals(found: Result, sight: Doubles, radius: float, press: floa
     assert found.normals is not None
     assert found.contact is not None
     known = (found.contact != 0) & np.isfinite(found.normals).all(axis=-1)
-    if np.count_nonzero(known) < _LEAST:
-        raise InputError(
-            f"too little of a ball is seen: {np.count_nonzero(known)} pixels in contact have a normal;"
-            " press deeper"
-        )
+    _check_enough(np.count_nonzero(known), "in contact have a normal")
     x, y, slope_x, slope_y = sight[:, known]
     lean_x, lean_y, upright = found.normals[known].astype(np.float64).T
     centre = np.zeros(3)
@@ -250,7 +246,7 @@ def _normal_errors(found: Result, truth: _Truth, cells: int) -> dict[str, Errors
         "azimuth": _errors(np.degrees(turn), "deg", cells),
         "normal": _errors(np.degrees(apart), "deg", cells, sigma),
     }
-    _check_enough(errors["zenith"])
+    _check_enough(errors["zenith"].whole.pixels)
     if found.height is not None and found.component is not None:
         error = found.height - truth.height
         for piece in np.unique(found.component[np.isfinite(error)]):
@@ -260,11 +256,10 @@ def _normal_errors(found: Result, truth: _Truth, cells: int) -> dict[str, Errors
     return errors
 
 
-def _check_enough(errors: Errors) -> None:
-    if errors.whole.pixels < _LEAST:
+def _check_enough(pixels: Any, what: str = "could be judged") -> None:
+    if pixels < _LEAST:
         raise InputError(
-            f"too little of a ball is seen: {int(errors.whole.pixels)} pixels could be judged;"
-            " press deeper, or on a larger ball"
+            f"too little of a ball is seen: {pixels} pixels {what}; press deeper, or on a larger ball"
         )
 
 
@@ -283,10 +278,7 @@ def _top_by_heights(found: Result, radius: float) -> tuple[float, float]:
     from scipy.optimize import least_squares
 
     here = _measured(found)
-    if np.count_nonzero(here) < _LEAST:
-        raise InputError(
-            f"too little of a ball is seen: {np.count_nonzero(here)} pixels turn light; press deeper"
-        )
+    _check_enough(np.count_nonzero(here), "turn light")
     assert found.height is not None
     x, y = (part[here] for part in np.meshgrid(*_axes(found)))
     height = found.height[here].astype(np.float64)
@@ -307,7 +299,7 @@ def _height_errors(found: Result, place: tuple[float, float], radius: float, cel
     rise = radius**2 - (x - place[0]) ** 2 - (y - place[1]) ** 2
     true = np.sqrt(np.where(_measured(found) & (rise > 0), rise, np.nan)) - radius
     height = _errors(found.height - true, "mm", cells, found.height_sigma)
-    _check_enough(height)
+    _check_enough(height.whole.pixels)
     return {"height": height}
 
 

@@ -203,8 +203,8 @@ _STUCK = 1e8  # damping at which no step helps
 class Prior:
     """What is known of the parameters before the fit."""
 
-    mean: Doubles  # (P,): Standard deviations may be infinite; a parameter whose is 0 stays as it is
-    sigma: Doubles  # (P,): Standard deviations may be infinite; a parameter whose is 0 stays as it is
+    mean: Doubles  # (P,)
+    sigma: Doubles  # (P,): standard deviations, also infinite; a parameter whose is 0 stays as it is
     rising: bool = True  # Whether the curve rises from the rim to the rest plane
 
 

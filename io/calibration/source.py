@@ -111,25 +111,9 @@ class Calibrated:
     What else the source has (``travel``, ``region``, ``fingerprint`` ...) this has as well. A live source is
     not asked for its header before someone asks this, because that moves the stage.
 
-    Parameters
-    ----------
-    source : Source
-        A recording, also of a part of the picture, or a live source.
-    calibration : Calibration
-        Of the camera's whole picture.
-
-    Attributes
-    ----------
-    source : Source
-    whole : Calibration
-        As given.
-    name, motion, rewindable
-        Those of the source.
-
-    Raises
-    ------
-    InputError
-        The calibration is of another camera or half-angle, or a part of it was made with another pixel size.
+    The ``source`` is live, or a recording, also of a part of the picture; the ``calibration``, kept as
+    ``whole``, is of the camera's whole picture. InputError where that is another camera or half-angle, or a
+    part of it was made with another pixel size.
     """
 
     def __init__(self, source: Source, calibration: Calibration) -> None:
