@@ -52,16 +52,10 @@ Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first
 StepFrames = Annotated[int | None, typer.Option("--frames", min=1, help="In steps: at each place.")]
 
 
-# Those after the first line are live's.
+# The options of one motion only; threshold, hold and window are live's.
 _OWN: Mapping[ScanName, tuple[str, ...]] = {
-    ScanName.vertical: (
-        *("start", "stop", "step", "speed"),
-        *("threshold", "hold"),
-    ),
-    ScanName.axial: (
-        *("press", "tilt", "turns", "phase_step", "rate"),
-        *("window",),
-    ),
+    ScanName.vertical: ("start", "stop", "step", "speed", "threshold", "hold"),
+    ScanName.axial: ("press", "tilt", "turns", "phase_step", "rate", "window"),
 }
 
 
@@ -75,8 +69,8 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
     foreign = [name for name in others if words.get(name) is not None]
     if foreign:
         raise InputError(
-            f"{_spelled(foreign[0])} says nothing of a motion that is {motion.value}: leave it out, or choose"
-            " the other"
+            f"--{foreign[0].replace('_', '-')} says nothing of a motion that is {motion.value}:"
+            " leave it out, or choose the other"
         )
     plan: Plan = _vertical(words) if motion == ScanName.vertical else _axial(words)
     check_steps(plan, words["settle"], words["frames"])
@@ -193,7 +187,3 @@ def _needed(value: str | None, option: str, example: str) -> str:
     if value is None:
         raise InputError(f"{option} is missing: say how far the body goes, as in {option} {example}")
     return value
-
-
-def _spelled(name: str) -> str:
-    return "--" + name.replace("_", "-")

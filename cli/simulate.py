@@ -56,6 +56,7 @@ _HORIZONTAL, _TWIST = options.MotionName.horizontal, options.MotionName.twist
 
 
 def command(
+    context: typer.Context,
     motion: Annotated[options.MotionName, typer.Argument(help="How the body moves.")],
     output: options.NewRecording,
     thing: Annotated[
@@ -155,25 +156,15 @@ def command(
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths
     from mirrorskin.hw.twin import Body, Camera
 
-    for given in map(Path, (thing, pattern)):
-        io.check_output(output, given if given.suffix else None)  # a name is no file to keep
-    words = {
-        "travel-step": travel_step,
-        "travel-start": travel_start,
-        "compliance": compliance,
-        "press": press,
-        "tilt": tilt,
-        "phase-step": phase_step,
-        "pivot": pivot,
-        "displacement-step": displacement_step,
-        "twist-step": twist_step,
-    }
+    for source in map(Path, (thing, pattern)):
+        io.check_output(output, source if source.suffix else None)  # a name is no file to keep
+    given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
     columns, rows = frame_size(size, "--size")
     twin = hw.Twin(
         object=thing,
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
-        movement=make_movement(motion, frames, release, words),
+        movement=make_movement(motion, frames, release, given),
         contact=contact.value,
         optics=optics.value,
         pattern=pattern,

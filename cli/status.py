@@ -83,11 +83,10 @@ class Board:
             return table
         table.add_row("frames", f"{status.frames} at {status.rate:.1f} Hz, {status.used} used")
         table.add_row("lost", f"{status.skipped} skipped, {status.dropped} dropped")
-        table.add_row("updates", f"{status.updates}, {_per_second(status):.1f} Hz")
+        table.add_row("updates", f"{status.updates}, {_per_second(status.updates, status):.1f} Hz")
         for stage, latency in status.latency.items():
             if not math.isnan(latency.median):
-                told = f"{1e3 * latency.median:.1f} ms, 99 % below {1e3 * latency.p99:.1f} ms"
-                table.add_row(stage, told)
+                table.add_row(stage, f"{1e3 * latency.median:.1f} ms, 99 % below {1e3 * latency.p99:.1f} ms")
         return table
 
 
@@ -110,19 +109,15 @@ def summary(status: Status) -> str:
     """Say in a line how well the work kept up."""
     from mirrorskin.engine.live import SHOWN
 
-    told = (
-        f"{status.frames} frames at {_rate(status):.4g} Hz: {status.used} used, {status.skipped} skipped,"
-        f" {status.dropped} dropped; {status.updates} updates"
+    line = (
+        f"{status.frames} frames at {_per_second(status.frames - 1, status):.4g} Hz: {status.used} used,"
+        f" {status.skipped} skipped, {status.dropped} dropped; {status.updates} updates"
     )
     shown = status.latency.get(SHOWN)
     if shown is None or math.isnan(shown.median):
-        return told
-    return f"{told}, {1e3 * shown.median:.1f} ms from frame to map (99 % below {1e3 * shown.p99:.1f} ms)"
+        return line
+    return f"{line}, {1e3 * shown.median:.1f} ms from frame to map (99 % below {1e3 * shown.p99:.1f} ms)"
 
 
-def _rate(status: Status) -> float:
-    return (status.frames - 1) / status.seconds if status.seconds > 0 else 0.0
-
-
-def _per_second(status: Status) -> float:
-    return status.updates / status.seconds if status.seconds > 0 else 0.0
+def _per_second(count: int, status: Status) -> float:
+    return count / status.seconds if status.seconds > 0 else 0.0

@@ -38,7 +38,7 @@ _STALEST = 0.5  # seconds: a camera's own time that is older is not a time of th
 _LONGEST_BACKLOG = 0.5  # seconds
 _USUAL_RATE = 25.0  # frames a second, of what does not say
 PATIENCE = 10.0  # seconds from the loss of a camera until it is given up
-_FIRST = OPEN_TIMEOUT + READ_TIMEOUT  # seconds until the first frame
+_FIRST_FRAME = OPEN_TIMEOUT + READ_TIMEOUT  # seconds until the first frame
 _CLOSING = READ_TIMEOUT + 1.0  # seconds that the thread has for its end
 _PAUSES = (0.05, 1.0)  # seconds between two tries to have a camera back, at first and at most
 _DEVICES = Path("/dev")
@@ -115,8 +115,10 @@ class VideoCamera(ThreadedCamera):
             _log.warning("%s does not let go: unplug it before it is used again", self.name)
 
     def _await_first(self) -> None:
-        if not self._ready.wait(_FIRST):
-            raise InputError(f"{self.name} gave no picture within {_FIRST:.3g} s: see its cable and power")
+        if not self._ready.wait(_FIRST_FRAME):
+            raise InputError(
+                f"{self.name} gave no picture within {_FIRST_FRAME:.3g} s: see its cable and power"
+            )
         if self._refusal is not None:
             raise self._refusal
 
@@ -136,7 +138,7 @@ class VideoCamera(ThreadedCamera):
         timeout = OPEN_TIMEOUT
         while not self._stop.is_set():
             try:
-                why = self._follow(Capture(self._source, self._settings, timeout))
+                why = self._read_until_lost(Capture(self._source, self._settings, timeout))
             except InputError as error:
                 why = str(error)
             if not self._ready.is_set():
@@ -148,7 +150,7 @@ class VideoCamera(ThreadedCamera):
             if not self._stop.is_set():
                 timeout = self._wait_for_return(why)
 
-    def _follow(self, capture: Capture) -> str:
+    def _read_until_lost(self, capture: Capture) -> str:
         """Put frames into the ring as they come, and return why they do not come any more."""
         pace = _Pace(capture.period) if self._source.kind == "file" else None
         try:
@@ -422,7 +424,7 @@ def to_grey(picture: NDArray[Any], out: NDArray[Any], name: str) -> None:
     """
     if picture.shape[:2] != out.shape or picture.dtype != out.dtype:
         raise InputError(
-            f"{name} gives pictures of {_say(picture)}, and {_say(out)} is asked for: "
+            f"{name} gives pictures of {_describe(picture)}, and {_describe(out)} is asked for: "
             "set camera.size, camera.dtype or camera.fourcc in the rig file so that they agree"
         )
     channels = 1 if picture.ndim == 2 else picture.shape[2]
@@ -434,5 +436,5 @@ def to_grey(picture: NDArray[Any], out: NDArray[Any], name: str) -> None:
         np.copyto(out, picture[..., 0])
 
 
-def _say(picture: NDArray[Any]) -> str:
+def _describe(picture: NDArray[Any]) -> str:
     return f"{picture.shape[1]} x {picture.shape[0]} {picture.dtype}"

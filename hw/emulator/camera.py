@@ -58,11 +58,11 @@ class TwinCamera(ThreadedCamera):
         self._twin, self._where, self._pivot = twin, where, pivot
         self._rate, self._delay, self._jitter = rate, delay, jitter
         self._random = np.random.default_rng(seed)
-        self._underway: deque[_Frame] = deque()
-        self._sent = threading.Condition()
+        self._in_transit: deque[_Frame] = deque()
+        self._change = threading.Condition()
         self._stalled, self._ended = threading.Event(), threading.Event()
         self._threads = [
-            threading.Thread(target=self._tell_if_it_fails, args=(work,), name=f"{self.name}: {name}")
+            threading.Thread(target=self._report_failure, args=(work,), name=f"{self.name}: {name}")
             for name, work in (("exposes", self._expose), ("delivers", self._deliver))
         ]
         for thread in self._threads:
@@ -80,13 +80,13 @@ class TwinCamera(ThreadedCamera):
     def close(self) -> None:
         """Stop; frames under way do not arrive. A second time does nothing."""
         self._ended.set()
-        with self._sent:
-            self._sent.notify_all()
+        with self._change:
+            self._change.notify_all()
         for thread in self._threads:
             thread.join()
         self._fail(f"{self.name} is closed")
 
-    def _tell_if_it_fails(self, work: Callable[[], None]) -> None:
+    def _report_failure(self, work: Callable[[], None]) -> None:
         try:
             work()
         except Exception as error:  # readers are told, and the other thread ends when it is closed
@@ -101,17 +101,19 @@ class TwinCamera(ThreadedCamera):
         last = -math.inf
         while True:
             middle = start + number * period
-            over = middle + self._twin.exposure / 2
-            arrival = max(over, last, middle + self._delay + self._jitter * self._random.standard_normal())
-            if self._wait_until(over):
+            exposure_end = middle + self._twin.exposure / 2
+            arrival = max(
+                exposure_end, last, middle + self._delay + self._jitter * self._random.standard_normal()
+            )
+            if self._wait_until(exposure_end):
                 return
             if self._stalled.is_set() or time.monotonic() > arrival + period:
                 lost += 1
             else:
                 pixels = self._render(middle, number)
-                with self._sent:
-                    self._underway.append(_Frame(pixels, arrival, lost))
-                    self._sent.notify_all()
+                with self._change:
+                    self._in_transit.append(_Frame(pixels, arrival, lost))
+                    self._change.notify_all()
                 last, lost = arrival, 0
             number += 1
 
@@ -129,11 +131,11 @@ class TwinCamera(ThreadedCamera):
         """Let each frame arrive when it is due."""
         missed = 0
         while True:
-            with self._sent:
-                self._sent.wait_for(lambda: self._underway or self._ended.is_set())
+            with self._change:
+                self._change.wait_for(lambda: self._in_transit or self._ended.is_set())
                 if self._ended.is_set():
                     return
-                frame = self._underway.popleft()
+                frame = self._in_transit.popleft()
             if self._wait_until(frame.arrival):
                 return
             if self._stalled.is_set():

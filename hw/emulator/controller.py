@@ -21,14 +21,14 @@ from mirrorskin.hw.emulator.motion import BLOCKS, Line, Move, Path, Place, Plann
 
 BANNER = "Grbl 1.1h ['$' for help]"
 BUILD = "[VER:1.1h.20190825:]"
-ROOM = 128  # bytes that the receive buffer holds
+RX_BUFFER = 128  # bytes that the receive buffer holds
 LINE_TIME = 1e-3  # seconds that a line takes to be read
 HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
 
-_RESET, _ASK, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
-_LONGEST = 79  # characters of a line, without spaces
-_OFFSET_EVERY = 10  # reports, of which one has the work offset
-_SEARCH = 1.5  # travels within which a homing switch must be found
+_RESET, _QUERY, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
+_LINE_MAX = 79  # characters of a line, without spaces
+_WCO_EVERY = 10  # reports, of which one has the work offset
+_SEEK_TRAVELS = 1.5  # travels within which a homing switch must be found
 _FIRST_AXIS = 2  # the firmware homes Z before the others
 
 # Settings of a small, quick stage: report in inches, soft limits, homing (on, slow and quick rate a minute,
@@ -57,11 +57,11 @@ class Controller:
         self._axes = len(axes)
         self._now = now
         self.planner = Planner(place, memory)
-        self._error = place  # true coordinates less the controller's own
+        self._offset = place  # true coordinates less the controller's own
         self._program = Interpreter(axes, self._own_place())
         self._received: deque[int] = deque()
         self._out = bytearray()
-        self._dead = False
+        self._powered_off = False
         self._locked = bool(self._settings[22])
         self._boot()
 
@@ -69,8 +69,8 @@ class Controller:
         """Begin anew, as after a reset; an alarm stays."""
         self._received.clear()
         self._program.reset(self._own_place())
-        self._homing = self._critical = self._beyond = self._at_work = False
-        self._asked = self._to_hold = False
+        self._homing = self._needs_reset = self._limit_reached = self._executing = False
+        self._report_due = self._hold_pending = False
         self._reports = 0
         self._steps = self._loop()
         self._wait: _Wait = -math.inf
@@ -78,7 +78,7 @@ class Controller:
         self._say(BANNER)
         if self._locked:
             self._say("[MSG:'$H'|'$X' to unlock]")
-        self._pump()
+        self._run_steps()
 
     @property
     def state(self) -> str:
@@ -102,7 +102,7 @@ class Controller:
 
     def next_event(self) -> float:
         """Return when something may happen next by itself, inf for never."""
-        if self._dead:
+        if self._powered_off:
             return math.inf
         due = math.inf if self._suspended or callable(self._wait) else self._wait
         return min(self.planner.next_event(), due)
@@ -116,40 +116,40 @@ class Controller:
 
     def receive(self, data: bytes) -> None:
         """Take bytes that arrive now, all at once; of several questions for a report one is answered."""
-        if self._dead:
+        if self._powered_off:
             return
         for byte in data:
-            if byte in (_RESET, _ASK, _HOLD, _RESUME):
-                self._obey_at_once(byte)
-            elif byte < 0x80 and len(self._received) < ROOM:
+            if byte in (_RESET, _QUERY, _HOLD, _RESUME):
+                self._on_realtime(byte)
+            elif byte < 0x80 and len(self._received) < RX_BUFFER:
                 self._received.append(byte)
         self._react()
-        if not self._critical:
-            self._answer()
+        if not self._needs_reset:
+            self._report()
 
     def alarm(self, code: int) -> None:
         """Raise an alarm: 1 and 2 wait for a reset, others bring one along."""
-        if self._dead:
+        if self._powered_off:
             return
         if code in (HARD_LIMIT, SOFT_LIMIT):
-            self._stop_for_reset(code)
+            self._lock_until_reset(code)
         else:
             self._abort(code)
 
     def die(self) -> None:
         """Stop dead for good."""
         self.planner.halt(self._now)
-        self._dead = True
+        self._powered_off = True
         self._out.clear()
 
     @property
     def _suspended(self) -> bool:
         """Whether lines are not read: held, or after an alarm that asks for a reset."""
-        return self._dead or self._critical or self.planner.held(self._now)
+        return self._powered_off or self._needs_reset or self.planner.held(self._now)
 
     def _own_place(self) -> Place:
         """Return where the axes are, as the controller believes."""
-        return tuple(a - b for a, b in zip(self.planner.place(self._now), self._error, strict=True))
+        return tuple(a - b for a, b in zip(self.planner.place(self._now), self._offset, strict=True))
 
     def _say(self, line: str) -> None:
         self._out += line.encode("ascii") + b"\r\n"
@@ -159,27 +159,27 @@ class Controller:
 
     # Realtime bytes, and what comes of them
 
-    def _obey_at_once(self, byte: int) -> None:
+    def _on_realtime(self, byte: int) -> None:
         if byte == _RESET:
             running = self.planner.busy and not self.planner.held(self._now)
             self._abort(HOMING_ABORTED if self._homing else ABORTED if running else None)
-        elif byte == _ASK:
-            self._asked = True
-        elif self._critical:
+        elif byte == _QUERY:
+            self._report_due = True
+        elif self._needs_reset:
             return
         elif byte == _HOLD and self._homing:
-            self._to_hold = True
+            self._hold_pending = True
         elif byte == _HOLD and not self._locked:
             self.planner.hold(self._now)
-        elif byte == _RESUME and self.planner.held(self._now) and not self._beyond:
+        elif byte == _RESUME and self.planner.held(self._now) and not self._limit_reached:
             self.planner.resume(self._now)
 
     def _react(self) -> None:
         """Do what the time, or new bytes, ask for."""
         self.planner.advance(self._now)
-        if self._beyond and self.planner.held(self._now):
-            self._stop_for_reset(SOFT_LIMIT)
-        self._pump()
+        if self._limit_reached and self.planner.held(self._now):
+            self._lock_until_reset(SOFT_LIMIT)
+        self._run_steps()
 
     def _abort(self, code: int | None) -> None:
         """Stop dead and begin anew, with an alarm or without."""
@@ -187,33 +187,33 @@ class Controller:
         if code is not None:
             self._say(f"ALARM:{code}")
             self._locked = True
-        if self._at_work:  # a line that is cut short counts as done
+        if self._executing:  # a line that is cut short counts as done
             self._say("ok")
         self._boot()
 
-    def _stop_for_reset(self, code: int) -> None:
+    def _lock_until_reset(self, code: int) -> None:
         self.planner.halt(self._now)
-        self._critical = self._locked = True
-        self._beyond = self._homing = False
+        self._needs_reset = self._locked = True
+        self._limit_reached = self._homing = False
         self._say(f"ALARM:{code}")
         self._say("[MSG:Reset to continue]")
 
-    def _answer(self) -> None:
+    def _report(self) -> None:
         """Report, if that has been asked for; not while homing."""
-        if not self._asked or self._homing:
+        if not self._report_due or self._homing:
             return
-        self._asked = False
+        self._report_due = False
         # Adding 0 makes plain zeros of negative ones.
         place = ",".join(f"{round(value, 3) + 0.0:.3f}" for value in self._own_place())
         fields = [self.state, f"MPos:{place}", f"FS:{self.planner.speed(self._now) * 60:.0f},0"]
-        if self._reports % _OFFSET_EVERY == 0:
+        if self._reports % _WCO_EVERY == 0:
             fields.append("WCO:" + ",".join(["0.000"] * self._axes))
         self._reports += 1
         self._say(f"<{'|'.join(fields)}>")
 
     # The main loop: one line after the other, waiting where the firmware waits
 
-    def _pump(self) -> None:
+    def _run_steps(self) -> None:
         """Go on as far as nothing has to be waited for."""
         while not self._suspended:
             steps, wait = self._steps, self._wait
@@ -231,15 +231,15 @@ class Controller:
             if byte not in b"\r\n":
                 line.append(byte)
                 continue
-            self._at_work = True
+            self._executing = True
             yield self._now + LINE_TIME
             yield from self._execute(re.sub(r"\s", "", line.decode("ascii")).upper())
-            self._at_work = False
+            self._executing = False
             line.clear()
 
     def _execute(self, line: str) -> _Steps:
         try:
-            if len(line) > _LONGEST:
+            if len(line) > _LINE_MAX:
                 raise GrblError(11)
             if line.startswith("$"):
                 yield from self._command(line[1:])
@@ -257,13 +257,13 @@ class Controller:
         """Wait for room in the planner, and put a move there; not beyond the soft limits, if they are on."""
         low = tuple(-travel for travel in self._per_axis(130))
         if self._settings[20] and not stays_inside(path, low, (0.0,) * self._axes):
-            self._beyond = True
+            self._limit_reached = True
             self.planner.hold(self._now)
             if self.planner.held(self._now):
-                self._stop_for_reset(SOFT_LIMIT)
+                self._lock_until_reset(SOFT_LIMIT)
             yield lambda: False
         yield lambda: self.planner.free > 0
-        path = shifted(path, self._error)
+        path = shifted(path, self._offset)
         rates = [rate / 60 for rate in self._per_axis(110)]
         self.planner.add(Move(path, *path.limits(feed, rates, self._per_axis(120))), self._now)
 
@@ -280,7 +280,7 @@ class Controller:
                 self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
         elif text == "I":
             self._say(BUILD)
-            self._say(f"[OPT:VM,{BLOCKS},{ROOM}]")
+            self._say(f"[OPT:VM,{BLOCKS},{RX_BUFFER}]")
         elif text == "H":
             yield from self._home()
         else:
@@ -294,19 +294,19 @@ class Controller:
         off = -self._settings[27]
         quick, slow = self._settings[25] / 60, self._settings[24] / 60
         for axis in sorted(range(self._axes), key=lambda axis: (axis != _FIRST_AXIS, axis)):
-            here, farthest = self.planner.place(self._now)[axis], _SEARCH * self._settings[130 + axis]
+            here, farthest = self.planner.place(self._now)[axis], _SEEK_TRAVELS * self._settings[130 + axis]
             if -here > farthest:
                 yield from self._seek(axis, here + farthest, quick)
                 self._abort(NO_SWITCH)
                 yield lambda: False
             for goal, speed in ((0.0, quick), (off, quick), (0.0, slow), (off, quick)):
                 yield from self._seek(axis, goal, speed)
-        self._error = (0.0,) * self._axes
+        self._offset = (0.0,) * self._axes
         self._program.place = self._own_place()
         self._homing = self._locked = False
-        self._answer()
-        if self._to_hold:
-            self._to_hold = False
+        self._report()
+        if self._hold_pending:
+            self._hold_pending = False
             self.planner.hold(self._now)
 
     def _seek(self, axis: int, goal: float, speed: float) -> _Steps:

@@ -22,7 +22,7 @@ _GROUPS = {
 _GROUP_OF = {code: group for group, codes in _GROUPS.items() for code in codes}
 _PLANES = {"G17": (0, 1), "G18": (2, 0), "G19": (1, 2)}
 _TURN_EPSILON = 5e-7  # radians below which an arc is a whole turn
-_NO_WAY = 1e-9  # axis units below which there is nothing to drive
+_MIN_MOVE = 1e-9  # axis units below which there is nothing to drive
 
 Drive = tuple[Path, float]
 """A path, and the feed along it in units a second, infinite for as fast as the axes go."""
@@ -106,7 +106,7 @@ class Interpreter:
             if not named <= set(plane):  # the firmware would go along a helix
                 raise GrblError(20)
             return self._arc(plane, values, end, motion == "G2"), feed / 60
-        if math.dist(self.place, end) < _NO_WAY:
+        if math.dist(self.place, end) < _MIN_MOVE:
             return None
         return Line(self.place, end), math.inf if motion == "G0" else feed / 60
 
@@ -118,9 +118,13 @@ class Interpreter:
         x, y = (-(offset or 0.0) for offset in offsets)
         centre = (self.place[plane[0]] - x, self.place[plane[1]] - y)
         u, v = (end[axis] - middle for axis, middle in zip(plane, centre, strict=True))
-        begins, ends = math.hypot(x, y), math.hypot(u, v)
-        apart = abs(begins - ends)
-        if min(begins, ends) < _NO_WAY or apart > 0.5 or (apart > 0.005 and apart > 0.001 * begins):
+        start_radius, end_radius = math.hypot(x, y), math.hypot(u, v)
+        mismatch = abs(start_radius - end_radius)
+        if (
+            min(start_radius, end_radius) < _MIN_MOVE
+            or mismatch > 0.5
+            or (mismatch > 0.005 and mismatch > 0.001 * start_radius)
+        ):
             raise GrblError(33)
         angle = math.atan2(x * v - y * u, x * u + y * v)
         if clockwise:

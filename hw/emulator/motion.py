@@ -58,7 +58,7 @@ class Line:
     ) -> tuple[float, float]:
         """Return the greatest speed, up to a feed, and acceleration that no axis' limit forbids."""
         unit = self.tangent(0.0)
-        return min(feed, _share(rates, unit)), _share(accelerations, unit)
+        return min(feed, _largest_multiple(rates, unit)), _largest_multiple(accelerations, unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class Arc:
 Path = Line | Arc
 
 
-def _share(limits: Sequence[float], direction: Sequence[float]) -> float:
+def _largest_multiple(limits: Sequence[float], direction: Sequence[float]) -> float:
     """Return the greatest multiple of a direction that no axis' limit forbids, inf for none."""
     return min(
         (limit / abs(part) for limit, part in zip(limits, direction, strict=True) if part), default=math.inf
@@ -186,7 +186,7 @@ class _Span:
     speed: float
     acceleration: float
 
-    def gone(self, at: float) -> float:
+    def distance_at(self, at: float) -> float:
         time = min(max(at, self.start), self.end) - self.start
         return self.distance + time * (self.speed + time * self.acceleration / 2)
 
@@ -214,7 +214,7 @@ class Planner:
         self._corners: list[float] = []  # the greatest speed at the begin of each queued move
         self._ends: list[float] = []  # when the queued moves end, as far as is planned
         self._stop: float | None = None  # when a hold comes, or came, to rest
-        self._seen = -math.inf
+        self._now = -math.inf
 
     @property
     def free(self) -> int:
@@ -238,18 +238,18 @@ class Planner:
     def next_event(self) -> float:
         """Return when a move ends or a hold comes to rest next, inf for never."""
         stop = [] if self._stop is None else [self._stop]
-        return min((time for time in self._ends[:1] + stop if time > self._seen), default=math.inf)
+        return min((time for time in self._ends[:1] + stop if time > self._now), default=math.inf)
 
     def advance(self, now: float) -> None:
         """Drop the moves that have ended."""
-        self._seen = now
+        self._now = now
         while self._ends and self._ends[0] <= now:
             del self._ends[0], self._moves[0], self._corners[0]
 
     def place(self, at: float) -> Place:
         """Return where the axes are at a time: past, or as planned."""
         span = self._span(at)
-        return self._first if span is None else span.move.path.point(span.gone(at))
+        return self._first if span is None else span.move.path.point(span.distance_at(at))
 
     def speed(self, at: float) -> float:
         """Return the speed along the path, units/s."""
@@ -321,7 +321,7 @@ class Planner:
         self._spans[-1] = last = replace(last, end=min(now, last.end))
         if not self._moves or last.move is not self._moves[0]:
             return 0.0, 0.0
-        return last.gone(now), last.speed_at(now) if under_way else 0.0
+        return last.distance_at(now), last.speed_at(now) if under_way else 0.0
 
     def _plan(self, now: float) -> None:
         """Plan the speed of all that is queued: as fast as the limits and a stop at the end allow."""

@@ -49,54 +49,54 @@ class GrblMachine:
     def receive(self, data: bytes) -> None:
         """Take bytes from the host, now."""
         with self._lock:
-            self._catch_up().receive(data)
+            self._current().receive(data)
 
     def take(self) -> bytes:
         """Return what has been replied since the last call."""
         with self._lock:
-            return self._catch_up().take()
+            return self._current().take()
 
     def next_event(self) -> float:
         """Return when something may happen next by itself, on the clock; inf for never."""
         with self._lock:
-            return self._catch_up().next_event()
+            return self._current().next_event()
 
     def position(self, at: float | None = None) -> dict[str, float]:
         """Return where the axes truly are at a time on the clock, by default now: mm or degrees, as homed."""
         with self._lock:
-            planner = self._catch_up().planner
+            planner = self._current().planner
             place = planner.place(self._clock() if at is None else at)
         return dict(zip(self.axes, place, strict=True))
 
     def moving(self, at: float | None = None) -> bool:
         """Return whether the axes move at a time on the clock, by default now."""
         with self._lock:
-            planner = self._catch_up().planner
+            planner = self._current().planner
             return planner.moving(self._clock() if at is None else at)
 
     def speed(self, at: float | None = None) -> float:
         """Return the speed along the path at a time on the clock, by default now; units/s."""
         with self._lock:
-            planner = self._catch_up().planner
+            planner = self._current().planner
             return planner.speed(self._clock() if at is None else at)
 
     @property
     def state(self) -> str:
         """The state as a report has it: Idle, Run, Hold:0, Hold:1, Alarm or Home."""
         with self._lock:
-            return self._catch_up().state
+            return self._current().state
 
     def alarm(self, code: int) -> None:
         """Raise an alarm: 1 and 2 as limits do, others as what aborts a cycle does (with a reset)."""
         with self._lock:
-            self._catch_up().alarm(code)
+            self._current().alarm(code)
 
     def cut_power(self) -> None:
         """Let the controller die: the axes stop dead, and nothing is answered any more."""
         with self._lock:
-            self._catch_up().die()
+            self._current().die()
 
-    def _catch_up(self) -> Controller:
+    def _current(self) -> Controller:
         self._controller.advance(self._clock())
         return self._controller
 
@@ -166,12 +166,12 @@ class GrblPort(Closing):
     def _run(self) -> None:
         try:
             while not self._closing:
-                self._turn()
+                self._step()
         finally:
             os.close(self._master)
             os.close(self._slave)
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         """Send what has been said, wait until there is something to do, and hear."""
         due = self.machine.next_event()  # before collecting: what becomes due meanwhile is not slept over
         said = self.machine.take()

@@ -117,9 +117,9 @@ ASK, HOLD, RESET = b"?", b"!", b"\x18"
 
 _TICK = 0.01  # seconds between two looks at the clock
 _SILENCE, _TRIPS = 0.07, 4  # seconds, and usual round trips at least, that a question may be open in motion
-_EAGER = 0.05  # seconds between questions at most, until `begin`
-_FAST = 0.025  # the same in motion and during a stop: how soon a silence shows
-_LOST = 0.5  # seconds at rest after which an answer that is out will not come
+_OPENING_PERIOD = 0.05  # seconds between questions at most, until `begin`
+_MOVING_PERIOD = 0.025  # the same in motion and during a stop: how soon a silence shows
+_ANSWER_LOST = 0.5  # seconds at rest after which an answer that is out will not come
 _SLICE = 0.05  # seconds of one wait
 _CHUNK = 1024  # bytes that are heard at a time, before others have their turn
 _INTERRUPTED = ("hold", "door", "sleep", "check")  # states that we did not ask for
@@ -172,7 +172,7 @@ class Link:
         self._replies: list[Reply] = []
         self._refused: Refusal | None = None
         self._active = False
-        self._moved = -math.inf  # when a line was last sent or answered
+        self._last_line = -math.inf  # when a line was last sent or answered
         self._stopping = Stopping()
         self._deaf = False  # what comes is noise, and was reported as such
         self._closing = False
@@ -339,7 +339,7 @@ class Link:
         self._on_report(self.seen)
         if status.state != "idle":
             self.rests = 0
-        elif self.seen.answer.asked > self._moved:
+        elif self.seen.answer.asked > self._last_line:
             self.rests += 1
         if not self._active:
             return
@@ -352,7 +352,7 @@ class Link:
         line = self.window.answer()
         if line is None:
             return
-        self._moved = time.monotonic()
+        self._last_line = time.monotonic()
         self.rests = 0
         self._refused = refusal
         if refusal is not None and self._active:
@@ -361,7 +361,7 @@ class Link:
 
     def _pump(self) -> None:
         while self.error is None and (data := self.window.next()) is not None:
-            self._moved = time.monotonic()
+            self._last_line = time.monotonic()
             try:
                 self._port.write(data)
             except Exception as error:  # as in send
@@ -374,8 +374,8 @@ class Link:
             with self.lock:
                 self._check_answers(now)
                 if self._stopping.begun:
-                    self._end(now)
-                self._times.period = self._pace()
+                    self._advance_stop(now)
+                self._times.period = self._poll_period()
                 ask = self._times.due(now) and not self.gone
                 if ask:
                     self._times.ask(time.monotonic())
@@ -392,10 +392,10 @@ class Link:
         """Stop it when it has been silent for too long, or lost an answer."""
         if not self._active or self._stopping.begun:
             return
-        if self._times.silence(now) > self._limit() and not self._waiting():
+        if self._times.silence(now) > self._limit() and not self._has_unread():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
         idle = self.seen is not None and self.seen.status.state == "idle"
-        if idle and self.patience is None and self.window.busy and now - self._moved > _LOST:
+        if idle and self.patience is None and self.window.busy and now - self._last_line > _ANSWER_LOST:
             self.halt("it rests without having answered all lines; look at the cable")
 
     def _limit(self) -> float:
@@ -409,20 +409,20 @@ class Link:
         taken = self.seen.status.state == "idle" and self.rests == 0  # a line, since the report of rest
         return taken or not self.seen.status.rests
 
-    def _pace(self) -> float:
+    def _poll_period(self) -> float:
         """Return the seconds between two questions, as things stand."""
         if not self._active:
-            return min(self._period, _EAGER)
-        return min(self._period, _FAST) if self._moving() or self._stopping.begun else self._period
+            return min(self._period, _OPENING_PERIOD)
+        return min(self._period, _MOVING_PERIOD) if self._moving() or self._stopping.begun else self._period
 
-    def _waiting(self) -> bool:
+    def _has_unread(self) -> bool:
         """Return whether there is something to be read that the reader did not get to."""
         try:
             return self._port.in_waiting > 0
         except Exception:  # as in send
             return False
 
-    def _end(self, now: float) -> None:
+    def _advance_stop(self, now: float) -> None:
         """Go on with a stop: reset once the machine is held, and wait until that is answered."""
         rested = self.seen.answer.asked if self.seen is not None and self.seen.status.rests else -math.inf
         if self._stopping.reset(now, rested, self.gone):

@@ -17,9 +17,9 @@ _STRAIGHT = "G53G1"  # in the machine's coordinates
 _PLANES = {("X", "Y"): "G17", ("Z", "X"): "G18", ("Y", "Z"): "G19"}
 _CENTRES = {"X": "I", "Y": "J", "Z": "K"}
 _NO_TRAVEL = 1e-3  # mm that count as none where the body leans as well
-_SHORT = math.radians(1)  # of an arc that is as good as straight
-_EVEN = 1e-9  # of a half turn
-_MOST = 10_000  # turns at a time, since all their lines are made beforehand
+_SHORT_ARC = math.radians(1)  # of an arc that is as good as straight
+_ROUNDING = 1e-9  # of a half turn
+_TURNS_MAX = 10_000  # turns at a time, since all their lines are made beforehand
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +87,13 @@ class Axes:
         self._check_rate(tilt, turns, rate)
         radius = tilt * self._axes["pitch"].scale
         feed = self._feed(math.tau * rate * radius)
-        count = max(1, math.ceil(2 * abs(turns) - _EVEN))
+        count = max(1, math.ceil(2 * abs(turns) - _ROUNDING))
         step = math.tau * turns / count
         word = "G3" if step * sense > 0 else "G2"
         commands = [Command(plane, 0.0)]
         for k in range(count):
             ends = [self._lean(tilt, start + step * number) for number in (k, k + 1)]
-            if abs(step) < _SHORT:
+            if abs(step) < _SHORT_ARC:
                 line = f"{_STRAIGHT}{_words(ends[1])}{feed}"
             else:
                 line = f"{word}{self._arc(ends[0], ends[1], offset)}{feed}"
@@ -134,10 +134,12 @@ class Axes:
                 f"{self._name}: {turns:g} turns at {rate:g} a second with a tilt of {math.degrees(tilt):g} "
                 "degrees are no precession; tilt and rate must be positive, and the turns not 0"
             )
-        if abs(turns) > _MOST:
-            raise InputError(f"{self._name}: {turns:g} turns are too many; go round {_MOST} times at most")
+        if abs(turns) > _TURNS_MAX:
+            raise InputError(
+                f"{self._name}: {turns:g} turns are too many; go round {_TURNS_MAX} times at most"
+            )
         greatest = min(self.speeds["pitch"], self.speeds["roll"]) / (math.tau * tilt)
-        if rate > greatest * (1 + _EVEN):
+        if rate > greatest * (1 + _ROUNDING):
             raise InputError(
                 f"{self._name}: {rate:.4g} turns a second at {math.degrees(tilt):.4g} degrees are more than "
                 f"pitch and roll go; at most {greatest:.4g}"
@@ -155,7 +157,7 @@ class Axes:
             raise InputError(f"{self._name}: a speed of {speed:g} is none; give a positive one")
         lean = math.hypot(changes.get("pitch", 0.0), changes.get("roll", 0.0))
         path = lean if lean > 0 and changes["travel"] < _NO_TRAVEL else changes["travel"]
-        if path / speed < times[slowest] * (1 - _EVEN):
+        if path / speed < times[slowest] * (1 - _ROUNDING):
             unit = "mm/s" if path != lean else "rad/s"
             raise InputError(
                 f"{self._name}: at {speed:.4g} {unit} the axis of {slowest} is too fast; at most "

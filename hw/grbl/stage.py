@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 
 _PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute
 _OLDEST = (1, 1)
-_REFRESH = 2.0  # seconds in which a report gives the work offset, at 20 questions a second
-_KEPT = 1 << 17  # reports: an hour of motion
-_THERE = 0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
+_OFFSET_TIMEOUT = 2.0  # seconds in which a report gives the work offset, at 20 questions a second
+_REPORTS_MAX = 1 << 17  # reports: an hour of motion
+_ARRIVED = (
+    0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
+)
 _RESTS = 3  # reports of rest elsewhere, until that is where it stays
 _MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
 _HOMING = 60.0  # seconds, where the settings do not say how long it takes
@@ -80,7 +82,7 @@ class GrblStage(Closing):
         self._settings = settings
         self._axes = Axes(settings, self.name)
         self._offset: Mapping[str, float] | None = None
-        self._reports: deque[Report] = deque(maxlen=_KEPT)
+        self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._latest: Report | None = None
         self._target: Position | None = None
         self._excess = math.inf  # how far beyond the limits it was at the least, since it works
@@ -175,7 +177,7 @@ class GrblStage(Closing):
         assert self._offset is not None  # it is open only when this is known
         commands = self._axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
-        if self._axes.distance(before, begin) > _THERE:
+        if self._axes.distance(before, begin) > _ARRIVED:
             raise InputError(
                 f"{self.name}: a precession begins where the body leans by {math.degrees(tilt):.4g} degrees "
                 f"at the phase {math.degrees(start):.4g} degrees; move there first"
@@ -243,7 +245,7 @@ class GrblStage(Closing):
         """Wait until a report has the offset at which the work coordinates begin."""
         try:
             self._link.until(
-                lambda: self._offset, max(self._settings.timeout, _REFRESH), "report its work offset"
+                lambda: self._offset, max(self._settings.timeout, _OFFSET_TIMEOUT), "report its work offset"
             )
         except HardwareError as error:
             raise InputError(
@@ -336,7 +338,7 @@ class GrblStage(Closing):
         if self._target is None:
             return latest if link.rests > 1 else None
         off = self._axes.distance(latest.position, self._target)
-        if off <= _THERE + self._rounding:
+        if off <= _ARRIVED + self._rounding:
             return latest
         if link.rests >= _RESTS:
             link.halt(f"it rests {off:.3g} mm or degrees from where it was sent; look at its cable")

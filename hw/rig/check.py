@@ -26,19 +26,19 @@ _PERIOD = 1.0  # seconds that reports and frames are counted for
 
 _LETTERS = "XYZABC"  # the order of the settings that each axis has
 _SOFT_LIMITS, _HOMING, _RATES, _LENGTHS = 20, 22, 110, 130  # numbers of GRBL's settings
-_ENOUGH = 0.8  # of the reports asked for
-_LOOK = 0.02  # seconds between two looks for more
-_SLOW = 0.05  # seconds that a report may take
-_ALIKE = 1e-6  # how far numbers of the controller may be beyond ours by rounding
+_REPORT_SHARE = 0.8  # of the reports asked for
+_POLL = 0.02  # seconds between two looks for more
+_ROUND_TRIP_MAX = 0.05  # seconds that a report may take
+_ROUNDING = 1e-6  # how far numbers of the controller may be beyond ours by rounding
 
-_FIRST = 5.0  # seconds that a camera may take to its first frame
-_MOST = 64  # frames taken at once
-_OFF = 0.05  # share that a rate may differ from the one asked
-_SATURATED = 0.01  # share of the pixels that may be
+_FRAME_TIMEOUT = 5.0  # seconds that a camera may take to its first frame
+_BATCH = 64  # frames taken at once
+_RATE_TOLERANCE = 0.05  # share that a rate may differ from the one asked
+_SATURATED_MAX = 0.01  # share of the pixels that may be
 
-_FARTHEST = {"mm": 0.5, "deg": math.radians(0.5)}  # how far an axis is moved at most, mm and rad
-_SHARE = 0.1  # of how far it may go
-_NEAR = {"mm": 0.02, "deg": math.radians(0.02)}  # how near it must come, mm and rad
+_MOVE_MAX = {"mm": 0.5, "deg": math.radians(0.5)}  # how far an axis is moved at most, mm and rad
+_MOVE_SHARE = 0.1  # of how far it may go
+_POSITION_TOLERANCE = {"mm": 0.02, "deg": math.radians(0.02)}  # how near it must come, mm and rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     if length is None:
         return Finding("stage", what, found)
     ends = sorted(axis.zero + axis.direction * value for value in (low, high))
-    most, remedy = length * (1 + _ALIKE), ""
+    most, remedy = length * (1 + _ROUNDING), ""
     within = -most <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= most
     if high - low > most:
         remedy = f"they are {high - low:g} {unit} apart, and the axis is shorter; correct stage.{name}.limits"
@@ -183,7 +183,7 @@ def _speed(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     theirs = parameters[number] / 60 if number in parameters else None
     found = f"{axis.speed:g} {unit}/s, of {_of_controller(theirs, f'{unit}/s')}"
     remedy = ""
-    if theirs is not None and axis.speed > theirs * (1 + _ALIKE):
+    if theirs is not None and axis.speed > theirs * (1 + _ROUNDING):
         remedy = f"the controller moves more slowly than the file says; set stage.{name}.speed = {theirs:g}"
     return _rated("stage", f"{name}: speed against ${number}", found, remedy)
 
@@ -208,11 +208,11 @@ def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
         return
     rate = (len(times) - 1) / (times[-1] - times[0])
     remedy = ""
-    if rate < _ENOUGH * asked:
+    if rate < _REPORT_SHARE * asked:
         remedy = f"the line is slow; set stage.report_rate = {max(1, round(rate))}, or raise stage.baud"
     yield _rated("stage", "reports", f"{rate:.1f} Hz, asked {asked:g} Hz", remedy)
     remedy = ""
-    if stage.round_trip > _SLOW:
+    if stage.round_trip > _ROUND_TRIP_MAX:
         remedy = "positions in motion are as uncertain as this is long; use a shorter or faster line"
     yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
 
@@ -225,7 +225,7 @@ def _listen(stage: GrblStage, settings: StageSettings) -> list[float]:
         stage.report()  # raises if it is lost
         if time.monotonic() > begun + _PERIOD + settings.timeout + 2 / settings.report_rate:
             break
-        time.sleep(_LOOK)
+        time.sleep(_POLL)
     return times
 
 
@@ -236,11 +236,11 @@ def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
     """Look at a camera that was opened, for about a second."""
     rows, columns = camera.shape
     yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
-    camera.take(1, _FIRST)
+    camera.take(1, _FRAME_TIMEOUT)
     camera.flush()
     before, dropped, end = camera.counts, 0, time.monotonic() + _PERIOD
     while True:
-        frames = camera.take(_MOST, _FIRST)
+        frames = camera.take(_BATCH, _FRAME_TIMEOUT)
         dropped += frames.dropped
         if time.monotonic() >= end:
             break
@@ -254,7 +254,7 @@ def _rate(counts: Counts, settings: CameraSettings) -> Finding:
     found, remedy = f"{counts.rate:.2f} Hz", ""
     if settings.rate is not None:
         found += f", asked {settings.rate:g} Hz"
-        if not abs(counts.rate - settings.rate) <= _OFF * settings.rate:
+        if not abs(counts.rate - settings.rate) <= _RATE_TOLERANCE * settings.rate:
             remedy = f"the exposure or the line may be too long for it; set camera.rate = {counts.rate:.3g}"
     return _rated("camera", "rate", found, remedy)
 
@@ -276,7 +276,7 @@ def _brightness(picture: NDArray[Any]) -> Finding:
     saturated, dark = float(np.mean(picture >= top)), float(np.mean(picture <= 0))
     found = f"{low:g} to {high:g}, median {middle:g}; {saturated:.2%} saturated, {dark:.2%} black"
     remedy = ""
-    if saturated > _SATURATED:
+    if saturated > _SATURATED_MAX:
         remedy = "too much light; shorten the exposure"
     elif high <= low:
         remedy = "all pixels are alike; look at the light and the lid"
@@ -302,9 +302,9 @@ def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
 def _step(limits: Limits, name: str, unit: str, value: float) -> float:
     """Return how far an axis is moved: travel goes up if it can, so that nothing is pressed."""
     if name != "travel":
-        return min(_FARTHEST[unit], _SHARE * limits.tilt)
+        return min(_MOVE_MAX[unit], _MOVE_SHARE * limits.tilt)
     low = limits.travel[0]
-    step = min(_FARTHEST[unit], _SHARE * (limits.press - low))
+    step = min(_MOVE_MAX[unit], _MOVE_SHARE * (limits.press - low))
     return step if value - step < low else -step
 
 
@@ -316,6 +316,6 @@ def _there_and_back(stage: GrblStage, settings: StageSettings, name: str, home: 
         off = max(off, abs(getattr(stage.wait().position, name) - place))
     unit, scale = axis.unit, axis.scale
     found = f"{step * scale:+.3g} {unit} and back, off by {off * scale:.4f} {unit}"
-    lost = off > _NEAR[unit]
+    lost = off > _POSITION_TOLERANCE[unit]
     remedy = f"it does not go where it is sent; look at {axis.letter} and its steps per unit" if lost else ""
     return _rated("move", f"{name} ({axis.letter})", found, remedy, "failed")

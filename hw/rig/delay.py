@@ -25,7 +25,7 @@ _FRAMES, _MOST_FRAMES = 60, 150  # one way, at least and at most
 _PRESSED = 0.5  # share of a press that comes before the move
 _LONGEST_DELAY = 0.6  # seconds that late frames are waited for
 _BLOCK = 8  # frames
-_STEADY = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
+_EVEN_RATIO = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
 _SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
 
 # The estimate
@@ -36,9 +36,9 @@ _RANGE = (-0.05, 0.6)  # seconds
 _TRIALS = 66
 _KNOTS = (5, 40)
 _FRAMES_A_KNOT = 5
-_STIFF = 1e-6
+_STIFFNESS = 1e-6
 _EXPLAINED = 0.5  # share of the picture's change that goes by the place
-_UNSURE = 0.01  # seconds
+_ERROR_MAX = 0.01  # seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Delay:
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
+class _Stroke:
     """From one place to another, and how far along it a place is."""
 
     begin: Position
@@ -68,7 +68,7 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
     against the stage's reports: what these are late by themselves is part of it, as it should be.
     """
-    way = _way(rig, plan)
+    way = _stroke(rig, plan)
     rests = rig.go(way.begin).time
     seconds = max(_SECONDS, _FRAMES * rig.period)
     speed = min(max(way.length / seconds, way.slowest), way.fastest)
@@ -88,21 +88,23 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     def place(times: Floats) -> Floats:
         return np.where(times < turned, down.at(times), way.length - up.at(times))
 
-    clock, unsure = log.clock()
+    clock, clock_error = log.clock()
     delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
     rig.go(plan.first)
-    of_reports = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
-    return replace(delay, error=math.hypot(delay.error, unsure, *of_reports))
+    report_errors = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
+    return replace(delay, error=math.hypot(delay.error, clock_error, *report_errors))
 
 
-def _way(rig: Rig, plan: Plan) -> _Way:
+def _stroke(rig: Rig, plan: Plan) -> _Stroke:
     stage = rig.settings.stage
     if isinstance(plan, AxialPlan):
         begin, end = plan.place(0.0), plan.place(math.pi)
-        return _Way(begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch))
+        return _Stroke(
+            begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch)
+        )
     length = (1 - _PRESSED) * (plan.stop - plan.start)
     first, end = plan.stop - length, Position(plan.stop)
-    return _Way(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
+    return _Stroke(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
 
 
 def _speeds(axis: Axis | None) -> tuple[float, float]:
@@ -136,7 +138,7 @@ class _FrameLog:
         number, time = np.concatenate(self._numbers), np.concatenate(self._times)
         line = even_times(number, time, len(time))
         off, near_off = (np.std(time - even) for even in (line, even_times(number, time)))
-        if off > _STEADY * near_off:
+        if off > _EVEN_RATIO * near_off:
             return time, 0.0
         return line, float(off / math.sqrt(len(time)))
 
@@ -178,14 +180,14 @@ def estimate_delay(
     """Find the delay at which the picture is one function of the place, on the way there and back.
 
     `arrival`, (n,), seconds, and `pictures`, (n, k), block means, are of the frames; `place` gives the
-    position, (n,), at given times. The function is a broken line through some twenty places, fitted together
+    position, (n,), at given times. The function is a linear spline of some twenty knots, fitted together
     with a linear drift to the principal components of the picture's change; the delay minimises the sum of
     squares. Its standard error follows from the residual of each frame as an error in time.
     """
     from scipy.optimize import minimize_scalar
 
     time = np.asarray(arrival, np.float64)
-    change = _components(np.asarray(pictures, np.float64))
+    change = _principal_components(np.asarray(pictures, np.float64))
     total = float(np.sum(change**2))
 
     def cost(delay: float) -> float:
@@ -202,7 +204,7 @@ def estimate_delay(
     around = tuple(trials[[best - 1, best + 1]])
     found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-5})
     error = _error(float(found.x), time, change, place)
-    if not error < _UNSURE:
+    if not error < _ERROR_MAX:
         raise HardwareError(
             f"{name}: its delay is {found.x:.3f} s, give or take {error:.3f} s, which is too little to go by:"
             f" press deeper, or {_REMEDY}"
@@ -210,7 +212,7 @@ def estimate_delay(
     return Delay(float(found.x), error)
 
 
-def _components(pictures: Floats) -> Floats:
+def _principal_components(pictures: Floats) -> Floats:
     """Return the largest principal components of the pictures' change, (n, c)."""
     change = pictures - pictures.mean(axis=0)
     left, size, _ = np.linalg.svd(change, full_matrices=False)
@@ -218,38 +220,38 @@ def _components(pictures: Floats) -> Floats:
 
 
 def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, int]:
-    """Fit a broken line over the places, and a drift with the time, to each component.
+    """Fit a linear spline of the place, and a drift with the time, to each component.
 
-    Return the residual and the line's slope at each frame, (n, c), and the number of parameters.
+    Return the residual and the spline's slope at each frame, (n, c), and the number of parameters.
     """
     count = int(np.clip(len(place) // _FRAMES_A_KNOT, *_KNOTS))
     low, high = float(place.min()), float(place.max())
     width = (high - low) / (count - 1) or 1.0
     along = np.clip((place - low) / width, 0, count - 1)
     knot = np.minimum(along.astype(np.intp), count - 2)
-    hats = _BrokenLines(knot, along - knot, count)
+    spline = _LinearSpline(knot, along - knot, count)
 
     since = (time - time.mean())[:, None]
-    of_change, of_since = hats.fit(change), hats.fit(since)
-    bent = since - hats.at(of_since)  # of the drift, what no line over the places can be
+    of_change, of_since = spline.fit(change), spline.fit(since)
+    bent = since - spline.at(of_since)  # the part of the drift orthogonal to all splines
     drift = np.sum(bent * change, axis=0) / max(float(np.sum(bent * since)), 1e-300)
     line = of_change - of_since * drift
     slope = (line[knot + 1] - line[knot]) / width
-    return change - hats.at(line) - since * drift, slope, count + 1
+    return change - spline.at(line) - since * drift, slope, count + 1
 
 
-class _BrokenLines:
-    """Least squares of broken lines; each frame, (n,), has the knot before it and its share to the next."""
+class _LinearSpline:
+    """Least squares of linear splines; each frame, (n,), has the knot before it and its share to the next."""
 
     def __init__(self, knot: NDArray[np.intp], share: Floats, count: int) -> None:
         self._knot, self._near, self._next, self._count = knot, 1 - share, share, count
         diagonal = np.bincount(knot, self._near**2, count) + np.bincount(knot + 1, self._next**2, count)
         above = np.bincount(knot + 1, self._near * self._next, count)
-        # A knot that no frame is near is held by a little stiffness.
-        self._bands = np.stack([above - _STIFF, diagonal + (2 + _STIFF) * _STIFF])
+        # A little stiffness determines knots that no frame is near.
+        self._bands = np.stack([above - _STIFFNESS, diagonal + (2 + _STIFFNESS) * _STIFFNESS])
 
     def fit(self, values: Floats) -> Floats:
-        """Return the lines' values at the knots, (count, c), for values at the frames, (n, c)."""
+        """Return the splines' values at the knots, (count, c), for values at the frames, (n, c)."""
         from scipy.linalg import solveh_banded
 
         sums = [
@@ -260,7 +262,7 @@ class _BrokenLines:
         return np.asarray(solveh_banded(self._bands, np.stack(sums, axis=1)))
 
     def at(self, line: Floats) -> Floats:
-        """Return the lines' values at the frames, (n, c)."""
+        """Return the splines' values at the frames, (n, c)."""
         found: Floats = self._near[:, None] * line[self._knot] + self._next[:, None] * line[self._knot + 1]
         return found
 
@@ -270,8 +272,8 @@ def _error(delay: float, time: Floats, change: Floats, place: Callable[[Floats],
     step = 1e-3
     residual, slope, parameters = _fit(place(time - delay), time, change)
     speed = (place(time - delay + step) - place(time - delay - step)) / (2 * step)
-    pace = slope * speed[:, None]
-    weight = np.sum(pace**2, axis=1)
-    late = np.sum(pace * residual, axis=1)  # the frame's error in time, times its weight
+    per_second = slope * speed[:, None]
+    weight = np.sum(per_second**2, axis=1)
+    late = np.sum(per_second * residual, axis=1)  # the frame's error in time, times its weight
     free = max(1, len(time) - parameters) / len(time)
     return math.sqrt(float(np.sum(late**2)) / free) / max(float(weight.sum()), 1e-300)

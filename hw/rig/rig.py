@@ -181,32 +181,32 @@ class Rig(Closing):
 
     def _watch(self) -> None:
         """Guard: stop the stage when something is wrong while it moves."""
-        looked, seen, without, last = self._move, -math.inf, 0.0, time.monotonic()
+        looked, seen, silence, last = self._move, -math.inf, 0.0, time.monotonic()
         while not self._closing.wait(_TICK):
-            # Who sleeps much longer than it wanted to is not alone; the camera may be waiting, too.
+            # A guard that woke late means a busy machine, on which the camera's thread may be late as well.
             passed, last = time.monotonic() - last, time.monotonic()
             move, latest = self._move, self.camera.latest
             if move is None or move.over:
                 continue
             if move is not looked or latest != seen:
-                looked, seen, without = move, latest, 0.0
+                looked, seen, silence = move, latest, 0.0
             else:
-                without += _TICK if passed < 2 * _TICK else _TICK / 2
-            fault = self._find(without)
+                silence += _TICK if passed < 2 * _TICK else _TICK / 2
+            fault = self._fault_after(silence)
             if fault is not None:
                 self._fault = self._fault or fault  # first, or the stop would pass for the cause
                 self.stage.stop()
                 return
 
-    def _find(self, without: float) -> HardwareError | None:
+    def _fault_after(self, silence: float) -> HardwareError | None:
         """Return what is wrong after so many seconds without a frame."""
         wrong = self.stage.error or self.camera.error
         if wrong is not None:
             return wrong
-        if without < max(self._stall, _STALL_PERIODS * self.period):
+        if silence < max(self._stall, _STALL_PERIODS * self.period):
             return None
         return HardwareError(
-            f"{self.camera.name} gave no frame for {without:.2f} s while the stage moved, which was stopped:"
+            f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"
             " look at its cable and its load"
         )
 

@@ -82,7 +82,7 @@ class Scan(Closing):
 
     def positions(self) -> Mapping[str, Floats]:
         """Return the positions of all frames so far; see ``LiveSource``."""
-        return {self._what: np.concatenate([np.empty(0), *self._live])}
+        return {self._coordinate: np.concatenate([np.empty(0), *self._live])}
 
     def rewind(self) -> None:
         """Refuse: time does not run back."""
@@ -101,7 +101,7 @@ class Scan(Closing):
             return None
         self.count += len(block.frames)
         self.dropped += block.dropped
-        self._live.append(getattr(block, self._what))
+        self._live.append(getattr(block, self._coordinate))
         return block
 
     def lift(self) -> Report:
@@ -133,7 +133,7 @@ class Scan(Closing):
             self.rig.stage.stop()
 
     @property
-    def _what(self) -> str:
+    def _coordinate(self) -> str:
         return "phase" if isinstance(self.plan, AxialPlan) else "travel"
 
     def _next(self, most: int, origin: float) -> Block | None:
@@ -146,7 +146,7 @@ class Scan(Closing):
         block = Block(
             frames, index=self.count, time=arrival - origin, dropped=dropped, lent=frames.flags.c_contiguous
         )
-        if self._what == "phase":
+        if self._coordinate == "phase":
             return replace(block, phase=place)
         return replace(block, travel=place)
 

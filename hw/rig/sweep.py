@@ -94,7 +94,7 @@ class SweepScan(Scan):
         number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
         times, ways = zip(*self._reports, strict=True)
         track = Track(times, ways, self._path)
-        return {self._what: self._place(track.at(even_times(number, arrival) - self.delay.seconds))}
+        return {self._coordinate: self._place(track.at(even_times(number, arrival) - self.delay.seconds))}
 
     def _prepare(self) -> None:
         super()._prepare()

@@ -11,15 +11,15 @@ from mirrorskin.hw.rig.plans import Plan, Trapezoid, VerticalPlan
 from mirrorskin.hw.stage import Report
 from mirrorskin.io.types import Floats
 
-_LOCK = 8  # of the latest reports, that show how far the way has come
+_RECENT = 8  # of the latest reports, that show how far the way has come
 _SLOPES = (0.2, 2.0)  # of a planned second, that may pass in one
 _AT_REST = 1e-3  # of the way's length, that the body may seem to have moved
 _RAMPS = (0.004, 2.0)  # seconds in which a stage reaches its speed
-_LEAST = 4  # reports under way, to find more than when the move began
-_SPREAD = 1.4826  # standard deviations in a median magnitude, of a normal distribution
-_ORDER = 1.5  # by which the plan's deviations exceed chance
+_REPORTS_MIN = 4  # reports under way, to find more than when the move began
+_MAD_TO_SIGMA = 1.4826  # standard deviations in a median magnitude, of a normal distribution
+_SYSTEMATIC = 1.5  # by which the plan's deviations exceed chance
 _SMOOTH = 5  # reports on either side
-_GAP = 0.6  # periods more than one, between two frames, among which one may have been lost
+_LOST_FRAME_GAP = 0.6  # periods more than one, between two frames, among which one may have been lost
 _NEAR = 9  # frames on either side of a gap
 
 
@@ -67,8 +67,8 @@ class LiveTrack:
         elif way >= self._path.length - rest:
             self._done = min(self._done, time)
         else:
-            self._reports = [*self._reports[1 - _LOCK :], (time, float(self._path.time(way)))]
-            self._line = self._lock()
+            self._reports = [*self._reports[1 - _RECENT :], (time, float(self._path.time(way)))]
+            self._line = self._fit_line()
 
     def at(self, times: ArrayLike) -> Floats:
         """Return the way so far at some times that increase, of the shape of `times`."""
@@ -80,7 +80,7 @@ class LiveTrack:
         self._last = float(way[-1]) if way.size else self._last
         return way
 
-    def _lock(self) -> tuple[float, float, float]:
+    def _fit_line(self) -> tuple[float, float, float]:
         """Return a time, the plan's second at it, and how many of these pass in one."""
         time, planned = np.array(self._reports).T
         slope = 1.0
@@ -104,10 +104,10 @@ class Track:
         time, way = np.asarray(times, np.float64), np.asarray(ways, np.float64)
         self.began, self.path = _fit(time, way, path)
         residual = way - self.path.place(time - self.began)
-        self._extra = _common_deviation(residual)
+        self._extra = _smooth_residual(residual)
         self._time = time
         self.reports = len(time)
-        self.spread = _deviation(residual - self._extra)
+        self.spread = _robust_sigma(residual - self._extra)
 
     @property
     def ended(self) -> float:
@@ -133,24 +133,24 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
         before = time[way <= rest]
         return (float(before[-1]) if len(before) else float(time[0])), path
     began = float(np.median(time[moving] - path.time(way[moving])))
-    if np.count_nonzero(moving) < _LEAST:
+    if np.count_nonzero(moving) < _REPORTS_MIN:
         return began, path
 
-    def gone(values: Floats) -> tuple[float, Trapezoid]:
+    def trajectory(values: Floats) -> tuple[float, Trapezoid]:
         shift, speed, ramp = values
         faster = path.speed * math.exp(speed)
         return began + shift, Trapezoid(path.length, faster, faster / math.exp(ramp))
 
-    def misses(values: Floats) -> Floats:
-        start, trial = gone(values)
+    def residuals(values: Floats) -> Floats:
+        start, trial = trajectory(values)
         return trial.place(time - start) - way
 
-    scale = _deviation(misses(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
+    scale = _robust_sigma(residuals(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
     low, high = (math.log(ramp) for ramp in _RAMPS)
     best = min(
         (
             least_squares(
-                misses,
+                residuals,
                 [0.0, 0.0, math.log(ramp)],
                 loss="soft_l1",
                 f_scale=0.3 * scale,
@@ -161,22 +161,22 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
         ),
         key=lambda fit: float(fit.cost),
     )
-    return gone(best.x)
+    return trajectory(best.x)
 
 
-def _common_deviation(residual: Floats) -> Floats:
+def _smooth_residual(residual: Floats) -> Floats:
     """Return what neighbouring reports agree on of what is residual; nothing where it looks like chance."""
-    chance = _deviation(np.diff(residual)) / math.sqrt(2)
-    if len(residual) <= 2 * _SMOOTH or _deviation(residual) <= _ORDER * chance:
+    chance = _robust_sigma(np.diff(residual)) / math.sqrt(2)
+    if len(residual) <= 2 * _SMOOTH or _robust_sigma(residual) <= _SYSTEMATIC * chance:
         return np.zeros_like(residual)
     weights = (1 - (np.abs(np.arange(-_SMOOTH, _SMOOTH + 1)) / (_SMOOTH + 1)) ** 3) ** 3
     edges = np.pad(residual, _SMOOTH, mode="edge")
     return np.asarray(np.convolve(edges, weights / weights.sum(), mode="valid"))
 
 
-def _deviation(values: Floats) -> float:
+def _robust_sigma(values: Floats) -> float:
     """Return the standard deviation, of which outliers take no notice."""
-    return float(_SPREAD * np.median(np.abs(values))) if values.size else 0.0
+    return float(_MAD_TO_SIGMA * np.median(np.abs(values))) if values.size else 0.0
 
 
 def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Floats:
@@ -214,7 +214,7 @@ def _with_lost_frames(number: Floats, arrival: Floats) -> Floats:
     period = float(np.median(np.diff(arrival) / np.diff(number)))
     late = arrival - period * (number - number[0])
     counted = number.copy()
-    for gap in np.flatnonzero(np.diff(late) > _GAP * period) + 1:
+    for gap in np.flatnonzero(np.diff(late) > _LOST_FRAME_GAP * period) + 1:
         before, after = late[max(0, gap - _NEAR) : gap], late[gap : gap + _NEAR]
         counted[gap:] += max(0, round((np.median(after) - np.median(before)) / period))
     return counted

@@ -290,7 +290,7 @@ def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monke
 
 
 def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(video, "_FIRST", 0.2)
+    monkeypatch.setattr(video, "_FIRST_FRAME", 0.2)
     monkeypatch.setattr(video, "_CLOSING", 0.2)
     driver.begins.clear()
     begun = time.monotonic()
