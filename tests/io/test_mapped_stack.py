@@ -26,8 +26,9 @@ def path(tmp_path):
     return write(tmp_path / "a.h5", compressible(SHAPE, "u2"))
 
 
-@pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
-@pytest.mark.parametrize("shape", [SHAPE, (2, 1, 1), (3, 1, 5), (7, 13, 1)])
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [(SHAPE, "u2"), ((2, 1, 1), "u1"), ((3, 1, 5), "u2"), ((7, 13, 1), "f4")]
+)
 def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
     path = write(tmp_path / "a.h5", compressible(shape, dtype))
     for room in (1, 2, 4, 20):
@@ -59,8 +60,8 @@ def test_pages_go_with_the_last_frame(path):
     assert maps() == 0
 
 
-@pytest.mark.parametrize("spare", [0, 1, PADDING - 1, PADDING, PADDING + 1, mmap.PAGESIZE - 1])
-@pytest.mark.parametrize("more", [0, 1, PADDING, 5000])
+@pytest.mark.parametrize("spare", [0, 1, PADDING - 1, PADDING])
+@pytest.mark.parametrize("more", [0, 1, PADDING])
 def test_frames_are_lent_where_a_longest_word_follows(tmp_path, spare, more):
     """The last frame ends ``spare`` bytes before a page does, and the file ``more`` bytes behind it."""
     frames = compressible((4, 8, 256), "u1")

@@ -113,9 +113,10 @@ def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
         assert file[f"{stage}/motion"].asstr()[()] == "axial"
 
 
-@pytest.mark.parametrize("block", [1, 3, 8])
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize(
+    ("compression", "dtype", "block"),
+    [*((one, "uint16", 3) for one in COMPRESSIONS), ("raw", "uint8", 1), ("bitshuffle", "float32", 8)],
+)
 def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
     frames, header = random_stack(dtype), full_header()
     path = record(MadeUp(frames, header, time=TRAVEL, phase=PHASE), tmp_path / "turn.h5", compression, block)
@@ -132,9 +133,8 @@ def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
             assert (found.travel, found.displacement, found.twist) == (None, None, None)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_the_twin_s_recording_is_the_twin(tmp_path, dtype):
-    twin = sphere(dtype)
+def test_the_twin_s_recording_is_the_twin(tmp_path):
+    twin = sphere("uint16")
     path = record(twin, tmp_path / "press.h5", "bitshuffle", block=3, truth=twin.truth)
     twin.rewind()
     with io.open_recording(path) as recording:
@@ -145,9 +145,8 @@ def test_the_twin_s_recording_is_the_twin(tmp_path, dtype):
             assert getattr(recording.header, name) == getattr(twin.header, name)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_raw_frames_begin_with_a_page(tmp_path, dtype):
-    stack = random_stack(dtype, (4, 600, 700))
+def test_raw_frames_begin_with_a_page(tmp_path):
+    stack = random_stack("float32", (4, 600, 700))
     header = io.Header("vertical", dark=np.ones((600, 700), "f4"))
     path = record(MadeUp(stack, header, travel=TRAVEL[:4]), tmp_path / "a.h5")
     with h5py.File(path) as file:
@@ -157,9 +156,13 @@ def test_raw_frames_begin_with_a_page(tmp_path, dtype):
     assert path.stat().st_size < stack.nbytes + header.dark.nbytes + 40_000
 
 
-@pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize(
-    "error", [io.InputError("frame 3 is gone"), OSError(5, "the camera is gone"), KeyboardInterrupt()]
+    ("error", "compression"),
+    [
+        (io.InputError("frame 3 is gone"), "raw"),
+        (OSError(5, "the camera is gone"), "gzip"),
+        (KeyboardInterrupt(), "blosc"),
+    ],
 )
 def test_a_source_that_fails_leaves_nothing(tmp_path, compression, error):
     old = tmp_path / "old.h5"
