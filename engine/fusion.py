@@ -146,7 +146,7 @@ def fuse_sources(
     press, rotation : mapping, optional
         Further options of `reconstruct_press` and `reconstruct_rotation`: how to read the one and the other.
     register : bool
-        Whether frames follow the object; they must not where nobody knows the pivot.
+        Whether frames follow the object; they must not where the pivot is unknown.
     robust : bool
         As for `fuse`.
     memory_limit : int

@@ -25,10 +25,10 @@ _SHARPEST = 1e-5  # mm: no height is known better than this
 _NARROWEST, _WIDEST = 2.0, 8.0  # standard deviation of a window that slopes are taken from, pixels
 _NEAR = 3.0  # such windows, beyond which pixels are too far from any normal
 _LEVEL = 0.05  # slope below which a surface has no terraces to speak of
-_FIRM = 30.0  # how many times a height with normals around is as sure as one of the press
+_FIRM = 30.0  # standard deviation of a press' height over that of one with normals around
 _OFF = 4.0  # standard deviations from those around, beyond which a height is a mistake
 _ROUGH = 3.0  # mean squared error in standard deviations of what is no smooth surface
-_OVERSTATED = 2.0  # times that heights may be less sure than their sigmas, and still be believed
+_OVERSTATED = 2.0  # times that errors of heights may exceed their sigmas, and these still be believed
 _SEVERAL = 6.0  # half intervals that heights go over, for their errors to be spread evenly
 _NEARLY_ALL = 0.9  # of all heights: the quantile that shows how much of their intervals errors use
 _LEAST_USED = 0.5
@@ -48,7 +48,7 @@ class PressHeights:
         """Take the finite ones of a map, where they are wanted."""
         height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
         known = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
-        # The few that claim to be far more sure than the others are mostly those whose light rose oddly.
+        # The few that claim a far smaller sigma than the others are mostly those whose light rose oddly.
         least = max(float(np.median(sigma[known])), _SHARPEST) if known.any() else _SHARPEST
         return cls(np.where(known, height, np.nan), np.where(known, np.maximum(sigma, least), np.nan))
 
@@ -180,23 +180,23 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
     height, weight = press.height.copy(), press.weight
     if not joined.any():
         return height, weight
-    piece, half = surface.component[joined], _UNIFORM * press.sigma[joined]
+    label, half = surface.component[joined], _UNIFORM * press.sigma[joined]
     middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
     # The mean that a solver finds is moved by mistakes, the median is not.
-    lift = np.asarray(ndimage.median(middle - shape, piece, np.arange(size.size)))
-    half *= _share_used(middle - shape - lift[piece], half, shape)
+    lift = np.asarray(ndimage.median(middle - shape, label, np.arange(size.size)))
+    half *= _share_used(middle - shape - lift[label], half, shape)
     for _ in range(_ITERATIONS):
-        at = shape + lift[piece]
+        at = shape + lift[label]
         spread = estimate_interval_errors(middle - at, half)
         inside = interval_evidence(at, middle, half, spread)
-        firm = np.bincount(piece, inside.weight, size.size)
-        lift += np.bincount(piece, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
+        firm = np.bincount(label, inside.weight, size.size)
+        lift += np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
     weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
     weight[has_both[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
     near = inside.weight > 0
-    count = np.maximum(np.bincount(piece, near, size.size), 1)
-    plain = np.where(near, weight[joined] / count[piece], 0.0)
-    ends = (firm > np.bincount(piece, plain, size.size))[piece]
+    count = np.maximum(np.bincount(label, near, size.size), 1)
+    plain = np.where(near, weight[joined] / count[label], 0.0)
+    ends = (firm > np.bincount(label, plain, size.size))[label]
     height[joined] = np.where(ends, inside.height, middle)
     weight[joined] = np.where(ends, inside.weight, plain)
     return height, weight
@@ -248,8 +248,8 @@ def _join(surface: Surface) -> Surface:
 
     answered = (surface.component >= 0) | (surface.filled > 0)
     relative = _relative(surface)
-    pieces, count = ndimage.label(answered & ~relative)
-    names = np.where(relative, count + surface.component, pieces - 1)
+    labels, count = ndimage.label(answered & ~relative)
+    names = np.where(relative, count + surface.component, labels - 1)
     _, first, rank = np.unique(names[answered], return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))
     component = np.full(answered.shape, -1, np.int32)

@@ -101,13 +101,13 @@ float saved(const float one, const float other, const float apart, const float s
     const float cost = had_##there && has_##there ? paid_##there : one_##there + other_##there;
 
 __kernel void bilateral_shares(
-    SIZE, SLOPES, MAP steep, MAP sure_x, MAP sure_y, KNOWN_MAPS MAP heights, const float k, const float width,
+    SIZE, SLOPES, MAP steep, MAP confidence_x, MAP confidence_y, KNOWN_MAPS MAP heights, const float k, const float width,
     const float height, OUT share_x, OUT share_y, OUT sums)
 {
 #define ONE_SHARE(p, before, after, above, below)                                                    \
     AXIS(RIGHT, slope_x, after, before, over_x, share_x, cost_x)                                     \
     AXIS(DOWN, slope_y, below, above, over_y, share_y, cost_y)                                       \
-    costs[p - start] = sure_x[p] * cost_x + sure_y[p] * cost_y HELD(p);
+    costs[p - start] = confidence_x[p] * cost_x + confidence_y[p] * cost_y HELD(p);
     const float over_x = 1 / width, over_y = 1 / height, inverse = k > 0 ? 1 / k : 0;
     const int all = (columns + CHUNK - 1) / CHUNK, mine = get_global_id(0);
     const int start = mine / all * columns + mine % all * CHUNK;
@@ -119,7 +119,7 @@ __kernel void bilateral_shares(
 }
 
 __kernel void bilateral_links(
-    SIZE, SLOPES, MAP steep, MAP sure_x, MAP sure_y, MAP share_x, MAP share_y, MAP heights, const float width,
+    SIZE, SLOPES, MAP steep, MAP confidence_x, MAP confidence_y, MAP share_x, MAP share_y, MAP heights, const float width,
     const float height, OUT right, OUT down, OUT pull_x, OUT pull_y)
 {
 #define LINK(there, to, sure, share, slope, over, unit, weight, pull)                                \
@@ -131,8 +131,8 @@ __kernel void bilateral_links(
     weight[p] = flags[p] & there ? (here_##there + far_##there) * over * unit : 0;                   \
     pull[p] = flags[p] & there ? asked_##there * unit : 0;
 #define ONE_LINK(p, before, after, above, below)                                                     \
-    LINK(RIGHT, after, sure_x, share_x, slope_x, over_x, height, right, pull_x)                      \
-    LINK(DOWN, below, sure_y, share_y, slope_y, over_y, width, down, pull_y)
+    LINK(RIGHT, after, confidence_x, share_x, slope_x, over_x, height, right, pull_x)                      \
+    LINK(DOWN, below, confidence_y, share_y, slope_y, over_y, width, down, pull_y)
     const float over_x = 1 / width, over_y = 1 / height;
     PIECE(ONE_LINK)
 }

@@ -52,20 +52,22 @@ def bilateral_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float,
     return curl
 
 
-def bilateral_shares(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, sure_x: Floats,
-                     sure_y: Floats, anchor: Floats, known: Floats, heights: Floats, k: float, width: float,
-                     height: float) -> tuple[Doubles, Doubles, float]:  # fmt: skip
+def bilateral_shares(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, confidence_x: Floats,
+                     confidence_y: Floats, anchor: Floats, known: Floats, heights: Floats, k: float,
+                     width: float, height: float) -> tuple[Doubles, Doubles, float]:  # fmt: skip
     """Return the shares of the links to the right and down in what their pixels require, and the energy.
 
-    Links to the left and up have what is missing to 1. ``steep`` is a^2, ``sure_x`` and ``sure_y`` are c,
-    ``anchor`` is h, 0 where no height is known, and ``heights`` are u, finite everywhere; a ``k`` of 0 gives
-    equal shares, plain least squares. The kernel writes an energy for each of its items, and may have no
-    known heights.
+    Links to the left and up have what is missing to 1. ``steep`` is a^2, ``confidence_x`` and
+    ``confidence_y`` are c, ``anchor`` is h, 0 where no height is known, and ``heights`` are u, finite
+    everywhere; a ``k`` of 0 gives equal shares, plain least squares. The kernel writes an energy for each
+    of its items, and may have no known heights.
     """
     u = heights.astype(np.float64)
     share_x, cost_x = _share(flags & RIGHT != 0, slope_x, steep, u, k, width)
     share_y, cost_y = _share((flags & DOWN != 0).T, slope_y.T, steep.T, u.T, k, height)
-    energy = np.sum(sure_x * cost_x) + np.sum(sure_y * cost_y.T) + np.sum(anchor * (u - known) ** 2)
+    energy = (
+        np.sum(confidence_x * cost_x) + np.sum(confidence_y * cost_y.T) + np.sum(anchor * (u - known) ** 2)
+    )
     return share_x, share_y.T, float(energy)
 
 
@@ -84,8 +86,8 @@ def _share(
     return np.where(both, share, ~before), np.where(both, soft, lone)
 
 
-def bilateral_links(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, sure_x: Floats,
-                    sure_y: Floats, share_x: Array, share_y: Array, heights: Floats, width: float,
+def bilateral_links(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Floats, confidence_x: Floats,
+                    confidence_y: Floats, share_x: Array, share_y: Array, heights: Floats, width: float,
                     height: float) -> tuple[Doubles, Doubles, Doubles, Doubles]:  # fmt: skip
     """Return weights of the links to the right and down, by their shares, and how hard these pull.
 
@@ -93,8 +95,8 @@ def bilateral_links(flags: Flags, slope_x: Floats, slope_y: Floats, steep: Float
     difference of the two heights is too large by.
     """
     u = heights.astype(np.float64)
-    right, pull_x = _link(flags & RIGHT != 0, slope_x, steep * sure_x, share_x, u, width)
-    down, pull_y = _link((flags & DOWN != 0).T, slope_y.T, (steep * sure_y).T, share_y.T, u.T, height)
+    right, pull_x = _link(flags & RIGHT != 0, slope_x, steep * confidence_x, share_x, u, width)
+    down, pull_y = _link((flags & DOWN != 0).T, slope_y.T, (steep * confidence_y).T, share_y.T, u.T, height)
     return height / width * right, width / height * down.T, height * pull_x, width * pull_y.T
 
 

@@ -1,7 +1,7 @@
-// Heights of the connected pieces of a surface. Specification: components.py.
+// Heights of the connected components of a surface. Specification: components.py.
 //
 // TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// ONE      1 where all that is answered hangs together: labels are then not read
+// ONE      1 where there is one component: labels are then not read
 //
 // PoCL makes vector code of loops without branches.
 
@@ -44,12 +44,12 @@ float chosen(const int which, const float one, const float other)
 __kernel void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
     MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
-    const int strip, const int pieces, OUT sums, OUT totals)
+    const int strip, const int components, OUT sums, OUT totals)
 {
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;
-    __global float *sum = sums + item * pieces, *total = totals + item * pieces;
-    for (int piece = 0; piece < pieces; ++piece) sum[piece] = total[piece] = 0.0f;
+    __global float *sum = sums + item * components, *total = totals + item * components;
+    for (int component = 0; component < components; ++component) sum[component] = total[component] = 0.0f;
     for (int row = top; row < bottom; ++row) {
         const float start = plane_z + plane_y * row;
         const int first = row * columns;
@@ -65,17 +65,17 @@ __kernel void components_sum(
             total[0] += share_of[lane];
         }
 #else
-        // Pixels of one piece side by side are summed first: a sum in memory is slow, and loses digits.
-        int piece = -1;
+        // Pixels of one component side by side are summed first: a sum in memory is slow, and loses digits.
+        int component = -1;
         float part = 0.0f, shares = 0.0f;
         for (int column = 0; column <= columns; ++column) {
             const int label = column < columns ? labels[first + column] : -1;
-            if (label != piece) {
-                if (piece >= 0) {
-                    sum[piece] += part;
-                    total[piece] += shares;
+            if (label != component) {
+                if (component >= 0) {
+                    sum[component] += part;
+                    total[component] += shares;
                 }
-                piece = label;
+                component = label;
                 part = shares = 0.0f;
             }
             if (label >= 0) ADD(part, shares, first + column, column)
@@ -84,12 +84,12 @@ __kernel void components_sum(
     }
 }
 
-__kernel void components_settle(
+__kernel void components_add_offsets(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
     MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP offsets, OUT height)
 {
-    const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
-    const int row = item / pieces, begin = item % pieces * CHUNK, end = LESSER(columns, begin + CHUNK);
+    const int chunks = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
+    const int row = item / chunks, begin = item % chunks * CHUNK, end = LESSER(columns, begin + CHUNK);
     if (row >= rows) return;
     const float start = plane_z + plane_y * row;
     const int first = row * columns;
@@ -99,15 +99,15 @@ __kernel void components_settle(
     }
 }
 
-// What brings the mean of each piece to 0.
+// What brings the mean of each component to 0.
 __kernel void components_level(const int strips, const int count, MAP sums, MAP totals, OUT offsets)
 {
-    const int piece = get_global_id(0);
-    if (piece >= count) return;
+    const int component = get_global_id(0);
+    if (component >= count) return;
     float sum = 0.0f, total = 0.0f;
     for (int strip = 0; strip < strips; ++strip) {
-        sum += sums[strip * count + piece];
-        total += totals[strip * count + piece];
+        sum += sums[strip * count + component];
+        total += totals[strip * count + component];
     }
-    offsets[piece] = total > 0.0f ? -sum / total : 0.0f;
+    offsets[component] = total > 0.0f ? -sum / total : 0.0f;
 }

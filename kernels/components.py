@@ -1,6 +1,6 @@
-"""Heights of a surface's connected pieces: what ``components.cl`` computes, in NumPy with float64 inside.
+"""Heights of a surface's connected components: what ``components.cl`` computes, in NumPy with float64 inside.
 
-A solver gives the relief: heights above a plane, up to an offset of each piece.
+A solver gives the relief: heights above a plane, up to an offset of each component.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Labels = NDArray[np.int32]
 
 
 def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, heights: Array | None,
-                   height_weights: Array | None, pieces: int) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Return of each piece a sum of heights, and what to divide it by for their mean; (pieces,) each.
+                   height_weights: Array | None, components: int) -> tuple[Doubles, Doubles]:  # fmt: skip
+    """Return of each component a sum of heights, and what to divide it by for their mean; (components,) each.
 
     With known heights it is the mean of what the others are above these, weighted like them. ``labels`` say
-    to which piece a pixel belongs, -1 without an answer; ``plane`` is how much it rises from column to column
-    and from row to row, and its height in the top left pixel, mm. Each of the kernel's items sums over a
-    strip of rows.
+    to which component a pixel belongs, -1 without an answer; ``plane`` is how much it rises from column to
+    column and from row to row, and its height in the top left pixel, mm. Each of the kernel's items sums
+    over a strip of rows.
     """
     risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
     if heights is not None:
@@ -32,18 +32,20 @@ def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, h
         risen = risen - np.where(known, heights, 0.0)
     inside = share > 0
     where, some = labels[inside], share[inside]
-    sums, totals = (np.bincount(where, part, pieces) for part in (some * risen[inside], some))
+    sums, totals = (np.bincount(where, part, components) for part in (some * risen[inside], some))
     return np.asarray(sums, np.float64), np.asarray(totals, np.float64)
 
 
-def components_settle(flags: Flags, labels: Labels, relief: Array, plane: Triple, offsets: Array) -> Doubles:
-    """Return heights: relief, plane, and the offset of the piece, mm; NaN without an answer."""
+def components_add_offsets(
+    flags: Flags, labels: Labels, relief: Array, plane: Triple, offsets: Array
+) -> Doubles:
+    """Return heights: relief, plane, and the offset of the component, mm; NaN without an answer."""
     height = relief + _level(plane, flags.shape) + np.asarray(offsets, np.float64)[labels]
     return np.where(labels >= 0, height, np.nan)
 
 
 def components_level(sums: Array, totals: Array) -> Doubles:
-    """Return the offset of each piece that brings its mean to 0, by sums and totals of strips."""
+    """Return the offset of each component that brings its mean to 0, by sums and totals of strips."""
     total = np.sum(totals, axis=0, dtype=np.float64)
     sum_ = np.sum(sums, axis=0, dtype=np.float64)
     return np.asarray(-np.divide(sum_, total, out=np.zeros(total.shape), where=total > 0))

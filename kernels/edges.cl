@@ -94,7 +94,7 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
 // Runs of CHUNK pixels of a row, one an item.
 __kernel void edges_jumps(
     const int rows, const int columns, MAP cells, __global const int *restrict places, MAP distances, const float jump,
-    const float bend, const float sure, const float quiet, const float floor_, const float lowest,
+    const float bend, const float significance, const float quiet, const float floor_, const float lowest,
     __global uchar *restrict doubt, OUT strength, __global uchar *restrict ways)
 {
     const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
@@ -192,7 +192,7 @@ __kernel void edges_jumps(
         const int unclear = (STEPS == 2) | (least[i] > quiet * quiet);
         const int clear = LAST | !unclear;
         const float deviation = sqrt(error[i]), wanted = jump + (clear ? -1 : 0.5f) * deviation;
-        const float enough = GREATER(GREATER(wanted, lowest), sure * deviation) + (STEPS == 2 ? bend : 0);
+        const float enough = GREATER(GREATER(wanted, lowest), significance * deviation) + (STEPS == 2 ? bend : 0);
         const int edge = doubt[target + i] && best[i] > 0 && sqrt(square[i]) >= enough;
         strength[target + i] = edge ? sqrt(best[i]) : 0;
         ways[target + i] = way[i];

@@ -70,7 +70,7 @@ class Limits:
         Angle to look for.
     bend : float
         What `NEAR` adds, as it takes bends for jumps.
-    sure : float
+    significance : float
         Standard errors that a jump must have.
     quiet : float
         Standard error of a jump with which no coarser pass is needed.
@@ -82,7 +82,7 @@ class Limits:
 
     jump: float
     bend: float
-    sure: float
+    significance: float
     quiet: float
     floor: float
     lowest: float
@@ -175,7 +175,7 @@ def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> t
     clear = (chosen is COARSE) | ~unclear
     wanted = limits.jump + np.where(clear, -1.0, 0.5) * error
     bend = limits.bend if chosen is NEAR else 0.0
-    enough = np.maximum(np.maximum(wanted, limits.lowest), limits.sure * error) + bend
+    enough = np.maximum(np.maximum(wanted, limits.lowest), limits.significance * error) + bend
     strength[(jump < enough) | (doubt == 0)] = 0
     doubt &= unclear
     return strength, way

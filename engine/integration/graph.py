@@ -297,7 +297,7 @@ class Levelling:
 
     def _sum(self, relief: Array, plane: Plane, maps: dict[str, Array], sums: Array, totals: Array) -> None:
         strip, strips = self._strips()
-        outputs = {"strip": strip, "pieces": self._of.count, "sums": sums, "totals": totals}
+        outputs = {"strip": strip, "components": self._of.count, "sums": sums, "totals": totals}
         given = {"heights": None, "height_weights": None, **maps}
         self._run("components_sum", strips, relief, plane, **given, **outputs)
 
@@ -310,7 +310,7 @@ class Levelling:
     def _add(self, relief: Array, plane: Plane, offsets: Array, height: Array) -> None:
         rows, columns = self._graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
-        self._run("components_settle", items, relief, plane, offsets=offsets, height=height)
+        self._run("components_add_offsets", items, relief, plane, offsets=offsets, height=height)
 
     @property
     def _of(self) -> Components:

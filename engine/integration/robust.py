@@ -169,13 +169,13 @@ class _Search:
         return self._bound.step(relief, self._solver.solve(tolerance=tolerance).height, part)
 
     def conclude(self, best: _Descent, sharpness: float, tolerance: float, steps: int) -> Robust:
-        """Solve the last graph to the tolerance, and tell what was found."""
+        """Solve the last graph to the tolerance, and return what was found."""
         bound, relief = self._bound, best.relief
         bound.share(0.0, relief)
         full = bound.weights(relief)
         bound.share(sharpness, relief)
-        wanted, left = (self._norm(bound.link(one)) for one in (self._zero, relief))
-        residual, met = left / wanted if wanted else 0.0, best.converged
+        wanted, rest = (self._norm(bound.link(one)) for one in (self._zero, relief))
+        residual, met = rest / wanted if wanted else 0.0, best.converged
         self._solver.rebuild(bound.link(relief))
         last = self._solver.solve(tolerance=min(1.0, tolerance / residual) if residual else 1.0)
         solved = bound.step(relief, last.height)
@@ -199,8 +199,8 @@ class _Search:
 
     def _norm(self, links: Links) -> float:
         """Return the norm of the right side."""
-        left = links.source.download().astype(np.float64)
-        norm = float(np.sqrt(np.sum(left * left)))
+        values = links.source.download().astype(np.float64)
+        norm = float(np.sqrt(np.sum(values * values)))
         links.source.upload()
         return norm
 
@@ -208,8 +208,8 @@ class _Search:
 def _cut(flags: Flags, weights: _Weights, full: _Weights) -> tuple[Flags, Flags]:
     """Return flags without the links that have no weight, and pixels beside those that have nearly none."""
     flags, edges = flags.copy(), np.zeros_like(flags)
-    for bit, axis, weight, whole in zip((RIGHT, DOWN), (1, 0), weights, full, strict=True):
-        broken = weight < BROKEN * whole
+    for bit, axis, weight, uncut in zip((RIGHT, DOWN), (1, 0), weights, full, strict=True):
+        broken = weight < BROKEN * uncut
         edges |= broken | np.roll(broken, 1, axis)
         flags[weight == 0] &= np.uint8(~bit & 255)
     return flags, edges
@@ -315,10 +315,10 @@ class _Bound:
         """Return inverse variances along x and y, relative to the typical one."""
         factor = inputs.weight / inputs.typical_weight
         one = np.ones(self._shape, np.float32) if inputs.weight_x is None else inputs.weight_x
-        first = second = self._device.given("sure x", factor * one)
+        first = second = self._device.given("weight x", factor * one)
         if inputs.weight_y is not None:
-            second = self._device.given("sure y", factor * inputs.weight_y)
-        return {"sure_x": first, "sure_y": second}
+            second = self._device.given("weight y", factor * inputs.weight_y)
+        return {"confidence_x": first, "confidence_y": second}
 
     def _find_known(self, inputs: Inputs, plane: Plane) -> dict[str, Array]:
         """Return known heights, and their weights relative to the typical one; nothing without any."""

@@ -86,7 +86,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
-    """How near a solver comes, and what it tells besides."""
+    """How near a solver comes, and what else it returns."""
 
     tolerance: float | None = None  # of the residual; None: as near as two cycles get
     deadline: float | None = None  # of ``time.perf_counter``; where there is one, no tolerance must be met

@@ -1,4 +1,4 @@
-"""What is integrated: slopes, where and how sure they are, and known heights; all of it checked, once."""
+"""What is integrated: slopes, where they are and their weights, and known heights; checked once."""
 
 from __future__ import annotations
 

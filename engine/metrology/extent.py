@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.metrology.fitting import far_less_sure
+from mirrorskin.engine.metrology.fitting import find_uncertain
 from mirrorskin.engine.metrology.patch import Patch
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.metrology.sections import apex
@@ -27,8 +27,8 @@ def heights(patch: Patch) -> dict[str, Quantity]:
     The *highest* is that of a paraboloid fitted to 7 x 7 pixels around the highest one after a median: the
     highest pixel itself would be that with the largest error. Where no paraboloid has its top there, it is
     the mean of the nine pixels around. The *lowest* is the lowest level that two neighbouring pixels
-    reach, as it often lies at the rim where nothing can be fitted; a few far less sure than others (see
-    `far_less_sure`) do not count. Its uncertainty grows with the number of pixels of which it is the
+    reach, as it often lies at the rim where nothing can be fitted; a few far more uncertain than others (see
+    `find_uncertain`) do not count. Its uncertainty grows with the number of pixels of which it is the
     lowest by chance. Where a filled point is above the highest, values that reach up to it are also given
     "with filled".
     """
@@ -126,7 +126,7 @@ def _lowest(patch: Patch) -> Quantity:
 
     counts = patch.measured
     if patch.sigma is not None:
-        counts = counts & ~far_less_sure(patch.sigma, counts)
+        counts = counts & ~find_uncertain(patch.sigma, counts)
     height = np.where(counts, patch.height, np.inf)
     # Only pixels with one beside them that is as low: a single low pixel does not count.
     around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
@@ -167,7 +167,7 @@ def volume(patch: Patch, level: float, level_sigma: float, name: str) -> dict[st
     """Return the volume between the surface and a plane at a level, mm, in mm3; negative where it lies below.
 
     Errors of heights are taken to be fully correlated, so their standard deviations add up: no correlation
-    makes the volume less sure than that.
+    makes the volume less certain than that.
     """
     above = patch.height - level
     value = patch.pixel_area * float(np.nansum(above))

@@ -1,9 +1,9 @@
-"""Forms fitted to points by least squares of their distances, and how sure their parameters are.
+"""Forms fitted to points by least squares of their distances, and the covariance of their parameters.
 
-Errors of heights that were integrated from slopes are alike over many pixels, and a fit is then far less sure
-than so many independent pixels would make it. So residuals are projected on a few smooth shapes that the fit
-leaves free. Errors with the form's own shape cannot be seen, but they are as large as those of the other
-smooth shapes, if errors have no reason to look like the form: the mean square of the projections is the
+Errors of heights that were integrated from slopes are correlated over many pixels, and a fit is then far less
+certain than so many independent pixels would make it. So residuals are projected on a few smooth shapes that
+the fit leaves free. Errors with the form's own shape cannot be seen, but they are as large as those of the
+other smooth shapes, if errors have no reason to look like the form: the mean square of the projections is the
 variance of what the fit took in. This is the long-run variance by orthonormal series of Y. Sun, "A
 heteroskedasticity and autocorrelation robust F test using an orthonormal series variance estimator", The
 Econometrics Journal 16 (2013). It covers white errors, correlated ones and a form that does not fit. Where
@@ -30,13 +30,13 @@ _CONVERGED = 1e-6  # of the residuals, by which a step may still change them
 _SINGULAR = 1e-14  # least eigenvalue of normal equations, of columns of length 1
 _MEDIAN = 0.6745  # of the magnitude of a normal variate
 _FAR = 5.0  # standard deviations, estimated by the median of the distances, beyond which points are outliers
-_FEW = 0.15  # of the points: if more are that far, or that unsure, they belong to the surface
+_FEW = 0.15  # of the points: if more are that far, or that uncertain, they belong to the surface
 _PASSES = 5  # over the outliers
 _ENOUGH = 65536  # points to begin with
 _CHUNK = 16384  # points at a time: their derivatives stay in the processor's cache
 _NOTHING = 1e-300
 _ROUNDING = 1e-9  # of the points' extent: distances below it are none; of a shape's squared length likewise
-_UNSURE = 5.0  # times the median standard deviation, beyond which a height shows its error alone
+_UNCERTAIN = 5.0  # times the median standard deviation, beyond which a height shows its error alone
 _OVERSTATED = 0.1  # of the claimed variance, that may be missing because claims are not exact
 
 
@@ -108,7 +108,7 @@ class PointCloud:
     def fit(self, form: Form) -> Fit | None:
         """Fit a form; None where none of its kind fits.
 
-        Distances are weighted by their inverse variances; no point counts as surer than the median. Outliers
+        Distances are weighted by their inverse variances; no weight is above that of the median. Outliers
         are left out: points beyond five standard deviations, estimated by the median of the weighted
         distances, if they are at most 15 %. If more are that far, they are part of the surface and all count.
         """
@@ -133,13 +133,13 @@ class PointCloud:
         return Fit(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
 
 
-def far_less_sure(sigma: Doubles, known: Mask) -> Mask:
+def find_uncertain(sigma: Doubles, known: Mask) -> Mask:
     """Return the known pixels, (H, W), of more than five times the median sigma, if at most 15 % are.
 
-    The highest and the lowest of all would be their errors. If more are that unsure, all count.
+    The highest and the lowest of all would be their errors. If more are that uncertain, all count.
     """
-    unsure = known & (sigma > _UNSURE * np.median(sigma[known]))
-    return np.asarray(unsure & (np.count_nonzero(unsure) <= _FEW * np.count_nonzero(known)))
+    uncertain = known & (sigma > _UNCERTAIN * np.median(sigma[known]))
+    return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(known)))
 
 
 def _fit_robustly(
@@ -255,23 +255,12 @@ def _shapes(points: Doubles, frame: _Frame) -> list[Doubles]:
 
 
 def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0) -> Doubles:
-    """Estimate the covariance of parameters that minimise a weighted sum of squares.
+    """Estimate the covariance, (k, k), of k least-squares parameters; NaN where residuals are too few.
 
-    Parameters
-    ----------
-    gram : ndarray, (k + m + 1, k + m + 1), float64
-        Weighted sums over all residuals of the products of: the derivatives of a residual by the k
-        parameters, m smooth functions of its place, about as smooth as the derivatives, and the residual
-        itself, at the minimum. Weights are any multiple of the inverse variances.
-    parameters, count : int
-        How many parameters and residuals.
-    claimed : float
-        Expectation of the weighted sum of squares, from standard deviations; 0 without these.
-
-    Returns
-    -------
-    ndarray, (k, k), float64
-        NaN where there are too few residuals.
+    ``gram``, (k + m + 1, k + m + 1), is the weighted sums over ``count`` residuals of the products of: the
+    derivatives of a residual by the parameters, m functions of its place, about as smooth, and the residual
+    itself. Weights are any multiple of the inverse variances; ``claimed`` is the expected weighted sum of
+    squares by standard deviations, 0 without these.
     """
     scale = np.sqrt(np.diag(gram))
     lengths = np.where(scale > 0, scale, np.inf)

@@ -60,27 +60,11 @@ class Plane:
 
 
 def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Plane:
-    """Fit a plane to a height map by least squares.
+    """Fit a plane to a height map, (H, W) mm with NaN where there is none, by least squares.
 
-    Parameters
-    ----------
-    height : array_like, (H, W)
-        Millimetres; NaN where there is none.
-    x, y : array_like, (W,) and (H,)
-        Millimetres of the pixel centres.
-    sigma : array_like, (H, W), optional
-        Standard deviations of the heights, mm; see `PointCloud.fit` for how they weigh.
-
-    Returns
-    -------
-    Plane
-        Uncertainties are those of `covariance`; to that of its height comes the mean standard deviation of
-        the heights, which may all be wrong together.
-
-    Raises
-    ------
-    InputError
-        Fewer than three pixels, or all of them in one line.
+    Pixel centres are at ``x``, (W,), and ``y``, (H,), mm. ``sigma``, (H, W) mm, are the heights' standard
+    deviations; `PointCloud.fit` says how they weight. Uncertainties are those of `covariance`, that of the
+    height joined by the mean standard deviation of the heights, which may have an error in common.
 
     Examples
     --------
@@ -173,23 +157,7 @@ class Sphere:
 
 
 def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Sphere:
-    """Fit a sphere to a height map by least squares of the distances from it.
-
-    Parameters
-    ----------
-    height, x, y, sigma
-        As for `fit_plane`.
-
-    Returns
-    -------
-    Sphere
-        Uncertainties are those of `covariance`; to those of heights comes the mean standard deviation of the
-        heights, which may all be wrong together.
-
-    Raises
-    ------
-    InputError
-        Fewer than four pixels, or a surface without curvature.
+    """Fit a sphere to a height map by least squares of the distances from it; arguments as for `fit_plane`.
 
     Examples
     --------

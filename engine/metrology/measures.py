@@ -129,9 +129,9 @@ def _forms(
         notes.append(
             f"pixels left out of roughness, too near to holes or ends for the filter: {rough.left_out}"
         )
-    if rough.unsure:
+    if rough.uncertain:
         notes.append(
-            f"pixels left out of roughness and lowest point, far less sure than others: {rough.unsure}"
+            f"pixels left out of roughness and lowest point, far less sure than others: {rough.uncertain}"
         )
     return found | rough.quantities()
 

@@ -1,4 +1,4 @@
-"""The part of a result that is measured: checked, cut out, and told apart from what was filled."""
+"""The part of a result that is measured: checked, cut out, and separated from what was filled."""
 
 from __future__ import annotations
 
@@ -62,28 +62,11 @@ def heights_of(result: Result) -> NDArray[np.float32]:
 
 
 def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Result]:
-    """Cut out what is to be measured.
+    """Cut out a region, and return the result without the heights that cannot be compared with its own.
 
     Only heights that were measured and whose standard deviation is finite count. Of several components, those
     whose height is relative cannot be compared with others: they are left out where others are absolute, and
     all but the largest where none is.
-
-    Parameters
-    ----------
-    result : Result
-        Of one picture.
-    region : Region, optional
-        In its pixels; by default all of it.
-
-    Returns
-    -------
-    (Patch, Result)
-        And the result with no other heights than those that can be compared with the patch's.
-
-    Raises
-    ------
-    InputError
-        No height, no pixel size, one map for each turn, or a region beyond the picture.
     """
     height = heights_of(result)
     if result.height_sigma is not None and not np.isfinite(result.height_sigma).any():
@@ -122,10 +105,10 @@ def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[M
     """Return which heights count, and notes on that."""
     known, notes = np.isfinite(height), []
     if result.height_sigma is not None:
-        unsure = known & ~np.isfinite(result.height_sigma) & ~filled
-        known &= ~unsure
-        if unsure.any():
-            notes.append(f"pixels left out, whose height has no standard deviation: {unsure.sum()}")
+        undefined = known & ~np.isfinite(result.height_sigma) & ~filled
+        known &= ~undefined
+        if undefined.any():
+            notes.append(f"pixels left out, whose height has no standard deviation: {undefined.sum()}")
     if 1 in height.shape:
         notes.append("a single row or column: pixels are taken to be square")
     return known, notes
@@ -136,19 +119,19 @@ def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple
     component, unknown = result.component, result.offset_unknown
     if component is None or unknown is None or not np.any(unknown):
         return known, True, []
-    # Numbers from -1 on: what belongs to no piece comes first, and counts as absolute.
+    # Numbers from -1 on: what belongs to no component comes first, and counts as absolute.
     relative = np.concatenate([[False], unknown != 0])[component + 1]
     inside = np.zeros(known.shape, bool)
     inside[part] = known[part]
     if np.any(inside & ~relative):
         lost = np.unique(component[inside & relative]).size
-        note = f"pieces left out, whose height is only relative: {lost}"
+        note = f"components left out, whose height is only relative: {lost}"
         return known & ~relative, True, [note] if lost else []
-    pieces, counts = np.unique(component[inside], return_counts=True)
+    labels, counts = np.unique(component[inside], return_counts=True)
     notes = ["heights are relative: their mean is 0"]
-    if pieces.size > 1:
-        known = known & (component == pieces[np.argmax(counts)])
-        notes.append(f"only the largest of {pieces.size} pieces is measured: how high they lie is unknown")
+    if labels.size > 1:
+        known = known & (component == labels[np.argmax(counts)])
+        notes.append(f"only the largest of {labels.size} components is measured: their offsets are unknown")
     return known, False, notes
 
 
@@ -163,5 +146,5 @@ def pixel_size_of(x: Doubles, y: Doubles) -> tuple[float, float]:
     steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
     known = [float(step) for step in steps if step is not None]
     if not known:
-        raise InputError("the result has a single pixel, which does not tell how large it is: take more")
+        raise InputError("the result has a single pixel, so its size is unknown: take more")
     return known[0], known[-1]

@@ -36,7 +36,7 @@ class Section:
     x, y : ndarray, (n,), float64
         Where it runs, from the picture's centre, in ``unit``.
     height, sigma : ndarray, (n,), float64
-        Millimetres: heights between four pixels, NaN beside a hole and between pieces; and their standard
+        Millimetres: heights between four pixels, NaN beside a hole and between components; and their standard
         deviations, NaN where they are not known or a height was filled.
     filled : ndarray, (n,), bool
         Where a height was filled, not measured.
@@ -200,26 +200,12 @@ class Step:
 
 
 def step_height(section: Section) -> Step:
-    """Measure the step along a section.
+    """Measure the step along a section in millimetres.
 
     The step is where two parallel lines fit the measured samples before and after it best. Then the third of
     either side that lies nearest to it is left out, and the lines are fitted once more: the step's
-    height is their distance, at right angles to them.
-
-    Parameters
-    ----------
-    section : Section
-        In millimetres.
-
-    Returns
-    -------
-    Step
-        Its uncertainty is that of `covariance`, with curves of either side as smooth shapes.
-
-    Raises
-    ------
-    InputError
-        Pixels of unknown size, too few measured samples, or a curve that fits better.
+    height is their distance, at right angles to them. Uncertainties are those of `covariance`, with curves of
+    either side as smooth shapes.
 
     Examples
     --------

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.metrology.fitting import far_less_sure
+from mirrorskin.engine.metrology.fitting import find_uncertain
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.io import InputError
 
@@ -31,9 +31,9 @@ class Roughness:
         Highest peak and deepest pit together, µm.
     noise : Quantity
         What Sq would be of a perfect surface: the root mean square of the standard deviations, µm.
-    pixels, left_out, unsure : int
+    pixels, left_out, uncertain : int
         Known pixels that count, that lie too near to an end or a hole for the filter, and whose standard
-        deviation is so much larger than others' that they count for not measured.
+        deviation is so much larger than others' that they count as not measured.
     """
 
     sa: Quantity
@@ -42,7 +42,7 @@ class Roughness:
     noise: Quantity
     pixels: int
     left_out: int
-    unsure: int
+    uncertain: int
 
     def quantities(self) -> dict[str, Quantity]:
         """Return its quantities by name."""
@@ -57,36 +57,19 @@ def roughness(
     cutoff: float | None = None,
     sigma: ArrayLike | None = None,
 ) -> Roughness:
-    """Return the roughness of a surface.
+    """Return the roughness of a surface from its residual, (H, W) mm with NaN where there is none.
+
+    ``pixel_size`` is that along x and y, mm. ``cutoff``, mm, is the nesting index of the L-filter: longer
+    waves are taken out, and pixels with more than a twentieth of the filter's weight on holes or outside the
+    picture do not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
 
     Values include the noise: the square of Sq is the sum of that of the surface and that of the noise, where
     these are uncorrelated. In any case noise changes Sq by no more than its own root mean square, and Sa by
     no more than its mean magnitude: these are the uncertainties. Noise makes Sz larger by something between
     nothing and all that noise spans; the errors of the highest and of the lowest pixel add to that.
 
-    Pixels that are far less sure than others (see `far_less_sure`) are not part of the definition area: Sz
-    would be their error. What a form's fit left out as outliers is: it may be the texture.
-
-    Parameters
-    ----------
-    residual : array_like, (H, W)
-        Heights above the form, mm, as of `fit_plane` or `fit_sphere`; NaN where there is none.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    cutoff : float, optional
-        Nesting index of the L-filter, mm: longer waves are taken out. Pixels with more than a twentieth of
-        the filter's weight on holes, or outside of the picture, do not count.
-    sigma : array_like, (H, W), optional
-        Standard deviations of the heights, mm.
-
-    Returns
-    -------
-    Roughness
-
-    Raises
-    ------
-    InputError
-        No known pixel, a cutoff of less than two pixels, or none that counts.
+    Pixels that are far more uncertain than others (see `find_uncertain`) are not part of the definition area:
+    Sz would be their error. What a form's fit left out as outliers is: it may be the texture.
 
     Examples
     --------
@@ -98,8 +81,8 @@ def roughness(
     if not known.any():
         raise InputError("there is no height to measure the roughness of")
     spread = np.full_like(height, np.nan) if sigma is None else np.asarray(sigma, np.float64)
-    unsure = far_less_sure(spread, known)
-    height = np.where(unsure, np.nan, height)
+    uncertain = find_uncertain(spread, known)
+    height = np.where(uncertain, np.nan, height)
     if cutoff is not None:
         height = height - long_waves(height, pixel_size, cutoff)
     kept = np.isfinite(height)
@@ -115,8 +98,8 @@ def roughness(
         micrometres(float(np.ptp(values)), math.hypot(span / math.sqrt(3), ends)),
         micrometres(noise, np.nan),
         values.size,
-        int(np.count_nonzero(known & ~unsure & ~kept)),
-        int(np.count_nonzero(unsure)),
+        int(np.count_nonzero(known & ~uncertain & ~kept)),
+        int(np.count_nonzero(uncertain)),
     )
 
 

@@ -30,9 +30,9 @@ def coarse_heights(
 ) -> Doubles:
     """Return the height of the sheet above its rest plane in the mean pose.
 
-    Slopes are integrated; the highest point of each piece is taken to be as high as the body was pressed.
+    Slopes are integrated; the highest point of each component is taken to be as high as the body was pressed.
     Where no normal is known, the nearest slope is taken, as over a crease; where that is because the surface
-    is too level to be seen, it becomes less towards the middle, as on a ball. Beyond the pieces, the nearest
+    is too level to be seen, it becomes less towards the middle, as on a ball. Beyond them, the nearest
     height is taken. Heights are finite, from 0 to the press, mm; the press where there is no contact at all.
     """
     from scipy import ndimage
@@ -60,9 +60,9 @@ def coarse_heights(
         tolerance=_TOLERANCE,
         device=device,
     )
-    piece = np.where(inside, surface.component, -1)
-    tops = ndimage.maximum(surface.height, piece, np.arange(surface.component.max() + 1))
-    heights = np.where(piece >= 0, surface.height - np.asarray(tops)[piece], np.nan)
+    label = np.where(inside, surface.component, -1)
+    tops = ndimage.maximum(surface.height, label, np.arange(surface.component.max() + 1))
+    heights = np.where(label >= 0, surface.height - np.asarray(tops)[label], np.nan)
     places = np.meshgrid(*((np.arange(length) + 0.5) / step - 0.5 for length in shape), indexing="ij")
     found = ndimage.map_coordinates(fill_with_nearest(heights), places, order=1, mode="nearest")
     return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))

@@ -25,7 +25,7 @@ from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 _STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
-_PIECE = 256  # frames whose tables a kernel gets at once
+_BATCH = 256  # frames whose tables a kernel gets at once
 _MAX_FRAMES = 2**23  # that integer sums can take
 _SUMS = {"total": "sum", "cosine": "cosine sum", "sine": "sine sum", "square": "square sum"}
 _PAIRS = {"reference": "reference", **_SUMS}
@@ -256,9 +256,9 @@ class _Sums:
         self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length)
         alone = len(self.bands) == 1
         self.room = self.bands[0].frames.host if alone else np.empty((length, *shape), dtype)
-        self._place = device.array("place", (_PIECE,), np.int32)
-        self._steps = device.array("basis", (max(6 * WINDOW, 3 * _PIECE),), np.int32)
-        self._floats = device.array("basis", (3 * _PIECE,), np.float32)
+        self._place = device.array("place", (_BATCH,), np.int32)
+        self._steps = device.array("basis", (max(6 * WINDOW, 3 * _BATCH),), np.int32)
+        self._floats = device.array("basis", (3 * _BATCH,), np.float32)
         self._fit = device.array("fit", (28,), np.float32)
 
     @property
@@ -362,8 +362,8 @@ class TurnSums(_Sums):
         fresh = not np.any(self._weight)
         for band, staged in self._stage(frames, lent):
             used = staged.frames.start + np.flatnonzero(weight[staged.frames])
-            for piece in range(0, len(used), _PIECE):
-                places = used[piece : piece + _PIECE]
+            for start in range(0, len(used), _BATCH):
+                places = used[start : start + _BATCH]
                 _fill(self._place, places - staged.frames.start)
                 _fill(basis, rows[places])
                 known = _maps_of(band, _SUMS if counts else _PAIRS)

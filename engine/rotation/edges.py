@@ -17,7 +17,7 @@ from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, p
 LIMITS = Limits(
     jump=math.radians(10.0),
     bend=math.radians(5.0),
-    sure=3.5,
+    significance=3.5,
     quiet=math.radians(1.2),
     floor=math.radians(0.05),
     lowest=math.radians(5.0),
@@ -165,7 +165,7 @@ class EdgeDrawing:
             **self._pairs[chosen],
             jump=LIMITS.jump,
             bend=LIMITS.bend,
-            sure=LIMITS.sure,
+            significance=LIMITS.significance,
             quiet=LIMITS.quiet,
             floor_=LIMITS.floor,
             lowest=LIMITS.lowest,

@@ -36,7 +36,7 @@ from mirrorskin.kernels.device import Device
 
 @dataclass(frozen=True)
 class Normals:
-    """Which way the pixels' surface faces, and how sure that is.
+    """Which way the pixels' surface faces, and the standard deviation of that.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The heights that fit the normals of a rotation: slopes, how sure those are, and their integration."""
+"""The heights that fit the normals of a rotation: slopes, their variances, and their integration."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def find_slopes(
     turns : int
         Of how many turns the normals are the mean.
     independent_sigma : ndarray, (H, W), float32, optional
-        What to weigh slopes by instead of ``sigma``, where errors of neighbours are correlated: independent
+        What to weight slopes by instead of ``sigma``, where errors of neighbours are correlated: independent
         errors that leave as much in a mean over many pixels.
 
     Returns
@@ -186,7 +186,7 @@ def integrate_normals(
     -------
     Result
         Heights, with a mean of 0 of each connected component, and what came with them; components are
-        numbered through all turns. Edges are those where the surface breaks, if that was asked for.
+        numbered through all turns. Edges are those where the surface breaks, if that was wanted.
 
     Raises
     ------

@@ -62,20 +62,6 @@ class Registered:
     It is not checked whether the sheet touches a point in every pose, nor whether a point is hidden: a mirror
     skin takes the object's shape, and a camera along the body's axis sees all of it that does not overhang.
 
-    Parameters
-    ----------
-    source : Source
-        Of axial motion, with pixel size, tilt, press and pivot in its header. Open it, or enter this, which
-        enters it.
-    heights : array_like, (H, W)
-        Millimetres of the object's surface; z = 0 is the sheet's rest plane at travel 0. NaN where unknown.
-    header : Header, optional
-        Instead of the source's own.
-    sight : Sight, optional
-        Of a camera that does not look along the body's axis everywhere.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``. It holds five maps and a frame.
-
     Attributes
     ----------
     name, header, motion, shape, rewindable
@@ -84,13 +70,6 @@ class Registered:
         float32.
     phase : ndarray, (T,), float64, or None
         That of the source, if it knows its phases beforehand.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The motion is not axial, the header says too little, or the heights do not fit.
-    mirrorskin.kernels.errors.DeviceError
-        No device, or one without room for the maps.
     """
 
     dtype = _FRAME
@@ -156,15 +135,7 @@ class Registered:
         _fill(self._noise, np.zeros_like(self._noise.host))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the next frames and resample them; see ``Source.read``.
-
-        Raises
-        ------
-        ValueError
-            ``out`` does not fit the frames.
-        InputError
-            The phase of a frame is missing, or the source cannot be read.
-        """
+        """Read the next frames and resample them; see ``Source.read``."""
         out = block_memory(out, self.shape, self.dtype)
         block = self._source.read(self._room[: len(out)])
         if block is None:

@@ -145,21 +145,7 @@ def make_response(
     pivot: tuple[float, float, float] | None = None,
     follows: bool = False,
 ) -> Response:
-    """Put a calibrated response together for the pixels of a picture.
-
-    Parameters
-    ----------
-    wall : WallResponse
-        With maps of the picture.
-    dark, bright : array_like, scalar or (H, W)
-        Counts without and with full light.
-    axes : (ndarray, ndarray)
-        x of the columns and y of the rows, mm.
-    heights, follows
-        As for `Response.at`.
-    pivot : (float, float, float), optional
-        What the body turns about, mm; by default the centre of the rest sheet.
-    """
+    """Put a calibrated response together for the pixels of a picture."""
     if wall.pattern != "graded":
         raise InputError("the calibration is of a uniform pattern, but normals need a graded one")
     if not 1 < len(wall.curve) <= _MAX_CURVE:

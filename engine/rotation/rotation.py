@@ -75,7 +75,7 @@ def reconstruct_rotation(
     Brightness is what the zenith response of the source's calibration says (see `mirrorskin.io.Calibrated`).
     Without one, it is taken to be linear in the zenith between the source's dark and bright references, where
     it has them. Without a zenith gain, there are azimuth, mean, modulation and residual only; without a pixel
-    size, no heights. Heights are relative: the mean of each connected piece is 0.
+    size, no heights. Heights are relative: the mean of each component is 0.
 
     Parameters
     ----------
@@ -340,7 +340,7 @@ class _Passes:
         return heights
 
     def _half_way(self) -> Doubles:
-        """Return the height of an object of which nothing is known yet, less the press, (H, W), mm."""
+        """Return the height of an object before the first estimate, less the press, (H, W), mm."""
         return np.full(self.source.shape[1:], -HALF_WAY * self._press)
 
     @property

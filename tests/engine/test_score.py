@@ -191,8 +191,8 @@ def test_a_score_prints_what_there_is():
     assert {name.split()[0] for name in table} == {"height", "normal"}
 
 
-def in_pieces():
-    """Return heights of two pieces, one of them relative, with a filled pixel each, and the truth."""
+def in_components():
+    """Return heights of two components, one of them relative, with a filled pixel each, and the truth."""
     truth = truth_of(np.array([[0, 1, 2, 3, 4, 5]], np.float32))
     height = np.array([[0.1, 1.1, 2.3, 7, 8.2, NAN]], np.float32)
     maps = {
@@ -204,7 +204,7 @@ def in_pieces():
 
 
 def test_relative_heights_are_compared_without_their_mean_difference():
-    result, truth = in_pieces()
+    result, truth = in_components()
     score = engine.score(result, truth)
     # Errors of 0.1 twice in the absolute piece, and of -0.1 and 0.1 about the mean of 4.1 in the other.
     assert score.height.answered == 4
@@ -216,7 +216,7 @@ def test_relative_heights_are_compared_without_their_mean_difference():
 
 
 def test_filled_heights_are_scored_apart():
-    result, truth = in_pieces()
+    result, truth = in_components()
     score = engine.score(result, truth)
     assert list(score.parts()) == ["height", "filled"]
     assert (score.filled.answered, score.filled.relative) == (1, 0)

@@ -706,7 +706,7 @@ def roughness() -> Answer:
     residual[10:13, 20:23] = np.nan
     plain = engine_roughness(residual, PIXEL)
     fine = engine_roughness(residual, PIXEL, cutoff=0.8, sigma=np.full(x.shape, 1e-3))
-    counts = [[one.pixels, one.left_out, one.unsure] for one in (plain, fine)]
+    counts = [[one.pixels, one.left_out, one.uncertain] for one in (plain, fine)]
     return {
         "plain": numbers(plain.quantities()),
         "fine": numbers(fine.quantities()),

@@ -106,14 +106,16 @@ def soft_minimum(squares, k):
 
 
 def energy_by_hand(maps, k):
-    flags, slope_x, slope_y, steep, sure_x, sure_y, anchor, known, u = (one.astype(float) for one in maps)
+    flags, slope_x, slope_y, steep, confidence_x, confidence_y, anchor, known, u = (
+        one.astype(float) for one in maps
+    )
     total = 0.0
     for row, column in np.ndindex(flags.shape):
         here = row, column
         total += anchor[here] * (u[here] - known[here]) ** 2
         for bit, slope, sure, size, (down, right) in (
-            (RIGHT, slope_x, sure_x, SIZE[0], (0, 1)),
-            (DOWN, slope_y, sure_y, SIZE[1], (1, 0)),
+            (RIGHT, slope_x, confidence_x, SIZE[0], (0, 1)),
+            (DOWN, slope_y, confidence_y, SIZE[1], (1, 0)),
         ):
             squares, before = [], (row - down, column - right)
             if int(flags[here]) & bit:

@@ -17,8 +17,8 @@ PLANE = 0.3, -0.2, 0.7
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("heights", [0, 1, 2])
-@pytest.mark.parametrize("pieces", ["one", "many"])
-def test_kernels_and_reference_settle_alike(device, shape, heights, pieces):
+@pytest.mark.parametrize("parts", ["one", "many"])
+def test_kernels_and_reference_agree(device, shape, heights, parts):
     random = np.random.default_rng(shape[0])
     known = np.where(random.random(shape) < 0.2, random.normal(2, 1, shape), np.nan)
     known[0, 0] = 1.0
@@ -28,20 +28,20 @@ def test_kernels_and_reference_settle_alike(device, shape, heights, pieces):
         np.zeros(shape),
         np.zeros(shape),
         (0.5, 0.25),
-        mask=wanted | (pieces == "one"),
+        mask=wanted | (parts == "one"),
         known_heights=known if heights else None,
         known_height_weights=share if heights == 2 else None,
     )
     room = PixelGraph(device, shape)
     flags = room.upload(inputs).copy()
     found = find_components(flags, cut=False)
-    assert min(shape) < 9 or (found.count > 20) == (pieces == "many")
+    assert min(shape) < 9 or (found.count > 20) == (parts == "many")
     relief = random.normal(0, 1, shape).astype(np.float32)
     array = device.array("relief", shape, np.float32)
     array.host[...] = relief
     array.upload()
-    settler = Levelling(room)
-    settler.use(found)
+    levelling = Levelling(room)
+    levelling.use(found)
 
     rise = PLANE[0] * 0.5, -PLANE[1] * 0.25, PLANE[2]
     given = flags, found.labels, relief, rise
@@ -54,8 +54,8 @@ def test_kernels_and_reference_settle_alike(device, shape, heights, pieces):
             total, share = components.components_sum(*given, *maps, found.count)
             offsets[some] = -(total[some] / share[some])
     offsets[~found.offset_unknown] += 5.0
-    exact = components.components_settle(*given, offsets)
-    np.testing.assert_allclose(settler.level(array, PLANE, 5.0), exact, atol=1e-5)
+    exact = components.components_add_offsets(*given, offsets)
+    np.testing.assert_allclose(levelling.level(array, PLANE, 5.0), exact, atol=1e-5)
     assert np.isnan(exact).sum() == np.sum(found.labels < 0)
 
 
@@ -69,19 +69,19 @@ def test_a_piece_without_known_height_has_the_mean_nothing_and_others_meet_what_
     heights = np.array([[0, 0, 0], [0, 0, 1130.0]])
     total, share = components.components_sum(flags, labels, relief, plane, heights, None, 2)
     assert (total[1], share.tolist()) == (4 + 1120 - 1130, [0, 1])
-    settled = components.components_settle(flags, labels, relief, plane, np.array([-1052.0, 6]))
-    np.testing.assert_array_equal(settled, [[-51, np.nan, 1028], [51, np.nan, 1130]])
+    levelled = components.components_add_offsets(flags, labels, relief, plane, np.array([-1052.0, 6]))
+    np.testing.assert_array_equal(levelled, [[-51, np.nan, 1028], [51, np.nan, 1130]])
 
 
-@pytest.mark.parametrize("pieces", [1, 7, 300])
-def test_offsets_bring_means_to_0(device, pieces):
-    random = np.random.default_rng(pieces)
-    sums, totals = random.normal(0, 5, (9, pieces)), random.integers(0, 4, (9, pieces))
+@pytest.mark.parametrize("parts", [1, 7, 300])
+def test_offsets_bring_means_to_0(device, parts):
+    random = np.random.default_rng(parts)
+    sums, totals = random.normal(0, 5, (9, parts)), random.integers(0, 4, (9, parts))
     totals[:, -1] = 0
-    offsets = device.given("offsets", np.full(pieces, 9.0))
+    offsets = device.given("offsets", np.full(parts, 9.0))
     given = [device.given(name, values) for name, values in (("sums", sums), ("totals", totals))]
     kernel = device.kernel("components", "components_level", ONE=0)
-    launch(kernel, pieces, 9, pieces, *given, offsets)
+    launch(kernel, parts, 9, parts, *given, offsets)
     expected = components.components_level(sums, totals)
     np.testing.assert_allclose(offsets.download(), expected, rtol=1e-5, atol=1e-6)
     assert offsets.download()[-1] == 0

@@ -173,8 +173,8 @@ def test_a_region_is_measured_alone(ball):
         engine.measure(ball, region=io.Region((0, 500), (0, 10)))
 
 
-def pieces(unknown):
-    """Two pieces: a level one of 6 x 20 pixels at 1 mm, and one of 6 x 10 at 5 mm."""
+def components(unknown):
+    """Two components: a level one of 6 x 20 pixels at 1 mm, and one of 6 x 10 at 5 mm."""
     height = np.full((20, 20), NAN)
     component = np.full((20, 20), -1, np.int32)
     height[2:8], component[2:8] = 1.0, 0
@@ -183,15 +183,15 @@ def pieces(unknown):
 
 
 def test_pieces_whose_height_is_relative_are_not_compared_with_others():
-    both, second, largest = (engine.measure(pieces(unknown)) for unknown in ([0, 0], [0, 1], [1, 1]))
+    both, second, largest = (engine.measure(components(unknown)) for unknown in ([0, 0], [0, 1], [1, 1]))
     assert both.quantities["height range"].value == pytest.approx(4)
     assert second.quantities["height range"].value == 0
     assert second.quantities["highest point"].value == 1
-    assert "pieces left out, whose height is only relative: 1" in second.notes
+    assert "components left out, whose height is only relative: 1" in second.notes
     assert largest.quantities["measured area"].value == pytest.approx(1.2)
     assert "volume below rest plane" not in largest.quantities
     assert largest.notes[0] == "heights are relative: their mean is 0"
-    assert largest.notes[1].startswith("only the largest of 2 pieces")
+    assert largest.notes[1].startswith("only the largest of 2 components")
 
 
 def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
@@ -213,8 +213,8 @@ def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
 
 def test_a_section_compares_no_heights_of_pieces_that_lie_nobody_knows_how_high():
     ends = (-0.7, -0.85), (-0.7, 0.95)
-    assert engine.measure(pieces([0, 0]), section=ends).quantities["height difference"].value == -4
-    alone = engine.measure(pieces([1, 1]), section=ends)
+    assert engine.measure(components([0, 0]), section=ends).quantities["height difference"].value == -4
+    alone = engine.measure(components([1, 1]), section=ends)
     assert alone.quantities["height difference"].value == 0
     assert any(note.startswith("section: an end has no measured height") for note in alone.notes)
 

@@ -76,14 +76,14 @@ def test_noise_changes_sq_by_no_more_than_its_uncertainty():
 
 
 @pytest.mark.parametrize(("share", "left_out"), [(0.1, True), (0.2, False)])
-def test_pixels_that_are_far_less_sure_are_left_out_if_they_are_few(share, left_out):
+def test_pixels_that_are_far_less_certain_are_left_out_if_they_are_few(share, left_out):
     height, sigma = grating((30, 100), (0.02, 0.03)), np.full((30, 100), 1e-4)
     few = slice(0, round(30 * share))
     height[few], sigma[few] = height[few] + 0.5, 0.1
     found = roughness(height, (0.02, 0.03), sigma=sigma)
     assert (found.sz.value < 11) == left_out
-    assert found.unsure == (300 if left_out else 0)
-    assert found.pixels == 3000 - found.unsure
+    assert found.uncertain == (300 if left_out else 0)
+    assert found.pixels == 3000 - found.uncertain
 
 
 def test_what_has_no_roughness_is_refused():
