@@ -90,7 +90,12 @@ class VideoCamera(ThreadedCamera):
         self._thread = threading.Thread(target=self._drain, name=self.name, daemon=True)
         self._thread.start()
         try:
-            self._await_first()
+            if not self._ready.wait(_FIRST_FRAME):
+                raise InputError(
+                    f"{self.name} gave no picture within {_FIRST_FRAME:.3g} s: see its cable and power"
+                )
+            if self._refusal is not None:
+                raise self._refusal
         except BaseException:
             self.close()
             raise
@@ -113,14 +118,6 @@ class VideoCamera(ThreadedCamera):
         self._thread.join(_CLOSING)
         if self._thread.is_alive():
             _log.warning("%s does not let go: unplug it before it is used again", self.name)
-
-    def _await_first(self) -> None:
-        if not self._ready.wait(_FIRST_FRAME):
-            raise InputError(
-                f"{self.name} gave no picture within {_FIRST_FRAME:.3g} s: see its cable and power"
-            )
-        if self._refusal is not None:
-            raise self._refusal
 
     def _drain(self) -> None:
         """Move frames to the ring until the end: what the thread does."""

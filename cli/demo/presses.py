@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from mirrorskin.cli.demo.lab import lab_camera, record
 from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mirrorskin import io
-    from mirrorskin.hw.twin import ContactName, OpticsName
+    from mirrorskin import hw, io
+    from mirrorskin.hw.twin import Camera, ContactName, OpticsName
 
 
 class Sensor(NamedTuple):
@@ -90,6 +89,26 @@ much that is above that of the paper's idealisations, conform and ideal."""
 # the pixels that all sensors answer.
 Outcome = dict[str, float]
 Outcomes = dict[str, dict[str, Outcome]]
+
+
+def lab_camera() -> Camera:
+    """Return a camera with read and shot noise, deviations of the pixels, and a lens."""
+    from mirrorskin.hw.twin import Camera
+
+    return Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5)
+
+
+def record(twin: hw.Twin, path: Path, doing: str) -> io.Truth:
+    """Record all frames of a twin, with a bar that says what it is doing; return the truth."""
+    from mirrorskin import io
+    from mirrorskin.cli.output import progress
+
+    with (
+        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
+        progress(doing, twin.shape[0]) as show,
+    ):
+        recorder.drain(show)
+    return twin.truth
 
 
 def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from mirrorskin.cli.demo.lab import lab_camera, record
+from mirrorskin.cli.demo.presses import lab_camera, record
 from mirrorskin.cli.output import print_table
 
 if TYPE_CHECKING:

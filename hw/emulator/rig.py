@@ -135,9 +135,9 @@ class EmulatedRig:
     def references(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Take dark and bright references with a ball, as a lab does, (H, W), float32; see `Twin`."""
         header = self.twin(Vertical([0.0])).header
-        dark, bright = header.dark, header.bright
-        assert dark is not None and bright is not None  # noqa: PT018 - a twin has both
-        return dark, bright
+        assert header.dark is not None
+        assert header.bright is not None
+        return header.dark, header.bright
 
     @property
     def settings(self) -> RigSettings:
