@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from calibration_scorer import Map, Rig, Surface
 from numpy.typing import NDArray
+from stacks import MadeUp
 
 from mirrorskin import hw, io
 from mirrorskin.hw.twin.camera import Sensor
@@ -54,38 +55,18 @@ class Thing(NamedTuple):
         return self.surface.slope(x, y)
 
 
-class Frames:
+class Frames(MadeUp):
     """A source of given frames, which can be read again."""
 
-    rewindable = True
+    rewindable, truth = True, None
 
     def __init__(self, name: str, frames: NDArray[Any], header: io.Header, **series: Map) -> None:
-        self.name, self.frames, self.header, self.series = name, frames, header, series
-        self.shape, self.dtype, self.motion = frames.shape, frames.dtype, header.motion
-        self.truth = None
-        self._next = 0
+        super().__init__(frames, header, **series)
+        self.name, self.series = name, series
 
     def rewind(self) -> None:
         """Go back to the first frame."""
-        self._next = 0
-
-    def read(self, out: NDArray[Any] | None = None, /) -> io.Block | None:
-        """Read the next frames."""
-        part = slice(self._next, min(self._next + (1 if out is None else len(out)), len(self.frames)))
-        if part.start == part.stop:
-            return None
-        self._next = part.stop
-        frames = self.frames[part].copy()
-        if out is not None:
-            out[: len(frames)] = frames
-            frames = out[: len(frames)]
-        return io.Block(frames, part.start, **{name: values[part] for name, values in self.series.items()})
-
-    def __enter__(self) -> Frames:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
+        self.frames_read = 0
 
 
 @dataclass(frozen=True, slots=True)

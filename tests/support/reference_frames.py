@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from stacks import MadeUp
+from calibration_scenes import Frames
 
 from mirrorskin import io
 
@@ -11,20 +11,11 @@ TOPS = {"uint8": 255, "uint16": 4095, "float32": None}
 SCALES = {"uint8": 1.0, "uint16": 16.0, "float32": 1.0}
 
 
-class Again(MadeUp):
-    """Frames that can be read a second time."""
-
-    rewindable = True
-
-    def rewind(self):
-        self.frames_read = 0
-
-
 def source(frames, name="made up", again=False):
     """Return a source of given frames, (T, H, W)."""
     travel = 0.01 * np.arange(len(frames))
-    made = (Again if again else MadeUp)(frames, io.Header("vertical", camera="lab"), travel=travel)
-    made.name = name
+    made = Frames(name, frames, io.Header("vertical", camera="lab"), travel=travel)
+    made.rewindable = again
     return made
 
 

@@ -5,7 +5,7 @@ import calibration_scorer as scorer
 import numpy as np
 import pytest
 from calibration_scenes import Frames, Thing
-from stacks import MadeUp, ball
+from stacks import ball
 from walls import response_of_twin
 
 from mirrorskin import io
@@ -48,8 +48,7 @@ def test_a_ball_is_found_beside_the_middle(press):
     press.rewind()
     frames = np.empty(press.shape, press.dtype)
     press.read(frames)
-    aside = MadeUp(np.roll(frames, 5, axis=2), press.header, travel=press.travel)
-    aside.rewindable, aside.rewind = True, lambda: None
+    aside = Frames("aside", np.roll(frames, 5, axis=2), press.header, travel=press.travel)
     assert check_ball(aside, calibration(), 10.0).place == pytest.approx((5 * PIXEL, 0), abs=0.03)
 
 
@@ -83,8 +82,7 @@ def test_what_the_table_has_no_number_for_is_explained(press):
     [({"rewindable": False}, "cannot be read twice"), ({"motion": "twist"}, "twist motion")],
 )
 def test_what_cannot_be_checked_is_refused(press, change, message):
-    source = MadeUp(np.zeros((3, *SHAPE), np.uint8), press.header, travel=np.arange(3.0))
-    source.rewindable = True
+    source = Frames("press", np.zeros((3, *SHAPE), np.uint8), press.header, travel=np.arange(3.0))
     for name, value in change.items():
         setattr(source, name, value)
     with pytest.raises(io.InputError, match=message):
@@ -98,16 +96,14 @@ def test_numbers_that_cannot_be_are_refused(press, ball_size, cells):
 
 
 def test_a_press_on_nothing_is_told(press):
-    source = MadeUp(np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
-    source.rewindable, source.rewind = True, lambda: None
+    source = Frames("nothing", np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
     with pytest.raises(io.InputError, match="too little of a ball"):
         check_ball(source, calibration(), 10.0)
 
 
 def test_a_rotation_needs_a_zenith(press):
     header = replace(press.header, motion="axial")
-    source = MadeUp(np.zeros((8, *SHAPE), np.uint8), header, phase=np.arange(8.0))
-    source.rewindable = True
+    source = Frames("turn", np.zeros((8, *SHAPE), np.uint8), header, phase=np.arange(8.0))
     with pytest.raises(io.InputError, match="calibrate zenith first"):
         check_ball(source, calibration(), 10.0)
 

@@ -255,8 +255,7 @@ def test_a_real_wall_off_the_axis_is_seen_through():
 
 def test_turns_that_cannot_be_used_are_refused():
     scale, dark = scale_of(None, (30, 30)), np.full((8, 30, 30), 16, np.uint8)
-    no_phase = recording("turn", dark)
-    no_phase.series = {}
+    no_phase = Frames("turn", dark, Header("axial", pixel_size=PIXEL))
     long = recording("turn", np.broadcast_to(dark[:1, :1, :1], (5000, 1000, 1000)))
     vertical = Frames("turn", dark, Header("vertical", pixel_size=PIXEL), travel=EIGHTHS)
     for source, radius, said in (
