@@ -28,9 +28,8 @@ from mirrorskin.bench.harness import (
     Work,
     agree,
     check_memory,
-    take_turns,
 )
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.paths import onset_maps, search_of
 from mirrorskin.engine import OnsetSearch
 from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
@@ -79,9 +78,8 @@ def run_batch(device: Device, quick: bool) -> Case:
             "clear the folder of results once more": clear,
             BATCH: partial(_run, jobs, device),
         }
-        limits = Limits(device, min(count, _COPIES) * math.prod(shape))
-        rounds = 1 if quick else _ROUNDS
-        measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
+        copies = min(count, _COPIES) * math.prod(shape)
+        limits, measured = beside_limits(works, copies, device, quick, check, rounds=_ROUNDS)
     rows = {name: Row(name, measured[name], size, count * shape[0]) for name in (LEAST, LOOP, BATCH)}
     each = {name: 1e3 * row.measured.wall.median / count for name, row in rows.items()}
     note = f"a file: {', '.join(f'{name} {ms:.2f} ms' for name, ms in each.items())}"
@@ -93,7 +91,7 @@ def run_batch(device: Device, quick: bool) -> Case:
         f"{count} presses, full default, references of each pixel, no holes filled; "
         f"{' x '.join(map(str, shape))} uint8 each, contiguous"
     )
-    return Case("batch-small", title, [*limits.rows(measured), *rows.values()], {}, (note,), targets)
+    return Case("batch-small", title, [*limits, *rows.values()], {}, (note,), targets)
 
 
 CASES: Cases = {"batch-small": run_batch}

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from mirrorskin import engine
 from mirrorskin.bench.files import make_press, make_turns, new_folder, record
-from mirrorskin.bench.harness import OURS, Case, Cases, Measured, Row, Timing, Work, check_memory, take_turns
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.harness import OURS, Case, Cases, Measured, Row, Timing, check_memory
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.scenes import (
     PIXEL,
     SCALES,
@@ -102,11 +102,9 @@ def _frames(name: str, shape: Shape, fill: Callable[[NDArray[Any]], None]) -> ND
 def _run(
     name: str, title: str, works: Mapping[str, Callable[[], object]], moved: int, device: Device, quick: bool
 ) -> Case:
-    limits = Limits(device, moved)
-    timed: dict[str, Work] = {**limits.works(), **works}
-    measured = take_turns(timed, 1 if quick else _ROUNDS, device.profile)
+    limits, measured = beside_limits(works, moved, device, quick, rounds=_ROUNDS)
     rows = [Row(f"{OURS}, {work}", measured[work], moved) for work in works]
-    return Case(name, title, [*limits.rows(measured), *rows], {}, tuple(map(_parts, rows)))
+    return Case(name, title, [*limits, *rows], {}, tuple(map(_parts, rows)))
 
 
 def run_reconstruct(name: str, shape: Shape, device: Device, quick: bool) -> Case:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.harness import (
     OURS,
-    ROUNDS,
     THREADS,
     Case,
     Cases,
@@ -21,9 +20,9 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
-    take_turns,
+    pusher,
 )
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.scenes import STEPS, fill_turns, phases
 from mirrorskin.engine import Correlator
 from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
@@ -59,16 +58,7 @@ def run_stack(device: Device, quick: bool) -> Case:
     fill_turns(frames)
     phase = phases(count)
 
-    def push() -> None:
-        correlator.reset()
-        correlator.push(frames, phase=phase)
-        device.finish()
-
-    def find() -> object:
-        correlator.reset()
-        correlator.push(frames, phase=phase)
-        return correlator.result()
-
+    push, find = (pusher(correlator, frames, maps=maps, phase=phase) for maps in (False, True))
     absent = missing("numba")
     peers: dict[str, Callable[[Counts, Doubles], Floats]] = {"NumPy": _numpy}
     peers |= {} if "numba" in absent else {"Numba": _numba}
@@ -80,12 +70,11 @@ def run_stack(device: Device, quick: bool) -> Case:
 
     moved = dict.fromkeys((f"{OURS}, push only", OURS, *theirs), (count + _MAPS) * pixels)
     moved[f"{OURS}, push only"] = count * pixels
-    limits = Limits(device, (count + _MAPS) * pixels)
-    works = {**limits.works(), f"{OURS}, push only": push, OURS: find, **theirs}
-    measured = take_turns(works, 1 if quick else ROUNDS, device.profile, check)
+    works = {f"{OURS}, push only": push, OURS: find, **theirs}
+    limits, measured = beside_limits(works, (count + _MAPS) * pixels, device, quick, check, first="triad")
     rows = [Row(name, measured[name], size, count) for name, size in moved.items()]
     title = f"mean, cosine, sine and residual; {' x '.join(map(str, shape))} uint8"
-    return Case("correlate-uint8", title, limits.rows(measured, first="triad") + rows, absent)
+    return Case("correlate-uint8", title, limits + rows, absent)
 
 
 def run_sliding(device: Device, quick: bool) -> Case:
@@ -113,14 +102,13 @@ def run_sliding(device: Device, quick: bool) -> Case:
         if peer is not None:
             _check("Numba", peer.wave(), correlator.result())
 
-    limits = Limits(device, a_frame)
     works: dict[str, Work] = {OURS: push_all}
     if peer is not None:
         works["Numba"] = peer.push_all
-    measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
+    limits, measured = beside_limits(works, a_frame, device, quick, check, first="triad")
     rows = [Row(name, measured[name], len(frames) * a_frame, len(frames)) for name in works]
     title = f"one new frame into a window of {STEPS}; {' x '.join(map(str, shape))} uint8"
-    return Case("sliding", title, limits.rows(measured, first="triad") + rows, absent)
+    return Case("sliding", title, limits + rows, absent)
 
 
 CASES: Cases = {"correlate-uint8": run_stack, "sliding": run_sliding}

@@ -199,6 +199,17 @@ def take_turns(
     return {name: _measured(mine, *known[name]) for name, mine in turns.items()}
 
 
+def pusher(estimator: Any, frames: NDArray[Any], *, maps: bool = False, **positions: Any) -> Work:
+    """Return a work that pushes frames, and waits for the device or, with `maps`, for the result."""
+
+    def work() -> object:
+        estimator.reset()
+        estimator.push(frames, **positions)
+        return estimator.result() if maps else estimator.device.finish()
+
+    return work
+
+
 def _turn(work: Work, profile: Profile) -> _Turn:
     profile.clear()
     start = time.perf_counter()

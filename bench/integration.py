@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from mirrorskin import engine
 from mirrorskin.bench.harness import (
     OURS,
-    ROUNDS,
     THREADS,
     Case,
     Cases,
@@ -30,9 +29,8 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
-    take_turns,
 )
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.scenes import PIXEL, Shape, blob_mask, drifting_slopes, noisy_slopes, random_cuts
 from mirrorskin.engine import Integrator
 from mirrorskin.engine.integration.graph import Links
@@ -86,9 +84,7 @@ def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
                 agree(work, {"height": found}, {"height": exact}, {"height": _NEAR["full"] * span})
                 errors[work] = float(np.sqrt(np.mean(np.square(found - exact)))) / span
 
-    limits = Limits(device, _FULL[SOLVE] * pixels)
-    measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
-    rows = limits.rows(measured, first="triad")
+    rows, measured = beside_limits(works, _FULL[SOLVE] * pixels, device, quick, check, first="triad")
     rows += [Row(work, measured[work], _FULL[work.partition(", ")[2]] * pixels) for work in works]
     notes = (_ratios(measured, "SciPy"), _errors(errors))
     title = f"heights of a full picture; {' x '.join(map(str, shape))} float32"
@@ -122,9 +118,7 @@ def run_mask(name: str, cuts: int, device: Device, quick: bool) -> Case:
             agree(work, {"height": found}, {"height": truth.map}, near, whose="a direct solution")
 
     moved = _MASKED | {SLOPES: _MASKED[SLOPES] + (edges is not None)}
-    limits = Limits(device, moved[SLOPES] * pixels)
-    measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
-    rows = limits.rows(measured, first="triad")
+    rows, measured = beside_limits(works, moved[SLOPES] * pixels, device, quick, check, first="triad")
     rows += [Row(work, measured[work], moved[work.partition(", ")[2]] * pixels) for work in works]
     notes += [] if absent else [_ratios(measured, PYAMG)]
     parts = f"{100 * np.mean(truth.wanted):.0f} % of {' x '.join(map(str, shape))} float32"
@@ -157,9 +151,8 @@ def run_frames(device: Device, quick: bool) -> Case:
         seconds.clear()  # of the warm-up
 
     moved = _MASKED[SLOPES] * math.prod(shape)
-    limits = Limits(device, moved)
-    measured = take_turns({**limits.works(), OURS: circle}, 1 if quick else ROUNDS, device.profile, check)
-    rows = [*limits.rows(measured, first="triad"), Row(OURS, measured[OURS], _FRAMES * moved, _FRAMES)]
+    limits, measured = beside_limits({OURS: circle}, moved, device, quick, check, first="triad")
+    rows = [*limits, Row(OURS, measured[OURS], _FRAMES * moved, _FRAMES)]
     lower, middle, upper = 1e3 * np.percentile(seconds, [25, 50, 75])
     notes = (f"a frame: median {middle:.2f} ms, quartiles {lower:.2f}-{upper:.2f}",)
     title = f"live, warm; heights of {100 * np.mean(mask):.0f} % of {' x '.join(map(str, shape))} float32"

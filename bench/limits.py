@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mirrorskin.bench.harness import Measured, Row, Work
+from mirrorskin.bench.harness import ROUNDS, Measured, Row, Work, take_turns
 from mirrorskin.kernels.device import Device
 
 _RUNS = {"read": 1, "copy": 2, "triad": 3}  # runs of words that a kernel touches
@@ -73,6 +73,22 @@ class Limits:
 
     def _count(self, limit: str, shape: Shape) -> int:
         return len(self._data.host) // shape.lanes // _RUNS[limit]
+
+
+def beside_limits(
+    works: Mapping[str, Work],
+    size: int,
+    device: Device,
+    quick: bool,
+    check: Callable[[dict[str, Any]], None] = lambda results: None,
+    *,
+    first: str = "read",
+    rounds: int = ROUNDS,
+) -> tuple[list[Row], dict[str, Measured]]:
+    """Time works in turns with the limits of `size` bytes; return the limits' rows, and what was measured."""
+    limits = Limits(device, size)
+    measured = take_turns({**limits.works(), **works}, 1 if quick else rounds, device.profile, check)
+    return limits.rows(measured, first), measured
 
 
 class Arithmetic:

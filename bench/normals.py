@@ -25,6 +25,7 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
+    pusher,
     take_turns,
 )
 from mirrorskin.bench.limits import Arithmetic, Limits
@@ -89,11 +90,7 @@ def run_normals(turn: Turn, device: Device, rounds: int) -> Case:
     frames = estimator.room[:STEPS]
     fill_turns(frames)
 
-    def find() -> object:
-        estimator.reset()
-        estimator.push(frames, phase=phases(STEPS))
-        return estimator.result()
-
+    find = pusher(estimator, frames, maps=True, phase=phases(STEPS))
     small = Turn(_SMALL if pixels > math.prod(_SMALL) else turn.shape, turn.dtype)
     repeats = -(-pixels // math.prod(small.shape))
     push = kernel_alone(small, device)
@@ -128,13 +125,7 @@ def kernel_alone(turn: Turn, device: Device) -> Work:
     frames = estimator.room[: STEPS + 1]
     fill_turns(frames[:STEPS])
     frames[STEPS] = frames[0]
-
-    def push() -> None:
-        estimator.reset()
-        estimator.push(frames, phase=phases(STEPS + 1))
-        device.finish()
-
-    return push
+    return pusher(estimator, frames, phase=phases(STEPS + 1))
 
 
 def _notes(turn: Turn, rows: dict[str, Row]) -> tuple[str, ...]:

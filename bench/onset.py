@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.bench.harness import (
     OURS,
-    ROUNDS,
     THREADS,
     Case,
     Cases,
@@ -23,9 +22,9 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
-    take_turns,
+    pusher,
 )
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 from mirrorskin.engine import OnsetSearch
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
@@ -41,10 +40,7 @@ _HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
 _BYTE = np.dtype(np.uint8)
 _THRESHOLD = 0.5
 _MAPS = 64  # bytes a pixel for all maps
-_PLATEAU, _SURELY = (
-    3.0,
-    6.0,
-)  # sigmas off its plateau, and below the level, at which a sample is dark
+_PLATEAU, _SURELY = 3.0, 6.0  # sigmas off its plateau, and below the level where it is surely dark
 # Threads of ours, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
 # core, as most people use it; PyTorch has threads of its own.
 _TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
@@ -85,7 +81,7 @@ class OnsetCase:
         return References(np.asarray(level), np.asarray(light), plateau)
 
 
-def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
+def run_onset(case: OnsetCase, device: Device, quick: bool) -> Case:
     """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
     size = math.prod(case.shape)
     check_memory(case.name, 2 * size + _MAPS * math.prod(case.shape[1:]))
@@ -95,16 +91,6 @@ def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
         raise DeviceError(f"{device.info.title} has no room for {case.shape[0]} frames at once: use --quick")
     fill_press(frames, case.stack)
     travel = travel_of(len(frames))
-
-    def push() -> None:
-        search.reset()
-        search.push(frames, travel=travel)
-        device.finish()
-
-    def find() -> object:
-        search.reset()
-        search.push(frames, travel=travel)
-        return search.result()
 
     theirs = _peer_works(case, frames, travel)
 
@@ -118,13 +104,13 @@ def run_onset(case: OnsetCase, device: Device, rounds: int) -> Case:
             else:  # a pixel with invalid input has no onset either
                 agree(name, {"frame": np.maximum(results[name], -1)}, found)
 
-    limits = Limits(device, size)
+    push, find = (pusher(search, frames, maps=maps, travel=travel) for maps in (False, True))
     works: dict[str, Work] = {f"{OURS}, push only": push, OURS: find, **theirs}
-    measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
+    limits, measured = beside_limits(works, size, device, quick, check)
     rows = [Row(name, measured[name], size, len(frames)) for name in works]
     what = "full default" if case.full else "frame of the onset, one threshold, hold 1"
     title = f"{what}; {' x '.join(map(str, case.shape))} uint8, {case.stack}"
-    return Case(case.name, title, limits.rows(measured) + rows, missing("torch", "numba"))
+    return Case(case.name, title, limits + rows, missing("torch", "numba"))
 
 
 class References(NamedTuple):
@@ -410,7 +396,7 @@ _ONSET = (
 
 def _run(case: OnsetCase) -> Callable[[Device, bool], Case]:
     small = replace(case, shape=_QUICK)
-    return lambda device, quick: run_onset(small if quick else case, device, 1 if quick else ROUNDS)
+    return lambda device, quick: run_onset(small if quick else case, device, quick)
 
 
 CASES: Cases = {case.name: _run(case) for case in _ONSET}

@@ -49,9 +49,8 @@ from mirrorskin.bench.harness import (
     check_memory,
     missing,
     ratio_target,
-    take_turns,
 )
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.onset import numba_onsets
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, Floats, references
 from mirrorskin.engine import Correlator, NormalEstimator, Onset, OnsetSearch
@@ -94,7 +93,7 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
     with new_folder(name, size + rounds * extra) as folder:
         press, path = make_press(shape), folder / "press.h5"
         record(press, path, compression)
-        search, limits = search_of(press, device), Limits(device, size)
+        search = search_of(press, device)
 
         def push() -> None:
             search.reset()
@@ -122,7 +121,7 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
                     f"{PATH}, saved", io.open_result(folder / "result.h5").maps(), expected, whose=IN_MEMORY
                 )
 
-            measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
+            limits, measured = beside_limits(works, size, device, quick, check, rounds=ROUNDS)
             notes = (f"frames: {recording.storage}; {recording.how}",)
     rows = {work: Row(work, measured[work], size, shape[0]) for work in works}
     if compression == "raw":
@@ -132,9 +131,7 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
     target = ratio_target(PATH, bound, rows[PATH], rows[other], than, faster=False)
     stored = "contiguous" if compression == "raw" else "bitshuffle-LZ4, one chunk a frame"
     title = f"full default, references of each pixel; {_size(shape)}, {stored}"
-    return Case(
-        name, title, limits.rows(measured) + list(rows.values()), {}, notes, () if quick else (target,)
-    )
+    return Case(name, title, limits + list(rows.values()), {}, notes, () if quick else (target,))
 
 
 def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, quick: bool) -> Case:
@@ -160,7 +157,6 @@ def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, qui
     with new_folder(name, size + rounds * extra) as folder:
         turns, path = make_turns(shape), folder / "turns.h5"
         record(turns, path)
-        limits = Limits(device, size)
         with io.open_recording(path) as recording:
             works: dict[str, Work] = {
                 kernels: partial(answer, estimator(), turns.block, 1),
@@ -179,13 +175,12 @@ def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, qui
                 agree(PATH, results[PATH].maps(), expected, whose=kernels)
                 agree(f"{PATH}, saved", io.open_result(folder / "result.h5").maps(), expected, whose=kernels)
 
-            measured = take_turns({**limits.works(), **works, **beside}, rounds, device.profile, check)
+            limit, measured = beside_limits({**works, **beside}, size, device, quick, check, rounds=ROUNDS)
     rows = {work: Row(work, measured[work], size, shape[0]) for work in works}
     # By the device's account: of short runs, the host's clock measures what calls cost.
     alone = replace(measured[cached], wall=measured[cached].device["kernel"])
     frames = _REPEATS * min(_CACHED, shape[0])
     rows[cached] = Row(cached, alone, frames * math.prod(shape[1:]), frames)
-    limit = limits.rows(measured)
     known = {"read": limit[0].bandwidth, "arithmetic": rows[cached].bandwidth}
     binds = min(known, key=lambda one: known[one])
     share, rate = rows[PATH].bandwidth / known[binds], rows[PATH].bandwidth / 1e9
@@ -234,7 +229,6 @@ def run_lab(device: Device, quick: bool) -> Case:
     with new_folder("file-lab", size + 10 * extra) as folder:
         press, path = make_press(shape), folder / "press.h5"
         record(press, path)
-        limits = Limits(device, size)
         with io.open_recording(path) as recording:
             dataset = recording.dataset
         known = path, dataset, *references(shape[1:], press.dtype), folder / "heights.npy"
@@ -255,8 +249,7 @@ def run_lab(device: Device, quick: bool) -> Case:
                 off = f"{np.count_nonzero(~inside)} heights lie outside of the step of equation 4"
                 raise DisagreementError(f"{PATH}: {off}; nothing was timed")
 
-        rounds = 1 if quick else ROUNDS
-        measured = take_turns({**limits.works(), **works}, rounds, device.profile, check)
+        limits, measured = beside_limits(works, size, device, quick, check, rounds=ROUNDS)
     rows = {work: Row(work, measured[work], size, shape[0]) for work in works}
     targets = tuple(
         ratio_target(PATH, bound, rows[PATH], rows[name], name, faster=True)
@@ -269,7 +262,7 @@ def run_lab(device: Device, quick: bool) -> Case:
     title = (
         f"heights by equation 4 with hold 2, saved; ours the full default as well; {_size(shape)}, contiguous"
     )
-    return Case("file-lab", title, [*limits.rows(measured), *rows.values()], absent, (), targets)
+    return Case("file-lab", title, [*limits, *rows.values()], absent, (), targets)
 
 
 def _lab_argmax(path: Path, dataset: str, dark: Floats, bright: Floats, target: Path) -> Floats:

@@ -13,11 +13,10 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Case, Cases, Row, Work, check_memory, take_turns
+from mirrorskin.bench.harness import Case, Cases, Row, Work, check_memory, pusher, take_turns
 from mirrorskin.bench.integration import divisors, link, solve_with_scipy
-from mirrorskin.bench.limits import Arithmetic, Limits
+from mirrorskin.bench.limits import Arithmetic, Limits, beside_limits
 from mirrorskin.bench.normals import NORMAL, Turn, kernel_alone
 from mirrorskin.bench.scenes import (
     LEVELS,
@@ -92,7 +91,7 @@ def press_job(device: Device, shape: Shape, kind: str, count: int, *, maps: bool
     search = OnsetSearch(shape, dtype, device=device, **known)
     fill_press(search.room[:count])
     frames = search.room[:count]
-    work = _pusher(search, frames, maps=maps, travel=travel_of(count))
+    work = pusher(search, frames, maps=maps, travel=travel_of(count))
     return Job(work, frames.nbytes, count, _SCAN * frames.size)
 
 
@@ -103,7 +102,7 @@ def correlation_job(device: Device, shape: Shape, kind: str, count: int, *, maps
     frames = correlator.room[:count]
     fill_turns(frames)
     moved = frames.nbytes + (16 * pixels if maps else 0)
-    work = _pusher(correlator, frames, maps=maps, phase=phases(count))
+    work = pusher(correlator, frames, maps=maps, phase=phases(count))
     return Job(work, moved, count, _WAVE * frames.size)
 
 
@@ -115,7 +114,7 @@ def turns_job(device: Device, shape: Shape, kind: str, count: int) -> Job:
     estimator = NormalEstimator(shape, kind, tilt=TILT, device=device, memory_limit=room, **known)
     frames = estimator.room[:count]
     fill_turns(frames)
-    work = _pusher(estimator, frames, maps=True, phase=phases(count))
+    work = pusher(estimator, frames, maps=True, phase=phases(count))
     return Job(work, frames.nbytes + NORMAL * math.prod(shape), count)
 
 
@@ -132,15 +131,6 @@ def surface_job(device: Device, shape: Shape) -> Job:
     return Job(work, (2 * 4 + 1 + 4) * mask.size)
 
 
-def _pusher(estimator: Any, frames: NDArray[Any], *, maps: bool = False, **where: Any) -> Work:
-    def work() -> object:
-        estimator.reset()
-        estimator.push(frames, **where)
-        return estimator.result() if maps else estimator.device.finish()
-
-    return work
-
-
 def _onset(device: Device, shape: Shape, kind: str, count: int) -> dict[str, Job]:
     return {"onset_scan": press_job(device, shape, kind, count)}
 
@@ -155,7 +145,7 @@ def _changes(device: Device, shape: Shape, kind: str, count: int, *, known: bool
     fill_press(frames)
     travel = travel_of(count)
     if known:
-        work = _pusher(search, frames, travel=travel)
+        work = pusher(search, frames, travel=travel)
         return {"changepoint_scan": Job(work, frames.nbytes, count, _CUSUM * frames.size)}
     np.nan_to_num(frames, copy=False)
 
@@ -342,12 +332,9 @@ def run_pixels(device: Device, quick: bool) -> Case:
 
 def _time(jobs: Mapping[str, Job], device: Device, quick: bool) -> list[Row]:
     """Return the limit, of as many bytes as the largest work, and the works."""
-    limits = Limits(device, max(job.bytes for job in jobs.values()))
-    works = limits.works() | {name: job.work for name, job in jobs.items()}
-    measured = take_turns(works, 1 if quick else _ROUNDS, device.profile)
-    return limits.rows(measured) + [
-        Row(name, measured[name], job.bytes, job.frames) for name, job in jobs.items()
-    ]
+    works, largest = {name: job.work for name, job in jobs.items()}, max(job.bytes for job in jobs.values())
+    rows, measured = beside_limits(works, largest, device, quick, rounds=_ROUNDS)
+    return rows + [Row(name, measured[name], job.bytes, job.frames) for name, job in jobs.items()]
 
 
 def _by_frame(name: str, rows: list[Row]) -> str:

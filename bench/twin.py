@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import OURS, ROUNDS, Case, Cases, DisagreementError, Row, Work, take_turns
-from mirrorskin.bench.limits import Limits
+from mirrorskin.bench.harness import OURS, Case, Cases, DisagreementError, Row, Work
+from mirrorskin.bench.limits import beside_limits
 from mirrorskin.hw.twin import Axial, Camera, Movement, Twin, Vertical
 from mirrorskin.kernels.device import Device
 
@@ -47,13 +47,12 @@ def run_twin(device: Device, quick: bool) -> Case:
         for name in (_PRESS, _PEER):
             _check(name, results[name], clean)
 
-    limits = Limits(device, frames.nbytes)
-    measured = take_turns({**limits.works(), **works}, 1 if quick else ROUNDS, device.profile, check)
+    limits, measured = beside_limits(works, frames.nbytes, device, quick, check)
     *stacks, sheet = works
     rows = [Row(name, measured[name], frames.nbytes, shape[0]) for name in stacks]
     rows.append(Row(sheet, measured[sheet], side * side, 1))
     title = f"rendering {' x '.join(map(str, shape))} uint8, the sphere"
-    return Case("twin", title, limits.rows(measured) + rows, {})
+    return Case("twin", title, limits + rows, {})
 
 
 CASES: Cases = {"twin": run_twin}
