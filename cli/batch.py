@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import glob
 import os
+import re
+import sys
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,12 +21,16 @@ import typer
 from mirrorskin.cli import options
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.batch_table import Show
+    from rich.console import RenderableType
+
     from mirrorskin.engine.batch.jobs import Job, Plan
     from mirrorskin.engine.batch.work import Outcome
 
 # How the commands name results unasked.
 _RESULTS = ("-result.h5", "-correlation.h5", "-fused.h5")
+_ROWS = 12  # of files that have ended
+# What other commands have as options, a batch has in its settings.
+_OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
 
 
 def command(
@@ -56,7 +63,6 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
-    from mirrorskin.cli.batch_table import show_batch
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.settings import read_settings
     from mirrorskin.engine.batch.jobs import make_jobs
@@ -69,7 +75,7 @@ def command(
     start = time.perf_counter()
     with (
         _reporting_interruption(outcomes, len(jobs)),
-        show_batch(len(jobs), as_json) as show,
+        _show_batch(len(jobs), as_json) as show,
         closing(_run(jobs, plan, device, workers, scheduler, show)) as run,
     ):
         for outcome in run:
@@ -154,7 +160,7 @@ def _run(
     device: Sequence[str] | None,
     workers: int | None,
     scheduler: str | None,
-    show: Show,
+    show: _Show,
 ) -> Generator[Outcome, None, None]:
     """Do the jobs here, or on a cluster."""
     if workers is not None or scheduler is not None:
@@ -180,7 +186,6 @@ def _reporting_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator
 
 def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: bool) -> None:
     """Print what became of all."""
-    from mirrorskin.cli.batch_table import printable, problem
     from mirrorskin.cli.output import print_json
 
     states = Counter({"done": 0, "kept": 0, "failed": 0})
@@ -192,13 +197,118 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
         return
     for outcome in outcomes:
         if outcome.state == "failed":
-            typer.echo(f"failed: {problem(outcome)}")
+            typer.echo(f"failed: {_problem(outcome)}")
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
-    typer.echo(f"{printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
+    typer.echo(f"{_printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:
     fields = dataclasses.asdict(outcome)
     job = fields.pop("job")
     return {"source": str(job["source"]), "result": str(job["target"])} | fields
+
+
+@contextmanager
+def _show_batch(total: int, as_json: bool) -> Iterator[_Show]:
+    """Show how a batch of so many files goes."""
+    if sys.stderr.isatty() and (as_json or sys.stdout.isatty()):
+        from rich.console import Console
+        from rich.live import Live
+
+        table = _Table(total)
+        console = Console(stderr=True)
+        with Live(get_renderable=table.render, console=console, transient=True, refresh_per_second=4):
+            yield table
+    else:
+        yield _Show(not as_json)
+
+
+def _problem(outcome: Outcome) -> str:
+    """Tell in a line what is wrong, and with which file."""
+    name, message = str(outcome.job.source), " ".join(outcome.message.split())
+    message = _OPTIONS.sub(r"\1 in [stack] of --settings", message)
+    return _printable(message if name in message else f"{name}: {message}")
+
+
+def _printable(text: str) -> str:
+    """Return a text of one line that any output takes: a file's name may be any bytes."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    known = text.encode(encoding, "replace").decode(encoding)
+    return "".join(letter if letter.isprintable() else "?" for letter in known)
+
+
+class _Show:
+    """Shows how a batch goes: a line for each file, if wanted."""
+
+    def __init__(self, wanted: bool) -> None:
+        self._wanted = wanted
+
+    def under_way(self, job: Job, frames: int, /) -> None:
+        """Take note, from any thread, that so many frames of a job were read."""
+
+    def ended(self, outcome: Outcome, /) -> None:
+        """Take note of what became of a job."""
+        if not self._wanted:
+            return
+        line = f"{outcome.state}: {_printable(str(outcome.job.source))}"
+        if outcome.state == "failed":
+            line = f"failed: {_problem(outcome)}"
+        elif outcome.state == "done":
+            line += f" in {outcome.seconds:.3g} s, {_speed(outcome)} MB/s: {outcome.message}"
+        typer.echo(line)
+
+
+class _Table(_Show):
+    """The files under way, the last that ended, and a bar of all."""
+
+    def __init__(self, total: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._lock = threading.Lock()
+        self._running: dict[Job, tuple[float, int]] = {}
+        self._last: deque[Outcome] = deque(maxlen=_ROWS)
+        self._states: Counter[str] = Counter()
+        columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
+        self._bar = Progress(*columns)
+        self._task = self._bar.add_task("", total=total)
+
+    def under_way(self, job: Job, frames: int, /) -> None:
+        with self._lock:
+            start, _ = self._running.get(job, (time.monotonic(), 0))
+            self._running[job] = start, frames
+
+    def ended(self, outcome: Outcome, /) -> None:
+        with self._lock:
+            self._running.pop(outcome.job, None)
+            self._last.append(outcome)
+            self._states[outcome.state] += 1
+            counts = ", ".join(f"{count} {state}" for state, count in sorted(self._states.items()))
+        self._bar.update(self._task, advance=1, description=counts)
+
+    def render(self) -> RenderableType:
+        """Draw it as it is now."""
+        from rich.console import Group
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, pad_edge=False)
+        for head in ("file", "motion", "state"):
+            table.add_column(head, no_wrap=True, overflow="ellipsis")
+        for head in ("seconds", "MB/s"):
+            table.add_column(head, justify="right")
+        with self._lock:
+            last, running = list(self._last), list(self._running.items())
+        for one in last:
+            state = _problem(one) if one.state == "failed" else one.state
+            speed = _speed(one) if one.bytes else ""
+            cells = _printable(str(one.job.source)), one.motion, state, f"{one.seconds:.2f}", speed
+            table.add_row(*map(Text, cells))
+        for job, (start, frames) in running:
+            state = f"{frames} frames" if frames else "begun"
+            table.add_row(Text(_printable(str(job.source))), "", state, f"{time.monotonic() - start:.2f}", "")
+        return Group(table, self._bar)
+
+
+def _speed(outcome: Outcome) -> str:
+    return f"{outcome.bytes / 1e6 / outcome.seconds:.0f}"

@@ -104,11 +104,8 @@ def check_export(result: Result, path: str | Path) -> None:
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
     if suffix == ".png" and find_spec("PIL") is None:
         raise InputError(f"{path} needs Pillow: pip install 'mirrorskin[export]'")
-    if suffix != _ARRAYS:
-        _check_heights(result, path)
-
-
-def _check_heights(result: Result, path: str | Path) -> None:
+    if suffix == _ARRAYS:
+        return
     remedy = f"or export its maps as {_ARRAYS}"
     if result.height is None:
         raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeGuard, cast
+from typing import TypeGuard, cast
 
 import h5py
 import numpy as np
@@ -202,7 +202,7 @@ class Layout:
 
     def _reference(self, name: str) -> NDArray[np.float32] | None:
         remedy = f"give --{name}, or take the reference again"
-        values = self._numbers(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
+        values = self._read(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
         return None if values is None else np.ascontiguousarray(values[self._part.region.slices], np.float32)
 
     def _map(self, name: str, unit: str | None = None) -> Floats | None:
@@ -234,15 +234,12 @@ class Layout:
     def _read(
         self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "", rows: int | None = None
     ) -> Floats | None:
-        values = self._numbers(name, *shapes, unit=unit, remedy=remedy, rows=rows)
-        return None if values is None else values.astype(np.float64, copy=False)
-
-    def _numbers(
-        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "", rows: int | None = None
-    ) -> NDArray[Any] | None:
-        """Read numbers of whatever type, if they are there."""
+        """Read numbers as float64, if they are there."""
         node = self._find(name)
-        return None if node is None else self._file.read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
+        if node is None:
+            return None
+        values = self._file.read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
+        return values.astype(np.float64, copy=False)
 
     def _text(self, name: str) -> str:
         node = self._find(name)

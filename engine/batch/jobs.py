@@ -98,22 +98,12 @@ _OF_MOTION = {"travel": "vertical", "phase": "axial", "tilt": "axial"}
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is done with every recording of a batch. It can be pickled.
+    """What is done with every recording of a batch. It can be pickled."""
 
-    Attributes
-    ----------
-    opening : mapping
-        Keywords of `mirrorskin.io.open_recording`, for all recordings.
-    press, rotation : mapping
-        Keywords of `mirrorskin.engine.reconstruct` for those of vertical and of axial motion.
-    memory_limit : int
-        Bytes of host memory for frames on the move, of each device.
-    """
-
-    opening: Mapping[str, Any] = field(default_factory=dict)
-    press: Mapping[str, Any] = field(default_factory=dict)
-    rotation: Mapping[str, Any] = field(default_factory=dict)
-    memory_limit: int = MEMORY_LIMIT
+    opening: Mapping[str, Any] = field(default_factory=dict)  # keywords of `io.open_recording`
+    press: Mapping[str, Any] = field(default_factory=dict)  # of `engine.reconstruct`, for vertical motion
+    rotation: Mapping[str, Any] = field(default_factory=dict)  # and for axial motion
+    memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames on the move, of each device
 
     def options(self, motion: Motion) -> Mapping[str, Any]:
         """Return the keywords of `mirrorskin.engine.reconstruct` for a motion."""

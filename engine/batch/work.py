@@ -29,29 +29,16 @@ State = Literal["done", "kept", "failed"]
 class Outcome:
     """What became of a job. It can be pickled.
 
-    Attributes
-    ----------
-    job : Job
-    state : {"done", "kept", "failed"}
-        Kept: the result was there already, made of the same recording with the same parameters.
-    message : str
-        One line: what the result holds, or what is wrong and the remedy.
-    seconds : float
-    bytes : int
-        Of frames, unpacked, that were reconstructed; 0 where none were.
-    device : str
-        Its title; nothing where none was used.
-    motion : str
-        Of the recording; nothing where it could not be opened.
+    It is kept if the result was there already, made of the same recording with the same parameters.
     """
 
     job: Job
     state: State
-    message: str
+    message: str  # one line: what the result holds, or what is wrong and the remedy
     seconds: float
-    bytes: int = 0
-    device: str = ""
-    motion: str = ""
+    bytes: int = 0  # of frames, unpacked, that were reconstructed
+    device: str = ""  # its title
+    motion: str = ""  # of the recording, if it could be opened
 
 
 def run_job(
