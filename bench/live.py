@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.files import shared_memory
 from mirrorskin.bench.harness import Case, Cases, Target
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
-from mirrorskin.engine.live import SHOWN, LiveEstimator, LivePress, LiveRotation, Status, Update, run
+from mirrorskin.engine.live import SHOWN, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
@@ -194,7 +194,7 @@ def _run(source: Paced, estimator: LiveEstimator) -> Ran:
 
     estimator.warm()
     load, begun = os.getloadavg()[0], time.monotonic()
-    status = run(source, estimator, on_update=keep)
+    status = Loop(source, estimator, on_update=keep).run()
     return Ran(status, time.monotonic() - begun, last[0], load)
 
 

@@ -1,4 +1,4 @@
-from .loop import LATENCY, LiveEstimator, Loop, run
+from .loop import LATENCY, LiveEstimator, Loop
 from .press import LivePress
 from .rotation import LiveRotation, choose_window
 from .status import PUSHED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
@@ -19,5 +19,4 @@ __all__ = [
     "Status",
     "Update",
     "choose_window",
-    "run",
 ]

@@ -56,22 +56,6 @@ class LiveEstimator(Estimator, Protocol):
         """Do what can wait, for so long at most."""
 
 
-def run(source: LiveSource, estimator: LiveEstimator, **options: Any) -> Status:
-    """Push the frames of a live source into an estimator until it ends.
-
-    Parameters
-    ----------
-    source, estimator, **options
-        As for `Loop`.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        A latency or rate that is not above 0, or what source and estimator raise.
-    """
-    return Loop(source, estimator, **options).run()
-
-
 class Loop:
     """Push the frames of a live source into an estimator; its status can be read after an exception as well.
 
@@ -97,6 +81,11 @@ class Loop:
         Called with the number of a first frame, and which from there on were used: ``StreamRecorder.mark``.
     guard : callable, optional
         Returns a context in which frames are pushed and marked, so that nothing interrupts that.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        A latency or rate that is not above 0.
     """
 
     def __init__(

@@ -17,6 +17,7 @@ from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Box = tuple[slice, slice]
 
 _SQUARE = np.ones((3, 3), bool)
 _SMALL = 2.0  # pixels from its rim that a hole must reach to be worth a smooth surface
@@ -120,11 +121,11 @@ def fill_holes(
     filled = field.labels > 0
     result, left = field.height.copy(), filled & ~field.cut[field.labels]
     filled[:] = left
-    for number, smooth in _smooth_surfaces(field, steepest):
-        own = field.labels[smooth.box] == number
-        result[smooth.box][own] = smooth.height[own]
-        filled[smooth.box] |= own
-        left[smooth.box] &= ~own
+    for number, box, smooth in _smooth_surfaces(field, steepest):
+        own = field.labels[box] == number
+        result[box][own] = smooth[own]
+        filled[box] |= own
+        left[box] &= ~own
     result = _stretch_over(field, result, left)
     result = np.where(filled, np.fmax(result, field.low), field.height)
     if deepest is not None and filled.any():
@@ -145,22 +146,8 @@ class _Field(NamedTuple):
     high: Doubles
     labels: NDArray[np.int32]
     cut: Mask
-    boxes: list[tuple[slice, slice]]
+    boxes: list[Box]
     spacing: tuple[float, float]
-
-
-class _Smooth(NamedTuple):
-    """A smooth surface over a box of the map."""
-
-    box: tuple[slice, slice]
-    height: Doubles
-
-
-class _Ring(NamedTuple):
-    """What determines a fill: the pixels around the hole that are known, in a box of the map."""
-
-    box: tuple[slice, slice]
-    known: Mask
 
 
 def _field_of(height: ArrayLike, sigma: ArrayLike, pixel_size: ArrayLike, above: ArrayLike | None) -> _Field:
@@ -237,8 +224,8 @@ def _in_hull(region: Mask, groups: NDArray[np.int32]) -> bool:
     return not np.any(region & (hull == 0))
 
 
-def _smooth_surfaces(field: _Field, steepest: float) -> Iterator[tuple[int, _Smooth]]:
-    """Yield the numbers of holes that a smooth surface fits, and these surfaces; the largest holes first."""
+def _smooth_surfaces(field: _Field, steepest: float) -> Iterator[tuple[int, Box, Doubles]]:
+    """Yield holes that a smooth surface fits, with these surfaces over boxes; the largest holes first."""
     radii = _radii(field)
     work = 0
     for number in np.argsort(-radii, kind="stable"):
@@ -246,13 +233,13 @@ def _smooth_surfaces(field: _Field, steepest: float) -> Iterator[tuple[int, _Smo
             return
         for width in (_RING, _NARROW):
             ring = _ring(field, number, radii[number], width)
-            cells = None if ring is None else _cells(ring, field.spacing, radii[number])
+            cells = None if ring is None else _cells(ring[1].shape, field.spacing, radii[number])
             if ring is None or cells is None:
                 break
             work += _EFFORT + (cells[0] + 3) * (cells[1] + 3)
-            smooth = _span(field, number, ring, cells, radii[number], steepest)
+            smooth = _span(field, number, *ring, cells, radii[number], steepest)
             if smooth is not None:
-                yield int(number), smooth
+                yield int(number), ring[0], smooth
                 break
 
 
@@ -265,8 +252,8 @@ def _radii(field: _Field) -> Doubles:
     return radii
 
 
-def _ring(field: _Field, number: int, radius: float, width: float) -> _Ring | None:
-    """Return the ring around a hole, wider where it spans too few terraces; None if there is none."""
+def _ring(field: _Field, number: int, radius: float, width: float) -> tuple[Box, Mask] | None:
+    """Return the known pixels around a hole, in a box; farther out where they span too few terraces."""
     while True:
         reach = max(width * radius, _LEAST_RING * max(field.spacing))
         box = _box(field, number, reach)
@@ -280,11 +267,11 @@ def _ring(field: _Field, number: int, radius: float, width: float) -> _Ring | No
             return None
         terrace = np.median((field.high[box] - field.low[box])[known])
         if np.ptp(field.height[box][known]) >= _TERRACES * terrace or width >= _WIDEST:
-            return _Ring(box, known)
+            return box, known
         width *= _WIDER
 
 
-def _box(field: _Field, number: int, reach: float) -> tuple[slice, slice]:
+def _box(field: _Field, number: int, reach: float) -> Box:
     """Return the part of the map that holds a hole and what is within reach of it."""
     rows, columns = field.boxes[number - 1]
     down, across = (math.ceil(reach / step) for step in field.spacing)
@@ -294,29 +281,34 @@ def _box(field: _Field, number: int, reach: float) -> tuple[slice, slice]:
     )
 
 
-def _cells(ring: _Ring, spacing: tuple[float, float], radius: float) -> tuple[int, int] | None:
+def _cells(shape: tuple[int, ...], spacing: tuple[float, float], radius: float) -> tuple[int, int] | None:
     """Return the splines' cells along y and x; None if the box is too small, or the hole too thin for it."""
-    if min(ring.known.shape) < 2:
+    if min(shape) < 2:
         return None
-    spans = [(length - 1) * step for length, step in zip(ring.known.shape, spacing, strict=True)]
+    spans = [(length - 1) * step for length, step in zip(shape, spacing, strict=True)]
     down, across = (min(math.ceil(_CELLS * span / radius), _MOST_CELLS) for span in spans)
     coarsest = max(spans[0] / down, spans[1] / across)
     return (down, across) if coarsest * _LEAST_CELLS <= radius else None
 
 
 def _span(
-    field: _Field, number: int, ring: _Ring, cells: tuple[int, int], radius: float, steepest: float
-) -> _Smooth | None:
-    """Return the smoothest surface within a ring's intervals, if there is one, and dark in the hole."""
-    hole = field.labels[ring.box] == number
-    low = np.where(ring.known | hole, field.low[ring.box], np.nan)
-    high = field.high[ring.box]
+    field: _Field,
+    number: int,
+    box: Box,
+    known: Mask,
+    cells: tuple[int, int],
+    radius: float,
+    steepest: float,
+) -> Doubles | None:
+    """Return the smoothest surface within the known pixels' intervals, if one is dark in the hole."""
+    hole = field.labels[box] == number
+    low, high = np.where(known | hole, field.low[box], np.nan), field.high[box]
     spline = Spline(low.shape, (field.spacing[0] / radius, field.spacing[1] / radius), cells)
-    resolution = np.median((high - low)[ring.known]) / 2 / (_DEPTH * radius)
+    resolution = np.median((high - low)[known]) / 2 / (_DEPTH * radius)
     fit = fit_within(spline, low, high, _STIFFNESS * float(resolution) ** 2)
     slopes = np.hypot(*np.gradient(fit.height, *field.spacing))
     dark = np.mean(slopes[hole] > steepest) <= _STEEP_SHARE
-    return _Smooth(ring.box, fit.height) if fit.misfit <= _MISFIT and dark else None
+    return fit.height if fit.misfit <= _MISFIT and dark else None
 
 
 def _stretch_over(field: _Field, height: Doubles, holes: Mask) -> Doubles:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from live_frames import Clock, paced, turn_header
 
-from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, run
+from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, Loop
 from mirrorskin.engine.live.status import Monitor
 from mirrorskin.io import InputError
 
@@ -53,7 +53,7 @@ def make(slots=64, **how):
 
 def test_a_quick_estimator_gets_each_frame_at_once_and_updates_each_time():
     source, slow = make(push_time=0.001, update_time=0.002)
-    status = run(source, slow)
+    status = Loop(source, slow).run()
     assert slow.pushed == list(range(COUNT))
     assert slow.updates == list(range(1, COUNT + 1))
     counts = status.frames, status.used, status.skipped, status.dropped, status.updates
@@ -67,7 +67,7 @@ def test_a_quick_estimator_gets_each_frame_at_once_and_updates_each_time():
 
 def test_a_slow_one_gets_all_that_waited_together():
     source, slow = make(update_time=0.035)
-    status = run(source, slow)
+    status = Loop(source, slow).run()
     assert slow.pushed == list(range(COUNT))
     assert np.all(np.diff(slow.updates)[:-1] >= 3)
     assert status.skipped == 0
@@ -81,7 +81,7 @@ def test_frames_that_are_too_old_are_skipped_counted_and_marked():
         assert np.all(marks[index : index + len(used)] == -1)
         marks[index : index + len(used)] = used
 
-    status = run(source, slow, latency=0.05, mark=mark)
+    status = Loop(source, slow, latency=0.05, mark=mark).run()
     assert np.flatnonzero(marks).tolist() == slow.pushed
     assert np.count_nonzero(marks == 0) == status.skipped == COUNT - status.used > 5
     assert slow.pushed[-1] == COUNT - 1
@@ -91,14 +91,14 @@ def test_of_frames_that_are_all_too_old_the_newest_is_used():
     source, slow = make(update_time=0.5)
     source_now = source.now
     source.now = lambda: source_now() + 1.0
-    status = run(source, slow, latency=0.05)
+    status = Loop(source, slow, latency=0.05).run()
     assert status.used == status.updates == len(slow.pushed) > 0
     assert status.skipped == COUNT - status.used
 
 
 def test_what_the_ring_lost_is_told_as_dropped():
     source, slow = make(slots=4, update_time=0.1)
-    status = run(source, slow)
+    status = Loop(source, slow).run()
     assert status.dropped > 0
     assert status.frames + status.dropped == COUNT
     assert len(slow.pushed) == status.used
@@ -106,28 +106,28 @@ def test_what_the_ring_lost_is_told_as_dropped():
 
 def test_updates_are_no_more_often_than_asked_and_the_last_frame_is_in_one():
     source, slow = make()
-    status = run(source, slow, updates=10.0)
+    status = Loop(source, slow, updates=10.0).run()
     assert status.updates == pytest.approx(COUNT / RATE * 10, abs=2)
     assert slow.updates[-1] == COUNT
 
 
 def test_an_estimator_that_asks_for_every_third_frame_gets_these():
     source, slow = make(update_time=0.033, every=3)
-    status = run(source, slow)
+    status = Loop(source, slow).run()
     assert slow.pushed == list(range(0, COUNT, 3))
     assert status.used + status.skipped == COUNT
 
 
 def test_time_to_spare_is_what_is_left_until_the_next_frame():
     source, slow = make(push_time=0.002, update_time=0.003)
-    run(source, slow)
+    Loop(source, slow).run()
     assert slow.spared[0] == 0
     np.testing.assert_allclose(slow.spared[1:], 1 / RATE - 0.005 - 0.001, atol=1e-9)
 
 
 def test_it_stops_when_asked():
     source, slow = make()
-    status = run(source, slow, stop=lambda: len(slow.pushed) >= 7)
+    status = Loop(source, slow, stop=lambda: len(slow.pushed) >= 7).run()
     assert status.frames == 7
     assert slow.updates[-1] == 7
 
@@ -135,7 +135,7 @@ def test_it_stops_when_asked():
 def test_each_update_has_the_newest_frame_and_the_status_so_far():
     source, slow = make()
     updates = []
-    run(source, slow, on_update=lambda *both: updates.append(both))
+    Loop(source, slow, on_update=lambda *both: updates.append(both)).run()
     for number, (update, status) in enumerate(updates):
         assert (update.frames, status.used) == (number + 1, number + 1)
         assert (update.motion, update.position) == ("axial", PLACES[number])
@@ -148,7 +148,7 @@ def test_each_update_has_the_newest_frame_and_the_status_so_far():
 def test_a_latency_or_rate_that_cannot_be_is_refused(wrong):
     source, slow = make()
     with pytest.raises(InputError, match="above 0"):
-        run(source, slow, **wrong)
+        Loop(source, slow, **wrong).run()
 
 
 def test_latencies_are_of_the_last_few_thousand_times():

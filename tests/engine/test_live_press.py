@@ -6,7 +6,7 @@ from live_frames import PIXEL, Clock, paced, press_frames, press_header, turn_he
 
 from mirrorskin.bench.scenes import references
 from mirrorskin.engine import find_onset
-from mirrorskin.engine.live import LivePress, run
+from mirrorskin.engine.live import LivePress, Loop
 from mirrorskin.io import InputError
 
 SHAPE = (30, 17, 23)
@@ -70,7 +70,7 @@ def test_a_whole_run_uses_each_frame():
     frames = press_frames(SHAPE)
     source = paced(frames, press_header(), TRAVEL, 1000.0, Clock())
     live = LivePress(source, fill=False)
-    assert run(source, live).used == SHAPE[0]
+    assert Loop(source, live).run().used == SHAPE[0]
     np.testing.assert_array_equal(live.result().height, find_onset(frames, TRAVEL).height)
 
 

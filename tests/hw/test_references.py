@@ -35,8 +35,9 @@ def references(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL, **changes: 
     return header.dark, header.bright
 
 
-@pytest.mark.parametrize("optics", ["ideal", "cylinder"])
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize(
+    ("dtype", "optics"), [("uint8", "cylinder"), ("uint16", "ideal"), ("float32", "cylinder")]
+)
 def test_a_ball_brings_dark_and_bright_of_each_pixel(dtype: str, optics: str) -> None:
     scale = 16 if dtype == "uint16" else 1
     camera = Camera(np.dtype(dtype), NOISE * scale, 3, gain_deviation=0.03, offset_deviation=4.0 * scale)
@@ -57,9 +58,7 @@ def test_a_ball_brings_dark_and_bright_of_each_pixel(dtype: str, optics: str) ->
     assert np.corrcoef(taken[0].ravel(), exact[0].ravel())[0, 1] > 0.99
 
 
-@pytest.mark.parametrize(
-    ("shape", "pixel"), [((40, 40), 0.8), ((40, 40), 1.2), ((30, 60), 1.5), ((60, 12), 1.0)]
-)
+@pytest.mark.parametrize(("shape", "pixel"), [((40, 40), 1.2), ((60, 12), 1.0)])
 def test_beyond_the_body_there_are_no_references(shape: tuple[int, int], pixel: float) -> None:
     away = np.hypot(*pixel_centres(shape, pixel))
     for optics in ("ideal", "cylinder"):

@@ -32,7 +32,7 @@ def across(azimuth: float, distance: Map, sideways: Map) -> tuple[Map, Map]:
     )
 
 
-AZIMUTHS = [0.0, 0.7, np.pi / 2, -2.5]
+AZIMUTHS = [0.7, -2.5]
 
 
 @pytest.mark.parametrize("azimuth", AZIMUTHS)

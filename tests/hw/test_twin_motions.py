@@ -138,8 +138,16 @@ def test_blocks_tell_where_the_body_is(name: str) -> None:
     assert at == len(movement.positions)
 
 
-@pytest.mark.parametrize("contact", ["conform", "elastic"])
-@pytest.mark.parametrize("name", MOVEMENTS)
+@pytest.mark.parametrize(
+    ("name", "contact"),
+    [
+        ("vertical", "elastic"),
+        ("axial", "elastic"),
+        ("axial", "conform"),
+        ("twist", "conform"),
+        ("horizontal", "elastic"),
+    ],
+)
 def test_truth_is_the_object_under_the_upright_body(name: str, contact: str) -> None:
     truth = make_twin(name, contact=contact).truth
     for found, expected in zip(
@@ -185,8 +193,10 @@ def test_contact_of_a_rotation_is_that_in_every_frame(tilt: float, pivot: tuple[
     assert 50 < touched.sum() < once.sum() - 20
 
 
-@pytest.mark.parametrize("name", MOVEMENTS)
-@pytest.mark.parametrize("contact", ["conform", "elastic"])
+@pytest.mark.parametrize(
+    ("name", "contact"),
+    [("vertical", "conform"), ("axial", "elastic"), ("horizontal", "conform"), ("twist", "elastic")],
+)
 def test_a_sheet_asked_for_is_that_of_its_frame(contact: str, name: str) -> None:
     twin = make_twin(SHORT[name], contact=contact, object=Cylinder(10.0, 4.0, 0.3))
     frames = read_all(twin)
@@ -392,8 +402,17 @@ ALL = {
 }
 
 
-@pytest.mark.parametrize("name", MOVEMENTS)
-@pytest.mark.parametrize("how", ALL)
+@pytest.mark.parametrize(
+    ("how", "name"),
+    [
+        ("conform", "vertical"),
+        ("conform, blurred", "axial"),
+        ("conform, blurred", "vertical"),
+        ("conform", "twist"),
+        ("elastic", "horizontal"),
+        ("elastic, forgetful", "axial"),
+    ],
+)
 def test_frames_are_the_same_however_they_are_read(
     how: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -449,7 +468,7 @@ EVERYTHING: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", MOVEMENTS)
+@pytest.mark.parametrize("name", ["vertical", "twist"])
 def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, name: str) -> None:
     for given in ({"noise": 1.5, "shape": (24, 30)}, EVERYTHING):
         first, again, other = (
@@ -482,17 +501,15 @@ def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, nam
         ({"movement": Axial([0.0], 0.1, 41.0)}, "rise 42.* mm into .*press less"),
         ({"movement": Twist([0.0], 3.0), "body": Body(height=3.0)}, "rise 3 mm into .* 3 mm high"),
         ({"movement": Axial([0.0], 0.1, 1.0, (1e3, 0.0, 0.0))}, "rise 10.* mm .*turn about a nearer pivot"),
-        ({"movement": Axial([0.0], 0.3, 1.0, (0.0, 0.0, 1e3))}, "rise 5.* mm .*turn about a nearer pivot"),
         ({"object": Sphere(36.0)}, "sphere is larger than the sensor.*36 mm.*35 mm"),
-        ({"object": "coin", "body": Body(diameter=20.0)}, "coin is larger than the sensor"),
         ({"movement": Vertical([1.0], compliance=0.1)}, "compliance needs contact 'elastic'"),
+        ({"distance": 30.0}, "not above the body"),
         ({"contact": "glue"}, "contact 'glue' is unknown: take conform, elastic"),
         ({"optics": "real"}, "optics 'real' is unknown: take ideal, cylinder"),
         ({"references": "guess"}, "references 'guess' is unknown: take exact, ball"),
         ({"pattern": "dots"}, "pattern 'dots' is unknown: take uniform, linear"),
         ({"pattern": "missing.png"}, "missing.png"),
         ({"body": Body(air_gap=1.0)}, "air gap.*cylinder"),
-        ({"body": Body(asymmetry=0.1)}, "lamps.*cylinder"),
         ({"shape": (20_000, 20_000)}, "too large"),
         ({"contact": "elastic", "pixel_size": 0.001}, "points.*conform"),
     ],
@@ -502,14 +519,3 @@ def test_what_cannot_be_is_refused_in_one_line(changes: dict[str, Any], words: s
     with pytest.raises(InputError, match=words) as caught:
         make_twin(given.pop("movement"), **given)
     assert "\n" not in str(caught.value)
-
-
-def test_a_pinhole_in_the_body_is_refused() -> None:
-    with pytest.raises(InputError, match="not above the body"):
-        Twin(
-            object="sphere",
-            shape=SHAPE,
-            pixel_size=PIXEL,
-            movement=Vertical([1.0]),
-            camera=Camera(distance=30.0),
-        )

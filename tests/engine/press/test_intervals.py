@@ -17,7 +17,7 @@ def log_likelihood(height, middle, half, blur):
     return upper + np.log1p(-np.exp(lower - upper))
 
 
-@pytest.mark.parametrize("blur", [0.004, 0.02, 0.1, 1.0])
+@pytest.mark.parametrize("blur", [0.004, 0.1, 1.0])
 def test_an_interval_pulls_as_its_likelihood_does(blur):
     middle, half = np.full(41, -0.3), np.full(41, 0.05)
     height = np.linspace(-0.3 - 0.05 - 2 * blur, -0.3 + 0.05 + 2 * blur, 41)
