@@ -370,7 +370,7 @@ def test_a_damaged_reference_is_refused(refusal, tmp_path):
 def documented():
     """Return the rows of the tables of keys: {table: {key: default}}."""
     tables, names = {}, []
-    for line in DOCS.read_text().split("## What is checked")[0].splitlines():
+    for line in DOCS.read_text().split("## Checks")[0].splitlines():
         if line.startswith("### "):
             names = re.findall(r"`\[([a-z.]+)\]`", line) or [""]
         elif row := re.match(r"\| `([a-z_]+)` .*\| (.*) \|$", line):
@@ -398,7 +398,7 @@ def test_documentation_and_code_agree_on_keys_and_defaults():
         assert keys == set(told[table]), table
         for key in keys:
             field, default = fields[key], told[table][key]
-            assert (default == "needed") == field.required, (table, key)
+            assert (default == "required") == field.required, (table, key)
             if isinstance(field.default, int | float):
                 assert tomllib.loads(f"a = {default}") == {"a": field.default}, (table, key)
 
