@@ -70,22 +70,8 @@ class Camera(Protocol):
     def take(self, most: int, timeout: float) -> Frames:
         """Take the oldest frames that wait, or wait for one.
 
-        Parameters
-        ----------
-        most : int
-            How many at most; at least 1.
-        timeout : float
-            Seconds to wait for the first.
-
-        Returns
-        -------
-        Frames
-            At least one, without a gap between them.
-
-        Raises
-        ------
-        HardwareError
-            None came in time, or none will come any more.
+        At least one is returned and at most `most`, without a gap between them. HardwareError if none came
+        within `timeout` seconds, or none will come any more.
         """
 
     def flush(self) -> None:

@@ -293,12 +293,6 @@ def load_rig(path: Path | str) -> RigSettings:
     RigSettings
         With the paths of those files.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, or has something that is not known or cannot be used. The message names the
-        file, the key and the remedy.
-
     Examples
     --------
     >>> load_rig("rig.toml").stage.press  # doctest: +SKIP

@@ -28,20 +28,11 @@ _MICROMETRES = 1e3  # in a millimetre
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Errors of a surface.
-
-    Attributes
-    ----------
-    measured : HeightScore
-    filled : HeightScore or None
-        Of what was not measured, if there is any.
-    apex : float
-        Of the picture's middle, mm; NaN where there is no answer.
-    """
+    """Errors of a surface."""
 
     measured: HeightScore
-    filled: HeightScore | None
-    apex: float
+    filled: HeightScore | None  # of what was not measured, if there is any
+    apex: float  # of the picture's middle, mm; NaN where there is no answer
 
 
 Outcomes = Mapping[str, Mapping[str, Shape]]

@@ -64,7 +64,7 @@ class Trapezoid:
 
 @dataclass(frozen=True, slots=True)
 class VerticalPlan:
-    """Lower the body from one travel to another.
+    """Lower the body from one travel to another; values that cannot be are an `InputError`.
 
     Attributes
     ----------
@@ -74,11 +74,6 @@ class VerticalPlan:
         From place to place, mm, where it goes in steps; the last place is the last that is not beyond `stop`.
     speed : float or None
         Where it goes without a halt, mm/s. Either `step` or `speed` is given.
-
-    Raises
-    ------
-    InputError
-        A value cannot be.
 
     Examples
     --------
@@ -136,6 +131,8 @@ class VerticalPlan:
 class AxialPlan:
     """Press, lean, and go round: the body's axis precesses, from phase 0 on, counter-clockwise.
 
+    Values that cannot be are an `InputError`.
+
     Attributes
     ----------
     press : float
@@ -148,11 +145,6 @@ class AxialPlan:
         From place to place, radians, where it goes in steps; the end of the turns is no place of its own.
     rate : float or None
         Where it goes without a halt, turns a second. Either `phase_step` or `rate` is given.
-
-    Raises
-    ------
-    InputError
-        A value cannot be.
 
     Examples
     --------

@@ -68,14 +68,8 @@ class Rig(Closing):
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
     the rig for anything gets the reason. Frames are missed after 0.1 s or three periods, whichever is longer;
-    a computer that is too busy to look that often gives the camera more time.
-
-    Parameters
-    ----------
-    stage : GrblStage
-        To move it, use the rig: only then is the move guarded.
-    camera : Camera
-    settings : RigSettings
+    a computer that is too busy to look that often gives the camera more time. Only moves that the rig begins
+    are guarded.
 
     Examples
     --------

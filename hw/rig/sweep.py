@@ -105,16 +105,19 @@ class SweepScan(Scan):
             taken, rest = self._begin(most)
             if not isinstance(self.plan, AxialPlan):
                 return self._give(taken, rest, np.zeros(rest.stop - rest.start), origin)
+        move = self._move
+        assert move is not None  # _begin has begun it
         while True:
             taken = self.rig.take(most)
             self._add_reports()
             exposed = taken.time - self.delay.seconds
             way = self._live_track.at(exposed)
-            part = self._thinned(taken, self._part(exposed, way))
+            part = self._thinned(taken, self._part(move, exposed, way))
             if part.start < part.stop:
                 return self._give(taken, part, way[part], origin)
             if part.stop < len(way):
-                self._end()
+                self.rig.end(move)
+                self._add_reports()
                 return None
 
     def _give(self, taken: Frames, part: slice, way: Floats, origin: float) -> Block:
@@ -141,32 +144,23 @@ class SweepScan(Scan):
         self._reports = [(self._move.began, 0.0)]
         return taken, slice(int(np.searchsorted(taken.time, rests, side="right")), len(taken.time))
 
-    def _end(self) -> None:
-        """Wait for the end of the move, and for the last reports."""
-        if self._move is not None:
-            self.rig.end(self._move)
-        self._add_reports()
-
     def _add_reports(self) -> None:
         """Take in the reports that came since."""
-        if self._move is None:
-            return
         for report in self.rig.stage.history(self._reports[-1][0]):
             way = self._progress(report)
             self._reports.append((report.time, way))
             self._live_track.add(report.time, way)
 
-    def _part(self, exposed: Floats, way: Floats) -> slice:
+    def _part(self, move: Move, exposed: Floats, way: Floats) -> slice:
         """Return which of some frames belong to the scan.
 
         A press has frames at rest on either side. A rotation has none: they would count one phase too often.
         """
-        began, ended = (self._move.began, self._move.ended) if self._move else (math.inf, math.inf)
-        end = int(np.searchsorted(exposed, ended, side="right"))
+        end = int(np.searchsorted(exposed, move.ended, side="right"))
         if not isinstance(self.plan, AxialPlan):
             return slice(0, end)
         end = min(end, int(np.searchsorted(way, self._path.length)))
-        return slice(min(end, int(np.searchsorted(exposed, began))), end)
+        return slice(min(end, int(np.searchsorted(exposed, move.began))), end)
 
     def _thinned(self, taken: Frames, part: slice) -> slice:
         """Leave out of a part of some frames what is not to be given."""
