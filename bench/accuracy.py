@@ -240,19 +240,13 @@ def run_surfaces(device: Device, quick: bool) -> Case:
     targets = []
     for name, (make, bound) in _SURFACES.items():
         known = make(*_grid(shape))
-        whole = integrate(known.dz_dx, known.dz_dy, _PIXEL, sigma=False, device=device)
-        targets.append(
-            at_most(f"{name}, whole picture: RMS error, of the range", _range_error(whole, known), bound)
-        )
-        mask = _ring(shape)
-        part = integrate(known.dz_dx, known.dz_dy, _PIXEL, mask=mask, sigma=False, device=device)
-        targets.append(
-            at_most(f"{name}, a ring: RMS error, of the range", _range_error(part, known), bound + 2e-5)
-        )
+        for where, mask, slack in (("whole picture", None, 0.0), ("a ring", _ring(shape), 2e-5)):
+            found = integrate(known.dz_dx, known.dz_dy, _PIXEL, mask=mask, sigma=False, device=device)
+            off = _range_error(found, known)
+            targets.append(at_most(f"{name}, {where}: RMS error, of the range", off, bound + slack))
     targets += _noisy(device, quick)
-    return _case(
-        "accuracy-surfaces", f"heights of {shape[0]} x {shape[1]} slopes of analytic surfaces", targets
-    )
+    title = f"heights of {shape[0]} x {shape[1]} slopes of analytic surfaces"
+    return _case("accuracy-surfaces", title, targets)
 
 
 def _plane(x: Doubles, y: Doubles) -> Known:
@@ -302,11 +296,8 @@ def _noisy(device: Device, quick: bool) -> list[Target]:
         found = integrate(*given, _PIXEL, slope_weights=1 / _SLOPE_NOISE**2, device=device)
         error = found.height - known.height
         square.append(np.mean(((error - error.mean()) / found.sigma) ** 2))
-    return [
-        within(
-            "noisy slopes: chi-square", float(np.mean(square)), 0.5 if quick else 0.75, 1.5 if quick else 1.25
-        )
-    ]
+    low, high = (0.5, 1.5) if quick else (0.75, 1.25)
+    return [within("noisy slopes: chi-square", float(np.mean(square)), low, high)]
 
 
 def run_fusion(device: Device, quick: bool) -> Case:

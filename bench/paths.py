@@ -48,6 +48,7 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
+    pusher,
     ratio_target,
 )
 from mirrorskin.bench.limits import beside_limits
@@ -93,18 +94,10 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
     with new_folder(name, size + rounds * extra) as folder:
         press, path = make_press(shape), folder / "press.h5"
         record(press, path, compression)
-        search = search_of(press, device)
-
-        def push() -> None:
-            search.reset()
-            push_block(search, press.block)
-            device.finish()
-
-        def find() -> Onset:
-            search.reset()
-            push_block(search, press.block)
-            return search.result()
-
+        search, block = search_of(press, device), press.block
+        push, find = (
+            pusher(search, block.frames, maps=maps, travel=block.travel, lent=True) for maps in (False, True)
+        )
         with io.open_recording(path) as recording:
             works: dict[str, Work] = {
                 KERNEL: push,
