@@ -53,19 +53,9 @@ class SamplePoints:
         return np.where(self.inside, values.ravel()[self.nearest], np.asarray(outside, values.dtype))
 
     def interpolate(self, values: Floats, count: Mask | None = None) -> Floats:
-        """Interpolate a map.
+        """Interpolate a map, (H, W), to values, (n,); NaN where the nearest pixel has no answer.
 
-        Parameters
-        ----------
-        values : ndarray, (H, W), float32
-            NaN where there is no answer.
-        count : ndarray, (4, n), bool, optional
-            Which of the four pixels count, the nearest always among them; by default all.
-
-        Returns
-        -------
-        ndarray, (n,), float32
-            NaN where the nearest pixel has no answer.
+        ``count``, (4, n), are the pixels that count, the nearest always among them; by default all do.
         """
         mean = self._mean([values.ravel()[self.pixels]], count)[0].astype(np.float32)
         return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)

@@ -91,7 +91,11 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
         raise InputError(
             "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
         )
-    x, y = (result.x, result.y) if result.x is not None and result.y is not None else _pixels(height.shape)
+    x, y = (
+        (result.x, result.y)
+        if result.x is not None and result.y is not None
+        else pixel_axes((height.shape[0], height.shape[1]), (1.0, 1.0))
+    )
     size = pixel_size_of(x, y) if height.size > 1 else (1.0, 1.0)
     if start is None or end is None:
         row = _top_row(height)
@@ -138,11 +142,6 @@ def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[f
     reach = size[0] * len(x), size[1] * len(y)
     if np.any(abs(np.subtract(ends, (x.mean(), y.mean()))) > reach):
         raise InputError("the section ends far outside of the picture: give mm from its centre")
-
-
-def _pixels(shape: tuple[int, ...]) -> tuple[Doubles, Doubles]:
-    """Return the places of pixels of size 1."""
-    return pixel_axes((shape[0], shape[1]), (1.0, 1.0))
 
 
 def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubles, Doubles]:

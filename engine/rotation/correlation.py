@@ -392,14 +392,8 @@ class WindowSums(_Sums):
     """The last frames of an endless rotation, in a ring.
 
     Integer sums move on with it: a frame that leaves takes with it exactly what it brought. Anything else is
-    summed anew.
-
-    Attributes
-    ----------
-    bands : list of Band
-        Map ``ring`` of each holds its rows of the frames.
-    oldest : int
-        Plane of the ring that the oldest frame of a full window is in; the next frame goes there.
+    summed anew. Map ``ring`` of each band holds its rows of the frames; the oldest frame of a full window is
+    in its plane ``oldest``, and the next frame goes there.
     """
 
     def __init__(

@@ -46,18 +46,8 @@ def check_weights(frame_weights: ArrayLike | None, count: int) -> Doubles:
 def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
     """Return phases as float64, (N,), if they determine mean, cosine and sine of what they sample.
 
-    Parameters
-    ----------
-    phase : array_like, (N,)
-        Radians.
-    frame_weights : array_like, (N,), optional
-        How much each frame counts; 0 for a missing one.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Phases or weights that are no finite numbers, weights below 0, fewer than three different phases, or
-        phases so close together that the condition of the Gram matrix exceeds 1e8.
+    InputError: phases, radians, or weights that are no finite numbers, weights below 0, fewer than three
+    different phases, or phases so close together that the condition of the Gram matrix exceeds 1e8.
     """
     alpha = check_phase(phase, int(np.size(phase)), "phase")
     weight = check_weights(frame_weights, len(alpha))
@@ -78,21 +68,11 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
 
 
 def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
-    """Return the matrix that makes mean, cosine and sine of samples: the weighted pseudo-inverse.
+    """Return the matrix, (3, N), that makes mean, cosine and sine of samples: the weighted pseudo-inverse.
 
     It minimises sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With N evenly spaced phases and equal
     weights, its rows are 1/N, (2/N) cos alpha and (2/N) sin alpha: the time average of the paper, and the
     correlations of its equations 17 and 20, as sums over a whole turn.
-
-    Parameters
-    ----------
-    phase, frame_weights
-        As for `check_phases`.
-
-    Returns
-    -------
-    ndarray, (3, N), float64
-        Its product with the samples, (N,), is a, b and c.
 
     Examples
     --------

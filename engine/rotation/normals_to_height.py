@@ -80,26 +80,12 @@ def find_slopes(
     *Bias.* An azimuth that is uncertain by s makes the mean of its vectors shorter by exp(-s^2 / 2), and
     a surface of them flatter. Slopes are made longer by as much.
 
-    Parameters
-    ----------
-    vectors : ndarray, (H, W, 3), float32
-        Unit normals; NaN where there is none.
-    sigma : ndarray, (H, W), float32
-        Their RMS angular error, radians.
-    contact : ndarray, (H, W), uint8
-        0 where they mean nothing.
-    tilt : float or None
-        Half-angle d of the precession, radians. None: errors are the same in all directions.
-    turns : int
-        Of how many turns the normals are the mean.
-    independent_sigma : ndarray, (H, W), float32, optional
-        What to weight slopes by instead of ``sigma``, where errors of neighbours are correlated: independent
-        errors that leave as much in a mean over many pixels.
-
-    Returns
-    -------
-    Slopes
-        Finite: a surface steeper than 80 degrees is taken to be as steep as that.
+    Of ``vectors``, (H, W, 3) unit normals, those count with a finite RMS angular error ``sigma``, (H, W)
+    radians, where ``contact`` is not 0. ``tilt`` is the half-angle d of the precession, radians; without it,
+    errors are the same in all directions. The normals are the mean of ``turns`` turns. Where errors of
+    neighbours are correlated, ``independent_sigma`` replaces sigma in the weights: independent errors that
+    leave as much in a mean over many pixels. A surface steeper than 80 degrees is taken to be as steep as
+    that.
     """
     nx, ny, nz = np.moveaxis(vectors, -1, 0)
     white = sigma if independent_sigma is None else independent_sigma
@@ -169,29 +155,11 @@ def integrate_normals(
     robust: bool = False,
     device: Device,
 ) -> Result:
-    """Integrate the normals of pixels in contact.
+    """Integrate the normals of pixels in contact, of one picture or of each turn, or raise NotConverged.
 
-    Parameters
-    ----------
-    normals : Normals
-        Of one picture, or of one for each turn.
-    independent_sigma : ndarray, (H, W) or (turns, H, W), float32
-        See `find_slopes`.
-    pixel_size : (float, float)
-        Millimetres along x and y.
-    robust, device
-        As for `mirrorskin.engine.integrate`.
-
-    Returns
-    -------
-    Result
-        Heights, with a mean of 0 of each connected component, and what came with them; components are
-        numbered through all turns. Edges are those where the surface breaks, if that was wanted.
-
-    Raises
-    ------
-    mirrorskin.engine.NotConverged
-        No heights were found that fit.
+    ``independent_sigma``, (H, W) or (turns, H, W), is that of `find_slopes`. The mean height of each
+    component is 0; components are numbered through all turns. Edges are where the surface breaks, if
+    ``robust``.
     """
     maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact, independent_sigma]
     per_turn = normals.contact.ndim == 3

@@ -213,22 +213,8 @@ def correlate_source(
 ) -> Result:
     """Fit mean, cosine and sine of the phase to each pixel's brightness, over all frames of a source.
 
-    Parameters
-    ----------
-    source : Source
-        Of axial motion. It is rewound first, if it can be.
-    memory_limit, device, progress
-        As for `reconstruct_rotation`.
-
-    Returns
-    -------
-    Result
-        With azimuth, mean, cosine, sine, modulation and residual.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The phases do not determine the fit.
+    The source is rewound first, if it can be; other arguments are as for `reconstruct_rotation`. InputError
+    where its phases do not determine the fit.
     """
     opened = open_device(device)
     limit = min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize)

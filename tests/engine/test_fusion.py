@@ -187,7 +187,7 @@ def test_without_normals_heights_are_those_of_the_press():
     assert (surface.component == 0).all()
 
 
-def test_pieces_without_a_height_are_told():
+def test_components_without_a_height_are_marked():
     true, normals = plane()
     contact = np.ones(SHAPE)
     contact[:, 7] = 0
@@ -276,15 +276,6 @@ def test_heights_that_fit_no_surface_count_as_little_as_they_deserve():
     assert 0.2 < rms(error / surface.sigma) < 3
 
 
-def test_only_what_is_wanted_is_told():
-    true, normals = plane()
-    mask = np.zeros(SHAPE)
-    mask[2:6, 3:9] = 7
-    surface = engine.fuse(heights(true), directions(normals), 0.1, mask=mask)
-    np.testing.assert_array_equal(np.isfinite(surface.height), mask > 0)
-    np.testing.assert_array_equal(surface.component >= 0, mask > 0)
-
-
 def test_holes_are_filled_from_absolute_heights_alone():
     true, normals = plane(shape=(30, 30))
     inside = np.zeros((30, 30), bool)
@@ -297,29 +288,6 @@ def test_holes_are_filled_from_absolute_heights_alone():
     assert surface.height == pytest.approx(true, abs=1e-3)
     assert (surface.component == 0).all()
     assert np.isnan(surface.sigma[inside]).all()
-
-
-def test_the_surface_may_break_on_request(monkeypatch):
-    true, normals = plane()
-    asked = []
-
-    def listen(*slopes, **options):
-        asked.append(options["robust"])
-        return engine.integrate(*slopes, **options)
-
-    monkeypatch.setattr("mirrorskin.engine.fusion_solver.integrate", listen)
-    for robust in (False, True):
-        engine.fuse(heights(true), directions(normals), 0.1, robust=robust)
-    assert asked == [False, False, True, True]
-
-
-def test_a_surface_that_was_not_found_is_no_answer(monkeypatch):
-    def fail(*slopes, **options):
-        raise engine.NotConverged("100 iterations left a residual of 0.1")
-
-    monkeypatch.setattr("mirrorskin.engine.fusion_solver.integrate", fail)
-    with pytest.raises(engine.NotConverged, match="100 iterations"):
-        engine.fuse(heights(plane()[0]), directions(plane()[1]), 0.1)
 
 
 BAD = {

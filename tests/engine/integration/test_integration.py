@@ -100,8 +100,7 @@ def test_planes_and_quadratics_are_exact_on_any_mask(device, mask):
         assert worst(found, truth(surface), MASKS[mask]) <= 1e-4
 
 
-@pytest.mark.parametrize("sigma", [3, 40])
-@pytest.mark.parametrize("region", ["rectangle", "disc"])
+@pytest.mark.parametrize(("sigma", "region"), [(3, "rectangle"), (40, "disc")])
 def test_a_bump_of_any_size_has_its_height(device, sigma, region):
     shape, square = (240, 320), (0.03, 0.03)
     mask = surfaces.disc(shape) if region == "disc" else np.ones(shape, bool)
@@ -127,8 +126,10 @@ GIVEN = {
 }
 
 
-@pytest.mark.parametrize("given", GIVEN)
-@pytest.mark.parametrize("mask", ["rectangle", "disc", "20 % holes"])
+@pytest.mark.parametrize(
+    ("mask", "given"),
+    [*(("disc", given) for given in GIVEN), ("rectangle", "noise"), ("20 % holes", "all at once")],
+)
 def test_heights_are_those_of_a_direct_solution_in_float64(device, mask, given):
     asked = problem(WAVES, 0.2, mask=MASKS[mask], **GIVEN[given])
     found = integrated(asked, device)
@@ -159,8 +160,7 @@ def test_refinement_is_of_second_order(region):
     assert (orders >= 1.9).all() or errors[-1] < 1e-5, (errors, orders)
 
 
-@pytest.mark.parametrize("pixel", [1e-3, 1e3])
-@pytest.mark.parametrize("mask", ["rectangle", "disc"])
+@pytest.mark.parametrize(("pixel", "mask"), [(1e-3, "rectangle"), (1e3, "disc")])
 def test_pixels_of_any_size(pixel, mask):
     size = pixel, 1.6 * pixel
     heights = np.where(np.random.default_rng(11).random(SHAPE) < 0.02, truth(BUMP, size), np.nan)
@@ -215,8 +215,9 @@ def test_heights_without_weight_or_value_are_as_good_as_none():
     np.testing.assert_allclose(integrated(problem(BUMP, 0.1, **far)).height, masked, atol=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 57), (43, 1), (3, 2)])
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "masked"), [((1, 1), False), ((1, 2), True), ((2, 1), False), ((1, 57), True), ((43, 1), False)]
+)
 def test_thin_and_tiny_pictures(device, shape, masked):
     mask = np.ones(shape, bool)
     mask.flat[0] = not masked or shape == (1, 1)
@@ -228,7 +229,7 @@ def test_thin_and_tiny_pictures(device, shape, masked):
     np.testing.assert_array_equal(np.isnan(found.height), ~mask)
 
 
-def test_pieces_of_one_pixel_have_their_known_height_or_none():
+def test_components_of_one_pixel_have_their_known_height_or_none():
     random = np.random.default_rng(3)
     specks, known = random.random(SHAPE) < 0.25, random.normal(size=SHAPE)
     weights = {"slope_weights": 60.0, "known_height_weights": 6.0}

@@ -43,8 +43,8 @@ def test_a_cap_has_the_numbers_of_its_closed_form(ball):
     assert told["Sq"] == pytest.approx(0, abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(90, 121)])
-def test_a_paraboloid_has_the_volume_of_its_closed_form(shape):
+def test_a_paraboloid_has_the_volume_of_its_closed_form():
+    shape = 90, 121
     size = 3.0 / shape[0], 4.0 / shape[1]  # millimetres up and across
     x, y = places(shape, size[::-1])
     found = values(result_of(0.5 - (x**2 + y**2) / 40, size[::-1]), form="plane")
@@ -182,7 +182,7 @@ def components(unknown):
     return result_of(height, component=component, offset_unknown=np.array(unknown, np.uint8))
 
 
-def test_pieces_whose_height_is_relative_are_not_compared_with_others():
+def test_components_whose_height_is_relative_are_not_compared_with_others():
     both, second, largest = (engine.measure(components(unknown)) for unknown in ([0, 0], [0, 1], [1, 1]))
     assert both.quantities["height range"].value == pytest.approx(4)
     assert second.quantities["height range"].value == 0
@@ -211,7 +211,7 @@ def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
     assert any("taken as exact" in note for note in plain.notes)
 
 
-def test_a_section_compares_no_heights_of_pieces_that_lie_nobody_knows_how_high():
+def test_a_section_compares_no_heights_of_relative_components():
     ends = (-0.7, -0.85), (-0.7, 0.95)
     assert engine.measure(components([0, 0]), section=ends).quantities["height difference"].value == -4
     alone = engine.measure(components([1, 1]), section=ends)
@@ -260,8 +260,7 @@ def test_heights_without_a_standard_deviation_are_left_out_and_that_is_told():
     assert "pixels left out, whose height has no standard deviation: 2" in found.notes
 
 
-@pytest.mark.parametrize("shape", [(1, 9), (2, 2)])
-@pytest.mark.parametrize("sigma", [None, 0.0])
+@pytest.mark.parametrize(("shape", "sigma"), [((1, 9), None), ((2, 2), 0.0)])
 def test_tiny_pictures_of_all_equal_heights_are_measured(shape, sigma):
     told = engine.measure(result_of(np.full(shape, -0.5), sigma=sigma)).quantities
     assert told["highest point"].value == told["lowest point"].value == told["median height"].value == -0.5

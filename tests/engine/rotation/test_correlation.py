@@ -70,8 +70,16 @@ def same(one, other):
     assert one.frames == other.frames
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("phases", PHASES)
+@pytest.mark.parametrize(
+    ("dtype", "phases"),
+    [
+        ("uint8", "measured"),
+        ("uint8", "narrow"),
+        ("uint16", "three"),
+        ("uint16", "turns"),
+        ("float32", "turns"),
+    ],
+)
 def test_it_is_least_squares(device, dtype, phases):
     phase = PHASES[phases]
     frames = swing(dtype, phase)
@@ -79,9 +87,9 @@ def test_it_is_least_squares(device, dtype, phases):
     # Cosines in steps of 2^-17: what noise does to a fit depends on them by that share, times its condition.
     model = np.stack([phase**0, np.cos(phase), np.sin(phase)], axis=1)
     share = np.linalg.cond(model) * 2.0**-17
-    unsure = np.sqrt(np.diag(np.linalg.inv(model.T @ model)))[:, None, None] * np.nan_to_num(expected[3])
+    sigma = np.sqrt(np.diag(np.linalg.inv(model.T @ model)))[:, None, None] * np.nan_to_num(expected[3])
     error = np.abs(stacked(found)[:3] - expected[:3])
-    assert np.all(error <= share * unsure + 3e-7 * np.abs(expected[:3]) + 1e-7 * np.ptp(frames))
+    assert np.all(error <= share * sigma + 3e-7 * np.abs(expected[:3]) + 1e-7 * np.ptp(frames))
     np.testing.assert_allclose(found.residual, expected[3], rtol=1e-4, atol=1e-5 * np.ptp(frames))
     assert stacked(found).dtype == np.float32
     assert found.frames == len(phase)
@@ -95,8 +103,10 @@ def in_window(frames, weight, device):
     return push(correlator, frames, MEASURED, weight, cuts=[1, 4]).result()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize(
+    ("dtype", "weights"),
+    [("uint8", "all"), ("uint8", "uneven"), ("uint16", "missing"), ("uint16", "late"), ("float32", "uneven")],
+)
 def test_frames_count_by_their_weights(device, dtype, weights):
     frames, weight = swing(dtype, MEASURED), WEIGHTS[weights]
     whole = correlate(frames, MEASURED, frame_weights=weight, device=device)
@@ -106,8 +116,9 @@ def test_frames_count_by_their_weights(device, dtype, weights):
         assert found.frames == (8 if weight is None else np.count_nonzero(weight))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize(
+    ("dtype", "weights"), [("uint8", "late"), ("uint16", "all"), ("uint16", "missing"), ("float32", "uneven")]
+)
 def test_blocks_make_no_difference(device, dtype, weights):
     phase = PHASES["turns"][:40]
     frames, weight = swing(dtype, phase), None if WEIGHTS[weights] is None else 5 * WEIGHTS[weights]

@@ -9,7 +9,6 @@ import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
 from mirrorskin.engine.rotation.normals import NormalEstimator, estimate_normals
-from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
 
@@ -382,19 +381,6 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
             estimator.push(block, phase=where, frame_weights=weights)
     push(estimator, frames[10:], phase[10:])
     same(estimator.result(), estimate_normals(frames, phase, **known()))
-
-
-def test_the_scale_is_zeniths_of_counts_between_ends():
-    def planes(gain=200.0, offset=10.0, dark=None, bright=None):
-        return make_scale(gain, offset, dark, bright, (3, 4))
-
-    assert not planes().ends
-    assert planes(bright=30.0).ends
-    np.testing.assert_allclose(planes(dark=30.0, bright=210.0).planes, [10, 1 / 200, 0.1, 1.0])
-    np.testing.assert_allclose(planes(-200.0, 230.0, 30.0, 210.0).planes, [230, -1 / 200, 0.1, 1.0])
-    np.testing.assert_allclose(planes(-200.0, 230.0, dark=30.0).planes[2:], [-np.inf, 1.0])
-    one = planes(offset=np.full((3, 4), 10.0), dark=30.0)
-    np.testing.assert_array_equal(one.thinned(5), np.repeat(planes(dark=30.0).planes[:, None], 3, axis=1))
 
 
 def test_a_pixel_without_a_scale_has_no_answer(device):
