@@ -30,7 +30,7 @@ def command(
 ) -> None:
     """Fit mean, cosine and sine of the phase to each pixel's brightness."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, save_and_tell
+    from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.rotation.rotation import correlate_source
@@ -49,4 +49,4 @@ def command(
         io.check_output(target, stack, phases)
         with progress("correlating", source.shape[0]) as show:
             result = correlate_source(source, memory_limit=limit, device=device, progress=show)
-    save_and_tell(result, target, device, as_json)
+    save_and_report(result, target, device, as_json)

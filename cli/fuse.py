@@ -49,7 +49,7 @@ def command(
 ) -> None:
     """Make one surface of a press and a rotation."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, save_and_tell
+    from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
     from mirrorskin.cli.stack import stack_options
@@ -86,7 +86,7 @@ def command(
                 device=device,
                 progress=show,
             )
-    save_and_tell(result, target, device, as_json)
+    save_and_report(result, target, device, as_json)
 
 
 def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:

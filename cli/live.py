@@ -187,12 +187,12 @@ class _Live:
         output = self._given["output"]
         if output is None:
             return
-        from mirrorskin.cli.output import save_and_tell, tell_what_is_missing
+        from mirrorskin.cli.output import report_missing_maps, save_and_report
 
         assert self._estimator is not None
         result = self._estimator.result()
-        tell_what_is_missing(self._settings.name, result.process, _REMEDIES)
-        save_and_tell(result, output, self._given["device"], as_json=False)
+        report_missing_maps(self._settings.name, result.process, _REMEDIES)
+        save_and_report(result, output, self._given["device"], as_json=False)
 
 
 class _Guard:

@@ -20,7 +20,7 @@ _NO_GEL = "none: the calibration has no gel"
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
-def save_and_tell(result: Result, path: Path, device: str | None, as_json: bool) -> None:
+def save_and_report(result: Result, path: Path, device: str | None, as_json: bool) -> None:
     """Write a result and say in a line what it holds, or in JSON how it came about as well."""
     from mirrorskin import io
     from mirrorskin.engine.summary import summarise
@@ -85,7 +85,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def tell_what_is_missing(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
+def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
     """Say which maps a result's process says are missing, why, what would bring them, and what a gel did."""
     for what, remedy in remedies.items():
         said = str(process.get(what))

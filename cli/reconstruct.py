@@ -121,7 +121,7 @@ def command(
 ) -> None:
     """Reconstruct heights from a press, or normals and heights from a rotation."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import progress, save_and_tell, tell_what_is_missing
+    from mirrorskin.cli.output import progress, report_missing_maps, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
     from mirrorskin.cli.stack import stack_options
@@ -162,8 +162,8 @@ def command(
                 device=device,
                 progress=show,
             )
-    tell_what_is_missing(str(recording), result.process, _REMEDIES)
-    save_and_tell(result, target, device, as_json)
+    report_missing_maps(str(recording), result.process, _REMEDIES)
+    save_and_report(result, target, device, as_json)
 
 
 def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) -> Source:

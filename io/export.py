@@ -22,8 +22,8 @@ from mirrorskin.io.export_formats import (
     encode_stl,
     encode_tiff,
     encode_xyz,
+    height_datum,
     notes_of,
-    tell_zero,
 )
 from mirrorskin.io.types import InputError, Result
 
@@ -93,7 +93,7 @@ def export_result(
             raise InputError(f"{path}: {error}") from error
         write_new(path, parts)
     relative = suffix != _ARRAYS and result.offset_unknown is not None and result.offset_unknown.any()
-    return f"{holds}, heights {tell_zero(result)}" if relative else holds
+    return f"{holds}, heights {height_datum(result)}" if relative else holds
 
 
 def check_export(result: Result, path: str | Path) -> None:

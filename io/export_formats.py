@@ -147,7 +147,7 @@ def notes_of(result: Result) -> dict[str, str]:
     notes = {name: _line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
     if maker:
         notes[_SOFTWARE] = _line(maker)
-    notes["heights"] = tell_zero(result)
+    notes["heights"] = height_datum(result)
     if result.height is not None and result.filled is not None and result.filled.any():
         known = np.isfinite(result.height)
         filled, of = np.count_nonzero(known & (result.filled > 0)), np.count_nonzero(known)
@@ -155,7 +155,7 @@ def notes_of(result: Result) -> dict[str, str]:
     return notes
 
 
-def tell_zero(result: Result) -> str:
+def height_datum(result: Result) -> str:
     """Say from where heights count: not from the rest sheet where their offset is unknown."""
     unknown = result.offset_unknown
     count, of = (0, 0) if unknown is None else (np.count_nonzero(unknown), unknown.size)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.positions import Positions, Steps, check_phase, check_stroke
+from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_stroke
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
 
 
@@ -126,7 +126,7 @@ class FrameSequence(Closing, ABC):
         if isinstance(given, Steps):
             taken = np.arange(self.shape[0]) + np.cumsum(self._lost)
             return np.asarray(given.start + given.step * taken)
-        return given.positions(self.shape[0]) if isinstance(given, Positions) else given
+        return along(given, self.shape[0])
 
 
 @contextmanager

@@ -20,6 +20,11 @@ class Positions(Protocol):
         """Return the positions of so many frames, mm or radians; InputError if they are of another number."""
 
 
+def along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
+    """Return the positions of so many frames, however they are given."""
+    return given.positions(count) if isinstance(given, Positions) else given
+
+
 @dataclass(frozen=True, slots=True)
 class Steps:
     """Evenly spaced positions: frame k is at ``start + k * step``, in millimetres or radians.

@@ -18,7 +18,7 @@ from mirrorskin.io.fingerprint import fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
 from mirrorskin.io.layout import MARK, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.positions import Positions
+from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.result import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
@@ -229,7 +229,7 @@ def open_recording(
             state_of_part, positions = state_of_part.of(chosen), layout.live(header.motion, chosen)
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
-            positions = layout.positions(header.motion, _along(given, shape[0]))
+            positions = layout.positions(header.motion, along(given, shape[0]))
         opened = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
         fetched = FrameSubset(opened, chosen) if live else opened
         recording = Recording(file, stack, fetched, cut, header, positions, truth, state_of_part, live)
@@ -256,10 +256,6 @@ def _cut(
     region = region or Region.whole(shape[1:])
     region.check(shape[1:], name)
     return Selection((start, stop), region)
-
-
-def _along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
-    return given.positions(count) if isinstance(given, Positions) else given
 
 
 def _used(

@@ -23,7 +23,7 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recorder import Compression, TeeSource
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource
 
-_LOOK = 0.5  # seconds from one look whether the program is still there to the next
+_POLL = 0.5  # seconds from one look whether the program is still there to the next
 _BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
 
 
@@ -195,7 +195,7 @@ class StreamRecorder(TeeSource[LiveSource]):
 
     def _begin(self) -> GrowingRecording | None:
         """Make the file with the first block in it, and give it its name; None if no block comes."""
-        while (block := self._wait(_LOOK)) is None:
+        while (block := self._wait(_POLL)) is None:
             pass
         if not isinstance(block, Block):
             return None
@@ -215,7 +215,7 @@ class StreamRecorder(TeeSource[LiveSource]):
                 return self._append_all(file)
         except InputError as error:
             self._error = error
-            while not isinstance(item := self._wait(_LOOK), _End):
+            while not isinstance(item := self._wait(_POLL), _End):
                 pass
             return _End(item.positions, _cut_short(error))
 

@@ -32,7 +32,7 @@ PATIENCE = 30.0
 
 _REACH = 10.0  # seconds, for a first answer
 _CHECK = 150.0  # seconds, for a worker to load everything from a slow disk and try its device
-_LOOK = 1.0  # seconds between two looks at the workers
+_POLL = 1.0  # seconds between two looks at the workers
 
 _log = logging.getLogger("mirrorskin.engine.batch")
 
@@ -64,23 +64,23 @@ class _Batch:
         self._running: dict[str, tuple[Job, Any]] = {}
         self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._present: set[str] = set()
-        self._looked, self._alive = 0.0, time.monotonic()
+        self._polled, self._alive = 0.0, time.monotonic()
 
     @contextmanager
     def enlisted(self, jobs: list[Job]) -> Iterator[None]:
         """Let workers take part that can, also those that come later; at the end, drop what is not begun."""
-        from mirrorskin.engine.batch.worker import RESOURCE, Enlist, look_around
+        from mirrorskin.engine.batch.worker import RESOURCE, Enlist, check_worker
 
         sizes = _one_of_each_folder(job.source.absolute() for job in jobs)
         name, own = f"mirrorskin-{uuid.uuid4()}", program_version()
-        with _trace(_that_exists(jobs[0].target.absolute().parent)) as trace:
+        with _trace(_nearest_existing(jobs[0].target.absolute().parent)) as trace:
             # A function of Python's own: one of ours could not be read by another version, or by none.
             for worker, found in self._run(version, "mirrorskin").items():
                 if found != own:
                     has = "not installed" if isinstance(found, PackageNotFoundError) else found
                     remedy = "install the same on both"
                     self._refuse(worker, f"has mirrorskin {has}, and this machine {own}: {remedy}")
-            for worker, found in self._run(look_around, sizes, trace).items():
+            for worker, found in self._run(check_worker, sizes, trace).items():
                 if isinstance(found, Exception):
                     self._refuse(worker, f"cannot take part ({type(found).__name__}: {found})")
                 if found is not None:
@@ -101,11 +101,11 @@ class _Batch:
         """
         waiting = deque(jobs)
         while waiting or self._running:
-            self._look()
+            self._poll()
             while waiting and len(self._running) < max(1, len(self._present)):
                 self._submit(waiting.popleft())
             with suppress(queue.Empty):
-                outcome = self._outcome(self._ended.get(timeout=_LOOK))
+                outcome = self._outcome(self._ended.get(timeout=_POLL))
                 if outcome is not None:
                     yield outcome
 
@@ -142,10 +142,10 @@ class _Batch:
         del self._running[key]
         return outcome
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """See that there is a scheduler and workers, and clear away what lost workers had begun to write."""
         now = time.monotonic()
-        if now - self._looked < _LOOK:
+        if now - self._polled < _POLL:
             return
         processing = self._ask(self._client.scheduler.processing, PATIENCE)
         lost = self._present - processing.keys()
@@ -154,7 +154,7 @@ class _Batch:
         if lost:
             for folder in {job.target.parent for job, _ in self._running.values()}:
                 remove_leftovers(folder)
-        self._present, self._looked = set(processing), now
+        self._present, self._polled = set(processing), now
         working = any(processing.values()) or not self._ended.empty()
         if working or (processing and not self._running):
             self._alive = now
@@ -287,6 +287,6 @@ def _one_of_each_folder(files: Iterable[Path]) -> dict[Path, int]:
     return {file: file.stat().st_size for file in first.values()}
 
 
-def _that_exists(folder: Path) -> Path:
+def _nearest_existing(folder: Path) -> Path:
     """Return a folder, or the nearest above it that is there."""
     return next(one for one in [folder, *folder.parents] if one.is_dir())

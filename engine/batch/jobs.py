@@ -52,13 +52,13 @@ def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
     targets = {
         source: folder / name
         for alike in names.values()
-        for source, name in zip(alike, _tell_apart(alike), strict=True)
+        for source, name in zip(alike, _distinct_names(alike), strict=True)
     }
     _check(sources, targets.values())
     return [Job(source, targets[source]) for source in sources]
 
 
-def _tell_apart(sources: Sequence[Path]) -> list[str]:
+def _distinct_names(sources: Sequence[Path]) -> list[str]:
     """Name the results of recordings of one name, below the results' folder."""
     if len(sources) == 1:
         return [f"{sources[0].stem}-result.h5"]

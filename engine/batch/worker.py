@@ -48,13 +48,13 @@ class Enlist(WorkerPlugin):
         """Give the worker what jobs need if it can do them; Dask calls this."""
         own = version("mirrorskin")
         problem = None if own == self.program else f"has mirrorskin {own}, and the batch {self.program}"
-        problem = problem or await look_around(self.sizes, self.trace, worker)
+        problem = problem or await check_worker(self.sizes, self.trace, worker)
         if problem is not None:
             worker.log_event(RESOURCE, f"worker {worker.address} is left out: it {problem}")
         await worker.set_resources(**{RESOURCE: int(problem is None)})
 
 
-async def look_around(sizes: Mapping[Path, int], trace: Path, dask_worker: Any) -> str | None:
+async def check_worker(sizes: Mapping[Path, int], trace: Path, dask_worker: Any) -> str | None:
     """Return what keeps a worker from taking part, and the remedy: the predicate of a sentence about it."""
     host = dask_worker.address.rpartition(":")[0]
     workers = [other for other in await dask_worker.scheduler.ncores() if other.rpartition(":")[0] == host]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mirrorskin.cli.output import tell_what_is_missing
+from mirrorskin.cli.output import report_missing_maps
 
 
 @pytest.mark.parametrize(
@@ -25,5 +25,5 @@ from mirrorskin.cli.output import tell_what_is_missing
     ],
 )
 def test_what_is_missing_and_what_a_gel_did_is_told_in_a_line(process, said, capsys):
-    tell_what_is_missing("a.h5", process, {"height": "it"})
+    report_missing_maps("a.h5", process, {"height": "it"})
     assert capsys.readouterr() == ("", f"{said}\n" if said else "")

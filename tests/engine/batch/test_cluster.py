@@ -30,7 +30,7 @@ PLAN = Plan(press={"fill": False})
 def own_environment(monkeypatch):
     """Workers in this process leave its environment as it was, and nobody waits long."""
     monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", os.environ.get("POCL_MAX_PTHREAD_COUNT", "2"))
-    monkeypatch.setattr(cluster, "_LOOK", 0.1)
+    monkeypatch.setattr(cluster, "_POLL", 0.1)
 
 
 @pytest.fixture(scope="module")
