@@ -93,7 +93,7 @@ float harmonic(const float a, const float b)
 #endif
 
 // What a pixel is by itself: with RIGHT and DOWN where its slopes count along these links.
-#define TELL(p, state) {                                                                               \
+#define CLASSIFY(p, state) {                                                                               \
     const int real = FINITE(dz_dx[p]) & FINITE(dz_dy[p]);                                              \
     const int x = WANTED(p) & X_COUNTS(p), y = WANTED(p) & Y_COUNTS(p);                                \
     const int slope = real ? SLOPE : LOST, links = (-x & RIGHT) | (-y & DOWN);                         \
@@ -108,12 +108,12 @@ __kernel void links_flags(
     if (top >= rows) return;
     const int width = end - begin, more = end < columns;
     int here[CHUNK + 1], below[CHUNK + 1];
-    for (int i = 0; i < width + more; ++i) TELL(top * columns + begin + i, here[i])
+    for (int i = 0; i < width + more; ++i) CLASSIFY(top * columns + begin + i, here[i])
     if (!more) here[width] = 0;
     for (int row = top; row < bottom; ++row) {
         const int first = row * columns + begin, down = row + 1 < rows ? columns : 0;
         const int open = down ? RIGHT | DOWN : RIGHT;
-        for (int i = 0; i < width + more; ++i) TELL(first + down + i, below[i])
+        for (int i = 0; i < width + more; ++i) CLASSIFY(first + down + i, below[i])
         if (!more) below[width] = 0;
         for (int i = 0; i < width; ++i) {
             const int links = (here[i + 1] & RIGHT) | (below[i] & DOWN);

@@ -33,29 +33,29 @@ typedef float F;
 
 #if ROOM
 typedef F *Point;
-#define APART 1
+#define STRIDE 1
 #define WORK Point work
 #define MINE work
 #define SCRATCH
 #define TAKE_WORK F work[2 * ROOM];
 #else
 typedef __global F *Point;
-#define APART apart
-#define WORK Point work, const long apart
-#define MINE work, apart
+#define STRIDE stride
+#define WORK Point work, const long stride
+#define MINE work, stride
 #define SCRATCH , __global F *restrict scratch
 #if LANES == 8
-#define TAKE_WORK const long apart = 1; Point work = scratch + 2 * (long)get_global_id(0) * size;
+#define TAKE_WORK const long stride = 1; Point work = scratch + 2 * (long)get_global_id(0) * size;
 #else
-#define TAKE_WORK const long apart = padded / 2; Point work = scratch + get_global_id(0);
+#define TAKE_WORK const long stride = padded / 2; Point work = scratch + get_global_id(0);
 #endif
 #endif
-#define AT(n) (work + 2 * APART * (long)(n))
+#define AT(n) (work + 2 * STRIDE * (long)(n))
 
 // ---- Fourier transforms in their place
 
-#define GET(n, at) F r##n = (at)[0], i##n = (at)[APART];
-#define PUT(n, at) (at)[0] = r##n; (at)[APART] = i##n;
+#define GET(n, at) F r##n = (at)[0], i##n = (at)[STRIDE];
+#define PUT(n, at) (at)[0] = r##n; (at)[STRIDE] = i##n;
 #define TURN(n, factor)                                     \
     {                                                       \
         const float c = (factor)[0], s = (factor)[1];       \
@@ -145,7 +145,7 @@ void step_odd(
                 off_r[n - 1] = r1 - r2; off_i[n - 1] = i1 - i2;
                 all_r += r1 + r2; all_i += i1 + i2;
             }
-            work[0] = all_r; work[APART] = all_i;
+            work[0] = all_r; work[STRIDE] = all_i;
             for (int k = 1; k <= pairs; ++k) {
                 const int other = radix - k;
                 F ar = r0, ai = i0, br = 0.0f, bi = 0.0f;
@@ -169,8 +169,8 @@ void step(WORK, const int from, const int count, __global const int *restrict pl
     MAP roots = factors + plan[2];
     work = AT(from);
 #define TAKE(steps, ...)                                                                               \
-    if (q > 1) steps(MINE, count, q, 2 * APART, 2 * APART * q, roots + some, way __VA_ARGS__);         \
-    else steps(MINE, 1, count, 2 * APART * radix, 2 * APART, roots + some, LEVEL __VA_ARGS__);
+    if (q > 1) steps(MINE, count, q, 2 * STRIDE, 2 * STRIDE * q, roots + some, way __VA_ARGS__);         \
+    else steps(MINE, 1, count, 2 * STRIDE * radix, 2 * STRIDE, roots + some, LEVEL __VA_ARGS__);
     if (radix == 4) { TAKE(step_4) }
     else if (radix == 2) { TAKE(step_2) }
     else if (radix == 3) { TAKE(step_3) }
@@ -306,20 +306,20 @@ __kernel void rectangle_modes(
     TAKE_WORK
     for (int side = 0; side < 2; ++side) {
         const int line = first + side * LANES;
-        Point part = work + side * APART;
+        Point part = work + side * STRIDE;
         int n = 0;
 #if LANES == 8
         F v[8];
         for (; n + 8 <= length; n += 8) {
             FETCH(v)
-            Point even = part + n * APART, odd = part + (2 * (length - 1) - n) * APART;
-            even[0] = v[0]; even[2 * APART] = v[2]; even[4 * APART] = v[4]; even[6 * APART] = v[6];
-            odd[0] = v[1]; odd[-2 * APART] = v[3]; odd[-4 * APART] = v[5]; odd[-6 * APART] = v[7];
+            Point even = part + n * STRIDE, odd = part + (2 * (length - 1) - n) * STRIDE;
+            even[0] = v[0]; even[2 * STRIDE] = v[2]; even[4 * STRIDE] = v[4]; even[6 * STRIDE] = v[6];
+            odd[0] = v[1]; odd[-2 * STRIDE] = v[3]; odd[-4 * STRIDE] = v[5]; odd[-6 * STRIDE] = v[7];
         }
         if (n < length) { FETCH(v) }
-        for (int i = 0; n + i < length; ++i) part[2 * SPOT(n + i) * APART] = v[i];
+        for (int i = 0; n + i < length; ++i) part[2 * SPOT(n + i) * STRIDE] = v[i];
 #else
-        for (; n < length; ++n) part[2 * SPOT(n) * APART] = source[PIXEL(LESSER(line, lines - 1), n)];
+        for (; n < length; ++n) part[2 * SPOT(n) * STRIDE] = source[PIXEL(LESSER(line, lines - 1), n)];
 #endif
     }
     FIND_MODES
@@ -387,18 +387,18 @@ __kernel void rectangle_heights(
 #if LANES == 8
     for (int side = 0; side < 2 && along; ++side) {
         const int line = first + side * LANES;
-        Point part = work + (1 - side) * APART;
+        Point part = work + (1 - side) * STRIDE;
         for (int n = 0; n < length; n += 16) {
             F v[8], w[8];
             if (n + 16 <= length) {
-                Point even = part + n * APART, odd = part + (2 * (length - 1) - n) * APART;
-                v[0] = even[0]; v[2] = even[2 * APART]; v[4] = even[4 * APART]; v[6] = even[6 * APART];
-                v[1] = odd[0]; v[3] = odd[-2 * APART]; v[5] = odd[-4 * APART]; v[7] = odd[-6 * APART];
-                w[0] = even[8 * APART]; w[2] = even[10 * APART]; w[4] = even[12 * APART]; w[6] = even[14 * APART];
-                w[1] = odd[-8 * APART]; w[3] = odd[-10 * APART]; w[5] = odd[-12 * APART]; w[7] = odd[-14 * APART];
+                Point even = part + n * STRIDE, odd = part + (2 * (length - 1) - n) * STRIDE;
+                v[0] = even[0]; v[2] = even[2 * STRIDE]; v[4] = even[4 * STRIDE]; v[6] = even[6 * STRIDE];
+                v[1] = odd[0]; v[3] = odd[-2 * STRIDE]; v[5] = odd[-4 * STRIDE]; v[7] = odd[-6 * STRIDE];
+                w[0] = even[8 * STRIDE]; w[2] = even[10 * STRIDE]; w[4] = even[12 * STRIDE]; w[6] = even[14 * STRIDE];
+                w[1] = odd[-8 * STRIDE]; w[3] = odd[-10 * STRIDE]; w[5] = odd[-12 * STRIDE]; w[7] = odd[-14 * STRIDE];
             } else {
-                EACH(i) v[i] = part[2 * SPOT(LESSER(n + i, length - 1)) * APART];
-                EACH(i) w[i] = part[2 * SPOT(LESSER(n + 8 + i, length - 1)) * APART];
+                EACH(i) v[i] = part[2 * SPOT(LESSER(n + i, length - 1)) * STRIDE];
+                EACH(i) w[i] = part[2 * SPOT(LESSER(n + 8 + i, length - 1)) * STRIDE];
             }
             TRANSPOSE(v)
             TRANSPOSE(w)
@@ -414,7 +414,7 @@ __kernel void rectangle_heights(
     for (int n = 0; n < length; ++n)
         for (int side = 0; side < 2; ++side) {
             const int line = first + side * LANES;
-            const F value = AT(SPOT(n))[(1 - side) * APART];
+            const F value = AT(SPOT(n))[(1 - side) * STRIDE];
 #if LANES == 8
             STORE_SOME(height + (long)n * lines + line, lines - line, value)
 #else

@@ -1,4 +1,4 @@
-"""A press while it goes on: the height map grows as contact spreads."""
+"""A press in progress: the height map grows as contact spreads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rotation while it goes on: normals of the last turn, edges, and heights that follow."""
+"""A rotation in progress: normals of the last turn, edges, and heights that follow."""
 
 from __future__ import annotations
 

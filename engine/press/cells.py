@@ -15,7 +15,7 @@ Mask = NDArray[np.bool_]
 
 _CELLS = 32  # along a side of what turned light, were it square
 _AROUND = 2  # cells beyond it
-_MARGIN = 6  # cells beyond the picture's border, where the object goes on there
+_MARGIN = 6  # cells beyond the picture's border, where the object reaches it
 _SHARE = 0.5  # of a cell's pixels that must have turned light
 _SMALL = 4  # cells of a gap that is no feature
 

@@ -1,4 +1,4 @@
-"""Heights of a press corrected for the elastomer: it touches later than eq. 3 has it, and is light before."""
+"""Heights of a press corrected for the elastomer: contact comes later than in eq. 3, light before contact."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def correct_onset(
     heights = np.where(state == _LIT, heights, np.nan)
     scene = _scene_of(heights, state, check_pixel_size(pixel_size), gel, deepest)
     smooth = _interpolate(scene, scene.height)
-    factors, fit, form = _fit_surface(scene, _first_guess(scene))
+    factors, fit, form = _fit_surface(scene, _initial_surface(scene))
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if everywhere - here > _BEYOND * everywhere:
         raise NotConverged("much of what touches lies beyond the picture")
@@ -260,8 +260,8 @@ def _interpolate(scene: _Scene, heights: Doubles) -> Doubles:
     return _solve(form, basis.T @ heights.ravel()[known] / _KNOWN**2)
 
 
-def _first_guess(scene: _Scene) -> Doubles:
-    """Return the factors of a surface to begin with: flat tops, and depths nearer to those of the touch."""
+def _initial_surface(scene: _Scene) -> Doubles:
+    """Return the factors of the initial surface: flat tops, and depths nearer to those of the contact."""
     lit = np.isfinite(scene.height)
     row, column = ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
     top = float(scene.height[lit].max())

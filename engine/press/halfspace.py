@@ -126,7 +126,7 @@ def press(
     Raises
     ------
     mirrorskin.engine.NotConverged
-        The contact goes on changing.
+        The contact does not converge.
     """
     surface = np.where(np.isfinite(surface), surface, -np.inf)
     reach = surface > 0
@@ -158,7 +158,7 @@ class _System:
                 load = float(strain.sum()) * self._space.pixel_area
                 return Pressed(strain, self._space.displacement(strain), contact, load)
             contact = changed
-        raise NotConverged(f"the contact did not come to rest in {_ROUNDS} rounds")
+        raise NotConverged(f"the contact did not converge in {_ROUNDS} rounds")
 
     def _solve(self, contact: Mask, strain: Doubles) -> tuple[Doubles, Doubles]:
         """Return the pressure that brings all that is in contact to the surface, and the gap everywhere."""
@@ -373,7 +373,7 @@ def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfS
     window = []
     for axis, size in zip((1, 0), space.shape, strict=True):
         places = np.flatnonzero(contact.any(axis=axis))
-        # Of few different sizes, so that what belongs to a size is worked out seldom.
+        # Of few different sizes, so that the spectra of a size are seldom computed.
         length = min(size, -(-(places[-1] + 1 - places[0]) // _SIZES) * _SIZES)
         start = min(int(places[0]), size - length)
         window.append(slice(start, start + int(length)))

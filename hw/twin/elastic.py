@@ -180,7 +180,7 @@ class Contact:
 
     @property
     def displacement(self) -> Floats:
-        """Of the surface, mm up from the body's rest plane, (H, W), float64; worked out at each call."""
+        """Of the surface, mm up from the body's rest plane, (H, W), float64; computed at each call."""
         return self.space.surface(self.pressure)
 
 

@@ -17,7 +17,7 @@ STEEP = 1e6  # a slope that no mirror shows, for the very edge of an object, whe
 
 _NOWHERE = 1e3  # "far below", in mm, for where there is no object
 _PRECISION = 1e-9  # of a height, mm
-_RAYS = 32768  # followed at a time: what is worked out of them stays in the processor's cache
+_RAYS = 32768  # followed at a time: what is computed from them stays in the processor's cache
 _SECANTS = 5  # that take a smooth surface from a millimetre to the precision
 _JUMP = 1e-6  # more than G can be, by the precision, on any slope up to STEEP / 1000
 

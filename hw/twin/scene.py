@@ -79,7 +79,7 @@ class CachedScene:
         if place not in self._kept:
             light = self._optics.light(self._lie(place))
             if len(self._kept) >= max(1, self._room):
-                self._kept.pop(next(iter(self._kept)))  # the one that was worked out first
+                self._kept.pop(next(iter(self._kept)))  # the oldest
             self._kept[place] = light
         return self._kept[place]
 
@@ -191,7 +191,8 @@ def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[
 def _passed(path: Floats, offsets: Floats) -> Floats:
     """Return where the body is so many frames before or after each frame, (T, offsets, ...).
 
-    Its velocity is constant between two frames; before the first and after the last it goes on as it went.
+    Its velocity is constant between two frames, and that of the nearest interval before the first and after
+    the last.
     """
     steps = np.diff(path, axis=0) if len(path) > 1 else np.zeros_like(path)
     before, after = np.concatenate([steps[:1], steps]), np.concatenate([steps, steps[-1:]])

@@ -159,14 +159,14 @@ class Twin(Closing):
     def truth(self) -> Truth:
         """The object as it is under the upright body, and what the movement does to the sheet.
 
-        Worked out at the first access; after the last frame most of it is known.
+        Computed at the first access; after the last frame most of it is known.
         """
         film = self._scene if self.motion != "vertical" and isinstance(self._scene, CachedScene) else None
         touched = None if film is None else film.touched_throughout()
         return make_truth(self._thing, self.movement, self._skin, self._view, self._body, touched)
 
     def sheet(self, frame: int) -> Sheet:
-        """Return how the sheet lies at the middle of a frame's exposure, worked out anew."""
+        """Return how the sheet lies at the middle of a frame's exposure, computed anew."""
         place = self.movement.reduced(self.movement.path[frame])
         return self._skin.drape(self.movement.pose(place))
 
@@ -223,7 +223,7 @@ class Twin(Closing):
         Parameters
         ----------
         pose_at : callable
-            Tells the pose so many seconds after the exposure's middle.
+            Returns the pose so many seconds after the exposure's middle.
         number : int
             Of the frame, which decides the noise.
         out : ndarray, (H, W), the source's dtype
