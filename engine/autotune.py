@@ -23,16 +23,8 @@ _log = logging.getLogger("mirrorskin.engine")
 def choose_layout(device: Device, prepare: Callable[[Device], Run]) -> None:
     """Give a device the layout in which it does a trial fastest, unless that has been measured before.
 
-    Parameters
-    ----------
-    device : Device
-    prepare : callable
-        Prepares the trial for a device in its present layout; what it returns does the work and waits.
-
-    Raises
-    ------
-    mirrorskin.kernels.errors.DeviceError
-        The trial runs in no layout.
+    ``prepare`` makes the trial for a device in its present layout; what it returns does the work and waits.
+    DeviceError if it runs in no layout.
     """
     with _lock:
         if device.tuned:

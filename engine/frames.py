@@ -37,12 +37,7 @@ def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, i
 class Noise:
     """The standard deviation of a sample: given, or estimated from the first two frames that are seen.
 
-    Parameters
-    ----------
-    given : float, optional
-        Counts.
-    integer : bool
-        Whether counts are integers.
+    ``given`` is in counts; ``integer`` says whether counts are.
     """
 
     def __init__(self, given: float | None, integer: bool) -> None:
@@ -99,24 +94,9 @@ def reference_maps(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Check the references and fill in what is missing from the range of the frames' type.
 
-    Parameters
-    ----------
-    dark, bright : array_like, scalar or (H, W), or None
-        Counts without and with full light.
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        Type of a sample.
-
-    Returns
-    -------
-    dark, bright : ndarray, scalar or (H, W), float32
-
-    Raises
-    ------
-    InputError
-        A shape that does not fit, float frames without references, or a bright that is not above dark
-        at half or more of the pixels where both are known, or none known at all.
+    Dark and bright are counts without and with full light, scalar or (H, W); shape is a frame's. InputError
+    if a shape does not fit, float frames have no references, or bright is not above dark at half or more of
+    the pixels where both are known, or none is known.
     """
     if dtype.kind == "f" and (dark is None or bright is None):
         raise InputError("float frames have no natural range: give dark and bright, as counts or as maps")

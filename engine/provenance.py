@@ -37,18 +37,7 @@ def signature() -> dict[str, str]:
 def attach_provenance(
     result: Result, source: Source, device: Device, process: dict[str, ProcessValue]
 ) -> Result:
-    """Return a result with the pixels' places, how its maps came about, and the calibration if there is one.
-
-    Parameters
-    ----------
-    result : Result
-    source : Source
-        What it was made from.
-    device : Device
-        On which.
-    process : dict
-        Method and parameters.
-    """
+    """Return a result with the pixels' places, how its maps came about, and the calibration if any."""
     own = source.source if isinstance(source, io.Calibrated) else source
     known: dict[str, ProcessValue] = {
         **signature(),

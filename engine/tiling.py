@@ -213,24 +213,9 @@ def cut_into_bands(
 ) -> list[Band]:
     """Make room for a picture: one band where the device has the memory, else as few as it takes.
 
-    Parameters
-    ----------
-    device : Device
-    shape : (int, int)
-        Rows and columns of the picture.
-    dtype : dtype
-        Type of a sample.
-    maps : mapping of str to dtype or Planes
-        The maps that are needed of each pixel.
-    length : int
-        Frames that a band should hold; fewer where they do not fit.
-    least : int
-        Frames that it must hold.
-
-    Raises
-    ------
-    DeviceError
-        Not even one row fits.
+    Shape is rows and columns of the picture, dtype a sample's, ``maps`` what is needed of each pixel. A band
+    holds ``length`` frames, fewer where they do not fit, but at least ``least``; DeviceError if not even one
+    row fits.
     """
 
     def cut(start: int, stop: int) -> list[Band]:

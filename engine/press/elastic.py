@@ -86,23 +86,8 @@ def correct_press(
 ) -> tuple[Result, str]:
     """Correct the heights of a press or a release for the elastomer, where all is known that it takes.
 
-    Parameters
-    ----------
-    result : Result
-        With height, its sigma and status, not filled yet.
-    source : Source
-        With the pixels' size.
-    deepest : float
-        Greatest travel of the frames that it was made of, mm.
-    threshold : float
-        Share of the way from dark to bright that was taken for light: as of what the gel was learned from.
-    gel : Gel or None
-
-    Returns
-    -------
-    Result
-    str
-        What was done, for the process.
+    Heights are not filled yet; ``deepest`` is the greatest travel of their frames, mm, and ``threshold``
+    what was taken for light, as a share from dark to bright. The text says what was done, for the process.
     """
     assert result.height is not None
     assert result.height_sigma is not None

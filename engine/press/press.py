@@ -125,24 +125,7 @@ def finish_press(
 ) -> tuple[Result, dict[str, ProcessValue]]:
     """Correct onsets for the elastomer, if a calibration describes it, and fill holes.
 
-    Parameters
-    ----------
-    onset : Onset
-    source : Source
-        With the pixels' size, and the calibration.
-    travel : ndarray, (T,)
-        Of the frames that it was made of, mm.
-    event : {"onset", "release"}
-    threshold : float
-        Share of the way from dark to bright that is light.
-    fill : bool
-        Whether holes are to be filled.
-
-    Returns
-    -------
-    Result
-    dict
-        What was done, for the process.
+    Travel, (T,), mm, is that of the frames that the onsets were made of. What was done is for the process.
     """
     result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
     done: dict[str, ProcessValue] = {"fill": "none: not asked"}
