@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from stacks import SHAPE, TRAVEL, MadeUp, assert_same, random_stack, read_all, record
+from stacks import SHAPE, TRAVEL, MadeUp, assert_same, put, random_stack, read_all, record
 
 from mirrorskin import hw, io
 from mirrorskin.io.types import MOTIONS
@@ -42,17 +42,6 @@ def make(path, motion, truth=None, **changes):
     return record(
         MadeUp(random_stack(), HEADERS[motion], **known), path / f"{motion}.h5", truth=truth, block=3
     )
-
-
-def put(path, name, value, units=None):
-    """Replace a dataset of a file, or take it away."""
-    with h5py.File(path, "r+") as file:
-        if name in file:
-            del file[name]
-        if value is not None:
-            file[name] = value
-            if units is not None:
-                file[name].attrs["units"] = units
 
 
 def some_truth(slip=None):

@@ -6,7 +6,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from stacks import SHAPE, TRAVEL, MadeUp, random_stack, read_all, record, sphere
+from stacks import SHAPE, TRAVEL, MadeUp, put, random_stack, read_all, record, sphere
 
 from mirrorskin import io
 
@@ -28,17 +28,6 @@ def turn(tmp_path):
         "axial", press=0.7, tilt=0.04, pivot=(0.0, 0.0, 40.0), zenith_gain=np.full((5, 7), 50.0)
     )
     return record(MadeUp(random_stack(), header, phase=PHASE), tmp_path / "turn.h5")
-
-
-def put(path, name, value, units=None):
-    """Replace a dataset of a file."""
-    with h5py.File(path, "r+") as file:
-        if name in file:
-            del file[name]
-        if value is not None:
-            file[name] = value
-            if units is not None:
-                file[name].attrs["units"] = units
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,17 @@ def read_all(source, block):
     return Read(*(None if parts[0] is None else np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
+def put(path, name, value, units=None):
+    """Replace a dataset of a file, or take it away."""
+    with h5py.File(path, "r+") as file:
+        if name in file:
+            del file[name]
+        if value is not None:
+            file[name] = value
+            if units is not None:
+                file[name].attrs["units"] = units
+
+
 def assert_same(found, expected):
     """Hold two headers, truths or results equal: arrays to the last bit and type, the rest by value."""
     for name in expected.__dataclass_fields__:
