@@ -386,9 +386,8 @@ def true_normals(truth: Truth) -> NDArray[np.float64]:
     """Return the normals that a simulation knows, (H, W, 3) float64; NaN where there is no object."""
     zenith = truth.zenith.astype(np.float64)
     azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # a level one has none
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def angle_between(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:

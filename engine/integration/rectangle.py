@@ -189,11 +189,8 @@ class Rectangle:
             weights = self._along, self._across, screening
             reach, fading, ends = find_rates(self._plan.length, self._lines, *weights)
             given = self._device.given
-            self._rates: dict[str, Any] = {
-                "reach": given("reach", reach, np.int32),
-                "fading": given("fading", fading),
-            }
-            self._rates["ends"] = given("ends", ends)
+            rates = {"fading": given("fading", fading), "ends": given("ends", ends)}
+            self._rates: dict[str, Any] = {"reach": given("reach", reach, np.int32), **rates}
             self._screening = screening
         moved = source.host.nbytes + self._spectrum.host.nbytes
         spectrum: dict[str, Any] = {"spectrum": self._spectrum}
@@ -256,8 +253,8 @@ def find_rates(
     weights = 4 * along * np.sin(np.pi * mode / (2 * length)) ** 2 + screening
     bend = 2 * np.arcsinh(np.sqrt(weights / across) / 2)
     with np.errstate(divide="ignore"):
-        settled = -np.log(_CONSTANT) / (2 * bend.min(axis=1))
-    depth = np.ceil(np.clip(settled, 1, lines)).astype(int)
+        lines_to_constant = -np.log(_CONSTANT) / (2 * bend.min(axis=1))
+    depth = np.ceil(np.clip(lines_to_constant, 1, lines)).astype(int)
     fading = [
         _fading(strip, np.arange(count)[:, np.newaxis]) for strip, count in zip(bend, depth, strict=True)
     ]

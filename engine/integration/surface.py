@@ -22,11 +22,7 @@ from mirrorskin.engine.integration.graph import (
 from mirrorskin.engine.integration.height_variance import find_sigma
 from mirrorskin.engine.integration.rectangle import Rectangle
 from mirrorskin.engine.integration.robust import solve_robust
-from mirrorskin.engine.integration.validation import (
-    Flags,
-    Floats,
-    Inputs,
-)
+from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array

@@ -332,11 +332,7 @@ class VCycle:
         """Go up by one level in one pass."""
         h, rows = self._h, self._h.extra[number].prolong
         arrays = {"b": self.b, "e": self.x, "x": self._t, "smoother": self.x, "parts": self.parts}
-        extra: dict[str, Any] = {
-            "extras": rows.count,
-            "first_extra": self._prolong_rows[number],
-            **h.table,
-        }
+        extra = {"extras": rows.count, "first_extra": self._prolong_rows[number], **h.table}
         self._half_cycle("ascend", number, 25, **arrays, **extra)
         self.parts_filled = -(-h.levels[number + 1].rows // _BAND)
 
@@ -344,15 +340,18 @@ class VCycle:
         h = self._h
         fine, coarse = h.levels[number : number + 2]
         places = {**fine.place, **fine.with_coarser(coarse)}
-        common: dict[str, Any] = {
+        h.kernel(name)(
+            -(-coarse.rows // _BAND),
+            **places,
             **h.graph,
-            "inverse": h.inverse,
-            "lines": self._lines,
-            "omega": _OMEGA,
-            "then": _THEN,
-        }
-        items = -(-coarse.rows // _BAND)
-        h.kernel(name)(items, **places, band=_BAND, **common, **arguments, moved=moved * fine.nodes)
+            band=_BAND,
+            inverse=h.inverse,
+            lines=self._lines,
+            omega=_OMEGA,
+            then=_THEN,
+            **arguments,
+            moved=moved * fine.nodes,
+        )
 
     def _restrict_source(self, number: int) -> None:
         """Bring the right side of full multigrid to the next level."""

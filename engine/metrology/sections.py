@@ -84,18 +84,15 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     [0.0, 1.0, 2.0]
     """
     height = heights_of(result)
-    known = result.x is not None and result.y is not None
     if (start is None) != (end is None):
         raise InputError("a section needs both ends, or neither")
-    if start is not None and not known:
-        raise InputError(
-            "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
-        )
-    x, y = (
-        (result.x, result.y)
-        if result.x is not None and result.y is not None
-        else pixel_axes((height.shape[0], height.shape[1]), (1.0, 1.0))
-    )
+    x, y, unit = result.x, result.y, "mm"
+    if x is None or y is None:
+        if start is not None:
+            raise InputError(
+                "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
+            )
+        (x, y), unit = pixel_axes((height.shape[0], height.shape[1]), (1.0, 1.0)), "px"
     size = pixel_size_of(x, y) if height.size > 1 else (1.0, 1.0)
     if start is None or end is None:
         row = _top_row(height)
@@ -107,7 +104,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
     values = _between(result, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
-    return Section(distance, along[0], along[1], *values, "mm" if known else "px")
+    return Section(distance, along[0], along[1], *values, unit)
 
 
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:

@@ -28,9 +28,8 @@ Floats = NDArray[np.float32]
 _STEEPEST = math.radians(80.0)  # zenith beyond which a slope would grow without bounds
 _AROUND = 5  # pixels across, from which the meridian's direction is taken
 _WIDEST = 0.5  # radians: standard deviation of an azimuth up to which its mean cosine is corrected for
-_TOLERANCE = (
-    1e-4  # residual to accept of many small facets, where integrate's is not met: normals err far more
-)
+# Residual to accept of many small facets, where integrate's is not met: normals err far more.
+_TOLERANCE = 1e-4
 _NO_LIMIT = 1e9  # seconds: with a budget, integrate returns what was reached
 _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see slopes.cl
 

@@ -163,7 +163,7 @@ def only(values, *places):
     return kept
 
 
-def test_one_height_tells_where_a_surface_is():
+def test_one_height_makes_a_surface_absolute():
     true, normals = plane()
     surface = engine.fuse(heights(only(true, (4, 5))), directions(normals), 0.1)
     assert surface.height == pytest.approx(true, abs=1e-5)
@@ -351,7 +351,7 @@ def test_a_result_of_both_says_how_it_came_about():
     assert {"program", "version", "date", "device", "driver"} <= set(told)
 
 
-def test_recordings_are_told_by_their_hashes(tmp_path):
+def test_recordings_are_named_by_their_hashes(tmp_path):
     paths = [
         record(source, tmp_path / name)
         for name, source in (("down.h5", press(SMALL, PIXEL)), ("round.h5", rotation(SMALL, PIXEL)))
@@ -389,7 +389,7 @@ def test_frames_may_stay_as_they_were_seen():
     assert not np.array_equal(result.normals, fused().normals, equal_nan=True)
 
 
-def test_progress_is_told_to_the_last_frame():
+def test_progress_goes_to_the_last_frame():
     for register, most in ((True, 30 + 3 * 8), (False, 30 + 8)):
         done = []
         down, turn = press(SMALL, PIXEL), rotation(SMALL, PIXEL)

@@ -206,7 +206,7 @@ def in_components():
 def test_relative_heights_are_compared_without_their_mean_difference():
     result, truth = in_components()
     score = engine.score(result, truth)
-    # Errors of 0.1 twice in the absolute piece, and of -0.1 and 0.1 about the mean of 4.1 in the other.
+    # Errors of 0.1 twice in the absolute component, and of -0.1 and 0.1 about the mean of 4.1 in the other.
     assert score.height.answered == 4
     assert score.height.relative == 1
     assert score.height.rms == pytest.approx(0.1, rel=1e-5)
@@ -215,7 +215,7 @@ def test_relative_heights_are_compared_without_their_mean_difference():
     assert score.table()["height offset"] == ("mean difference taken off; pieces without a known height: 1")
 
 
-def test_filled_heights_are_scored_apart():
+def test_filled_heights_are_scored_separately():
     result, truth = in_components()
     score = engine.score(result, truth)
     assert list(score.parts()) == ["height", "filled"]
@@ -227,7 +227,7 @@ def test_filled_heights_are_scored_apart():
     assert engine.score(dataclasses.replace(result, filled=result.filled * 0), truth).filled is None
 
 
-def test_each_piece_of_each_turn_has_its_own_difference():
+def test_each_component_of_each_turn_has_its_own_difference():
     truth = truth_of(np.array([[0, 1, 2]], np.float32))
     height = np.array([[[5, 6, NAN]], [[-3, -2, -1.3]]], np.float32)
     component = np.array([[[0, 0, -1]], [[1, 1, 2]]], np.int32)

@@ -94,22 +94,22 @@ def test_nothing_steps_on_a_smooth_surface(k, noise):
 
 
 def uneven(size=36, radius=14.0):
-    """Return a ball on a plane with slopes unequally sure and some known heights."""
+    """Return a ball on a plane with slopes of unequal weight and some known heights."""
     truth, slopes, on = ball(size, radius)
     rng = np.random.default_rng(5)
-    sure = rng.uniform(0.3, 3.0, (2, size, size)) * 1000
+    weights = rng.uniform(0.3, 3.0, (2, size, size)) * 1000
     known = np.where(rng.random(truth.shape) < 0.1, truth + rng.normal(0, 0.2, truth.shape), np.nan)
-    return truth, noisy(slopes, 0.02), on, sure, known, rng.uniform(10, 40, truth.shape)
+    return truth, noisy(slopes, 0.02), on, weights, known, rng.uniform(10, 40, truth.shape)
 
 
 def test_known_heights_lift_a_ball_off_its_plane():
-    truth, slopes, _, sure, known, sure_z = uneven()
+    truth, slopes, _, weights, known, height_weights = uneven()
     surface = engine.integrate(
         *slopes,
         1.0,
-        slope_weights=sure,
+        slope_weights=weights,
         known_heights=known,
-        known_height_weights=sure_z,
+        known_height_weights=height_weights,
         robust=True,
         sigma=False,
     )
@@ -122,7 +122,7 @@ def test_known_heights_lift_a_ball_off_its_plane():
     assert not surface.edges[~rim].any()
 
 
-def test_what_is_cut_all_round_is_a_piece_of_its_own(device):
+def test_what_is_cut_all_round_is_a_component_of_its_own(device):
     truth, slopes, on = ball()
     surface = engine.integrate(
         *noisy(slopes, 0.01), 1.0, robust=True, initial_heights=truth, sigma=False, device=device

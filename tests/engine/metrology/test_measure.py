@@ -55,7 +55,7 @@ def test_a_paraboloid_has_the_volume_of_its_closed_form():
     assert "sphere radius" not in found
 
 
-def test_the_surface_in_contact_is_told_by_normals(ball):
+def test_the_surface_in_contact_is_that_of_the_normals(ball):
     x, y = places(SHAPE, SIZE)
     up = np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.1)) / RADIUS
     normals = np.stack([x / RADIUS, y / RADIUS, up], axis=-1).astype(np.float32)
@@ -68,7 +68,7 @@ def test_the_surface_in_contact_is_told_by_normals(ball):
     assert "contact surface area" not in engine.measure(ball).quantities
 
 
-def test_contact_that_is_told_is_taken_for_the_contact(ball):
+def test_a_map_of_contact_gives_the_contact_area(ball):
     x, y = places(SHAPE, SIZE)
     contact = (x**2 + y**2 < 4).astype(np.uint8)
     told = engine.measure(dataclasses.replace(ball, contact=contact)).quantities
@@ -78,7 +78,7 @@ def test_contact_that_is_told_is_taken_for_the_contact(ball):
     assert told["measured area"].value == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
 
 
-def test_uncertainties_of_volumes_are_those_of_errors_that_all_go_together(ball):
+def test_uncertainties_of_volumes_are_those_of_correlated_errors(ball):
     sure, unsure = (engine.measure(result_of(ball.height, SIZE, sigma=s)).quantities for s in (1e-6, 0.01))
     name = "volume below rest plane"
     edge = 2 * np.pi * WIDTH * 0.015 / np.sqrt(3) * SAG
@@ -111,7 +111,7 @@ def test_the_lowest_of_many_noisy_pixels_is_known_to_be_too_low():
     assert abs(told.value) < 2 * told.sigma
 
 
-def test_what_was_filled_is_told_apart(ball):
+def test_filled_heights_are_measured_separately(ball):
     filled = np.asarray(ball.height > -0.1).astype(np.uint8)
     sigma = np.where(filled, np.float32(NAN), ball.height_sigma)
     part = engine.measure(dataclasses.replace(ball, filled=filled, height_sigma=sigma))
@@ -237,7 +237,7 @@ def test_a_form_that_does_not_fit_is_told():
         assert notes_of_fit(unlike, form, sigma=None) == []  # which nobody knows
 
 
-def test_what_hardly_knows_its_height_is_not_the_lowest_and_not_rough():
+def test_uncertain_pixels_count_neither_as_lowest_nor_as_rough():
     rng = np.random.default_rng(7)
     height = rng.normal(0, 0.001, (40, 50))
     sigma = np.full((40, 50), 0.001, np.float32)

@@ -71,7 +71,7 @@ def test_next_to_a_hole_nothing_is_told():
     )
 
 
-def test_nothing_is_told_between_two_pieces():
+def test_a_section_has_no_height_between_two_components():
     height = np.zeros(SHAPE)
     height[:, 20:] = 5.0
     component = (height > 0).astype(np.int32)

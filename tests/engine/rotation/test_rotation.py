@@ -218,7 +218,7 @@ def test_the_heights_are_those_that_fit_the_normals():
     assert none.process["height"] == "none: the recording has no pixel size"
 
 
-def test_contacts_apart_have_heights_apart():
+def test_separate_contacts_have_separate_heights():
     made = frames().copy()
     made[:, :, 10:13] = 150  # level, which no normal that turns is: no contact
     result = engine.reconstruct(source(OF_A_SURFACE, frames=made))
@@ -233,7 +233,7 @@ def test_contacts_apart_have_heights_apart():
 @pytest.mark.parametrize(
     ("robust", "residual", "accepted"), [(True, 5e-5, True), (False, 5e-4, False), (False, np.nan, False)]
 )
-def test_heights_that_are_not_near_enough_are_no_answer(monkeypatch, robust, residual, accepted):
+def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual, accepted):
     broken = np.zeros(SHAPE, np.uint8)
     broken[3, 4] = 1
 
