@@ -38,12 +38,7 @@ class HalfSpace:
     wavenumbers above the grid's own (Vico, Greengard and Ferrando, J. Comput. Phys. 323, 2016, 191-203).
     Nothing outside the grid presses.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    pixel_size : (float, float)
-        Millimetres along x and y.
+    Shape is rows and columns, the pixel size mm along x and y.
     """
 
     def __init__(self, shape: tuple[int, int], pixel_size: tuple[float, float]) -> None:
@@ -109,24 +104,9 @@ def press(
     is found by an active set: on those of the set the pressure is solved for by conjugate gradients; then
     those that pull are removed, and those that overlap are added, until neither happens.
 
-    Parameters
-    ----------
-    space : HalfSpace
-    surface : ndarray, (H, W), float64
-        Millimetres above the rest plane if the stage were stiff; NaN where there is nothing.
-    compliance : float
-        Millimetres by which the stage gives way for each mm^2 of load, 1/mm.
-    start : Pressed, optional
-        A similar case, to begin with.
-
-    Returns
-    -------
-    Pressed
-
-    Raises
-    ------
-    mirrorskin.engine.NotConverged
-        The contact does not converge.
+    The surface, (H, W), is mm above the rest plane if the stage were stiff, NaN where there is nothing; the
+    stage gives way by ``compliance`` for each mm^2 of load, 1/mm. A similar case is a ``start``.
+    NotConverged if the contact does not converge.
     """
     surface = np.where(np.isfinite(surface), surface, -np.inf)
     reach = surface > 0

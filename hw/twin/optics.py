@@ -293,15 +293,8 @@ def scatter_rays(scatter: float) -> Floats:
     from -a to a, whichever way that plane lies. The rays are the points of a Fibonacci lattice: each in a
     slice of its own, each turned by the golden angle.
 
-    Parameters
-    ----------
-    scatter : float
-        Radians.
-
-    Returns
-    -------
-    ndarray, (S, 3), float64
-        Parts along the mirrored ray, along u and along v; the mirrored ray alone where nothing scatters.
+    Scatter is in radians. Rays are (S, 3): parts along the mirrored ray, along u and along v; the mirrored
+    ray alone where nothing scatters.
     """
     if scatter == 0:
         return np.array([[1.0, 0.0, 0.0]])
