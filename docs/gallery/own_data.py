@@ -1,8 +1,8 @@
 """Your own frames.
 
-A stack of pictures lies in somebody's HDF5 file, under a name of their own. All that is needed besides is
-how far the body went from frame to frame, and how large a pixel is. Here a file of that kind is written
-first: a press on a cone, with a camera of 16 bits whose dark is 300 and whose full light is 9000 counts.
+The frames are a dataset of any name in an HDF5 file. Besides them, only the travel from frame to frame and
+the pixel size are required. This script first writes such a file: a press on a cone, with a 16-bit camera
+whose dark level is 300 and whose bright level is 9000 counts.
 """
 
 import h5py

@@ -1,9 +1,8 @@
 """A ball from a press.
 
-The twin, a simulated sensor, is lowered on a ball of 10 mm in steps of 0.1 mm: the paper's Fig. 5. The
-height of a pixel is minus the travel at which it turned light. The top is level, so it never did: that hole
-is filled smoothly and told apart (`filled`), as nobody measured it. How well it went is told by the truth,
-which only a simulation knows.
+The twin, a simulated sensor, is lowered onto a 10 mm ball in steps of 0.1 mm: the paper's Fig. 5. The
+height of a pixel is minus the travel at which it turned bright. The level top never did: this hole is filled
+smoothly and marked in `filled`. The errors are known from the ground truth of the simulation.
 """
 
 import numpy as np
