@@ -1,8 +1,8 @@
 """A press and a rotation make one surface.
 
-The press tells how high slopes lie, in steps, and nothing of what is level. The rotation tells which way
-each pixel faces, but not how high it lies. Fused, they are one surface in millimetres: the crater of the
-press closes, and the ball's radius comes out.
+The press measures the absolute height of slopes, quantized by the step, but no level areas. The rotation
+measures the normal of each pixel, but no absolute height. Fused, they give one surface in millimetres: the
+crater of the press is closed, and the ball's radius is correct.
 """
 
 import numpy as np
