@@ -106,15 +106,15 @@ def _steps(radices: list[int]) -> tuple[Whole, Doubles]:
     size = int(np.prod(radices, dtype=np.int64))
     steps, factors, begin = [], [np.empty(0)], 0
     for radix in radices:
-        apart = size // radix
-        point, mode = np.ogrid[:apart, 1:radix]
+        distance = size // radix
+        point, mode = np.ogrid[:distance, 1:radix]
         roots = np.exp(-2j * np.pi * np.arange(radix if radix > 5 else 0) / radix)
         turns = np.exp(-2j * np.pi * point * mode / size)
         parts = _parts(np.concatenate([roots, turns.ravel()])).ravel()
-        steps.append((radix, apart, begin))
+        steps.append((radix, distance, begin))
         factors.append(parts)
         begin += parts.size
-        size = apart
+        size = distance
     return np.asarray(steps, np.int32).reshape(-1, 3), np.concatenate(factors)
 
 

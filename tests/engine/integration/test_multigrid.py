@@ -85,7 +85,7 @@ def test_without_a_tolerance_two_cycles_are_done(device):
     assert error_of(graph, heights_of(found)) < 2e-3
 
 
-def test_a_limit_that_is_too_low_is_told(device):
+def test_a_limit_that_is_too_low_is_reported(device):
     found = Multigrid(links_of(device, graphs.pixel_graph("holes", (45, 70)))).solve(tolerance=1e-6, limit=2)
     assert found.iterations == 2
     assert not found.converged
@@ -111,7 +111,7 @@ def test_a_solver_takes_one_graph_after_the_other(device):
         assert error_of(graph, heights_of(solver.solve(tolerance=1e-6))) < 1e-5
 
 
-def test_what_float32_cannot_reach_is_told_and_the_next_graph_is_solved(device):
+def test_what_float32_cannot_reach_is_reported_and_the_next_graph_is_solved(device):
     length = 3000  # a corridor so long that rounding bends it more than the tolerance
     corridor = graphs.pixel_graph("rectangle", (1, length))
     corridor.source[...] = np.random.default_rng(0).normal(size=(1, length))
@@ -127,8 +127,7 @@ def test_what_float32_cannot_reach_is_told_and_the_next_graph_is_solved(device):
     assert error_of(again, heights_of(solver.solve(tolerance=1e-4))) < 1e-3
 
 
-@pytest.mark.parametrize("anchored", [False, True], ids=["free", "anchored"])
-@pytest.mark.parametrize("kind", ["disc", "cuts", "holes"])
+@pytest.mark.parametrize(("kind", "anchored"), [("disc", True), ("cuts", False), ("holes", True)])
 def test_half_cycles_in_one_pass_do_what_single_passes_do(kind, anchored):
     graph = graphs.pixel_graph(kind, (150, 270), anchored)
     answers = []
