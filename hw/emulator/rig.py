@@ -51,6 +51,8 @@ class EmulatedRig:
 
     The body begins at rest, upright, 4 mm above the object.
 
+    The ``machine``, and inside ``with`` its ``port`` and the ``camera``, can be commanded to fail.
+
     Parameters
     ----------
     object : Object, str or Path
@@ -69,8 +71,6 @@ class EmulatedRig:
         Whether the machine has switches, and must find them before it moves.
     **scene
         Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
-
-    The ``machine``, and inside ``with`` its ``port`` and the ``camera``, can be commanded to fail.
 
     Examples
     --------
