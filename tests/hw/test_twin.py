@@ -126,6 +126,7 @@ def test_the_same_seed_gives_the_same_frames_however_they_are_cut(dtype: str, si
         ({"shape": (0, 10)}, "shape"),
         ({"shape": (10,)}, "shape"),
         ({"noise": -1.0}, "noise"),
+        ({"noise": np.nan}, "noise"),
         ({"seed": -1}, "seed"),
         ({"dtype": "int16"}, "int16.*uint8, uint16, float32"),
         ({"dtype": "counts"}, "counts"),

@@ -513,3 +513,9 @@ def test_frames_that_do_not_follow_are_refused():
     for shape, dtype in (((2, 9, 5), "u1"), ((2, 1, 1), "u1"), ((2, 3, 3), "u2"), ((0, 3, 3), "u1")):
         with pytest.raises(InputError, match="expected uint8"):
             search.push(np.zeros(shape, dtype), travel=2 + np.arange(float(shape[0])))
+
+
+@pytest.mark.parametrize("threshold", [np.nan, -0.1, 1.1])
+def test_a_threshold_is_a_share(threshold):
+    with pytest.raises(InputError, match="a share from 0"):
+        find_onset(np.zeros((3, 2, 2), np.uint8), np.arange(3.0), threshold=threshold)
