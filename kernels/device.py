@@ -289,6 +289,7 @@ class Kernel:
         self._kernel = kernel
         self._signature = signature
         self.arguments = tuple(name for name, _ in signature)
+        self._names = frozenset(self.arguments)
         self._group = group
 
     def __call__(
@@ -337,11 +338,12 @@ class Kernel:
 
     def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
         """Return arguments in the source's order, numbers in its types."""
-        names = self.arguments
-        if arguments.keys() != set(names):
-            missing = [name for name in names if name not in arguments]
-            unknown = [name for name in arguments if name not in names]
-            raise TypeError(f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {[*names]}")
+        if arguments.keys() != self._names:
+            missing = [name for name in self.arguments if name not in arguments]
+            unknown = [name for name in arguments if name not in self._names]
+            raise TypeError(
+                f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {[*self.arguments]}"
+            )
         values = []
         for name, convert in self._signature:
             value = arguments[name]
