@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.result import UNITS
+from mirrorskin.io.result import UNITS, map_shape
 from mirrorskin.io.types import Result
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def as_xarray(result: Result) -> xarray.Dataset:
     import xarray
 
     maps = result.maps()
-    lead = ("turn",) if _of_turns(result) else ()
+    lead = ("turn",) if len(map_shape(result)) == 3 else ()
     dimensions = {
         name: (*lead, "y", "x", "vector") if name == "normals" else (*lead, "y", "x") for name in maps
     }
@@ -77,10 +77,6 @@ def _rows(result: Result) -> list[tuple[str, str, str]]:
 def _origin(result: Result) -> str:
     source = result.process.get("source")
     return f" of {source}" if source else ""
-
-
-def _of_turns(result: Result) -> bool:
-    return any(values.ndim == (4 if name == "normals" else 3) for name, values in result.maps().items())
 
 
 def _picture(name: str, values: NDArray[Any]) -> str:

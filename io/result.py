@@ -184,6 +184,12 @@ def _size_of(found: Mapping[str, Node]) -> Shape | None:
     return None
 
 
+def map_shape(result: Result) -> tuple[int, ...]:
+    """Return the size of a result's maps: (H, W), or (turns, H, W)."""
+    sizes = (values.shape[: values.ndim - (name == "normals")] for name, values in result.maps().items())
+    return next(sizes, (0, 0))
+
+
 def select_turn(result: Result, turn: int | None) -> Result:
     """Return the maps of one turn, or those of a result that has no turns.
 
@@ -209,8 +215,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
     >>> select_turn(turns, 1).zenith.shape
     (4, 5)
     """
-    maps = result.maps()
-    size = next((values.shape[: values.ndim - (name == "normals")] for name, values in maps.items()), (0, 0))
+    maps, size = result.maps(), map_shape(result)
     if len(size) == 2:
         if turn is not None:
             raise InputError("the maps of this result are not of single turns: leave --turn out")
