@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeGuard, cast
+from typing import Any, TypeGuard, cast
 
 import h5py
 import numpy as np
@@ -202,7 +202,7 @@ class Layout:
 
     def _reference(self, name: str) -> NDArray[np.float32] | None:
         remedy = f"give --{name}, or take the reference again"
-        values = self._read(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
+        values = self._numbers(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
         return None if values is None else np.ascontiguousarray(values[self._part.region.slices], np.float32)
 
     def _map(self, name: str, unit: str | None = None) -> Floats | None:
@@ -231,15 +231,14 @@ class Layout:
             raise InputError(f"{self._file.path}: {name} is {values}, which is not finite: {remedy}")
         return values
 
-    def _read(
-        self, name: str, *shapes: Shape, unit: str | None = None, remedy: str = "", rows: int | None = None
-    ) -> Floats | None:
-        """Read numbers as float64, if they are there."""
+    def _read(self, name: str, *shapes: Shape, **how: Any) -> Floats | None:
+        """Read numbers as float64, if they are there; see `Hdf5File.read`."""
+        values = self._numbers(name, *shapes, **how)
+        return None if values is None else values.astype(np.float64, copy=False)
+
+    def _numbers(self, name: str, *shapes: Shape, **how: Any) -> NDArray[Any] | None:
         node = self._find(name)
-        if node is None:
-            return None
-        values = self._file.read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
-        return values.astype(np.float64, copy=False)
+        return None if node is None else self._file.read(node, *shapes, **how)
 
     def _text(self, name: str) -> str:
         node = self._find(name)
