@@ -82,6 +82,17 @@ class Array:
             event = cl.enqueue_copy(self._device.queue, self.buffer, part)
             self._device.profile.wait("upload", self.name, event, part.nbytes)
 
+    def put(self, row: int, values: NDArray[Any]) -> None:
+        """Write one row where the device holds it; the others stay as they are."""
+        if self._shared:
+            self.claim()
+            self.host[row].reshape(-1)[: values.size].reshape(values.shape)[...] = values
+        else:
+            part = np.ascontiguousarray(values, self.host.dtype)
+            place = row * self.host[row].nbytes
+            event = cl.enqueue_copy(self._device.queue, self.buffer, part, dst_offset=place)
+            self._device.profile.wait("upload", self.name, event, part.nbytes)
+
     def upload_async(self, values: NDArray[Any]) -> None:
         """Begin to copy values from elsewhere on the host; kernels that take this array wait for it.
 

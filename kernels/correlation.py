@@ -6,10 +6,10 @@ SS = sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2 is least. With X the 
 Z is W X but for rounding, and E'W E.
 
 Whole counts of frames that all have weight 1 are summed as integers, with the cosines and sines of Z rounded
-to multiples of a unit, so that nothing is lost however long a stack is, nor where a frame leaves a sliding
-window again. The rounding of Z does no harm: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol,
-Econometrica 9, 1941), exact for samples that the model describes, and SS is E'W E - beta' X'W X beta then.
-Otherwise it differs from least squares by the noise times the rounding, less than a part in 100 000 of it.
+to multiples of a unit, so that nothing is lost however long a stack is, and however it is cut into blocks.
+The rounding of Z does no harm: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol, Econometrica 9,
+1941), exact for samples that the model describes, and SS is E'W E - beta' X'W X beta then. Otherwise it
+differs from least squares by the noise times the rounding, less than a part in 100 000 of it.
 
 Any other samples are summed as pairs of floats, which are as good as float64, after the first one has been
 subtracted; Z is then rounded to float32.
@@ -36,38 +36,35 @@ Floats = NDArray[np.float64]
 Answers = tuple[Floats, Floats, Floats, Floats]
 
 WINDOW = 64
-"""Frames that a sliding window can hold."""
+"""Frames that can be summed at once, and that a sliding window can hold."""
 
 
-def correlation_slide(frames: Array, first: int, window: int, basis: Array, ring: Array, total: Counts,
-                      cosine: Counts, sine: Counts, square: Counts) -> None:  # fmt: skip
-    """Move a sliding window on over some frames: add them, and take away those that they replace.
+def correlation_window(frames: Array, place: Array, basis: Array, used: int, cosines: int, sines: int,
+                       fit: Array) -> Answers:  # fmt: skip
+    """Return mean, cosine, sine and residual, counts, of at most `WINDOW` frames of weight 1.
+
+    It is ``correlation_add`` and ``correlation_solve_counts`` at once; the kernel's sums are int32 for uint8.
+    """
+    total, cosine, sine, square = sums = np.zeros((4, frames.shape[1]), np.int64)
+    correlation_add(frames, place, basis, True, *sums)
+    return correlation_solve_counts(used, cosines, sines, total, cosine, sine, square, fit)
+
+
+def correlation_add(frames: Array, place: Array, basis: Array, fresh: bool, total: Counts, cosine: Counts,
+                    sine: Counts, square: Counts) -> None:  # fmt: skip
+    """Add frames of weight 1 to sums, or begin these anew where ``fresh``.
 
     Parameters
     ----------
     frames : (n, P), uint8 or uint16
-    first : number of the first of these frames since the window was empty
-    window : frames that it holds
-    basis : (n, 6), of each new frame its weight, 0 or 1, and the weight times cosine and sine, in units; and
-        the same of the frame that it replaces
-    ring : (window, P), the samples that are in the window, each frame at its number modulo ``window``
+    place : (m,), which of them
+    basis : (m, 3), 1, and cosine and sine in whole units
     total, cosine, sine, square : (P,), sums of the samples, of their products with cosine and sine, in units,
-        and of their squares; the kernel's are int32 for uint8
+        and of their squares
     """
-    for number, frame in enumerate(frames, start=first):
-        row = basis[number - first].astype(np.int64)
-        now, gone = frame.astype(np.int64), ring[number % window].astype(np.int64)
-        total += row[0] * now - row[3] * gone
-        cosine += row[1] * now - row[4] * gone
-        sine += row[2] * now - row[5] * gone
-        square += row[0] * now**2 - row[3] * gone**2
-        ring[number % window] = frame
-
-
-def correlation_add(
-    frames: Array, place: Array, basis: Array, total: Counts, cosine: Counts, sine: Counts, square: Counts
-) -> None:
-    """Add frames of weight 1 to sums: those at ``place``, (m,); ``basis`` is 1, cosine and sine, (m, 3)."""
+    if fresh:
+        for array in (total, cosine, sine, square):
+            array[:] = 0
     for number, (_, along, across) in zip(place, basis.astype(np.int64), strict=True):
         sample = frames[number].astype(np.int64)
         total += sample
@@ -76,27 +73,27 @@ def correlation_add(
         square += sample**2
 
 
-def correlation_solve_counts(frames: int, cosines: int, sines: int, total: Counts, cosine: Counts,
+def correlation_solve_counts(used: int, cosines: int, sines: int, total: Counts, cosine: Counts,
                              sine: Counts, square: Counts, fit: Array) -> Answers:  # fmt: skip
-    """Return mean, cosine, sine and residual, counts, by integer sums over so many frames.
+    """Return mean, cosine, sine and residual, counts, by integer sums over ``used`` frames.
 
     ``cosines`` and ``sines`` are the sums of the frames' own, units; for ``fit`` see the module.
     """
-    return _solve(_centre(frames, cosines, sines, total, cosine, sine, square), fit)
+    return _solve(_centre(used, cosines, sines, total, cosine, sine, square), fit)
 
 
-def correlation_convert(frames: int, cosines: int, sines: int, unit: float, total: Counts, cosine: Counts,
+def correlation_convert(used: int, cosines: int, sines: int, unit: float, total: Counts, cosine: Counts,
                         sine: Counts,
                         square: Counts) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
     """Return the reference and the sums with which ``correlation_sum`` goes on; the kernel works in place.
 
     ``unit`` is what cosines and sines were rounded to multiples of.
     """
-    reference, *sums = _centre(frames, cosines, sines, total, cosine, sine, square)
+    reference, *sums = _centre(used, cosines, sines, total, cosine, sine, square)
     return reference, sums[0], unit * sums[1], unit * sums[2], sums[3]
 
 
-def correlation_sum(frames: Array, fresh: bool, place: Array, basis: Array, reference: Array, total: Floats,
+def correlation_sum(frames: Array, place: Array, basis: Array, fresh: bool, reference: Array, total: Floats,
                     cosine: Floats, sine: Floats, square: Floats) -> None:  # fmt: skip
     """Add some frames of any weights to the sums so far.
 
@@ -123,16 +120,10 @@ def correlation_solve_pairs(
     return _solve(np.stack([reference.astype(np.float64), total, cosine, sine, square]), fit)
 
 
-def correlation_keep(frames: Array, first: int, window: int, ring: Array) -> None:
-    """Put frames into the ring of a sliding window whose samples are summed anew each time."""
-    for number, frame in enumerate(frames, start=first):
-        ring[number % window] = frame
-
-
-def correlation_window(ring: Array, place: Array, basis: Array, fit: Array) -> Answers:
-    """Return mean, cosine, sine and residual, counts, of the frames in a ring, summed anew."""
-    reference, total, cosine, sine, square = sums = np.zeros((5, ring.shape[1]))
-    correlation_sum(ring, True, place, basis, *sums)
+def correlation_window_pairs(frames: Array, place: Array, basis: Array, fit: Array) -> Answers:
+    """Return mean, cosine, sine and residual, counts, of frames of any weights, of which nothing is kept."""
+    reference, total, cosine, sine, square = sums = np.zeros((5, frames.shape[1]))
+    correlation_sum(frames, place, basis, True, *sums)
     return correlation_solve_pairs(reference, total, cosine, sine, square, fit)
 
 

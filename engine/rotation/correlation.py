@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
-from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
@@ -118,11 +118,15 @@ def correlate(
     """
     if frames.ndim != 3 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
-    alpha = check_phase(phase, len(frames), "phase")
-    check_phases(alpha, check_weights(frame_weights, len(frames)))
+    alpha, weights = check_phase(phase, len(frames), "phase"), check_weights(frame_weights, len(frames))
+    check_phases(alpha, weights)
+    if StackSums.take(frames, weights):
+        stack = StackSums(open_device(device), frames.shape[1:], frames.dtype, len(frames))
+        stack.push(frames, alpha, weights)
+        return stack.correlation()
     limit = min(MEMORY_LIMIT, 2 * frames.nbytes)
     correlator = Correlator(frames.shape[1:], frames.dtype, device=device, memory_limit=limit)
-    correlator.push(frames, phase=alpha, frame_weights=frame_weights)
+    correlator.push(frames, phase=alpha, frame_weights=weights)
     return correlator.result()
 
 
@@ -243,21 +247,16 @@ class _Sums:
         dtype: np.dtype[Any],
         maps: Mapping[str, DTypeLike | Planes],
         length: int,
-        wide: bool,
+        least: int = 1,
     ) -> None:
         self._device, self._size, self._integer = device, dtype.itemsize, dtype.kind == "u"
         self._step = _STEPS.get(dtype.itemsize, 1)
-        self._macros: dict[str, str | int] = {
-            "FRAME": C_TYPES[dtype.name],
-            "BITS": 8 * dtype.itemsize,
-            "WIDE": int(wide and self._integer),
-        }
+        self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
         answers = dict.fromkeys(_ANSWERS.values(), np.float32)
-        self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length)
-        alone = len(self.bands) == 1
-        self.room = self.bands[0].frames.host if alone else np.empty((length, *shape), dtype)
+        self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length, least)
+        self.room = room_of(self.bands, length)
         self._place = device.array("place", (_BATCH,), np.int32)
-        self._steps = device.array("basis", (max(6 * WINDOW, 3 * _BATCH),), np.int32)
+        self._steps = device.array("basis", (3 * _BATCH,), np.int32)
         self._floats = device.array("basis", (3 * _BATCH,), np.float32)
         self._fit = device.array("fit", (28,), np.float32)
 
@@ -270,11 +269,16 @@ class _Sums:
         """Return the fit that the sums determine; see `Correlator.result`."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
-        mean, cosine, sine, residual = self._solve()
+        self._solve()
+        parts = []
+        for band in self.bands:
+            with band.resident():
+                parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
+        mean, cosine, sine, residual = (np.concatenate(part) for part in zip(*parts, strict=True))  # copies
         return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
 
-    def _solve(self) -> list[NDArray[np.float32]]:
-        """Return mean, cosine, sine and residual, (H, W) each."""
+    def _solve(self) -> None:
+        """Put mean, cosine, sine and residual into the bands' maps."""
         raise NotImplementedError
 
     def _rows_in_steps(self, phase: Doubles, weight: Doubles) -> Doubles:
@@ -295,24 +299,53 @@ class _Sums:
         items = -(-band.pixels // self._device.layout.tile)
         kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
 
-    def _answer(
-        self, name: str, moved: int, maps: Mapping[str, str], **arguments: Any
-    ) -> list[NDArray[np.float32]]:
-        """Have a kernel turn maps of each band into the answers."""
-        parts = []
-        for band in self.bands:
-            known = {"fit": self._fit, **_maps_of(band, maps), **_maps_of(band, _ANSWERS), **arguments}
-            if "ring" in maps:
-                known["stride"] = band.stride
-            with band.resident():
-                self._run(band, name, moved, **known)
-                parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
-        return [np.concatenate(part) for part in zip(*parts, strict=True)]  # copies
+    def _run_at_once(
+        self,
+        band: Band,
+        frames: Operand,
+        stride: int,
+        places: NDArray[np.intp],
+        phase: Doubles,
+        weight: Doubles,
+    ) -> None:
+        """Sum and solve frames, at most `WINDOW`, that are all on the device."""
+        used, name = np.flatnonzero(weight), "correlation_window"
+        known: dict[str, int] = {}
+        if self._integer and _are_counts(weight):
+            rows, table = self._rows_in_steps(phase, weight), self._steps
+            known |= _counted(rows)
+        else:
+            rows, table, name = _float_rows(phase, weight), self._floats, f"{name}_pairs"
+        _fill(self._fit, _fit_table(phase, rows))
+        _fill(self._place, places[used])
+        _fill(table, rows[used])
+        count = len(used)
+        self._run(
+            band, name, self._size * count + 16, frames=frames, count=count, stride=stride, place=self._place,
+            basis=table, fit=self._fit, **known, **_maps_of(band, _ANSWERS),
+        )  # fmt: skip
 
-    def _answer_counts(self, rows: Doubles, size: int) -> list[NDArray[np.float32]]:
-        """Return the answers of integer sums of ``size`` bytes."""
-        _fill(self._fit, _fit_table(self._phase, rows))
-        return self._answer("correlation_solve_counts", 4 * (size + 4), _SUMS, **_counted(rows))
+
+class StackSums(_Sums):
+    """Sums over a stack that is there all at once: it is summed and solved in one run, and no sum is kept."""
+
+    def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
+        super().__init__(device, shape, dtype, {}, length, least=length)
+
+    @staticmethod
+    def take(frames: NDArray[Any], weight: Doubles) -> bool:
+        """Whether a stack is short enough, and its weights allow it."""
+        few = np.count_nonzero(weight) <= WINDOW and frames.flags.c_contiguous and frames.flags.aligned
+        return bool(few and (check_dtype(frames.dtype).kind == "f" or _are_counts(weight)))
+
+    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+        """Sum all frames, which stay as they are until the result is there."""
+        self._phase, self._weight = phase, weight
+        for band, staged in self._stage(frames, lent=True):
+            self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
+
+    def _solve(self) -> None:
+        """Nothing is left to do."""
 
 
 class TurnSums(_Sums):
@@ -321,16 +354,13 @@ class TurnSums(_Sums):
     def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
         # Eight bytes, for a whole number or for two floats.
         maps = {"reference": np.float32, **dict.fromkeys(_SUMS.values(), np.int64)}
-        super().__init__(device, shape, dtype, maps, length, wide=True)
+        super().__init__(device, shape, dtype, maps, length)
         self.reset()
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._phase, self._weight = np.empty((2, 0))
         self._counts: int | None = None if self._integer else 0  # frames in integer sums; None for all
-        for band in self.bands:
-            for name in _SUMS.values():
-                band.write(name, 0)
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add some frames."""
@@ -345,14 +375,18 @@ class TurnSums(_Sums):
             self._convert_to_pairs()
             self._add(frames, phase, weight, lent)
 
-    def _solve(self) -> list[NDArray[np.float32]]:
+    def _solve(self) -> None:
         rows = self._rows_in_steps(self._phase, self._weight)
-        if self._counts is None:
-            return self._answer_counts(rows, size=8)
-        rows /= [1, self._step, self._step]
-        rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
+        name, moved, sums, known = "counts", 48, _SUMS, _counted(rows)
+        if self._counts is not None:
+            rows /= [1, self._step, self._step]
+            rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
+            name, moved, sums, known = "pairs", 52, _PAIRS, {}
         _fill(self._fit, _fit_table(self._phase, rows))
-        return self._answer("correlation_solve_pairs", 52, _PAIRS)
+        for band in self.bands:
+            with band.resident():
+                maps = _maps_of(band, {**sums, **_ANSWERS})
+                self._run(band, f"correlation_solve_{name}", moved, fit=self._fit, **maps, **known)
 
     def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
@@ -367,9 +401,9 @@ class TurnSums(_Sums):
                 _fill(self._place, places - staged.frames.start)
                 _fill(basis, rows[places])
                 known = _maps_of(band, _SUMS if counts else _PAIRS)
-                if not counts:
-                    known["fresh"] = fresh and not np.any(weight[: places[0]])
-                known |= {"frames": staged.array, "count": len(places), "place": self._place, "basis": basis}
+                known |= {"frames": staged.array, "count": len(places), "stride": band.pixels}
+                known |= {"place": self._place, "basis": basis}
+                known["fresh"] = fresh and not np.any(weight[: places[0]])
                 moved = self._size * len(places) + (64 if counts else 72)
                 self._run(band, f"correlation_{name}", moved, **known)
         self._phase = np.concatenate([self._phase, phase])
@@ -389,11 +423,10 @@ class TurnSums(_Sums):
 
 
 class WindowSums(_Sums):
-    """The last frames of an endless rotation, in a ring.
+    """The last frames of an endless rotation, in a ring: they are summed when the fit is asked for.
 
-    Integer sums move on with it: a frame that leaves takes with it exactly what it brought. Anything else is
-    summed anew. Map ``ring`` of each band holds its rows of the frames; the oldest frame of a full window is
-    in its plane ``oldest``, and the next frame goes there.
+    Map ``ring`` of each band holds its rows of the frames; the oldest frame of a full window is in its plane
+    ``oldest``, and the next frame goes there.
     """
 
     def __init__(
@@ -408,55 +441,36 @@ class WindowSums(_Sums):
         if not 3 <= window <= WINDOW:
             raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
         self._window = window
-        self._width = {1: 4, 2: 8}.get(dtype.itemsize, 0)  # bytes of an integer sum
-        sums = dict.fromkeys(_SUMS.values() if self._width else (), f"i{self._width}")
-        maps = {"ring": Planes(window, dtype), **sums, **(other_maps or {})}
-        super().__init__(device, shape, dtype, maps, length, wide=False)
+        super().__init__(device, shape, dtype, {"ring": Planes(window, dtype), **(other_maps or {})}, length)
         self.reset()
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._phase, self._weight = np.zeros((2, self._window))  # the oldest frame first; weight 0 for none
         self.oldest = 0
-        for band in self.bands:
-            for name in _SUMS.values() if self._integer else ():
-                band.write(name, 0)
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Move the window on; of a block that is longer than it, only the end is ever in it."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
-        phase, weight = np.concatenate([self._phase, phase]), np.concatenate([self._weight, weight])
-        rows = self._rows_in_steps(phase, weight)
-        moves = np.hstack([rows[self._window :], rows[: len(frames)]])
-        for band, staged in self._stage(frames, lent):
-            known: dict[str, Any] = {
-                "frames": staged.array,
-                "count": staged.count,
-                "stride": band.stride,
-                "first": self.oldest + staged.frames.start,
-                "window": self._window,
-                "ring": band.maps["ring"],
-            }
-            moved = 2 * self._size * staged.count
-            if not self._integer:
-                self._run(band, "correlation_keep", moved, **known)
-                continue
-            _fill(self._steps, moves[staged.frames])
-            moved += self._size * staged.count + 8 * self._width
-            self._run(band, "correlation_slide", moved, basis=self._steps, **known, **_maps_of(band, _SUMS))
+        for band in self.bands:
+            with band.resident():
+                for number, frame in enumerate(frames[:, band.rows], self.oldest):
+                    band.maps["ring"].put(number % self._window, frame)
         self.oldest = (self.oldest + len(frames)) % self._window
-        self._phase, self._weight = phase[-self._window :], weight[-self._window :]
+        self._phase = np.concatenate([self._phase, phase])[-self._window :]
+        self._weight = np.concatenate([self._weight, weight])[-self._window :]
 
-    def _solve(self) -> list[NDArray[np.float32]]:
-        phase, weight = self._phase, self._weight
-        if self._integer and np.all((weight == 0) | (weight == 1)):
-            return self._answer_counts(self._rows_in_steps(phase, weight), self._width)
-        rows, used = _float_rows(phase, weight), np.flatnonzero(weight)
-        _fill(self._fit, _fit_table(phase, rows))
-        _fill(self._place, (self.oldest + used) % self._window)
-        _fill(self._floats, rows[used])
-        known = {"count": len(used), "place": self._place, "basis": self._floats}
-        return self._answer("correlation_window", self._size * len(used) + 16, {"ring": "ring"}, **known)
+    def _solve(self) -> None:
+        places = (self.oldest + np.arange(self._window)) % self._window
+        for band in self.bands:
+            with band.resident():
+                ring = band.maps["ring"]
+                self._run_at_once(band, ring, band.stride, places, self._phase, self._weight)
+
+
+def _are_counts(weight: Doubles) -> bool:
+    """Whether frames of such weights can be summed as integers."""
+    return bool(np.all((weight == 0) | (weight == 1)))
 
 
 def _maps_of(band: Band, names: Mapping[str, str]) -> dict[str, Any]:
@@ -471,8 +485,8 @@ def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:
 
 def _counted(rows: Doubles) -> dict[str, int]:
     """Return how many frames are in integer sums, and the sums of their cosines and sines, in steps."""
-    frames, cosines, sines = np.sum(rows.astype(np.int64), axis=0)
-    return {"frames": int(frames), "cosines": int(cosines), "sines": int(sines)}
+    used, cosines, sines = np.sum(rows.astype(np.int64), axis=0)
+    return {"used": int(used), "cosines": int(cosines), "sines": int(sines)}
 
 
 def _fit_table(phase: Doubles, rows: Doubles) -> NDArray[np.float32]:

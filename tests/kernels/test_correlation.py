@@ -46,7 +46,7 @@ def fit_of(rows: NDArray[Any]) -> NDArray[np.float32]:
     return np.concatenate(table).astype(np.float32)
 
 
-def run(device: Device, name: str, pixels: int, arguments: list[Any], wide: int, dtype: str) -> list[Any]:
+def run(device: Device, name: str, pixels: int, arguments: list[Any], dtype: str) -> list[Any]:
     """Run a kernel; return its arrays as it leaves them."""
     arrays: list[Array] = []
     values: list[Any] = []
@@ -59,7 +59,7 @@ def run(device: Device, name: str, pixels: int, arguments: list[Any], wide: int,
         else:
             values.append(argument)
     bits = 8 * np.dtype(dtype).itemsize
-    kernel = device.kernel("correlation", name, FRAME=C_TYPES[dtype], BITS=bits, WIDE=wide)
+    kernel = device.kernel("correlation", name, FRAME=C_TYPES[dtype], BITS=bits)
     launch(kernel, -(-pixels // device.layout.tile), *values)
     return [array.download().copy() for array in arrays]
 
@@ -77,49 +77,45 @@ def close(found: list[Any], expected: Any, dtype: str) -> None:
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("pixels", PIXELS)
-def test_a_window_moves_on(device: Device, dtype: str, pixels: int) -> None:
-    frames, rows, window, stride = samples(dtype, pixels), steps(dtype), 4, pixels + 3
-    width = np.int32 if dtype == "uint8" else np.int64
-    basis = np.hstack([rows, np.vstack([np.zeros((window, 3), np.int32), rows[:-window]])])
-    ring, sums = np.zeros((window, stride), dtype), np.zeros((4, pixels), np.int64)
-    shape = len(frames), pixels, stride, 1, window
-    arrays = [ring, *sums.astype(width)]
-    found = run(device, "correlation_slide", pixels, [frames, *shape, basis, *arrays], 0, dtype)[2:]
-    correlation.correlation_slide(frames, 1, window, basis, ring[:, :pixels], *sums)
-    np.testing.assert_array_equal(found[0], ring)
-    np.testing.assert_array_equal(found[1:], sums)
-    last = frames[-window:].astype(object)
-    np.testing.assert_array_equal(sums[3], (last**2).sum(axis=0).astype(np.int64))
-    np.testing.assert_array_equal(
-        sums[1], (rows[-window:, 1:2].astype(object) * last).sum(axis=0).astype(int)
-    )
+@pytest.mark.parametrize(("count", "fresh"), [(1, 1), (11, 0), (150, 1), (150, 0)])
+def test_frames_are_added(device: Device, dtype: str, pixels: int, count: int, fresh: int) -> None:
+    frames, rows, stride = samples(dtype, pixels + 3), steps(dtype), pixels + 3
+    place = np.arange(count, dtype=np.int32) * 5 % len(frames)
+    sums = np.random.default_rng(1).integers(-(10**6), 10**6, (4, pixels))
+    given = [frames, count, pixels, stride, place, rows[place], fresh, *sums.copy()]
+    found = run(device, "correlation_add", pixels, given, dtype)[3:]
+    correlation.correlation_add(frames[:, :pixels], place, rows[place], bool(fresh), *sums)
+    np.testing.assert_array_equal(found, sums)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("pixels", PIXELS)
-@pytest.mark.parametrize("count", [1, 8, 11, 150])
-def test_frames_are_added(device: Device, dtype: str, pixels: int, count: int) -> None:
-    frames, rows = samples(dtype, pixels), steps(dtype)
-    place = np.arange(count, dtype=np.int32) * 5 % len(frames)
-    sums = np.random.default_rng(1).integers(-(10**6), 10**6, (4, pixels))
-    given = [frames, count, pixels, place, rows[place], *sums.copy()]
-    found = run(device, "correlation_add", pixels, given, 1, dtype)[3:]
-    correlation.correlation_add(frames, place, rows[place], *sums)
-    np.testing.assert_array_equal(found, sums)
-
-
-@pytest.mark.parametrize(("dtype", "wide"), [("uint8", 0), ("uint8", 1), ("uint16", 0), ("uint16", 1)])
-@pytest.mark.parametrize("pixels", PIXELS)
-def test_counts_tell_the_fit(device: Device, dtype: str, wide: int, pixels: int) -> None:
-    frames, rows = samples(dtype, pixels), steps(dtype)
+def test_counts_tell_the_fit(device: Device, dtype: str, pixels: int) -> None:
+    frames, rows, place = samples(dtype, pixels), steps(dtype), np.arange(len(PHASES), dtype=np.int32)
     sums = np.zeros((4, pixels), np.int64)
-    correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, *sums)
-    narrow = sums if wide or dtype == "uint16" else sums.astype(np.int32)
+    correlation.correlation_add(frames, place, rows, True, *sums)
     known = len(rows), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
     fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
-    given = [pixels, *known, *narrow, fit, *answers]
-    found = run(device, "correlation_solve_counts", pixels, given, wide, dtype)[5:]
+    found = run(device, "correlation_solve_counts", pixels, [pixels, *known, *sums, fit, *answers], dtype)[5:]
     close(found, correlation.correlation_solve_counts(*known, *sums, fit), dtype)
+    given = [frames, len(frames), pixels, pixels, place, rows, *known, fit, *answers]
+    at_once = run(device, "correlation_window", pixels, given, dtype)[4:]
+    np.testing.assert_array_equal(at_once, found)
+
+
+def test_narrow_sums_hold_a_whole_window(device: Device) -> None:
+    """The largest sums there can be: saturated samples where all cosines are 1."""
+    frames, place = (
+        np.full((correlation.WINDOW, 5), 255, np.uint8),
+        np.arange(correlation.WINDOW, dtype=np.int32),
+    )
+    rows = np.tile(np.array([1, STEPS["uint8"], -STEPS["uint8"]], np.int32), (len(frames), 1))
+    rows[::9, 1:] = 0
+    known = len(frames), *(np.int64(n) for n in rows.astype(np.int64).sum(axis=0)[1:])
+    fit, answers = np.full(28, 0.001, np.float32), np.zeros((4, 5), np.float32)
+    given = [frames, len(frames), 5, 5, place, rows, *known, fit, *answers]
+    found = run(device, "correlation_window", 5, given, "uint8")[4:]
+    close(found, correlation.correlation_window(frames, place, rows, *known, fit), "uint8")
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -128,12 +124,12 @@ def test_counts_tell_the_fit(device: Device, dtype: str, wide: int, pixels: int)
 def test_counts_become_pairs(device: Device, dtype: str, pixels: int, turns: int) -> None:
     frames, rows = samples(dtype, pixels), steps(dtype)
     sums = np.zeros((4, pixels), np.int64)
-    correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, *sums)
+    correlation.correlation_add(frames, np.arange(len(rows), dtype=np.int32), rows, True, *sums)
     sums *= turns
     known = len(rows) * turns, *(np.int64(n) * turns for n in rows.astype(np.int64).sum(axis=0)[1:])
     unit = np.float32(1 / STEPS[dtype])
     given = [pixels, *known, unit, np.zeros(pixels, np.float32), *sums]
-    reference, *found = run(device, "correlation_convert", pixels, given, 1, dtype)
+    reference, *found = run(device, "correlation_convert", pixels, given, dtype)
     expected = correlation.correlation_convert(*known, unit, *sums)
     # A mean next to a half may be rounded either way: the sums of the samples themselves are the same.
     np.testing.assert_allclose(reference, expected[0], atol=1)
@@ -151,9 +147,9 @@ def test_samples_are_summed_as_in_float64(device: Device, dtype: str, pixels: in
     kept, state = [np.zeros(pixels, np.float32), *np.zeros((4, pixels, 2), np.float32)], np.zeros((5, pixels))
     for fresh, place in ((1, [3, 1, 4]), (0, [0, 9])):
         which = np.array(place, np.int32)
-        given = [frames, len(place), pixels, fresh, which, basis[place], *kept]
-        kept = run(device, "correlation_sum", pixels, given, int(dtype != "float32"), dtype)[3:]
-        correlation.correlation_sum(frames, bool(fresh), which, basis[place], *state)
+        given = [frames, len(place), pixels, pixels, which, basis[place], fresh, *kept]
+        kept = run(device, "correlation_sum", pixels, given, dtype)[3:]
+        correlation.correlation_sum(frames, which, basis[place], bool(fresh), *state)
     np.testing.assert_array_equal(kept[0], frames[3])
     for one, other in zip(kept[1:], state[1:], strict=True):
         np.testing.assert_allclose(pairs(one), other, rtol=1e-13, atol=1e-13 * np.abs(other).max())
@@ -167,26 +163,21 @@ def test_a_ring_is_summed_anew(device: Device, dtype: str, pixels: int) -> None:
     order = (np.arange(len(frames), dtype=np.int32) + 3) % len(frames)
     ring = np.zeros((len(frames), stride), dtype)
     ring[order, :pixels] = frames
-    if dtype == "float32":
-        given = [frames, len(frames), pixels, stride, 3, len(frames), np.zeros_like(ring)]
-        kept = run(device, "correlation_keep", pixels, given, 0, dtype)[1]
-        np.testing.assert_array_equal(kept, ring)
-
     fit, answers = fit_of(rows), np.zeros((4, pixels), np.float32)
     given = [ring, len(frames), pixels, stride, order, rows, fit, *answers]
-    found = run(device, "correlation_window", pixels, given, 0, dtype)[4:]
-    expected = correlation.correlation_window(ring[:, :pixels], order, rows, fit)
+    found = run(device, "correlation_window_pairs", pixels, given, dtype)[4:]
+    expected = correlation.correlation_window_pairs(ring[:, :pixels], order, rows, fit)
     close(found, expected, dtype)
 
     state = np.zeros((5, pixels))
-    correlation.correlation_sum(ring[:, :pixels], True, order, rows, *state)
+    correlation.correlation_sum(ring[:, :pixels], order, rows, True, *state)
     high = state.astype(np.float32)
     held = [
         np.stack([part, whole - part], axis=1).astype(np.float32)
         for part, whole in zip(high, state, strict=True)
     ][1:]
     given = [pixels, high[0], *held, fit, *answers]
-    again = run(device, "correlation_solve_pairs", pixels, given, int(dtype != "float32"), dtype)[6:]
+    again = run(device, "correlation_solve_pairs", pixels, given, dtype)[6:]
     close(again, expected, dtype)
 
 
@@ -195,7 +186,7 @@ def test_the_reference_is_least_squares_in_fractions() -> None:
     counts = [[10, 200], [17, 3], [12, 250], [200, 0]]
     rows = np.array([[1, c, s] for c, s in phases], np.int32)
     sums = np.zeros((4, 2), np.int64)
-    correlation.correlation_add(np.array(counts, np.uint8), np.arange(4, dtype=np.int32), rows, *sums)
+    correlation.correlation_add(np.array(counts, np.uint8), np.arange(4, dtype=np.int32), rows, True, *sums)
     upper = np.diag([2, np.sqrt(2), np.sqrt(2)])
     project = np.linalg.inv(upper).ravel()
     high = project.astype(np.float32)
