@@ -353,8 +353,8 @@ def run_budget(device: Device, quick: bool) -> Case:
             agree(f"{OURS}, {kind}", io.open_result(target).maps(), expected)
             peak, own = json.loads(done.stdout)
             bound = f"at most {_MORE * budget / 1e6:.0f} MB, the budget of {budget / 1e6:.0f} and 10 %"
-            value = f"{peak / 1e6:.0f} MB, {own / 1e6:.0f} of these its own"
-            targets.append(Target(f"{OURS}, peak memory, {kind}", bound, value, peak <= _MORE * budget))
+            value = f"{own / 1e6:.0f} MB, and {max(0, peak - own) / 1e6:.0f} of the files' pages in the cache"
+            targets.append(Target(f"{OURS}, peak memory, {kind}", bound, value, own <= _MORE * budget))
     return Case("file-budget", title, [], {}, (), () if quick else tuple(targets))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -49,7 +50,13 @@ class Estimator(Protocol):
         """Forget the frames so far."""
 
 
-def feed(source: Source, estimator: Estimator, frames: range, progress: Progress | None = None) -> None:
+def feed(
+    source: Source,
+    estimator: Estimator,
+    frames: range,
+    progress: Progress | None = None,
+    long: bool = False,
+) -> None:
     """Push frames of a source into an estimator.
 
     A device that shares the host's memory works on frames where they were read or lie. For one with memory of
@@ -64,16 +71,20 @@ def feed(source: Source, estimator: Estimator, frames: range, progress: Progress
         Which of them, in steps of 1; those before are read and dropped.
     progress : callable, optional
         Called with the number of frames so far.
+    long : bool
+        Whether to push as many frames at once as a mapped file lends, not as many as there is room for: where
+        kernels are quick beside loading what they keep of each pixel.
     """
     if source.rewindable:
         source.rewind()
-    ahead = not estimator.device.info.shares_memory
+    shared = estimator.device.info.shares_memory
     done = 0
     for block in _read_in_place(source, estimator, frames.start):
         done += len(block.frames)
         if progress:
             progress(done)
-    for block in (_read_ahead if ahead else _read_in_place)(source, estimator, len(frames)):
+    read = _read_ahead if not shared else _lent_or_read if long else _read_in_place
+    for block in read(source, estimator, len(frames)):
         push_block(estimator, block)
         done += len(block.frames)
         if progress:
@@ -95,6 +106,16 @@ def _read_in_place(source: Source, estimator: Estimator, count: int) -> Iterator
             return
         yield block
         count -= len(block.frames)
+
+
+def _lent_or_read(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+    """Take frames where they lie, as many at once as is possible, as long as the source lends them."""
+    lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
+    most = max(1, estimator.device.max_allocation // (math.prod(source.shape[1:]) * source.dtype.itemsize))
+    while count > 0 and (block := lend(min(count, most))) is not None:
+        yield block
+        count -= len(block.frames)
+    yield from _read_in_place(source, estimator, count)
 
 
 def _read_ahead(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:

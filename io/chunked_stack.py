@@ -280,6 +280,9 @@ class ChunkedStack:
         aligned = stop if stop == self.shape[0] else (first + stop) // length * length - first
         return aligned if start < aligned else stop
 
+    def lend(self, start: int, stop: int) -> None:
+        """Lend nothing that was not read."""
+
     def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
         """Return frames in ``out``, or lend those that are kept."""
         first, last = self._part.frames[0] + start, self._part.frames[0] + stop

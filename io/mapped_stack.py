@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import mmap
 import os
@@ -19,7 +20,9 @@ PADDING = 64
 class MappedStack:
     """Frames in one piece, from some byte of an open file on; whole ones are lent where they lie.
 
-    OSError: the file is too short, or cannot be mapped. The descriptor may be closed afterwards.
+    OSError: the file is too short, or cannot be mapped. The descriptor may be closed afterwards. At most
+    ``span`` bytes are lent at once, and at most a quarter of the machine's memory: a kernel that comes by
+    them again and again must find them there.
     """
 
     def __init__(
@@ -31,6 +34,7 @@ class MappedStack:
         dtype: np.dtype[Any],
         part: Selection,
         how: str = "mapped",
+        span: int = 0,
     ) -> None:
         self.shape, self.dtype, self.how = part.shape, dtype, how
         self._place, self._first = place, part.frames[0]
@@ -49,25 +53,28 @@ class MappedStack:
         reach = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
         lendable = whole.flags.aligned and part.region.shape == shape[1:]
         self._lendable = (reach - PADDING - self._offset) // self._frame if lendable else 0
+        self._longest = max(1, min(span, _machine_memory() // 4) // self._frame)
         self._used = self._dropped = 0
 
     def end(self, start: int, stop: int) -> int:
         """Return ``stop``: a read may end anywhere."""
         return stop
 
+    def lend(self, start: int, stop: int) -> NDArray[Any] | None:
+        """Return frames where they lie, perhaps fewer; None if the first cannot be lent."""
+        stop = min(stop, start + self._longest, self._lendable - self._first)
+        if stop <= start:
+            return None
+        self._turn_to(start, stop)
+        return self._frames[start:stop]
+
     def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
         """Lend frames, or copy them into ``out``."""
-        first, last = self._first + start, self._first + stop
-        with self._place.reading(first, last):
-            if self._map is None:
-                raise ValueError("(it is closed)")
-            _check_length(self._map.size(), self._end)
-            self._drop_pages(self._map, start)
-        frames = self._frames[start:stop]
-        if last <= self._lendable:
-            return frames
+        self._turn_to(start, stop)
+        if self._first + stop <= self._lendable:
+            return self._frames[start:stop]
         room = out[: stop - start]
-        room[...] = frames
+        room[...] = self._frames[start:stop]
         return room
 
     def close(self) -> None:
@@ -75,8 +82,16 @@ class MappedStack:
         self._frames = np.empty((0, *self.shape[1:]), self.dtype)  # a view would hold the mapping
         self._map = None
 
+    def _turn_to(self, start: int, stop: int) -> None:
+        """See that frames are there, and let go of those before the block before."""
+        with self._place.reading(self._first + start, self._first + stop):
+            if self._map is None:
+                raise ValueError("(it is closed)")
+            _check_length(self._map.size(), self._end)
+            self._drop_pages(self._map, start)
+
     def _drop_pages(self, pages: mmap.mmap, start: int) -> None:
-        """Take the pages before the block before out of this process, whose memory they count to."""
+        """Take pages out of this process, whose memory they count to."""
         behind = self._offset + (self._first + min(self._used, start)) * self._frame
         behind -= behind % mmap.PAGESIZE
         if behind > self._dropped:
@@ -87,3 +102,8 @@ class MappedStack:
 def _check_length(size: int, end: int) -> None:
     if size < end:
         raise OSError("truncated: the file became shorter")
+
+
+@functools.cache
+def _machine_memory() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -114,7 +114,22 @@ class Recording(Closing):
             return None
         stop = self._stack.end(start, min(start + len(out), self.shape[0]))
         frames = self._stack.read(start, stop, out)
-        self._next = stop
+        return self._block(frames, lent=not np.may_share_memory(frames, out))
+
+    def lend(self, most: int) -> Block | None:
+        """Return the next frames where they lie in the file, at most so many.
+
+        None at the end, and where frames have to be read. Their pages are the system's, which takes them back
+        when it needs memory.
+        """
+        start = self._next
+        frames = self._stack.lend(start, min(start + most, self.shape[0]))
+        return None if frames is None else self._block(frames, lent=True)
+
+    def _block(self, frames: NDArray[Any], lent: bool) -> Block:
+        """Go on behind the next frames, and return them."""
+        start = self._next
+        self._next = stop = start + len(frames)
 
         def here(values: Floats | None) -> Floats | None:
             return None if values is None else values[start:stop]
@@ -128,7 +143,7 @@ class Recording(Closing):
             displacement=here(self.displacement),
             twist=here(self.twist),
             origin=self.origin,
-            lent=not np.may_share_memory(frames, out),
+            lent=lent,
         )
 
     def rewind(self) -> None:

@@ -2,7 +2,7 @@
 
 A stack has `shape`, `dtype` and `how` (in words); `end(start, stop)` says where a read had better end; and
 `read(start, stop, out)` returns frames in ``out`` or in memory of its own, which nobody writes to as long as
-someone refers to it.
+someone refers to it. `lend(start, stop)` returns frames where they lie, as many of these as is wise, or None.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from mirrorskin.io.selection import Place, Selection
 from mirrorskin.io.types import InputError
 
 _LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is given
+_MAPPED = (
+    4  # times as many of a mapped file are lent at once: they are in the system's cache, in no memory of ours
+)
 
 
 def open_stack(
@@ -55,7 +58,7 @@ def open_stack(
                     file = -1 if isinstance(chunks, ChunkReader) else file
                     return ChunkedStack(chunks, place, part, limit)
                 offset = chunks
-            return MappedStack(file, place, offset, shape, dataset.dtype, part)
+            return MappedStack(file, place, offset, shape, dataset.dtype, part, span=_MAPPED * limit)
         finally:
             if file >= 0:
                 os.close(file)
@@ -127,6 +130,11 @@ class FrameSubset:
         """Return where a read that begins at ``start`` had better end, at the latest with its run."""
         first = self._frames[start]
         return start + self._stack.end(first, first + min(stop, self._ends[start]) - start) - first
+
+    def lend(self, start: int, stop: int) -> NDArray[Any] | None:
+        """Return frames of one run where they lie, or None."""
+        first = self._frames[start]
+        return self._stack.lend(first, first + min(stop, self._ends[start]) - start)
 
     def read(self, start: int, stop: int, out: NDArray[Any]) -> NDArray[Any]:
         """Return frames of one run."""

@@ -98,7 +98,7 @@ def reconstruct_press(
         device=device,
         memory_limit=min(memory_limit, 2 * size),
     )
-    feed(source, search, frames, progress)
+    feed(source, search, frames, progress, long=True)
     twice = isinstance(search, ChangePointSearch) and search.passes == 2
     if isinstance(search, ChangePointSearch) and twice:
         search.start_second_pass()

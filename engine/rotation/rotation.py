@@ -220,7 +220,7 @@ def correlate_source(
     limit = min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize)
     with naming(source):
         correlator = Correlator(source.shape[1:], source.dtype, device=opened, memory_limit=limit)
-        feed(source, correlator, range(source.shape[0]), progress)
+        feed(source, correlator, range(source.shape[0]), progress, long=True)
         wave = correlator.result()
     names = "azimuth", "mean", "cosine", "sine", "modulation", "residual"
     result = Result(**{name: getattr(wave, name) for name in names})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, cast
@@ -178,10 +178,12 @@ class Calibrated:
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the source's next frames, with corrected phases; see ``Source.read``."""
-        block = self.source.read(out)
-        if block is None or block.phase is None:
-            return block
-        return replace(block, phase=self._turned(block.phase))
+        return self._corrected(self.source.read(out))
+
+    def lend(self, most: int) -> Block | None:
+        """Return a recording's next frames where they lie, or None; see ``Recording.lend``."""
+        lend: Callable[[int], Block | None] | None = getattr(self.source, "lend", None)
+        return None if lend is None else self._corrected(lend(most))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -206,6 +208,9 @@ class Calibrated:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
         self.source.__exit__(kind, error, trace)
+
+    def _corrected(self, block: Block | None) -> Block | None:
+        return block and replace(block, phase=self._turned(block.phase))
 
     def _turned(self, phase: Floats | None) -> Floats | None:
         precession = self.whole.precession

@@ -59,6 +59,26 @@ def test_each_frame_is_pushed_once_and_in_order(device, room, wanted):
     assert told[-1:] == ([wanted.stop] if wanted else [])
 
 
+@pytest.mark.parametrize("longest", [3, 100])
+def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
+    """The last of them has to be read."""
+
+    class Lender(Source):
+        def lend(self, most):
+            start, stop = self.next, min(self.next + min(most, longest), self.shape[0] - 1)
+            self.next = stop
+            frames = np.broadcast_to(np.arange(start, stop, dtype="u2")[:, None, None], (stop - start, 3, 5))
+            return (
+                Block(frames, start, travel=0.1 * np.arange(start, stop), lent=True) if len(frames) else None
+            )
+
+    estimator, told = Estimator(device, 1), []
+    feed(Lender(10), estimator, range(2, 10), told.append, long=True)
+    assert estimator.seen == list(range(2, 10))
+    if device.info.shares_memory:
+        assert told == ([1, 2, 5, 8, 9, 10] if longest == 3 else [1, 2, 9, 10])
+
+
 def test_a_source_that_ends_early_is_no_error(device):
     estimator = Estimator(device, 4)
     feed(Source(6), estimator, range(9))

@@ -37,6 +37,20 @@ def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
         assert how == "mapped"
 
 
+def test_a_recording_lends_what_lies_in_one_piece(path, tmp_path):
+    with io.open_recording(path, **GIVEN, frames=(1, 8)) as recording:
+        recording.read()
+        block = recording.lend(5)
+        assert (block.index, len(block.frames), block.lent) == (1, 5, True)
+        np.testing.assert_array_equal(block.frames, theirs(path)[2:7])
+        assert recording.read(np.empty((5, 50, 70), "u2")).index == 6
+        assert recording.lend(5) is None
+    with io.open_recording(path, **GIVEN, memory_limit=7000) as recording:  # 4 times that are mapped at once
+        assert len(recording.lend(9).frames) == 4
+    with io.open_recording(path, **GIVEN, region=Region((3, 40), (5, 60))) as recording:
+        assert recording.lend(5) is None
+
+
 def test_lent_frames_outlive_their_recording(path):
     frames = compressible(SHAPE, "u2")
     with io.open_recording(path, **GIVEN) as recording:
