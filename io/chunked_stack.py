@@ -24,9 +24,6 @@ from mirrorskin.io.mapped_stack import PADDING, MappedStack
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.selection import Place, Region, Selection
 
-_CACHE = 32 << 20  # bytes of frames to unpack at a time, which are worked on next
-_AT_ONCE = 32  # frames to unpack at a time at least: for fewer, each of them costs more
-
 _log = logging.getLogger("mirrorskin.io")
 
 
@@ -271,10 +268,8 @@ class ChunkedStack:
         return self._chunks.how if self._held is None else "unpacked into memory"
 
     def end(self, start: int, stop: int) -> int:
-        """End a read where chunks end, so that none is unpacked twice, and while all is in the cache."""
+        """End a read where chunks end, so that none is unpacked twice."""
         first, length = self._part.frames[0], self._chunks.chunk[0]
-        size = math.prod(self.shape[1:]) * self.dtype.itemsize
-        stop = min(stop, start + max(length, _AT_ONCE, _CACHE // size))
         if (first + start) % length and start:
             return min(stop, self._chunk_span(start)[1] - first)
         aligned = stop if stop == self.shape[0] else (first + stop) // length * length - first
