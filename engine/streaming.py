@@ -89,6 +89,8 @@ def feed(
         done += len(block.frames)
         if progress:
             progress(done)
+    if hasattr(source, "fingerprint"):
+        source.fingerprint()  # while the device is at work: it is needed for the result
 
 
 def push_block(estimator: Estimator, block: Block, part: slice = slice(None)) -> None:

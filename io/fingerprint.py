@@ -69,13 +69,24 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
     for path, parts in spans.items():
         with as_input_error(str(path)), path.open("rb", buffering=0) as opened:
             state = os.fstat(opened.fileno())
-            if _state(state) != origins[path]:
-                raise InputError(f"{path} was changed while it was open: start again")
+            _compare(path, state, origins[path])
             digest.update(state.st_size.to_bytes(8, "little"))
             for start, stop in _chosen(_joined(parts), state.st_size):
                 for place in range(start, stop, _PIECE):
                     digest.update(os.pread(opened.fileno(), min(_PIECE, stop - place), place))
     return digest.hexdigest()
+
+
+def check_unchanged(origins: Mapping[Path, State]) -> None:
+    """Raise InputError if a file is no longer as it was when it was opened."""
+    for path, state in origins.items():
+        with as_input_error(str(path)):
+            _compare(path, path.stat(), state)
+
+
+def _compare(path: Path, found: os.stat_result, state: State) -> None:
+    if _state(found) != state:
+        raise InputError(f"{path} was changed while it was open: start again")
 
 
 def _of_growing(file: h5py.File, dataset: h5py.Dataset, frames: int) -> str:

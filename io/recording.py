@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.fingerprint import fingerprint, modified, origins
+from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
 from mirrorskin.io.layout import MARK, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
@@ -151,7 +151,13 @@ class Recording(Closing):
         self._next = 0
 
     def fingerprint(self) -> str:
-        """Return what tells the file from others; see ``mirrorskin.io.fingerprint``."""
+        """Return what tells the file from others, if it is as it was; see ``mirrorskin.io.fingerprint``."""
+        if not self._file.root.swmr_mode:
+            check_unchanged(self._origins)
+        return self._fingerprint
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
 
     @functools.cached_property
