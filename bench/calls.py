@@ -1,7 +1,6 @@
-"""Whole calls as users make them: arrays in and maps out; commands and imports in processes of their own.
+"""Whole calls: functions on arrays that no peer has, commands and imports in processes of their own.
 
-Each row has the seconds of its kernels beside those of the call: the rest is copies and host work.
-Sizes: ``call-NAME`` is that of the paper's cameras, ``call-NAME-small`` 480 x 640 or less.
+The functions that peers have too are in the modules of their kernels.
 """
 
 from __future__ import annotations
@@ -11,132 +10,124 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin import engine
-from mirrorskin.bench.files import make_press, make_turns, new_folder, record
-from mirrorskin.bench.harness import OURS, Case, Cases, Measured, Row, Timing, check_memory
-from mirrorskin.bench.limits import beside_limits
+from mirrorskin.bench.files import new_folder
+from mirrorskin.bench.harness import OURS, Case, Cases, Measured, Row, Target, Timing, check_memory
+from mirrorskin.bench.limits import time_call
 from mirrorskin.bench.scenes import (
+    LEVELS,
     PIXEL,
     SCALES,
     STEPS,
     TILT,
-    blob_mask,
+    Shape,
     fill_press,
     fill_turns,
-    noisy_slopes,
     phases,
-    references,
+    press_noise,
+    roof,
     travel_of,
     turn_noise,
 )
+from mirrorskin.hw.twin import Axial, Twin, Vertical
+from mirrorskin.io import Recorder
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 
-Shape = tuple[int, int, int]
-Run = Callable[[Device, bool], Case]
-
-_HD, _VGA, _TINY = (1080, 1920), (480, 640), (8, 48, 64)
-_PRESS = 30  # frames of a press that is reconstructed
-_ROUNDS = 7
-_ROOM = 200  # bytes of a pixel for maps and what is kept
+_SIZES: dict[str, Shape] = {"": (1080, 1920), "-4k": (2160, 3840)}
+_QUICK: Shape = (48, 64)
+_PRESS = 16  # frames
+_ROOM = 400  # bytes of a pixel for maps and what is kept
 _BYTE = np.dtype(np.uint8)
 
-
-def run_onset(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time `find_onset` with references of each pixel."""
-    frames = _frames(name, shape, fill_press)
-    dark, bright = references(shape[1:], _BYTE)
-    call = partial(engine.find_onset, frames, travel_of(shape[0]), dark=dark, bright=bright, device=device)
-    title = f"onset of {_size(shape)}, references"
-    return _run(name, title, {"find_onset": call}, frames.nbytes, device, quick)
+_SCENE, _QUICK_SCENE = (480, 480), (96, 96)
+_FRAMES = 30  # of a press that a command reconstructs
+_FIELD = 12.0  # side of its picture, mm
+_ROUNDS = 7
+_WITHIN = {"reconstruct press": 0.5, "reconstruct turn": 0.5, "fuse": 1.5}  # seconds of a command
 
 
-def run_normals(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time `estimate_normals` of one turn."""
-    frames = _frames(name, shape, fill_turns)
-    offset, gain, _ = SCALES["uint8"]
+def _change_point(shape: Shape, device: Device) -> tuple[Callable[[], object], int, int]:
+    frames = np.empty((_PRESS, *shape), np.uint8)
+    fill_press(frames)
+    dark, bright = LEVELS[_BYTE.name]
+    known: dict[str, Any] = {"dark": dark, "bright": bright, "noise": press_noise(_BYTE), "device": device}
+    call = partial(engine.find_change_point, frames, travel_of(_PRESS), **known)
+    return call, frames.nbytes, _PRESS
+
+
+def _edges(shape: Shape, device: Device) -> tuple[Callable[[], object], int, int]:
+    maps = roof(shape)
+    return partial(engine.find_edges, *maps, device=device), sum(one.nbytes for one in maps), 0
+
+
+def _fuse(shape: Shape, device: Device) -> tuple[Callable[[], object], int, int]:
+    frames, turns = (np.empty((count, *shape), np.uint8) for count in (_PRESS, STEPS))
+    fill_press(frames)
+    fill_turns(turns)
+    offset, gain, _ = SCALES[_BYTE.name]
+    dark, bright = LEVELS[_BYTE.name]
+    onset = engine.find_onset(frames, travel_of(_PRESS), dark=dark, bright=bright, device=device)
     known: dict[str, Any] = {"tilt": TILT, "gain": gain, "offset": offset, "noise": turn_noise(_BYTE)}
-    call = partial(engine.estimate_normals, frames, phases(shape[0]), device=device, **known)
-    title = f"normals of {_size(shape)}"
-    return _run(name, title, {"estimate_normals": call}, frames.nbytes, device, quick)
+    normals = engine.estimate_normals(turns, phases(STEPS), device=device, **known)
+    moved = onset.height.nbytes + normals.vectors.nbytes
+    return partial(engine.fuse, onset, normals, PIXEL, device=device), moved, 0
 
 
-def run_correlate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time `correlate`."""
-    frames = _frames(name, shape, fill_turns)
-    call = partial(engine.correlate, frames, phases(shape[0]), device=device)
-    return _run(name, f"wave of {_size(shape)}", {"correlate": call}, frames.nbytes, device, quick)
+_FUNCTIONS = {
+    "change-point": (f"change-points between known levels of {_PRESS} x {{}} uint8", _change_point),
+    "edges": ("edges of normals of {}", _edges),
+    "fuse": (f"one surface of a press of {_PRESS} and a turn of {STEPS} x {{}}", _fuse),
+}
 
 
-def run_integrate(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time `integrate` of a full picture and within a mask, with standard deviations and without."""
-    picture = shape[1:]
-    dz_dx, dz_dy = noisy_slopes(picture)
-    mask = blob_mask(picture)
-    call = partial(engine.integrate, dz_dx, dz_dy, PIXEL, device=device)
-    works = {
-        "integrate": partial(call, sigma=False),
-        "integrate, sigma": partial(call, sigma=True),
-        "integrate within a mask": partial(call, mask=mask, sigma=False),
-        "integrate within a mask, sigma": partial(call, mask=mask, sigma=True),
-    }
-    title = f"heights of slopes of {picture[0]} x {picture[1]}"
-    return _run(name, title, works, 3 * dz_dx.nbytes, device, quick)
+def _run_function(name: str, function: str, shape: Shape, device: Device, quick: bool) -> Case:
+    shape = _QUICK if quick else shape
+    check_memory(name, (_ROOM + 2 * _PRESS) * math.prod(shape))
+    title, make = _FUNCTIONS[function]
+    call, moved, frames = make(shape, device)
+    return time_call(
+        name, title.format(f"{shape[0]} x {shape[1]}"), call, moved, device, quick, frames=frames
+    )
 
 
-def _frames(name: str, shape: Shape, fill: Callable[[NDArray[Any]], None]) -> NDArray[np.uint8]:
-    check_memory(name, (4 * shape[0] + _ROOM) * math.prod(shape[1:]))
-    frames = np.empty(shape, np.uint8)
-    fill(frames)
-    return frames
+def _run_commands(device: Device, quick: bool) -> Case:
+    """Time commands from process start to end: a press, a turn, and both fused."""
+    shape, name = _QUICK_SCENE if quick else _SCENE, "call-commands"
+    movements = {"press": Vertical(np.linspace(0.1, 3.0, _FRAMES)), "turn": Axial(phases(STEPS), TILT, 1.0)}
+    rows, targets = [], []
+    with new_folder(name, 4 * (_FRAMES + STEPS) * math.prod(shape)) as folder:
+        recordings = {what: folder / f"{what}.h5" for what in movements}
+        for what, movement in movements.items():
+            known: dict[str, Any] = {"pixel_size": _FIELD / shape[0], "movement": movement, "device": device}
+            twin = Twin(object="sphere", shape=shape, pattern="linear", **known)
+            with Recorder(twin, recordings[what]) as recorder:
+                recorder.drain(lambda count: None)
+        inputs = {f"reconstruct {what}": [str(path)] for what, path in recordings.items()}
+        for what, words in {**inputs, "fuse": [str(path) for path in recordings.values()]}.items():
+            made = folder / "result.h5"
+            command = [sys.executable, "-m", "mirrorskin.cli.main", what.split()[0], *words]
+            command += ["-o", str(made), "--json", "--device", device.info.title]
+            row = Row(f"{OURS} {what}", _time_process(command, 1 if quick else _ROUNDS, made))
+            rows.append(row)
+            most, took = _WITHIN[what], row.measured.wall.median
+            targets.append(Target(row.name, f"at most {most:g} s", f"{took:.2f} s", took <= most))
+    title = f"commands on a press of {_FRAMES} and a turn of {STEPS} x {shape[0]} x {shape[1]} uint8"
+    return Case(name, title, rows, {}, tuple(map(_share, rows)), () if quick else tuple(targets))
 
 
-def _run(
-    name: str, title: str, works: Mapping[str, Callable[[], object]], moved: int, device: Device, quick: bool
-) -> Case:
-    limits, measured = beside_limits(works, moved, device, quick, rounds=_ROUNDS)
-    rows = [Row(f"{OURS}, {work}", measured[work], moved) for work in works]
-    return Case(name, title, [*limits, *rows], {}, tuple(map(_parts, rows)))
-
-
-def run_reconstruct(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time the command ``mirrorskin reconstruct`` of a press and of a turn, from process start to end."""
-    offset, gain, _ = SCALES["uint8"]
-    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "pixel_size": (0.03, 0.03)}
-    sources = {
-        f"press of {_PRESS}": make_press((_PRESS, *shape[1:]), pixels=True),
-        f"turn of {STEPS}": make_turns((STEPS, *shape[1:]), **known),
-    }
-    rows = []
-    with new_folder(name, 4 * (_PRESS + STEPS) * math.prod(shape[1:])) as folder:
-        for number, (what, source) in enumerate(sources.items()):
-            path = folder / f"{number}.h5"
-            record(source, path)
-            words = ["reconstruct", str(path), "-o", str(folder / f"{number}-result.h5"), "--json"]
-            words += ["--device", device.info.title]
-            command = [sys.executable, "-m", "mirrorskin.cli.main", *words]
-            measured = _time_process(command, 1 if quick else _ROUNDS, Path(words[3]))
-            rows.append(
-                Row(f"{OURS}, reconstruct, {what}", measured, math.prod(source.shape), source.shape[0])
-            )
-    title = f"the command reconstruct on {shape[1]} x {shape[2]} uint8, caches of kernels full"
-    return Case(name, title, rows, {}, tuple(map(_parts, rows)))
-
-
-def run_import(_: Device, quick: bool) -> Case:
+def _run_import(_: Device, quick: bool) -> Case:
     """Time processes that import the engine, what a press or a turn needs of it, and NumPy alone."""
-    rows = []
-    for line in ("import mirrorskin.engine", "from mirrorskin.engine import reconstruct", "import numpy"):
-        measured = _time_process([sys.executable, "-c", line], 1 if quick else _ROUNDS)
-        rows.append(Row(line, measured))
+    lines = "import mirrorskin.engine", "from mirrorskin.engine import reconstruct", "import numpy"
+    rounds = 1 if quick else _ROUNDS
+    rows = [Row(line, _time_process([sys.executable, "-c", line], rounds)) for line in lines]
     return Case("call-import", "a process that imports, from start to end", rows, {})
 
 
@@ -174,34 +165,18 @@ def _time_process(command: list[str], rounds: int, made: Path | None = None) -> 
     )
 
 
-def _parts(row: Row) -> str:
-    """Say which share of a call is in kernels, and which in copies."""
-    wall, device = row.measured.wall.median, row.measured.device
-    copies = sum(device[kind].median for kind in device if kind != "kernel")
-    kernel = device["kernel"].median if "kernel" in device else 0.0
-    shares = f"{100 * kernel / wall:.0f} % in kernels, {100 * copies / wall:.0f} % in copies"
-    return f"{row.name}: {1e3 * wall:.1f} ms, {shares}"
+def _share(row: Row) -> str:
+    """Say which share of a command is in kernels."""
+    wall, kernel = row.measured.wall.median, row.measured.kernel
+    return f"{row.name}: {1e3 * wall:.0f} ms, {100 * kernel / wall:.0f} % in kernels"
 
 
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{' x '.join(map(str, shape))} uint8"
-
-
-def _case(name: str, run: Callable[[str, Shape, Device, bool], Case], shape: Shape) -> Run:
-    return lambda device, quick: run(name, _TINY if quick else shape, device, quick)
-
-
-_CALLS: tuple[tuple[str, Callable[[str, Shape, Device, bool], Case], Shape, Shape], ...] = (
-    ("call-onset", run_onset, (64, *_HD), (16, *_VGA)),
-    ("call-normals", run_normals, (8, *_HD), (8, *_VGA)),
-    ("call-correlate-8", run_correlate, (8, *_HD), (8, *_VGA)),
-    ("call-correlate-64", run_correlate, (64, *_HD), (64, *_VGA)),
-    ("call-integrate", run_integrate, (1, 1024, 1024), (1, 256, 256)),
-    ("call-reconstruct", run_reconstruct, (1, 480, 480), (1, 120, 120)),
-)
 CASES: Cases = {
-    name + size: _case(name + size, run, shape)
-    for name, run, *shapes in _CALLS
-    for size, shape in zip(("", "-small"), shapes, strict=True)
+    **{
+        f"call-{function}{size}": partial(_run_function, f"call-{function}{size}", function, shape)
+        for function in _FUNCTIONS
+        for size, shape in _SIZES.items()
+    },
+    "call-commands": _run_commands,
+    "call-import": _run_import,
 }
-CASES["call-import"] = run_import

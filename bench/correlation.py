@@ -20,21 +20,19 @@ from mirrorskin.bench.harness import (
     agree,
     check_memory,
     missing,
-    pusher,
 )
-from mirrorskin.bench.limits import beside_limits
+from mirrorskin.bench.limits import beside_limits, time_call
 from mirrorskin.bench.scenes import STEPS, fill_turns, phases
-from mirrorskin.engine import Correlator
+from mirrorskin.engine import Correlator, correlate
 from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.errors import DeviceError
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Counts = NDArray[np.uint8]
 Sums = NDArray[np.int32]
 
-_HD, _WINDOW, _QUICK = (64, 1080, 1920), (64, 480, 640), (16, 48, 64)
+_WINDOW, _QUICK = (64, 480, 640), (16, 48, 64)
 _MAPS = 4 * 4  # bytes of a pixel: mean, cosine, sine and residual
 _ROOM = 128  # bytes of a pixel for what all works keep
 _STATE = 4 * 4  # bytes of a pixel's sums over a window
@@ -43,38 +41,29 @@ _TILE = 1024  # pixels of Numba
 _SAMPLES = 65_536  # of a tile of NumPy: more leave the cache, fewer pay for calls
 
 
-def run_stack(device: Device, quick: bool) -> Case:
+def run_stack(name: str, shape: tuple[int, int, int], device: Device, quick: bool) -> Case:
     """Time the fit of a wave to a stack, the limits and the peers; their maps must be the same first.
 
-    Bytes are those of the frames, each once, and of the four maps; of a push those of the frames alone.
+    Bytes are those of the frames, each once, and of the four maps.
     """
-    shape = _QUICK if quick else _HD
     count, pixels = shape[0], math.prod(shape[1:])
-    check_memory("correlate-uint8", (2 * count + _MAPS + _ROOM) * pixels)
-    correlator = Correlator(shape[1:], np.uint8, device=device, memory_limit=2 * count * pixels)
-    frames = correlator.room[:count]
-    if len(frames) < count:
-        raise DeviceError(f"{device.info.title} has no room for {count} frames at once: use --quick")
+    check_memory(name, (2 * count + _MAPS + _ROOM) * pixels)
+    frames = np.empty(shape, np.uint8)
     fill_turns(frames)
     phase = phases(count)
-
-    push, find = (pusher(correlator, frames, maps=maps, phase=phase) for maps in (False, True))
+    call = functools.partial(correlate, frames, phase, device=device)
     absent = missing("numba")
     peers: dict[str, Callable[[Counts, Doubles], Floats]] = {"NumPy": _numpy}
     peers |= {} if "numba" in absent else {"Numba": _numba}
     theirs: dict[str, Work] = {name: functools.partial(fit, frames, phase) for name, fit in peers.items()}
 
     def check(results: dict[str, Any]) -> None:
-        for name in theirs:
-            _check(name, results[name], results[OURS])
+        for peer in theirs:
+            _check(peer, results[peer], results[OURS])
 
-    moved = dict.fromkeys((f"{OURS}, push only", OURS, *theirs), (count + _MAPS) * pixels)
-    moved[f"{OURS}, push only"] = count * pixels
-    works = {f"{OURS}, push only": push, OURS: find, **theirs}
-    limits, measured = beside_limits(works, (count + _MAPS) * pixels, device, quick, check, first="triad")
-    rows = [Row(name, measured[name], size, count) for name, size in moved.items()]
     title = f"mean, cosine, sine and residual; {' x '.join(map(str, shape))} uint8"
-    return Case("correlate-uint8", title, limits + rows, absent)
+    known: dict[str, Any] = {"frames": count, "peers": theirs, "check": check, "absent": absent}
+    return time_call(name, title, call, (count + _MAPS) * pixels, device, quick, first="triad", **known)
 
 
 def run_sliding(device: Device, quick: bool) -> Case:
@@ -111,7 +100,19 @@ def run_sliding(device: Device, quick: bool) -> Case:
     return Case("sliding", title, limits + rows, absent)
 
 
-CASES: Cases = {"correlate-uint8": run_stack, "sliding": run_sliding}
+def _stack(name: str, shape: tuple[int, int, int]) -> Callable[[Device, bool], Case]:
+    return lambda device, quick: run_stack(name, _QUICK if quick else shape, device, quick)
+
+
+_SHAPES = {
+    "correlate-uint8": (64, 1080, 1920),
+    "correlate-turn": (STEPS, 1080, 1920),
+    "correlate-4k": (STEPS, 2160, 3840),
+}
+CASES: Cases = {
+    **{name: _stack(name, shape) for name, shape in _SHAPES.items()},
+    "sliding": run_sliding,
+}
 
 
 def _check(name: str, theirs: Floats, ours: Any) -> None:

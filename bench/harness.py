@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,16 @@ from mirrorskin.kernels.profile import Kind, Profile, Record
 Work = Callable[[], object]
 
 OURS = "mirrorskin"
+FIRST = f"{OURS}, first call"
+"""A whole call, and the same with no memory kept from calls before it."""
 ROUNDS = 15
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 _PAUSE = 0.005  # seconds before a turn, in which the threads of the work before it go to sleep
 _PATIENCE = 10.0  # seconds that a work may take in all; it is timed _LEAST times however slow it is
 _LEAST = 3
+_SECOND_CALL, _FIRST_CALL, _OTHER = 1.3, 1.6, 3e-3  # kernels' times that calls may take, and seconds more
+_PEERS = {"NumPy": 10.0}  # times as fast as which we want to be; 1 for the others
 _MEMINFO = Path("/proc/meminfo")
 
 
@@ -178,9 +182,11 @@ def take_turns(
     rounds: int,
     profile: Profile,
     check: Callable[[dict[str, Any]], None] = lambda results: None,
+    before: Mapping[str, Callable[[], object]] | None = None,
 ) -> dict[str, Measured]:
     """Time several works, each once a round, after one warm-up that does not count.
 
+    What is to be done `before` a work, by its name, is not timed.
     A work that has taken 10 s in all and had three turns leaves the remaining rounds to the others.
     """
     firsts = {name: _turn(work, profile) for name, work in works.items()}
@@ -193,6 +199,7 @@ def take_turns(
         for name, work in works.items():
             mine = turns[name]
             if len(mine) < _LEAST or sum(turn.wall for turn in mine) < _PATIENCE:
+                (before or {}).get(name, lambda: None)()
                 time.sleep(_PAUSE)
                 turn = _turn(work, profile)
                 mine.append(_Turn(turn.wall, turn.records))
@@ -253,6 +260,23 @@ def ratio_target(what: str, bound: float, ours: Row, theirs: Row, than: str, *, 
     return Target(
         what, said, f"{ratio:.{1 if faster else 2}f} times ({mine:.0f} against {other:.0f} ms)", met
     )
+
+
+def call_targets(rows: Sequence[Row]) -> tuple[Target, ...]:
+    """Return what a whole call aims at: to take little more than its kernels do, and less than each peer."""
+    by_name = {row.name: row for row in rows}
+    ours = by_name[OURS]
+    targets = []
+    for name, factor in ((OURS, _SECOND_CALL), (FIRST, _FIRST_CALL)):
+        most, took = factor * ours.measured.kernel + _OTHER, by_name[name].measured.wall.median
+        bound = f"at most {factor} times the kernels and {1e3 * _OTHER:.0f} ms: {1e3 * most:.1f} ms"
+        targets.append(Target(name, bound, f"{1e3 * took:.1f} ms", took <= most))
+    for peer in rows:
+        name, comma, part = peer.name.partition(", ")
+        if name != OURS and "limit" not in name:
+            mine, wanted = by_name[OURS + comma + part], _PEERS.get(name, 1.0)
+            targets.append(ratio_target(mine.name, wanted, mine, peer, peer.name, faster=True))
+    return tuple(targets)
 
 
 def agree(

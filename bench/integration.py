@@ -19,16 +19,20 @@ from numpy.typing import NDArray
 
 from mirrorskin import engine
 from mirrorskin.bench.harness import (
+    FIRST,
     OURS,
     THREADS,
     Case,
     Cases,
     Measured,
     Row,
+    Target,
     Work,
     agree,
+    call_targets,
     check_memory,
     missing,
+    ratio_target,
 )
 from mirrorskin.bench.limits import beside_limits
 from mirrorskin.bench.scenes import PIXEL, Shape, blob_mask, drifting_slopes, noisy_slopes, random_cuts
@@ -45,6 +49,7 @@ Flags = NDArray[np.uint8]
 
 SLOPES, SETUP, SOLVE = "from slopes", "set-up and solve", "solve only"
 PYAMG = "pyamg"
+_SIGMA = 2.5  # times of a call without sigma that one with it may take
 
 _MPIXEL, _LIVE, _QUICK = (1024, 1024), (480, 640), (48, 64)
 _FULL = {SLOPES: 2 * 4 + 4, SETUP: 2 * 4, SOLVE: 2 * 4}  # bytes of a pixel of a full picture: in and out
@@ -69,7 +74,7 @@ def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
     single, span = source.astype(np.float32), float(np.ptp(exact))
     given, ready = device.given("source", single), Rectangle(shape, (1.0, 1.0), device)
     works: dict[str, Work] = {
-        f"{OURS}, {SLOPES}": lambda: _integrate(slopes, None, None, device),
+        **_calls(slopes, None, None, device),
         f"{OURS}, {SETUP}": lambda: Rectangle(shape, (1.0, 1.0), device).solve(given).download(),
         f"{OURS}, {SOLVE}": lambda: ready.solve(given).download(),
     }
@@ -84,11 +89,14 @@ def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
                 agree(work, {"height": found}, {"height": exact}, {"height": _NEAR["full"] * span})
                 errors[work] = float(np.sqrt(np.mean(np.square(found - exact)))) / span
 
-    rows, measured = beside_limits(works, _FULL[SOLVE] * pixels, device, quick, check, first="triad")
-    rows += [Row(work, measured[work], _FULL[work.partition(", ")[2]] * pixels) for work in works]
+    before = {FIRST: engine.free_memory}
+    rows, measured = beside_limits(
+        works, _FULL[SOLVE] * pixels, device, quick, check, first="triad", before=before
+    )
+    rows += [Row(work, measured[work], _FULL.get(_part(work), _FULL[SLOPES]) * pixels) for work in works]
     notes = (_ratios(measured, "SciPy"), _errors(errors))
     title = f"heights of a full picture; {' x '.join(map(str, shape))} float32"
-    return Case(name, title, rows, {}, notes)
+    return Case(name, title, rows, {}, notes, () if quick else _targets(rows))
 
 
 def run_mask(name: str, cuts: int, device: Device, quick: bool) -> Case:
@@ -113,17 +121,21 @@ def run_mask(name: str, cuts: int, device: Device, quick: bool) -> Case:
     def check(results: dict[str, Any]) -> None:
         for work in works:
             errors[work] = truth.error(results[work])
-            found = results[work] if SLOPES in work else truth.as_map(truth.centred(results[work]))
+            values = results[work]
+            found = truth.as_map(truth.centred(values)) if _part(work) in (SETUP, SOLVE) else values
             near = {"height": _NEAR["mask"] * truth.span}
             agree(work, {"height": found}, {"height": truth.map}, near, whose="a direct solution")
 
     moved = _MASKED | {SLOPES: _MASKED[SLOPES] + (edges is not None)}
-    rows, measured = beside_limits(works, moved[SLOPES] * pixels, device, quick, check, first="triad")
-    rows += [Row(work, measured[work], moved[work.partition(", ")[2]] * pixels) for work in works]
+    before = {FIRST: engine.free_memory}
+    rows, measured = beside_limits(
+        works, moved[SLOPES] * pixels, device, quick, check, first="triad", before=before
+    )
+    rows += [Row(work, measured[work], moved.get(_part(work), moved[SLOPES]) * pixels) for work in works]
     notes += [] if absent else [_ratios(measured, PYAMG)]
     parts = f"{100 * np.mean(truth.wanted):.0f} % of {' x '.join(map(str, shape))} float32"
     title = f"heights of {parts}{f', {cuts} cuts' if cuts else ''}, in {truth.count} components"
-    return Case(name, title, rows, absent, (*notes, _errors(errors)))
+    return Case(name, title, rows, absent, (*notes, _errors(errors)), () if quick else _targets(rows))
 
 
 def run_frames(device: Device, quick: bool) -> Case:
@@ -166,15 +178,35 @@ def _rectangle(name: str, shape: Shape) -> Callable[[Device, bool], Case]:
 CASES: Cases = {
     "integrate-rectangle": _rectangle("integrate-rectangle", _MPIXEL),
     "integrate-rectangle-4mp": _rectangle("integrate-rectangle-4mp", (2048, 2048)),
+    "integrate-rectangle-4k": _rectangle("integrate-rectangle-4k", (2160, 3840)),
     "integrate-mask": partial(run_mask, "integrate-mask", 0),
     "integrate-cuts": partial(run_mask, "integrate-cuts", 50),
     "integrate-live": run_frames,
 }
 
 
-def _integrate(slopes: Floats, mask: Flags | None, edges: Flags | None, device: Device) -> Floats:
+def _calls(slopes: Floats, mask: Flags | None, edges: Flags | None, device: Device) -> dict[str, Work]:
+    """Return `integrate` with its defaults, so with sigma, and without sigma."""
     dz_dx, dz_dy = slopes
-    return engine.integrate(dz_dx, dz_dy, PIXEL, mask=mask, edges=edges, sigma=False, device=device).height
+
+    def call(sigma: bool) -> Floats:
+        known = {"mask": mask, "edges": edges, "sigma": sigma, "device": device}
+        return engine.integrate(dz_dx, dz_dy, PIXEL, **known).height
+
+    default = partial(call, True)
+    return {OURS: default, FIRST: default, f"{OURS}, {SLOPES}": partial(call, False)}
+
+
+def _targets(rows: list[Row]) -> tuple[Target, ...]:
+    """Return what the whole call aims at; with sigma it is to take little more than without."""
+    by_name = {row.name: row for row in rows}
+    plain = by_name[f"{OURS}, {SLOPES}"]
+    sigma = ratio_target(OURS, _SIGMA, by_name[OURS], plain, "without sigma", faster=False)
+    return *call_targets(rows), sigma
+
+
+def _part(work: str) -> str:
+    return work.partition(", ")[2]
 
 
 def _ratios(measured: Mapping[str, Measured], who: str) -> str:
@@ -241,7 +273,7 @@ def _mask_works(slopes: Floats, mask: Flags, edges: Flags | None, device: Device
     links = Links(device, mask.shape, *maps, None, device.given("source", graph.source))
     ready = Multigrid(links)
     return {
-        f"{OURS}, {SLOPES}": lambda: _integrate(slopes, mask, edges, device),
+        **_calls(slopes, mask, edges, device),
         f"{OURS}, {SETUP}": lambda: Multigrid(links).solve().height.download(),
         f"{OURS}, {SOLVE}": lambda: ready.solve().height.download(),
     }

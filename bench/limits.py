@@ -8,7 +8,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mirrorskin.bench.harness import ROUNDS, Measured, Row, Work, take_turns
+from mirrorskin.bench.harness import (
+    FIRST,
+    OURS,
+    ROUNDS,
+    Case,
+    Measured,
+    Row,
+    Work,
+    call_targets,
+    take_turns,
+)
+from mirrorskin.engine import free_memory
 from mirrorskin.kernels.device import Device
 
 _RUNS = {"read": 1, "copy": 2, "triad": 3}  # runs of words that a kernel touches
@@ -84,11 +95,36 @@ def beside_limits(
     *,
     first: str = "read",
     rounds: int = ROUNDS,
+    before: Mapping[str, Callable[[], object]] | None = None,
 ) -> tuple[list[Row], dict[str, Measured]]:
     """Time works in turns with the limits of `size` bytes; return the limits' rows, and what was measured."""
     limits = Limits(device, size)
-    measured = take_turns({**limits.works(), **works}, 1 if quick else rounds, device.profile, check)
+    every = {**limits.works(), **works}
+    measured = take_turns(every, 1 if quick else rounds, device.profile, check, before)
     return limits.rows(measured, first), measured
+
+
+def time_call(
+    name: str,
+    title: str,
+    call: Work,
+    moved: int,
+    device: Device,
+    quick: bool,
+    *,
+    frames: int = 0,
+    peers: Mapping[str, Work] | None = None,
+    check: Callable[[dict[str, Any]], None] = lambda results: None,
+    first: str = "read",
+    absent: Mapping[str, str] | None = None,
+) -> Case:
+    """Time a public function, arrays in and maps out, with the limits and its peers; see `call_targets`."""
+    works = {OURS: call, FIRST: call, **(peers or {})}
+    limits, measured = beside_limits(
+        works, moved, device, quick, check, first=first, before={FIRST: free_memory}
+    )
+    rows = [*limits, *(Row(work, measured[work], moved, frames) for work in works)]
+    return Case(name, title, rows, dict(absent or {}), targets=() if quick else call_targets(rows))
 
 
 class Arithmetic:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.bench.harness import (
+    FIRST,
     OURS,
     ROUNDS,
     THREADS,
@@ -23,6 +24,7 @@ from mirrorskin.bench.harness import (
     Row,
     Work,
     agree,
+    call_targets,
     check_memory,
     missing,
     pusher,
@@ -30,7 +32,7 @@ from mirrorskin.bench.harness import (
 )
 from mirrorskin.bench.limits import Arithmetic, Limits
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, fill_turns, phases, turn_noise
-from mirrorskin.engine import NormalEstimator
+from mirrorskin.engine import NormalEstimator, estimate_normals, free_memory
 from mirrorskin.engine.rotation.design_matrix import fit_matrix
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.normals import Answer, Variance, contact_limits, normals_exact
@@ -41,7 +43,7 @@ Maps = dict[str, NDArray[Any]]
 CACHED = f"{OURS}, in the cache"
 NORMAL = 3 * 4 + 4 + 1 + 4  # bytes of a pixel: normal, sigma, contact and mean
 
-_HD, _QUICK = (1080, 1920), (48, 64)
+_QUICK = (48, 64)
 _ROOM = 160  # bytes of a pixel for what all works keep
 _SMALL = (256, 1024)  # rows and columns of a stack that stays in the cache, and is no trifle to launch
 _TILE = 256  # pixels of Numba
@@ -82,15 +84,13 @@ class Turn:
         )
 
 
-def run_normals(turn: Turn, device: Device, rounds: int) -> Case:
+def run_normals(name: str, turn: Turn, device: Device, rounds: int) -> Case:
     """Time normals, the limits and Numba on one stack; their maps must be the same first."""
-    name, pixels = f"normals-{turn.dtype.name}", math.prod(turn.shape)
+    pixels = math.prod(turn.shape)
     check_memory(name, 2 * turn.bytes + _ROOM * pixels)
-    estimator = turn.estimator(device)
-    frames = estimator.room[:STEPS]
+    frames = np.empty((STEPS, *turn.shape), turn.dtype)
     fill_turns(frames)
-
-    find = pusher(estimator, frames, maps=True, phase=phases(STEPS))
+    call = functools.partial(estimate_normals, frames, phases(STEPS), device=device, **turn.options)
     small = Turn(_SMALL if pixels > math.prod(_SMALL) else turn.shape, turn.dtype)
     repeats = -(-pixels // math.prod(small.shape))
     push = kernel_alone(small, device)
@@ -107,16 +107,18 @@ def run_normals(turn: Turn, device: Device, rounds: int) -> Case:
             _check(peer, results[OURS], results[peer], frames, turn)
 
     limits, arithmetic = Limits(device, turn.bytes), Arithmetic(device, pixels)
-    works: dict[str, Work] = {**limits.works(), **arithmetic.works(), CACHED: cached, OURS: find, **theirs}
-    measured = take_turns(works, rounds, device.profile, check)
+    works: dict[str, Work] = {**limits.works(), **arithmetic.works(), CACHED: cached}
+    works |= {OURS: call, FIRST: call, **theirs}
+    measured = take_turns(works, rounds, device.profile, check, {FIRST: free_memory})
     # Of short runs, the host's clock measures what calls cost: the device's account of kernels stands for it.
     inside = replace(measured[CACHED], wall=measured[CACHED].device["kernel"])
     rows = [*limits.rows(measured, first="triad"), arithmetic.row(measured)]
     rows.append(Row(CACHED, inside, repeats * small.bytes, repeats * STEPS))
-    rows += [Row(one, measured[one], turn.bytes, STEPS) for one in (OURS, *theirs)]
+    rows += [Row(one, measured[one], turn.bytes, STEPS) for one in (OURS, FIRST, *theirs)]
     shape = " x ".join(map(str, (STEPS, *turn.shape)))
     title = f"exact method to normals, sigma, contact and mean; {shape} {turn.dtype.name}"
-    return Case(name, title, rows, absent, _notes(turn, {row.name: row for row in rows}))
+    notes = _notes(turn, {row.name: row for row in rows})
+    return Case(name, title, rows, absent, notes, call_targets(rows) if rounds > 1 else ())
 
 
 def kernel_alone(turn: Turn, device: Device) -> Work:
@@ -365,10 +367,13 @@ def _numba_normals() -> Any:  # noqa: C901  # functions to compile
     return numba.njit(parallel=True, **options)(run)
 
 
-def _case(kind: str) -> Callable[[Device, bool], Case]:
+def _case(name: str, kind: str, shape: tuple[int, int] = (1080, 1920)) -> Callable[[Device, bool], Case]:
     return lambda device, quick: run_normals(
-        Turn(_QUICK if quick else _HD, np.dtype(kind)), device, 1 if quick else ROUNDS
+        name, Turn(_QUICK if quick else shape, np.dtype(kind)), device, 1 if quick else ROUNDS
     )
 
 
-CASES: Cases = {f"normals-{kind}": _case(kind) for kind in ("uint8", "uint16", "float32")}
+CASES: Cases = {
+    **{f"normals-{kind}": _case(f"normals-{kind}", kind) for kind in ("uint8", "uint16", "float32")},
+    "normals-4k": _case("normals-4k", "uint8", (2160, 3840)),
+}

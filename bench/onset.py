@@ -17,19 +17,16 @@ from mirrorskin.bench.harness import (
     THREADS,
     Case,
     Cases,
-    Row,
     Work,
     agree,
     check_memory,
     missing,
-    pusher,
 )
-from mirrorskin.bench.limits import beside_limits
+from mirrorskin.bench.limits import time_call
 from mirrorskin.bench.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
-from mirrorskin.engine import OnsetSearch
+from mirrorskin.engine import find_onset
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels
 
 Maps = dict[str, NDArray[Any]]
@@ -63,7 +60,7 @@ class OnsetCase:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keywords of `OnsetSearch`."""
+        """Keywords of `find_onset`."""
         if self.full:
             dark, bright = references(self.shape[1:], _BYTE)
             return {"dark": dark, "bright": bright}
@@ -85,13 +82,10 @@ def run_onset(case: OnsetCase, device: Device, quick: bool) -> Case:
     """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
     size = math.prod(case.shape)
     check_memory(case.name, 2 * size + _MAPS * math.prod(case.shape[1:]))
-    search = OnsetSearch(case.shape[1:], _BYTE, **case.options, device=device, memory_limit=2 * size)
-    frames = search.room[: case.shape[0]]
-    if len(frames) < case.shape[0]:
-        raise DeviceError(f"{device.info.title} has no room for {case.shape[0]} frames at once: use --quick")
+    frames = np.empty(case.shape, _BYTE)
     fill_press(frames, case.stack)
     travel = travel_of(len(frames))
-
+    call = functools.partial(find_onset, frames, travel, device=device, **case.options)
     theirs = _peer_works(case, frames, travel)
 
     def check(results: dict[str, Any]) -> None:
@@ -104,13 +98,11 @@ def run_onset(case: OnsetCase, device: Device, quick: bool) -> Case:
             else:  # a pixel with invalid input has no onset either
                 agree(name, {"frame": np.maximum(results[name], -1)}, found)
 
-    push, find = (pusher(search, frames, maps=maps, travel=travel) for maps in (False, True))
-    works: dict[str, Work] = {f"{OURS}, push only": push, OURS: find, **theirs}
-    limits, measured = beside_limits(works, size, device, quick, check)
-    rows = [Row(name, measured[name], size, len(frames)) for name in works]
     what = "full default" if case.full else "frame of the onset, one threshold, hold 1"
     title = f"{what}; {' x '.join(map(str, case.shape))} uint8, {case.stack}"
-    return Case(case.name, title, limits + rows, missing("torch", "numba"))
+    absent = missing("torch", "numba")
+    known: dict[str, Any] = {"frames": len(frames), "peers": theirs, "check": check, "absent": absent}
+    return time_call(case.name, title, call, size, device, quick, **known)
 
 
 class References(NamedTuple):

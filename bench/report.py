@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from mirrorskin.bench.harness import OURS
+from mirrorskin.bench.harness import FIRST, OURS
 from mirrorskin.bench.run import Data, Run
 from mirrorskin.io import InputError, check_output
 
@@ -41,8 +41,9 @@ _METHOD = (
 )
 _AIMS = "What was aimed at, and what came of it."
 _CALLS = (
-    "Calls as users make them, NumPy arrays in and maps out, and the share of the time that their kernels "
-    "take."
+    "Calls as users make them, NumPy arrays in and maps out, and commands from process start to end, in "
+    "milliseconds: what memory needs to read as many bytes, the kernels, a call after others, one with no "
+    "memory kept from calls before it, and the quickest peer that returns the same maps."
 )
 _BESIDE = (
     "Each work of ours beside the quickest of the peers that do the same. of limit: bandwidth as a share "
@@ -227,15 +228,29 @@ def _aims(machine: Machine) -> list[str]:
 
 
 def _calls(machine: Machine) -> list[str]:
-    """Return the calls with the share that their kernels take."""
+    """Return whole calls with limit, kernels and quickest peer, and commands with their kernels."""
     cells = []
     for case in machine.values():
-        if _is(case, "call-"):
-            for row in (row for row in case["rows"] if not is_limit(row)):
-                wall, kernel = row["wall"]["median"], row["device"].get("kernel", {}).get("median")
-                share = "" if kernel is None else f"{100 * kernel / wall:.0f} %"
-                cells.append([case["title"], row["name"], as_ms(wall), share])
-    return [as_table(("call", "work", "ms", "in kernels"), cells)] if cells else []
+        works = [row for row in case["rows"] if not is_limit(row)]
+        limit = next((as_ms(row["wall"]["median"]) for row in case["rows"] if is_limit(row)), "")
+        by_name = {row["name"]: row for row in works}
+        ours = [by_name[OURS]] if FIRST in by_name else works if _is(case, "call-") else []
+        for row in ours:
+            kernel = row["device"].get("kernel")
+            first = by_name.get(FIRST) if row["name"] == OURS else None
+            rival = _quickest(row, [other for other in works if not is_ours(other)]) if first else None
+            cells.append(
+                [
+                    case["title"] if first else f"{case['title']}: {row['name']}",
+                    limit,
+                    "" if kernel is None else as_ms(kernel["median"]),
+                    as_ms(row["wall"]["median"]),
+                    as_ms(first["wall"]["median"]) if first else "",
+                    f"{_head(rival)} {as_ms(rival['wall']['median'])}" if rival else "",
+                ]
+            )
+    head = ("call", "limit, ms", "kernels", "call", "first call", "quickest peer")
+    return [as_table(head, cells)] if cells else []
 
 
 def _beside_peers(machine: Machine) -> list[str]:

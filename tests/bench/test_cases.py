@@ -9,6 +9,8 @@ import pytest
 
 from mirrorskin.bench import integration, suite
 from mirrorskin.bench.harness import (
+    FIRST,
+    OURS,
     Case,
     DisagreementError,
     InaccurateError,
@@ -17,6 +19,7 @@ from mirrorskin.bench.harness import (
     Target,
     Timing,
     agree,
+    call_targets,
 )
 from mirrorskin.bench.run import as_data
 from mirrorskin.bench.scenes import blob_mask, noisy_slopes, random_cuts
@@ -29,7 +32,7 @@ QUICK = (
     "correlate-uint8",
     "sliding",
     "normals-uint8",
-    "call-onset",
+    "call-edges",
     "integrate-mask",
     "integrate-live",
     "twin",
@@ -67,11 +70,23 @@ def test_every_other_case_runs_at_a_tiny_size(name):
     check_case(name)
 
 
-def test_a_call_says_which_share_its_kernels_take():
-    (case,) = suite.run_suite(open_device(), ["call-correlate-8"], quick=True)
-    (work,) = [row for row in case.rows if "limit" not in row.name]
-    assert set(work.measured.kernels) == set(work.measured.moved) != set()
-    assert "% in kernels" in case.notes[0]
+def test_a_call_has_its_kernels_and_the_first_call_beside_it():
+    (case,) = suite.run_suite(open_device(), ["call-edges"], quick=True)
+    again, first = [row for row in case.rows if "limit" not in row.name]
+    assert set(again.measured.kernels) == set(again.measured.moved) != set()
+    assert (again.name, first.name) == (OURS, FIRST)
+
+
+def test_a_call_aims_at_its_kernels_and_at_its_peers():
+    def row(name, ms, kernel=None):
+        timing = Timing(1e-3 * ms, 1e-3 * ms, 1e-3 * ms, 3)
+        device = {} if kernel is None else {"kernel": Timing(1e-3 * kernel, 0.0, 0.0, 3)}
+        return Row(name, Measured(timing, device, {}, {}, 1.0, 0.0), 100)
+
+    ours = row(OURS, 16.1, 10), row(FIRST, 18.9, 10), row(f"{OURS}, solve", 5, 5)
+    peers = row("NumPy", 150), row("Numba", 16.2), row("OpenCV, solve", 4)
+    found = [(one.what, one.met) for one in call_targets([row("read limit", 1), *ours, *peers])]
+    assert found == [(OURS, False), (FIRST, True), (OURS, False), (OURS, True), (f"{OURS}, solve", False)]
 
 
 def test_importing_the_package_imports_no_case_peer_or_report():
