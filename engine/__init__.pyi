@@ -11,6 +11,7 @@ from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
 from .scoring import Score, score
+from .tiling import free_memory
 
 __all__ = [
     "ChangePointSearch",
@@ -31,6 +32,7 @@ __all__ = [
     "find_change_point",
     "find_edges",
     "find_onset",
+    "free_memory",
     "fuse",
     "integrate",
     "measure",

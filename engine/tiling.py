@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.device import free_memory as free_memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 MEMORY_LIMIT = 256_000_000
@@ -191,8 +192,8 @@ class Band:
     def _make(self, name: str) -> Array:
         kind = self._kinds[name]
         if isinstance(kind, Planes):
-            return self._device.array(name, (kind.count, self.stride), kind.dtype)
-        return self._device.array(name, self._shape, kind)
+            return self._device.array(name, (kind.count, self.stride), kind.dtype, zeroed=False)
+        return self._device.array(name, self._shape, kind, zeroed=False)
 
     def _park(self) -> None:
         for array in self.maps.values():
@@ -253,7 +254,7 @@ def _second(device: Device, first: Array) -> Array | None:
     if device.info.shares_memory:
         return None
     try:
-        return device.array(first.name, first.host.shape, first.host.dtype)
+        return device.array(first.name, first.host.shape, first.host.dtype, zeroed=False)
     except DeviceMemoryError:
         return None
 
@@ -262,7 +263,7 @@ def _longest(device: Device, length: int, least: int, shape: tuple[int, int], dt
     """Make room for as many frames as fit, up to a length."""
     while True:
         try:
-            return device.array("frames", (length, *shape), dtype)
+            return device.array("frames", (length, *shape), dtype, zeroed=False)
         except DeviceMemoryError:
             if length <= least:
                 raise

@@ -11,13 +11,13 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from mirrorskin.kernels import memory
 from mirrorskin.kernels.errors import DeviceMemoryError
 
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
 
 _READ_WRITE = cl.map_flags.READ | cl.map_flags.WRITE
-_PAGE = 4096
 _SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
 _NO_ROOM = {
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
@@ -30,6 +30,7 @@ _NO_ROOM = {
 class Array:
     """An array that host and device both see: one memory where they share it, a copy each otherwise.
 
+    It is filled with zeros, unless what it holds at first does not matter.
     The host writes it at first; ``upload`` hands it to the device and ``download`` brings it back, which
     moves nothing on a device that shares the host's memory.
 
@@ -43,7 +44,9 @@ class Array:
         The last kernel that took it as an argument.
     """
 
-    def __init__(self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    def __init__(
+        self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], zeroed: bool = True
+    ) -> None:
         self.name = name
         self.arrived: cl.Event | None = None
         self.last_use: cl.Event | None = None
@@ -56,7 +59,7 @@ class Array:
         if nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, nbytes))
         try:
-            self._memory = _aligned(nbytes + _SLACK)
+            self._memory = memory.take(nbytes + _SLACK, zeroed)
             self.host = self._memory[:nbytes].view(dtype).reshape(shape)
         except MemoryError as error:
             raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
@@ -227,13 +230,6 @@ def _map(
         queue, buffer, flags, 0, like.shape, like.dtype, wait_for=after, is_blocking=True
     )
     return view
-
-
-def _aligned(nbytes: int) -> NDArray[np.uint8]:
-    """Return zeros that start on a page, so that a device sharing the memory need not copy them."""
-    raw = np.zeros(nbytes + _PAGE, np.uint8)
-    start = -raw.ctypes.data % _PAGE
-    return raw[start : start + nbytes]
 
 
 @contextmanager

@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels import embedded
+from mirrorskin.kernels import embedded, memory
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, pinned
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -33,6 +33,7 @@ C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
+_opened: list[Device] = []
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 
 
@@ -99,6 +100,24 @@ def open_device(choice: str | Device | None = None) -> Device:
         return _open(_choose(choice))
 
 
+def free_memory() -> None:
+    """Give the memory that is kept from call to call back to the system.
+
+    Arrays that the engine works in and the maps that it returns lie in memory that is used again once nobody
+    refers to it: its pages need not be made anew. No more than `mirrorskin.kernels.memory.KEPT`, 512 MB, is
+    kept while nobody uses it, besides the solver of the last call of `mirrorskin.engine.integrate`.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine
+    >>> engine.free_memory()
+    """
+    with _opening:
+        for device in _opened:
+            device.spare.clear()
+    memory.free()
+
+
 class Device:
     """An open device: its context and queue, its compiled programs, its profile.
 
@@ -138,7 +157,7 @@ class Device:
         self.spare: dict[str, Any] = {}
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
 
-    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Array:
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zeroed: bool = True) -> Array:
         """Make room for an array on the device.
 
         Parameters
@@ -147,13 +166,15 @@ class Device:
             What the profile calls it.
         shape : tuple of int
         dtype : dtype
+        zeroed : bool
+            Whether it holds zeros at first, or anything.
 
         Raises
         ------
         DeviceMemoryError
             It does not fit; a smaller one may.
         """
-        return Array(self, name, shape, np.dtype(dtype))
+        return Array(self, name, shape, np.dtype(dtype), zeroed)
 
     def given(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
         """Make an array that holds values; where there are none, one element that means nothing.
@@ -173,7 +194,7 @@ class Device:
         shape = np.shape(values)
         if 0 in shape:
             return self.given(name, np.zeros(1), dtype)
-        array = self.array(name, shape, dtype)
+        array = self.array(name, shape, dtype, zeroed=False)
         array.host[...] = values
         array.upload()
         return array
@@ -443,7 +464,8 @@ def _default(devices: list[cl.Device]) -> cl.Device:
 
 @functools.cache
 def _open(device: cl.Device) -> Device:
-    return Device(device)
+    _opened.append(Device(device))
+    return _opened[-1]
 
 
 def _read_source(path: Path) -> str:

@@ -62,7 +62,10 @@ def test_a_page_has_runs_aims_calls_and_the_quickest_peer():
     works = row("mirrorskin, quick", 0.2, moved=10**9, kernel=0.1, share=0.5), slow, quick
     aims = target("whole path", True), target("memory | peak", False, "12 MB")
     found = page_of(
-        run(case("press", LIMIT, OURS, targets=aims), case("call-edges", LIMIT, OURS, FIRST, row("Numba", 0.3))),
+        run(
+            case("press", LIMIT, OURS, targets=aims),
+            case("call-edges", LIMIT, OURS, FIRST, row("Numba", 0.3)),
+        ),
         run(case("turn", LIMIT, *works), case("accuracy-all", targets=aims), quick=True),
     )
     assert (
