@@ -116,13 +116,19 @@ def new_file(path: Path) -> Iterator[int]:
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[NewHdf5]:
     """Write an HDF5 file as ``new_file`` does."""
-    with new_file(path) as descriptor:
-        new = NewHdf5(path, descriptor)
-        try:
-            yield new
-        finally:
-            new.close()
-            new.check()
+    with new_file(path) as descriptor, hdf5_in(path, descriptor) as new:
+        yield new
+
+
+@contextmanager
+def hdf5_in(path: Path, descriptor: int) -> Iterator[NewHdf5]:
+    """Write HDF5 into a file that is open, and will be ``path``."""
+    new = NewHdf5(path, descriptor)
+    try:
+        yield new
+    finally:
+        new.close()
+        new.check()
 
 
 def remove_leftovers(folder: Path) -> list[Path]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.os_errors import as_input_error, is_flagged, legible
+from mirrorskin.io.os_errors import as_input_error, is_flagged
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
 
@@ -21,12 +21,6 @@ Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
 Shape = tuple[int, ...]
 
 _LINKS_DEEP = 16
-_TEXT, _ONE = h5py.string_dtype(), h5py.h5s.create(h5py.h5s.SCALAR)
-_STORED_TEXT = h5py.h5t.py_create(_TEXT, logical=True)
-_UNDATED, _WITH_GROUPS = h5py.h5p.create(h5py.h5p.DATASET_CREATE), h5py.h5p.create(h5py.h5p.LINK_CREATE)
-_UNDATED.set_obj_track_times(False)
-_WITH_GROUPS.set_create_intermediate_group(True)
-_WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 
 
 class Hdf5File(Closing):
@@ -362,41 +356,6 @@ def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int
     _, last = selected.get_select_bounds()
     reaches = all(end < count for end, count in zip(last, source.shape, strict=True))
     return int(part.vspace.get_select_npoints()) if reaches else 0
-
-
-class DatasetSpec(NamedTuple):
-    """A dataset to write: its name, what it holds, and its attributes."""
-
-    name: str
-    values: NDArray[Any]
-    attributes: Mapping[str, str]
-
-
-def write_dataset(root: h5py.Group, spec: DatasetSpec) -> None:
-    """Write one in a piece, so that it lies there as it is in memory.
-
-    It does what ``root[spec.name] = spec.values`` does, in a fifth of the time where that is little.
-    """
-    values = np.asarray(spec.values, order="C")
-    kind, space = h5py.h5t.py_create(values.dtype, logical=True), h5py.h5s.create_simple(values.shape)
-    node = h5py.h5d.create(root.id, spec.name.encode(), kind, space, _UNDATED, _WITH_GROUPS)
-    if values.size:
-        node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
-    for name, text in spec.attributes.items():
-        h5py.h5a.create(node, name.encode(), _STORED_TEXT, _ONE).write(np.array(text, _TEXT))
-
-
-def fixed_text(text: str) -> NDArray[Any]:
-    """Return a text as UTF-8 of a fixed length, so that it lies in the file in one piece."""
-    encoded = legible(text).encode() or b"\0"
-    return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
-
-
-def process_specs(place: str, process: Mapping[str, ProcessValue]) -> Iterator[DatasetSpec]:
-    """Yield what says how something came about."""
-    for name, value in process.items():
-        values = fixed_text(value) if isinstance(value, str) else np.asarray(value)
-        yield DatasetSpec(f"{place}/{name}", values, {})
 
 
 def read_process(file: Hdf5File, place: str, names: Iterable[str] | None = None) -> dict[str, ProcessValue]:

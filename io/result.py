@@ -8,14 +8,13 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import new_hdf5
-from mirrorskin.io.calibration.file import CARRIED, carried_by, write_calibration
-from mirrorskin.io.hdf5 import DatasetSpec, Hdf5File, Node, Shape, process_specs, read_process, write_dataset
+from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
+from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
+from mirrorskin.io.writing import Item, process_items, write_file
 
 MARK = "mirrorskin_result"
 UNITS = (
@@ -53,32 +52,33 @@ def save_result(result: Result, path: str | Path) -> None:
     >>> from mirrorskin import io
     >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
     """
+    write_file(Path(path), _items(result))
+
+
+def _items(result: Result) -> Iterator[Item]:
     maps = result.maps()
-    with new_hdf5(Path(path)) as new:
-        new.root.attrs.update(NX_class="NXroot", default="entry")
-        entry = new.root.create_group("entry")
-        entry.attrs.update({"NX_class": "NXentry", "default": "result", MARK: 1})
-        shown = entry.create_group("result")
-        shown.attrs.update(NX_class="NXdata", **_plot(result, maps))
-        entry.create_group("process").attrs["NX_class"] = "NXprocess"
-        for spec in (*_map_specs(result, maps), *process_specs(_PROCESS, result.process)):
-            write_dataset(new.root, spec)
-        if result.calibration is not None:
-            write_calibration(new.root, result.calibration, CARRIED)
-        if "height_sigma" in shown:
-            shown["height_errors"] = h5py.SoftLink(f"{_RESULT}/height_sigma")  # where viewers look for them
+    yield Item("/", None, {"NX_class": "NXroot", "default": "entry"})
+    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", MARK: 1})
+    yield Item(_RESULT, None, {"NX_class": "NXdata", **_plot(result, maps)})
+    yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
+    yield from _map_items(result, maps)
+    yield from process_items(_PROCESS, result.process)
+    if result.calibration is not None:
+        yield from calibration_items(result.calibration, CARRIED)
+    if result.height_sigma is not None:
+        yield Item(f"{_RESULT}/height_errors", f"{_RESULT}/height_sigma", {})  # where viewers look for them
 
 
-def _map_specs(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[DatasetSpec]:
+def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Item]:
     """Yield the maps and a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
         attributes = {} if name == _VECTORS else {"interpretation": "image"}
         attributes |= {"units": UNITS[name]} if name in UNITS else {}
-        yield DatasetSpec(f"{_RESULT}/{name}", values, attributes)
+        yield Item(f"{_RESULT}/{name}", values, attributes)
     if result.offset_unknown is not None:
-        yield DatasetSpec(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+        yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
     for name, positions in _axes(result, maps).items():
-        yield DatasetSpec(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
+        yield Item(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 
 
 def _axes(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

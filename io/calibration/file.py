@@ -14,7 +14,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.source import check_camera
 from mirrorskin.io.calibration.types import (
     BITS,
@@ -27,16 +26,9 @@ from mirrorskin.io.calibration.types import (
     stored,
     unit_of,
 )
-from mirrorskin.io.hdf5 import (
-    DatasetSpec,
-    Hdf5File,
-    Node,
-    fixed_text,
-    process_specs,
-    read_process,
-    write_dataset,
-)
+from mirrorskin.io.hdf5 import Hdf5File, Node, read_process
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
+from mirrorskin.io.writing import Item, fixed_text, process_items, write_file, write_item
 
 MARK, VERSION = "mirrorskin_calibration", 1
 """The attribute of the group that holds a calibration, and the layout that is written and read here."""
@@ -90,9 +82,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     >>> print(open_calibration("left.h5").camera)
     'left', 640 x 480, uint8
     """
-    with new_hdf5(Path(path)) as new:
-        new.root.attrs.update(NX_class="NXroot", default="entry")
-        write_calibration(new.root, calibration, ENTRY)
+    root = Item("/", None, {"NX_class": "NXroot", "default": "entry"})
+    write_file(Path(path), [root, *calibration_items(calibration, ENTRY)])
 
 
 def update_calibration(
@@ -150,36 +141,41 @@ def update_calibration(
 
 def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> None:
     """Write a calibration as the group ``place``, which may exist already."""
+    for item in calibration_items(calibration, place):
+        write_item(file, item)
+
+
+def calibration_items(calibration: Calibration, place: str) -> Iterator[Item]:
+    """Yield a calibration as the group ``place``."""
     parts = [GROUPS[name] for name in calibration.parts()]
     maps = [name for name in parts if name in _SIGNALS]
     default = {"default": maps[0]} if maps else {}
     kind = "NXentry" if place == ENTRY else "NXcollection"
-    file.require_group(place).attrs.update({"NX_class": kind, MARK: VERSION, **default})
+    yield Item(place, None, {"NX_class": kind, MARK: VERSION, **default})
     for name in ("camera", *parts):
         signal = {"signal": _SIGNALS[name]} if name in _SIGNALS else {}
-        attributes = {"NX_class": "NXdata" if signal else "NXcollection", **signal}
-        file.require_group(f"{place}/{name}").attrs.update(attributes)
-    file.require_group(f"{place}/process").attrs["NX_class"] = "NXprocess"
-    for spec in _specs(calibration, place):
-        write_dataset(file, spec)
+        yield Item(f"{place}/{name}", None, {"NX_class": "NXdata" if signal else "NXcollection", **signal})
+    yield Item(f"{place}/process", None, {"NX_class": "NXprocess"})
+    yield from _datasets(calibration, place)
 
 
 def size_of(calibration: Calibration) -> int:
     """Return how many bytes its values have."""
-    return sum(spec.values.nbytes for spec in _specs(calibration, ""))
+    items = _datasets(calibration, "")
+    return sum(item.values.nbytes for item in items if isinstance(item.values, np.ndarray))
 
 
-def _specs(calibration: Calibration, place: str) -> Iterator[DatasetSpec]:
+def _datasets(calibration: Calibration, place: str) -> Iterator[Item]:
     camera = calibration.camera
-    yield DatasetSpec(f"{place}/camera/name", fixed_text(camera.name), {})
-    yield DatasetSpec(f"{place}/camera/shape", np.asarray(camera.shape, np.int64), {})
-    yield DatasetSpec(f"{place}/camera/dtype", fixed_text(np.dtype(camera.dtype).name), {})
+    yield Item(f"{place}/camera/name", fixed_text(camera.name), {})
+    yield Item(f"{place}/camera/shape", np.asarray(camera.shape, np.int64), {})
+    yield Item(f"{place}/camera/dtype", fixed_text(np.dtype(camera.dtype).name), {})
     for name, part in calibration.parts().items():
-        yield from _part_specs(part, f"{place}/{GROUPS[name]}", camera)
-    yield from process_specs(f"{place}/process", calibration.process)
+        yield from _part_items(part, f"{place}/{GROUPS[name]}", camera)
+    yield from process_items(f"{place}/process", calibration.process)
 
 
-def _part_specs(part: Part, place: str, camera: CameraId) -> Iterator[DatasetSpec]:
+def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
     """Yield what a part holds; ValueError if it does not fit the camera or itself."""
     sizes = _sizes_of(camera)
     how = stored(part)
@@ -190,13 +186,13 @@ def _part_specs(part: Part, place: str, camera: CameraId) -> Iterator[DatasetSpe
         if one.kind == "mapping":
             for key, number in value.items():
                 values = np.asarray(number, np.float64)
-                yield DatasetSpec(f"{place}/{name}/{key}", values, _units(unit_of(key, how)))
+                yield Item(f"{place}/{name}/{key}", values, _units(unit_of(key, how)))
             continue
         values = _values_of(value, one)
         if values.shape != _shape_of(one, values.shape, sizes):
             raise ValueError(f"{place}/{name} is of shape {values.shape}: {one.shape} is needed")
         image = {"interpretation": "image"} if one.kind == "map" else {}
-        yield DatasetSpec(f"{place}/{name}", values, image | _units(one.unit))
+        yield Item(f"{place}/{name}", values, image | _units(one.unit))
 
 
 def _values_of(value: Any, how: Stored) -> NDArray[Any]:

@@ -10,6 +10,7 @@ import pytest
 from stacks import assert_same, plot_of, record, sphere
 
 from mirrorskin import io
+from mirrorskin.io import writing
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 
@@ -128,6 +129,30 @@ def test_pieces_of_a_surface_come_back(path, turns):
     assert "offset_unknown" not in group.attrs["auxiliary_signals"]
     facts = io.describe(path)
     assert (facts["kind"], facts["components"]) == ("result", "2, of which 1 have an unknown offset")
+
+
+def test_a_file_that_is_written_like_the_one_before_is_what_hdf5_would_write(tmp_path, monkeypatch):
+    camera = io.CameraId("left", (50, 70), np.dtype(np.uint8))
+
+    def result(seed):
+        rng = np.random.default_rng(seed)
+        maps = {name: rng.normal(size=(50, 70)).astype("f4") for name in ("height", "height_sigma")}
+        references = io.References(*rng.uniform(0, 9, (4, 50, 70)).astype("f4"), np.zeros((50, 70), "u1"))
+        facts = PROCESS | {"noise": rng.uniform(), "source": f"{seed} 五円.h5", "frames": seed}
+        known = {"calibration": io.Calibration(camera, references=references), "process": facts}
+        return io.Result(**maps, status=rng.integers(0, 4, (50, 70)).astype("u1"), **known)
+
+    paths = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "c.h5"
+    for seed, path in enumerate(paths[:2]):
+        io.save_result(result(seed), path)
+    monkeypatch.setattr(writing, "_layouts", {})
+    io.save_result(result(1), paths[2])
+    first, like, anew = (path.read_bytes() for path in paths)
+    assert like == anew != first
+    found = io.open_result(paths[1])
+    np.testing.assert_array_equal(found.height, result(1).height)
+    assert found.process["source"] == "1 五円.h5"
+    assert found.calibration.references.dark.tobytes() == result(1).calibration.references.dark.tobytes()
 
 
 def test_a_result_of_another_program_s_types_is_read(path):
