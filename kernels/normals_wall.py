@@ -1,4 +1,4 @@
-"""Surface normals where a cylindrical wall makes the light: what ``normals.cl`` computes with WALL, in NumPy.
+"""Surface normals where a cylindrical wall makes the light: what ``normals_wall.cl`` computes, in NumPy.
 
 As `mirrorskin.kernels.normals.normals_exact`, but samples are lights (`mirrorskin.kernels.response`), not
 zeniths, and places count. The body sees a normal n at phase alpha as Rz(alpha) Ry(tilt) Rz(-alpha) n, and the

@@ -20,15 +20,13 @@ from mirrorskin.engine.tiling import Band, Planes
 from mirrorskin.io import Header, InputError
 from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
-from mirrorskin.kernels.normals import MORE, contact_limits
-from mirrorskin.kernels.normals_wall import STEPS
+from mirrorskin.kernels.normals import contact_limits
 
 NormalMethod = Literal["exact", "paper"]
 NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
 MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
 """What the kernel leaves, by name."""
 
-_LANES = 8  # pixels that are best worked on side by side, where a word has room for as many
 _TABLES = 64  # turns whose tables the device has at once
 _TABLE_BYTES = 4 * 6 * LONGEST
 _ENOUGH = 500  # pixels to estimate the noise from
@@ -194,30 +192,19 @@ class NormalKernel:
         The maps become the mean of ``turns`` turns, this one included. ``bare`` leaves out those of the wave:
         mean, cosine, sine and residual.
         """
-        layout, count, tilt, noise = self.device.layout, samples.count, model.tilt, model.noise
-        lanes = min(_LANES, layout.lanes)
-        integer, per_pixel = self._dtype.kind == "u", self._scale.per_pixel
-        kernel = self.device.kernel(
-            "normals",
-            f"normals_{self._method}" if self._wall is None else "normals_wall",
-            FRAME=C_TYPES[self._dtype.name],
-            COUNTED=int(integer),
-            TOP=int(np.iinfo(self._dtype).max) if integer else 0,
-            LANES=lanes,
-            COUNT=count,
-            WEIGHTED=int(fit.weighted),
-            ROOM=LONGEST,
-            MAPS=int(per_pixel),
-            ENDS=int(self._scale.ends),
-            MORE=MORE,
-            RING=int(samples.ring),
-            BARE=int(bare),
-            **self._wall_macros,
-        )
+        count, tilt, noise, layout = samples.count, model.tilt, model.noise, self.device.layout
+        lanes, per_pixel = vector_lanes(self.device), self._scale.per_pixel
+        file = "normals" if self._wall is None else "normals_wall"
+        name = f"normals_{self._method}" if self._wall is None else "normals_wall"
+        kernel = self.device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
         limits = contact_limits(count - 3, tilt)
         fitted = tilt if self._method == "exact" else 0.0  # exact fits what a pixel's tilt is more than this
-        further: dict[str, Any] = {} if self._wall is None else {"wall": self._wall}
-        if self._method == "paper":
+        further: dict[str, Any] = {}
+        if isinstance(self._scale, Response):
+            wall = self._scale.wall
+            sizes = {"curve_length": len(wall.curve), "inverse_length": len(wall.inverse)}
+            further = {"wall_numbers": self._wall, "follows": int(wall.follows), **sizes}
+        elif self._method == "paper":
             (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             further = {"of_mean": mean, "of_cosine": cosine, "of_both": both, "of_sine": sine}
         planes = 4 * len(self._scale.planes) * per_pixel
@@ -229,9 +216,14 @@ class NormalKernel:
             scale=band.maps["scale"] if per_pixel else self._one_scale,
             table=self._places[fit],
             start=samples.start,
+            count=count,
+            slots=count if samples.ring else samples.start + count,
+            each=band.stride if samples.ring else band.pixels,
             pixels=band.pixels,
             stride=band.stride,
             turns=turns,
+            per_pixel=int(per_pixel),
+            bare=int(bare),
             cos_tilt=math.cos(tilt),
             sin_tilt=math.sin(tilt),
             noise_base=noise.base,
@@ -249,14 +241,12 @@ class NormalKernel:
             moved=band.pixels * (count * self._dtype.itemsize + _MAP_BYTES + planes),
         )
 
-    @property
-    def _wall_macros(self) -> dict[str, int]:
-        """What a kernel under a wall is compiled with besides; nothing without one."""
-        if not isinstance(self._scale, Response):
-            return {}
-        wall = self._scale.wall
-        sizes = {"CURVE": len(wall.curve), "INVERSE": len(wall.inverse)}
-        return {"WALL": 1, "STEPS": STEPS, "FOLLOWS": int(wall.follows), **sizes}
+
+def vector_lanes(device: Device) -> int:
+    """Return how many pixels an item of `normals.cl` works on side by side: as a CPU's registers hold."""
+    if device.layout.tile == 1:
+        return 1
+    return 16 if device.queue.device.native_vector_width_float >= 16 else 8
 
 
 def _even_noise(noise: float) -> CountNoise:

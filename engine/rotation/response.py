@@ -56,7 +56,7 @@ class Response:
 
     @property
     def table(self) -> NDArray[np.float32]:
-        """The wall's numbers in the order of the names in ``normals.cl``."""
+        """The wall's numbers in the order of the names in ``normals_wall.cl``."""
         wall = self.wall
         radius, rim, scatter = wall.geometry
         low, high = wall.reach

@@ -10,6 +10,7 @@ from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special
 
 from mirrorskin.engine.rotation.design_matrix import fit_matrix
+from mirrorskin.engine.rotation.normals_kernel import vector_lanes
 from mirrorskin.kernels import normals
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.normals import Answer, Variance, contact_limits
@@ -95,39 +96,24 @@ class Answers:
             turn.limits.most - (turn.tilt if method == "exact" else 0),
             turn.limits.rest,
         )
-        whole = start, start, self.pixels, self.stride, self.turns
+        per_pixel = int(scale.ndim == 2)
+        whole = start, start, count, start + count, self.pixels, self.pixels, self.stride, self.turns
         arrays = [self.put(stack), self.put(tables), self.put(scale)]
-        arguments = [*arrays, *whole, *reals, *self.maps.values()]
+        arguments = [*arrays, *whole, per_pixel, 0, *reals, *self.maps.values()]
         if method == "paper":
             arguments += [*turn.spread]
-        kernel, lanes = self.kernel(method, turn)
+        lanes = vector_lanes(self.device)
+        kernel = self.device.kernel(
+            "normals", f"normals_{method}", FRAME=C_TYPES[turn.frames.dtype.name], LANES=lanes
+        )
         launch(kernel, -(-self.pixels // (lanes * self.device.layout.words)), *arguments)
         return self
-
-    def kernel(self, method, turn):
-        dtype, count = turn.frames.dtype, len(turn.frames)
-        lanes = min(8, self.device.layout.lanes)
-        return self.device.kernel(
-            "normals",
-            f"normals_{method}",
-            FRAME=C_TYPES[dtype.name],
-            COUNTED=int(dtype.kind == "u"),
-            TOP=int(np.iinfo(dtype).max) if dtype.kind == "u" else 0,
-            LANES=lanes,
-            COUNT=count,
-            WEIGHTED=int(np.any(turn.weights != 1)),
-            ROOM=ROOM,
-            MAPS=int(turn.scale.ndim == 2),
-            ENDS=int(np.isfinite(turn.scale[2:]).any()),
-            MORE=normals.MORE,
-            RING=0,
-            BARE=0,  # both as the engine sets them, so that each kernel is compiled once for all tests
-        ), lanes
 
     def read(self):
         """Return the answers; nothing behind the last vector of a plane may have been written."""
         found = {name: array.download().copy() for name, array in self.maps.items()}
-        behind = -(-self.pixels // 8) * 8
+        lanes = vector_lanes(self.device)
+        behind = -(-self.pixels // lanes) * lanes
         for name, values in found.items():
             whole = 3 * behind if name == "vectors" else behind
             np.testing.assert_array_equal(values.reshape(-1)[whole:], UNTOUCHED)
@@ -181,7 +167,6 @@ def frames_of(setup, pixels, seed=1):
     return rotations.expose(facing(pixels, setup), setup, seed=seed)
 
 
-# Each number of frames is a kernel of its own, and takes its time to be built: few of them, of many kinds.
 CASES = {
     "uint8, uneven": (UINT8, 481, {}),
     "uint8, one pixel": (UINT8, 1, {}),

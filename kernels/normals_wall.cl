@@ -1,0 +1,214 @@
+// Surface normals where a cylindrical wall makes the light: samples are lights, not zeniths. Specification: normals_wall.py,
+// response.py; macros and arguments: normals.clh.
+
+#include "normals.clh"
+
+#define STEPS 3  // Gauss-Newton steps of all pixels
+#define SETTLED 1e-12f  // square of a step, radians, after which the next ones are none
+
+// The wall's numbers, before those of its inverse and its curve.
+enum {
+    RADIUS,
+    RIM,
+    SCATTER,  // square of the sine of its half-angle
+    BEND,
+    BEND_SQUARE,
+    LAMP_X,   // by the radius, as LAMP_Y
+    LAMP_Y,
+    NEAREST,  // the q between which the curve holds
+    FURTHEST,
+    DARKEST,  // and the lights
+    LIGHTEST,
+    SENSE,    // 1 where steeper is brighter, -1 where it is darker
+    PIVOT_X,
+    PIVOT_Y,
+    PIVOT_Z,
+    MIDDLE,   // what q is counted from in the curve, and how often
+    PER_Q,
+    INVERSE
+};
+
+typedef struct {
+    MAP is;
+    int inverse_length, curve_length;
+    int follows;  // whether a pixel keeps seeing one point of the object
+    float cos_tilt, sin_tilt;
+} Wall;
+
+// The point that a pixel sees in the mean pose, by how much its line of sight moves for each mm of z, and that for each mm
+// from the axis.
+typedef struct { F x, y, z, slope_x, slope_y, bend; } Place;
+
+// The expected light of a sample; by how much it grows along the meridian, across it and with the tilt, by its weight; and
+// whether all its rays meet the wall.
+typedef struct { F light, u1, u2, u3; I inside; } Expected;
+
+Place place_of(const Wall wall, const F x, const F y, const F z)
+{
+    const F bend = wall.is[BEND] + wall.is[BEND_SQUARE] * (x * x + y * y);
+    const Place place = {x * (1.0f - z * bend), y * (1.0f - z * bend), z, -bend * x, -bend * y, bend};
+    return place;
+}
+
+// The normal and the point turn with the body first: along the phase's direction and up only. The line of sight need not be
+// a unit vector.
+Expected expect(const Direction at, const Place place, const Wall wall, const Samples of, const int k)
+{
+    const float c = entry(of, COSINE, k), s = entry(of, SINE, k), root = entry(of, ROOT_WEIGHT, k);
+    const float cos_tilt = wall.cos_tilt, sin_tilt = wall.sin_tilt, radius = wall.is[RADIUS];
+    const F nx = at.st * at.cp, ny = at.st * at.sp, nz = at.ct;
+    const F flat_n = nx * c + ny * s, out_n = flat_n * cos_tilt + nz * sin_tilt;
+    const F bz = nz * cos_tilt - flat_n * sin_tilt, bx = nx + c * (out_n - flat_n), by = ny + s * (out_n - flat_n);
+    const F out_p = (place.x - wall.is[PIVOT_X]) * c + (place.y - wall.is[PIVOT_Y]) * s;
+    const F up_p = place.z - wall.is[PIVOT_Z], pz = wall.is[PIVOT_Z] + up_p * cos_tilt - out_p * sin_tilt;
+    F sx = place.slope_x, sy = place.slope_y, px, py;
+    if (wall.follows) {
+        const F shift = out_p * (cos_tilt - 1.0f) + up_p * sin_tilt;
+        px = place.x + c * shift;
+        py = place.y + s * shift;
+        sx -= place.bend * c * shift;
+        sy -= place.bend * s * shift;
+    } else {
+        px = place.x + (pz - place.z) * sx;
+        py = place.y + (pz - place.z) * sy;
+    }
+
+    // Where the reflected ray meets the wall, and the light there.
+    const F facing = sx * bx + sy * by + bz, twice = facing + facing;
+    const F rx = twice * bx - sx, ry = twice * by - sy, rz = twice * bz - 1.0f, flat = rx * rx + ry * ry;
+    const F room = radius * radius - px * px - py * py, along = px * rx + py * ry;
+    const F square = along * along + flat * room, per_leave = inverse_roots(square);
+    const F way = room / (along + square * per_leave), mx = px + way * rx, my = py + way * ry, h = pz + way * rz;
+    const F far = h * h + radius * radius, per_far = inverse_roots(far), per_both = 1.0f / (far * per_far + radius);
+    const F q = h * per_both, least_q = GREATER(q, (F)wall.is[NEAREST]), held = LESSER(least_q, (F)wall.is[FURTHEST]);
+    const F place_q = (held - wall.is[MIDDLE]) * wall.is[PER_Q];
+    MAP curve = wall.is + INVERSE + wall.inverse_length;
+    F level = curve[wall.curve_length - 1], steep = 0.0f;
+    for (int i = wall.curve_length - 2; i >= 0; --i) {
+        steep = steep * place_q + level;
+        level = level * place_q + curve[i];
+    }
+    steep *= wall.is[PER_Q];
+    level += steep * (q - held);
+
+    // Its derivatives by the normal that the body sees, and by that of the mean pose.
+    const float lamp_x = wall.is[LAMP_X], lamp_y = wall.is[LAMP_Y];
+    const F lamp = 1.0f + lamp_x * mx + lamp_y * my, by_height = lamp * steep * (radius * per_far * per_both);
+    const F further = (level * (lamp_x * rx + lamp_y * ry) + by_height * rz) * per_leave;
+    const F gx = way * (level * lamp_x - further * mx), gy = way * (level * lamp_y - further * my), gz = way * by_height;
+    const F pull_n = gx * bx + gy * by + gz * bz;
+    const F vx = 2.0f * (facing * gx + pull_n * sx), vy = 2.0f * (facing * gy + pull_n * sy);
+    const F vz = 2.0f * (facing * gz + pull_n), flat_v = vx * c + vy * s;
+    const F back = flat_v * cos_tilt - vz * sin_tilt - flat_v;
+    const F wx = vx + c * back, wy = vy + s * back, wz = flat_v * sin_tilt + vz * cos_tilt;
+    Expected found;
+    found.light = lamp * level;
+    found.u1 = root * (at.ct * (at.cp * wx + at.sp * wy) - at.st * wz);
+    found.u2 = root * (at.cp * wy - at.sp * wx);
+    found.u3 = root * (flat_v * bz - vz * out_n);
+
+    // Whether the rays that are turned up and down by the scatter meet the wall, too: by the sines of the angles to its edges.
+    const F below = wall.is[RIM] - h, over = wall.is[RIM] - pz, apart = way * way * flat;
+    const F turned = wall.is[SCATTER] * (sx * sx + sy * sy + 1.0f);
+    found.inside = (q == held) & (below >= 0.0f) & (h >= 0.0f)
+        & (flat * below * below >= turned * (apart + over * over)) & (flat * h * h >= turned * (apart + pz * pz));
+    return found;
+}
+
+// The mean light is that of a place on the wall; the wave gives its azimuth, and so how far it is from here. A missing
+// sample is taken for the mean of the others.
+Direction begin_at(const Samples of, const F mean, const Place place, const Wall wall)
+{
+    const float radius = wall.is[RADIUS], nearest = wall.is[NEAREST], furthest = wall.is[FURTHEST];
+    MAP inverse = wall.is + INVERSE;
+    F x = 0.0f, y = 0.0f, q = inverse[wall.inverse_length - 1];
+    for (int k = 0; k < of.count; ++k) {
+        const F light = zenith_of(of, raw_of(of, k)), deviation = light == light ? light - mean : (F)0.0f;
+        x += entry(of, IN_COSINE, k) * deviation;
+        y += entry(of, IN_SINE, k) * deviation;
+    }
+    const F most = LESSER(mean, (F)wall.is[LIGHTEST]), light = GREATER(most, (F)wall.is[DARKEST]);
+    for (int i = wall.inverse_length - 2; i >= 0; --i) q = q * light + inverse[i];
+    q = q < nearest ? (F)nearest : q;
+    q = q > furthest ? (F)furthest : q;
+    const F swing = x * x + y * y;
+    const I swings = swing > 0.0f;
+    const F per_swing = wall.is[SENSE] * inverse_roots(swings ? swing : (F)1.0f);
+    x = swings ? x * per_swing : (F)1.0f;
+    y = swings ? y * per_swing : (F)0.0f;
+    const F along = place.x * x + place.y * y;
+    const F out = roots(along * along + radius * radius - place.x * place.x - place.y * place.y) - along;
+    const F rise = 2.0f * radius * q / (1.0f - q * q) - place.z, per_ray = inverse_roots(out * out + rise * rise);
+    const F per_sight = inverse_roots(place.slope_x * place.slope_x + place.slope_y * place.slope_y + 1.0f);
+    return direction_of(out * x * per_ray + place.slope_x * per_sight, out * y * per_ray + place.slope_y * per_sight,
+                        rise * per_ray + per_sight);
+}
+
+// The normal equations at a direction, of samples that are all there and all within range.
+Sums look(const Direction at, const Samples of, const Place place, const Wall wall, const Wave wave)
+{
+    Sums sums = {0};
+    for (int k = 0; k < of.count; ++k) {
+        const F light = zenith_of(of, raw_of(of, k)), off = off_wave(of, k, light, wave);
+        const Expected seen = expect(at, place, wall, of, k);
+        const F error = entry(of, ROOT_WEIGHT, k) * (light - seen.light);
+        add(&sums, seen.u1, seen.u2, seen.u3, 1.0f, error, error * error);
+        sums.waves += off * off;
+        sums.within += seen.inside & 1;
+    }
+    return sums;
+}
+
+// The same of any samples.
+Sums look_closely(const Direction at, const Samples of, const Place place, const Wall wall, const F error_of_one)
+{
+    Sums sums = {0};
+    for (int k = 0; k < of.count; ++k) {
+        const F raw = raw_of(of, k);
+        const Expected seen = expect(at, place, wall, of, k);
+        add_closely(
+            &sums, of, k, raw, seen.light, seen.inside, seen.inside, error_of_one, seen.u1, seen.u2, seen.u3);
+        sums.within += seen.inside & whole_of(raw) & 1;
+    }
+    return sums;
+}
+
+__kernel void normals_wall(
+    ARGUMENTS, __global const float *restrict wall_numbers, const int inverse_length, const int curve_length,
+    const int follows)
+{
+    GATHER_ARGUMENTS
+    const Wall wall = {wall_numbers, inverse_length, curve_length, follows, cos_tilt, sin_tilt};
+    for (int p = first; p < end; p += LANES) {
+        const Samples of = SAMPLES((F)wall.is[DARKEST], (F)wall.is[LIGHTEST]);
+        const Place place = place_of(wall, SCALE(2), SCALE(3), SCALE(4));
+        const Known known = survey(of, noise);
+        const Direction begin = begin_at(of, zenith_of(of, known.level), place, wall);
+        Direction found = begin;
+        Sums sums;
+        for (int number = 0; number < STEPS; ++number) {
+            sums = look(found, of, place, wall, known.wave);
+            found = step(found, sums);
+        }
+        const F waves = sums.waves;
+        // Where too few samples tell anything, there is no answer, however closely one looks.
+        const I irregular = ((known.usable < count) | (sums.within < count)) & (known.usable >= LEAST);
+        if (any_of(irregular)) {
+            Direction at = begin;
+            for (int more = 0; more < MORE; ++more) {
+                const Sums closer = look_closely(at, of, place, wall, known.error_of_one);
+                sums = blend_sums(sums, closer, irregular);
+                const Direction before = at;
+                at = step(at, closer);
+                const F along = at.ct - before.ct, x = at.st * at.cp - before.st * before.cp;
+                const F y = at.st * at.sp - before.st * before.sp;
+                if (!any_of(irregular & (along * along + x * x + y * y > SETTLED))) break;
+            }
+            found = blend(found, at, irregular);
+        }
+        const I usable = LESSER(known.usable, sums.within), at_rest = found.st < limits.rest;
+        const F model = limits.model * (1.0f / count) * sums.m11;
+        conclude(maps, p, turns, found, sums, known.error_of_one, count, usable, at_rest, limits, model);
+        if (!bare) keep_wave(maps, p, turns, of, known.wave, waves);
+    }
+}
