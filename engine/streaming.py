@@ -84,13 +84,16 @@ def feed(
         if progress:
             progress(done)
     read = _read_ahead if not shared else _lent_or_read if long else _read_in_place
-    for block in read(source, estimator, len(frames)):
-        push_block(estimator, block)
-        done += len(block.frames)
-        if progress:
-            progress(done)
-    if hasattr(source, "fingerprint"):
-        source.fingerprint()  # while the device is at work: it is needed for the result
+    with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as beside:
+        # It is needed for the result, and is there by then.
+        known = beside.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
+        for block in read(source, estimator, len(frames)):
+            push_block(estimator, block)
+            done += len(block.frames)
+            if progress:
+                progress(done)
+    if known is not None:
+        known.result()
 
 
 def push_block(estimator: Estimator, block: Block, part: slice = slice(None)) -> None:

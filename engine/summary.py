@@ -78,7 +78,7 @@ def summarise(result: Result) -> Summary:
         answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")
     what, quantity, unit = names
     answered = np.isfinite(answers)
-    lowest, highest = _range(values[answered]) or (np.nan, np.nan)
+    lowest, highest = _range(values if answers is height else values[answered]) or (np.nan, np.nan)
     return Summary(
         what,
         answers.size,

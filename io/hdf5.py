@@ -29,9 +29,11 @@ class Hdf5File(Closing):
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
         self.path = path
         self.memory_limit = memory_limit
-        self._home = Path(os.path.realpath(path)).parent
-        self._files: dict[str, h5py.File] = {}
-        self.root = self.open_beside(None, path, "")
+        real = os.path.realpath(path)
+        self._home = Path(real).parent
+        with as_input_error(str(path)):
+            self.root = _open_file(path, real)
+        self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
 
     def close(self) -> None:
@@ -71,7 +73,7 @@ class Hdf5File(Closing):
         """Tell whether a file is one of ours: whether its entry, or that group, has a certain attribute."""
         entry = self.find(group)
         with as_input_error(f"{self.path}: {group}"):
-            return isinstance(entry, h5py.Group) and mark in entry.attrs
+            return isinstance(entry, h5py.Group) and h5py.h5a.exists(entry.id, mark.encode())
 
     def check_layout(self, mark: str, known: int = 1) -> None:
         """Raise InputError if a file of ours is laid out as nobody knew when this was written."""
@@ -83,7 +85,9 @@ class Hdf5File(Closing):
         """Return an attribute, a text or a number, of an object; None where it has none."""
         node = self.find(name)
         with as_input_error(f"{self.path}: {name}"):
-            return None if node is None else _first(node.attrs.get(attribute))
+            if node is None or not h5py.h5a.exists(node.id, attribute.encode()):
+                return None
+            return _first(_attribute(node.id, attribute.encode()))
 
     def stacks(self) -> dict[str, str]:
         """Return the three-dimensional datasets that the file itself holds: their names, sizes and types."""
@@ -153,13 +157,13 @@ class Hdf5File(Closing):
                 node = following
         return node
 
-    def open_beside(self, node: Node | None, filename: str | Path, what: str) -> h5py.File:
-        """Open a file that an object refers to; the file itself if there is none."""
-        path = self.path if node is None else self.beside(node, str(filename), what)
+    def open_beside(self, node: Node, filename: str, what: str) -> h5py.File:
+        """Open a file that an object refers to."""
+        path = self.beside(node, filename, what)
         real = os.path.realpath(path)
         if real not in self._files:
             with as_input_error(str(path)):
-                self._files[real] = _open_file(path)
+                self._files[real] = _open_file(path, real)
         return self._files[real]
 
     def beside(self, node: Node, filename: str, what: str) -> Path:
@@ -215,7 +219,7 @@ def _values(node: h5py.h5d.DatasetID) -> NDArray[Any]:
     return values
 
 
-def _attribute(node: h5py.h5d.DatasetID, name: bytes) -> NDArray[Any]:
+def _attribute(node: Any, name: bytes) -> NDArray[Any]:
     attribute = h5py.h5a.open(node, name)
     values: NDArray[Any] = np.empty(attribute.shape, attribute.dtype)
     attribute.read(values)
@@ -231,7 +235,7 @@ def _first(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _open_file(path: Path) -> h5py.File:
+def _open_file(path: Path, real: str) -> h5py.File:
     if not path.exists():
         raise InputError(f"{path}: no such file")
     if path.is_dir():
@@ -241,14 +245,14 @@ def _open_file(path: Path) -> h5py.File:
     if not path.is_file():
         raise InputError(f"{path} is no regular file: save what it gives in one first")
     try:
-        return h5py.File(os.path.realpath(path), "r")
+        return h5py.File(real, "r")
     except OSError as error:
         with path.open("rb"):
             pass
         if is_flagged(error):
             # It may be read while it is written, or its writer died: a lock tells which, so none is taken.
             with suppress(OSError):
-                return h5py.File(os.path.realpath(path), "r", swmr=True, locking=False)
+                return h5py.File(real, "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
             raise
         raise InputError(
