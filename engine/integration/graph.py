@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
+from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE, Mask
 
 Labels = NDArray[np.int32]
 Plane = tuple[float, float, float]
@@ -207,16 +207,11 @@ class Components:
 
 def find_components(flags: Flags, cut: bool) -> Components:
     """Label the pixels that links connect; ``cut``: some neighbours with an answer may have no link."""
-    answered = np.asarray(flags & (SLOPE | KNOWN), np.uint8)
-    if cut:  # on a doubled grid: pixels at even places, links between them
-        doubled = np.zeros([2 * size - 1 for size in flags.shape], np.uint8)
-        doubled[::2, ::2] = answered
-        doubled[::2, 1::2] = (flags & RIGHT)[:, :-1]
-        doubled[1::2, ::2] = (flags & DOWN)[:-1]
-        labels, count = _label(doubled)
-        labels = np.ascontiguousarray(labels[::2, ::2])
-    else:
-        labels, count = _label(answered)
+    answered = flags & (SLOPE | KNOWN) != 0
+    right, down = answered[:, :-1] & answered[:, 1:], answered[:-1] & answered[1:]
+    if cut:
+        right, down = right & (flags[:, :-1] & RIGHT != 0), down & (flags[:-1] & DOWN != 0)
+    labels, count = _label(answered, right, down)
     unknown = np.ones(count, bool)
     unknown[labels[flags & KNOWN != 0]] = False
     for shared in (labels, unknown):  # by the surfaces of several frames
@@ -224,13 +219,28 @@ def find_components(flags: Flags, cut: bool) -> Components:
     return Components(labels, unknown)
 
 
-def _label(answered: Flags) -> tuple[Labels, int]:
-    import cv2
-
-    count, numbers = cv2.connectedComponents(answered, connectivity=4, ltype=cv2.CV_32S)
-    labels = np.asarray(numbers, np.int32)
-    labels -= 1
-    return labels, count - 1
+def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
+    """Label what links to the right and down connect: runs of pixels in a row, then runs that touch."""
+    starts = answered.copy()
+    starts[:, 1:] &= ~right
+    run = np.cumsum(starts, dtype=np.int32).reshape(answered.shape) - 1
+    changes = down.copy()  # one link of each pair of runs
+    changes[:, 1:] &= ~(down[:, :-1] & right[:-1] & right[1:])
+    upper, lower = run[:-1][changes], run[1:][changes]
+    label = np.arange(int(starts.sum()), dtype=np.int32)
+    while upper.size:
+        one, other = label[upper], label[lower]
+        apart = one != other
+        upper, lower, one, other = upper[apart], lower[apart], one[apart], other[apart]
+        np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
+        while not np.array_equal(label, shorter := label[label]):
+            label = shorter
+    first = label == np.arange(label.size)
+    count = int(first.sum())
+    if count < 2:
+        return answered.astype(np.int32) - 1, count
+    number = (np.cumsum(first, dtype=np.int32) - 1)[label]
+    return np.where(answered, number[run], np.int32(-1)), count
 
 
 class Levelling:

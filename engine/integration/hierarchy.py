@@ -259,9 +259,8 @@ def _bytes(level: Level, arguments: dict[str, Any]) -> int:
 
 def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.floating]) -> NDArray[np.float64]:
     """Invert a matrix whose components' offsets are free, but for those that have an anchor."""
-    from scipy.sparse.csgraph import connected_components
-
-    count, label = connected_components(matrix != 0, directed=False)
+    label = _components(matrix)
+    count = int(label.max()) + 1
     members = np.bincount(label, minlength=count)
     free = np.bincount(label, anchor, count) <= _LEAST * np.bincount(label, np.diagonal(matrix), count)
     typical = np.bincount(label, np.diagonal(matrix), count) / members
@@ -269,6 +268,17 @@ def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.floating]) -
     mean = same / members[label]  # projects on what is free
     inverse: NDArray[np.float64] = _invert(matrix + typical[label] * mean) - mean / typical[label]
     return inverse
+
+
+def _components(matrix: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return to which component each node of a small matrix belongs; the least node of each tells."""
+    nodes = np.arange(len(matrix))
+    linked = (matrix != 0) | np.eye(len(matrix), dtype=bool)
+    least, lower = nodes[::-1], nodes
+    while np.any(least != lower):
+        least, lower = lower, np.where(linked, lower, len(nodes)).min(axis=1)
+        lower = lower[lower]
+    return np.unique(lower, return_inverse=True)[1]
 
 
 def _invert(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

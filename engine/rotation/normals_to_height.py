@@ -125,12 +125,19 @@ def _cosine_squared(nx: Floats, ny: Floats, known: NDArray[np.bool_], azimuth_va
     made longer, and the weighted mean would be wrong. Squares are the same on both sides of a ridge. Noise of
     the azimuth makes their means more alike, by exp(-2 variance).
     """
-    from scipy import ndimage
-
-    x, y = (ndimage.uniform_filter(np.where(known, n * n, 0), _AROUND, mode="constant") for n in (nx, ny))
+    x, y = (_mean_around(np.where(known, n * n, 0)) for n in (nx, ny))
     least = np.finfo(np.float32).tiny
     square = (x + least) / (x + y + 2 * least)
     return np.asarray(np.clip(0.5 + (square - 0.5) * np.exp(2 * azimuth_variance), 0, 1), np.float32)
+
+
+def _mean_around(values: Floats) -> Floats:
+    """Return the mean of each pixel's surroundings, (H, W), with 0 beyond the border."""
+    height, width = values.shape
+    padded = np.pad(values, _AROUND // 2)
+    rows = sum(padded[row : row + height] for row in range(1, _AROUND)) + padded[:height]
+    columns = sum(rows[:, column : column + width] for column in range(1, _AROUND)) + rows[:, :width]
+    return np.asarray(columns / np.float32(_AROUND**2), np.float32)
 
 
 def _variances(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,16 +83,39 @@ def valid(samples: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _variance(squares: Doubles, freedom: int) -> float:
     """Return the variance of normal samples from sums of squares, some of which are of other pixels."""
-    from scipy import special
-
-    furthest = float(special.chdtri(freedom, _BEYOND))
-    kept_share = float(special.chdtr(freedom + 2, furthest) / special.chdtr(freedom, furthest))
-    variance = float(np.median(squares)) / float(special.chdtri(freedom, 0.5))
+    furthest = _chi_square_beyond(freedom, _BEYOND)
+    kept_share = (1 - _share_beyond(freedom + 2, furthest)) / (1 - _share_beyond(freedom, furthest))
+    variance = float(np.median(squares)) / _chi_square_beyond(freedom, 0.5)
     for _ in range(10):
         kept = squares[squares <= furthest * variance]
         if kept.size == 0 or variance == (variance := float(np.mean(kept)) / (freedom * kept_share)):
             break
     return variance
+
+
+def _share_beyond(freedom: int, square: float) -> float:
+    """Return how probable it is that chi^2 exceeds a value: its sum for whole degrees of freedom.
+
+    To load SciPy's takes a quarter of a second.
+    """
+    half = square / 2
+    powers = np.arange(1 if freedom % 2 == 0 else 1.5, freedom / 2, dtype=np.float64)
+    if freedom % 2 == 0:
+        first = term = math.exp(-half)
+    else:
+        first, term = math.erfc(math.sqrt(half)), math.sqrt(2 * square / math.pi) * math.exp(-half)
+        first += term if freedom > 1 else 0.0
+    return float(first + np.sum(term * np.cumprod(half / powers)))
+
+
+def _chi_square_beyond(freedom: int, share: float) -> float:
+    """Return the value that chi^2 exceeds with this probability, to a double's last digits, by bisection."""
+    low, high = 0.0, 1.0
+    while _share_beyond(freedom, high) > share:
+        low, high = high, 2 * high
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if _share_beyond(freedom, middle) > share else (low, middle)
+    return high
 
 
 def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
