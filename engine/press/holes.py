@@ -4,42 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import spsolve
 
 from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Box = tuple[slice, slice]
 
-_SQUARE = np.ones((3, 3), bool)
-_SMALL = 2.0  # pixels from its rim that a hole must reach to be worth a smooth surface
+_SQUARE = np.ones((3, 3), np.uint8)
+_LINES: tuple[Any, ...] = np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]  # a map's sides
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+_LEAST_AREA, _LEAST_SIDE = 9, 3  # pixels of a hole that is worth a smooth surface, and
+_SMALL = 2.0  # how many it must reach from its rim
 _RING = 1.1  # width of the ring that determines the fill, in radii of the hole
 _NARROW = 0.6  # of one tried where the surface beyond is another one
 _LEAST_RING = 3.0  # pixels
 _TERRACES = 1.9  # that a ring's heights must span: two steps, but for rounding, show how the slope changes
 _WIDEST, _WIDER = 3.0, 1.3  # radii, and by how much to widen
-_CELLS = 2  # of the splines in a hole's radius
-_LEAST_CELLS = 1.2  # below which a hole is too long and thin for splines
-_MOST_CELLS = 30  # along the picture's axes
+_SAMPLES = 12  # of the ring in a hole's radius: more would say no more
+_MOST_SAMPLES = 120  # along a side of its box, about
+_MOST_CELLS = 20  # of the splines, a hole's radius long, along the picture's axes; longer holes are too thin
 _STIFFNESS = 2e-4  # of a surface over a hole of radius 1, with intervals of half-width _DEPTH
 _MISFIT = 0.5  # RMS excess, in half-widths, beyond which the ring is not one smooth surface
 _STEEP_SHARE = 0.05  # of a hole's pixels that may be steeper than dark ones are
 _DEPTH = 0.1  # of a round cap that is dark up to 11.8 degrees, in radii of its hole
-_MOST_CUT = 16  # holes at the border that are looked at, the largest ones
 _CUT = 0.2  # of a hole's outline along the picture's border, up to which it is still surrounded
-_EFFORT = 300  # of a smooth surface, in splines
-_WORK = 30_000  # in all: the smallest of very many holes get membranes
-_DIRECT = 10_000  # unknowns that a direct solution is quick for
-_TOLERANCE = 1e-5  # of the right side
-_ITERATIONS = 200
+_HEAVY = 250  # splines of a surface that takes twice as long as a small one
+_WORK = 40.0  # small surfaces in all: the smallest of very many holes get membranes
 _EXACT = 0.01  # pixel sizes: half-width of a height that claims to be exact
 
 
@@ -118,41 +119,42 @@ def fill_holes(
     """
     field = _field_of(height, sigma, pixel_size, above)
     _check_limits(steepest, deepest)
-    filled = field.labels > 0
-    result, left = field.height.copy(), filled & ~field.cut[field.labels]
-    filled[:] = left
-    for number, box, smooth in _smooth_surfaces(field, steepest):
-        own = field.labels[box] == number
-        result[box][own] = smooth[own]
-        filled[box] |= own
-        left[box] &= ~own
-    result = _stretch_over(field, result, left)
-    result = np.where(filled, np.fmax(result, field.low), field.height)
-    if deepest is not None and filled.any():
-        filled &= result > deepest + _step(field, filled)
-    return np.where(filled, result, field.height).astype(np.float32), filled.astype(np.uint8)
+    result, filled = field.height.copy(), np.zeros(field.height.shape, np.uint8)
+    left, top, across, down = cv2.boundingRect(np.isfinite(result).view(np.uint8))
+    if across:
+        part = slice(top, top + down), slice(left, left + across)
+        sides = top == 0, top + down == len(result), left == 0, left + across == len(result[0])
+        _fill(field.part(part), sides, steepest, deepest, result[part], filled[part])
+    return result, filled
 
 
 class _Field(NamedTuple):
-    """A map with holes.
+    """Heights, (H, W), NaN where there are none, and what else is known of them.
 
-    Heights, NaN where there are none, and what is known of them: the ends of their intervals, NaN where
-    nothing is, infinite where there is no upper one. The holes' numbers, from 1 on, whether the picture cuts
-    them, and the parts of the map that they lie in. The distances of rows and of columns. Lengths are in mm.
+    Standard deviations, and heights that pixels lie above, NaN where nothing is known: one a pixel, or one.
+    The distances of rows and of columns. Lengths are in mm.
     """
 
-    height: Doubles
-    low: Doubles
-    high: Doubles
-    labels: NDArray[np.int32]
-    cut: Mask
-    boxes: list[Box]
+    height: Floats
+    sigma: NDArray[Any]
+    above: NDArray[Any]
     spacing: tuple[float, float]
+
+    def part(self, box: Box) -> _Field:
+        """Return a part of the map."""
+        return _Field(self.height[box], self.sigma[box], self.above[box], self.spacing)
+
+    def intervals(self, holes: Mask) -> tuple[Doubles, Doubles]:
+        """Return the intervals' ends: NaN where nothing is known, the upper infinite where only one is."""
+        height = self.height.astype(np.float64)
+        half = np.maximum(math.sqrt(3) * self.sigma, _EXACT * min(self.spacing))
+        answered = np.isfinite(height)
+        low = np.where(answered, height - half, np.where(holes, self.above, np.nan))
+        return low, np.where(answered, height + half, np.inf)
 
 
 def _field_of(height: ArrayLike, sigma: ArrayLike, pixel_size: ArrayLike, above: ArrayLike | None) -> _Field:
-    """Return the map that the arguments describe, with its holes found."""
-    heights = np.array(height, np.float64)
+    heights = np.asarray(height, np.float32)
     if heights.ndim != 2 or 0 in heights.shape:
         raise InputError(f"heights have shape {heights.shape}: one map (H, W) is needed")
     sigmas = _like("sigma", sigma, heights)
@@ -160,17 +162,12 @@ def _field_of(height: ArrayLike, sigma: ArrayLike, pixel_size: ArrayLike, above:
     if np.any(sigmas < 0):
         raise InputError("sigma is negative somewhere: standard deviations in mm are needed")
     width, tall = check_pixel_size(pixel_size)
-    answered = np.isfinite(heights)
-    labels, cut = _find_holes(answered)
-    half = np.where(answered, np.maximum(np.sqrt(3) * sigmas, _EXACT * min(width, tall)), np.nan)
-    low = np.where(answered, heights - half, np.where(labels > 0, least, np.nan))
-    high = np.where(answered, heights + half, np.inf)
-    return _Field(heights, low, high, labels, cut, ndimage.find_objects(labels), (tall, width))
+    return _Field(heights, sigmas, least, (tall, width))
 
 
-def _like(name: str, values: ArrayLike, heights: Doubles) -> Doubles:
+def _like(name: str, values: ArrayLike, heights: Floats) -> NDArray[Any]:
     """Return one number a pixel."""
-    given = np.asarray(values, np.float64)
+    given = np.asarray(values)
     if given.shape not in ((), heights.shape):
         raise InputError(
             f"{name} has shape {given.shape}, the heights {heights.shape}: give one a pixel, or one"
@@ -185,215 +182,249 @@ def _check_limits(steepest: float, deepest: float | None) -> None:
         raise InputError(f"deepest {deepest}: a height in mm is needed, such as -3.0")
 
 
-def _find_holes(answered: Mask) -> tuple[NDArray[np.int32], Mask]:
-    """Find the holes: their numbers, from 1 on, and which of them the picture cuts.
+def _fill(
+    field: _Field,
+    sides: tuple[bool, ...],
+    steepest: float,
+    deepest: float | None,
+    result: Floats,
+    filled: Bytes,
+) -> None:
+    """Fill the holes of a map, of which some sides are the picture's: top, bottom, left, right."""
+    answered = np.isfinite(field.height)
+    left = _find_holes(answered.view(np.uint8), sides)
+    labels, boxes = map(np.asarray, cv2.connectedComponentsWithStats(left, connectivity=4)[1:3])
+    _open_cut_holes(left, labels, boxes, answered.view(np.uint8), sides)
+    for number, box, smooth in _smooth_surfaces(field, labels, boxes, steepest):
+        own = labels[box] == number
+        result[box][own] = smooth[own]
+        filled[box] |= own
+        left[box][own] = 0
+    _stretch_over(field, answered, left, result)
+    filled |= left
+    holes = filled > 0
+    np.fmax(result, field.above, out=result, where=holes)
+    if deepest is not None and holes.any():
+        rim = (cv2.dilate(filled, _CROSS) > 0) & answered
+        step = np.median(2 * np.maximum(math.sqrt(3) * field.sigma[rim], _EXACT * min(field.spacing)))
+        filled[result <= deepest + step] = 0
+        np.copyto(result, field.height, where=holes & (filled == 0))
 
-    What is dark is a hole if it does not reach the picture's border, or lies in the convex hull of what is
-    around it; small gaps are closed before, and what that hides of a hole is added again.
+
+def _find_holes(answered: Bytes, sides: tuple[bool, ...]) -> Bytes:
+    """Return the holes.
+
+    What is dark is a hole if it cannot be reached from outside, where the picture's border is closed within
+    the convex hull of what is answered; small gaps are closed before, and what that hides of a hole is added
+    again.
     """
-    closed = ndimage.binary_closing(np.pad(answered, 2), _SQUARE)[2:-2, 2:-2]
-    dark, count = ndimage.label(~closed)
-    border = np.ones_like(answered)
-    border[1:-1, 1:-1] = False
-    outside = np.bincount(dark[border], minlength=count + 1) > 0
-    outside[0] = False
-    groups, _ = ndimage.label(answered, _SQUARE)
-    largest = np.argsort(-np.where(outside, np.bincount(dark.ravel(), minlength=count + 1), 0), kind="stable")
-    for number in largest[:_MOST_CUT]:
-        outside[number] &= not _in_hull(dark == number, groups)
-    outside[0] = True
-    core = ndimage.binary_dilation(~outside[dark], _SQUARE)
-    holes, count = ndimage.label((core | ndimage.binary_fill_holes(answered)) & ~answered)
-    rim = np.bincount(holes[ndimage.binary_dilation(answered)], minlength=count + 1)
-    edge = np.bincount(holes[border], minlength=count + 1)
-    cut = edge > _CUT * (edge + rim)
-    cut[0] = False
-    return np.where(rim[holes] > 0, holes, 0), cut
+    wall = _beside(np.zeros_like(answered), 1)
+    if any(sides):
+        hull = _beside(_hull(answered), 1, cv2.BORDER_REPLICATE)
+        for side, line in zip(sides, _LINES, strict=True):
+            wall[line] = hull[line] if side else 0
+    closed = cv2.morphologyEx(_beside(answered, 2), cv2.MORPH_CLOSE, _SQUARE)[2:-2, 2:-2]
+    core = np.asarray(cv2.dilate(_enclosed(closed, wall), _SQUARE), np.uint8)
+    return np.asarray((core | _enclosed(answered, wall)) & (1 - answered))
 
 
-def _in_hull(region: Mask, groups: NDArray[np.int32]) -> bool:
-    """Return whether a region lies in the convex hull of the groups that it touches, gaps included."""
-    touched = np.unique(groups[ndimage.binary_dilation(region, _SQUARE, iterations=2)])
-    around = np.isin(groups, touched[touched > 0])
-    if not around.any():
-        return False
-    import cv2  # a tenth of a second to load
-
-    corners = cv2.convexHull(np.argwhere(around)[:, ::-1].astype(np.int32))
-    hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1)
-    return not np.any(region & (hull == 0))
+def _beside(values: Bytes, count: int, kind: int = cv2.BORDER_CONSTANT) -> Bytes:
+    """Return a map with rows and columns beside it, of zeros or of what is next to them."""
+    return np.asarray(cv2.copyMakeBorder(values, count, count, count, count, kind), np.uint8)
 
 
-def _smooth_surfaces(field: _Field, steepest: float) -> Iterator[tuple[int, Box, Doubles]]:
+def _hull(answered: Bytes) -> Bytes:
+    rows = np.flatnonzero(answered.any(axis=1))
+    first, last = answered.argmax(axis=1), answered.shape[1] - 1 - answered[:, ::-1].argmax(axis=1)
+    ends = np.concatenate([np.stack([column[rows], rows], axis=1) for column in (first, last)])
+    corners = cv2.convexHull(ends.astype(np.int32))
+    return np.asarray(cv2.fillConvexPoly(np.zeros(answered.shape, np.uint8), corners, 1), np.uint8)
+
+
+def _enclosed(answered: NDArray[Any], wall: Bytes) -> Bytes:
+    """Return the dark pixels that cannot be reached from outside of a wall around the picture."""
+    room = wall.copy()
+    room[1:-1, 1:-1] = answered
+    room = _beside(room, 1)
+    cv2.floodFill(room, None, (0, 0), 1)
+    return np.asarray(1 - room[2:-2, 2:-2], np.uint8)
+
+
+def _open_cut_holes(
+    holes: Bytes,
+    labels: NDArray[Any],
+    boxes: NDArray[Any],
+    answered: Bytes,
+    sides: tuple[bool, ...],
+) -> None:
+    """Take away the holes of which the picture's border cuts off more than a corner."""
+    border = np.zeros_like(holes)
+    for side, line in zip(sides, _LINES, strict=True):
+        border[line] |= side
+    for number in np.unique(labels[(border > 0) & (labels > 0)]):
+        left, top, across, down, _ = boxes[number]
+        box = slice(top, top + down), slice(left, left + across)
+        own = labels[box] == number
+        edge = np.count_nonzero(own & (border[box] > 0))
+        rim = np.count_nonzero(own & (cv2.dilate(answered, _CROSS)[box] > 0))
+        if edge > _CUT * (edge + rim):
+            holes[box][own] = 0
+
+
+def _smooth_surfaces(
+    field: _Field, labels: NDArray[Any], boxes: NDArray[Any], steepest: float
+) -> Iterator[tuple[int, Box, Doubles]]:
     """Yield holes that a smooth surface fits, with these surfaces over boxes; the largest holes first."""
-    radii = _radii(field)
-    work = 0
-    for number in np.argsort(-radii, kind="stable"):
-        if radii[number] < _SMALL * max(field.spacing) or work > _WORK:
+    work = 0.0
+    for number in 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable"):
+        _, _, across, down, area = boxes[number]
+        if area < _LEAST_AREA or work > _WORK:
             return
-        for width in (_RING, _NARROW):
-            ring = _ring(field, number, radii[number], width)
-            cells = None if ring is None else _cells(ring[1].shape, field.spacing, radii[number])
+        if min(across, down) < _LEAST_SIDE:
+            continue
+        hole = _Hole(labels, int(number), boxes[number], field.spacing)
+        for width in (_RING, _NARROW) if hole.radius >= _SMALL * max(field.spacing) else ():
+            ring = _ring(field, hole, width)
+            cells = None if ring is None else _cells(_size(ring.box), field.spacing, hole.radius)
             if ring is None or cells is None:
                 break
-            work += _EFFORT + (cells[0] + 3) * (cells[1] + 3)
-            smooth = _span(field, number, *ring, cells, radii[number], steepest)
+            work += 1 + ((cells[0] + 3) * (cells[1] + 3) / _HEAVY) ** 3
+            smooth = _span(field, hole, ring, cells, steepest)
             if smooth is not None:
-                yield int(number), ring[0], smooth
+                yield hole.number, hole.box, smooth
                 break
 
 
-def _radii(field: _Field) -> Doubles:
-    """Return the radius of the largest circle in each hole, mm; 0 for what is no hole."""
-    depth = ndimage.distance_transform_edt(field.labels > 0, sampling=field.spacing)
-    radii = np.zeros(int(field.labels.max()) + 1)
-    np.maximum.at(radii, field.labels, depth)
-    radii[0] = 0.0
-    return radii
+class _Hole:
+    """A hole: its number in a map of labels, its box, and the radius of the largest circle in it, mm."""
+
+    def __init__(
+        self, labels: NDArray[Any], number: int, box: NDArray[Any], spacing: tuple[float, float]
+    ) -> None:
+        left, top, across, down, _ = map(int, box)
+        self.number, self._labels = number, labels
+        self.box = slice(top, top + down), slice(left, left + across)
+        stride = max(1, min(down, across) // (4 * _SAMPLES))
+        # The picture's border is no rim.
+        ends = zip(self.box, labels.shape, strict=True)
+        rims = [(int(part.start > 0), int(part.stop < size)) for part, size in ends]
+        inside = np.pad(self.within(_thinned(self.box, (stride, stride))), rims)
+        depth = _distance(inside, (spacing[0] * stride, spacing[1] * stride))
+        self.radius = min(float(depth.max()), max(down * spacing[0], across * spacing[1]))
+
+    def within(self, box: Box) -> Mask:
+        """Return the hole's pixels in a part of the map."""
+        return np.asarray(self._labels[box] == self.number)
+
+    def around(self, reach: float, spacing: tuple[float, float]) -> Box:
+        """Return the part of the map that holds the hole and what is within reach of it, mm."""
+        down, across = (
+            slice(
+                max(part.start - math.ceil(reach / step), 0), min(part.stop + math.ceil(reach / step), size)
+            )
+            for part, step, size in zip(self.box, spacing, self._labels.shape, strict=True)
+        )
+        return down, across
 
 
-def _ring(field: _Field, number: int, radius: float, width: float) -> tuple[Box, Mask] | None:
+class _Ring(NamedTuple):
+    """What is known around a hole: a box, and samples of it with the ends of their intervals."""
+
+    box: Box
+    strides: tuple[int, int]
+    hole: Mask
+    low: Doubles
+    high: Doubles
+
+
+def _distance(inside: Mask, spacing: tuple[float, float]) -> Floats:
+    """Return the distance of each pixel of a region to the nearest one outside."""
+    finest = min(spacing)
+    down, across = (round(length * step / finest) for length, step in zip(inside.shape, spacing, strict=True))
+    even = cv2.resize(inside.view(np.uint8), (across, down), interpolation=cv2.INTER_NEAREST)
+    distance = cv2.distanceTransform(even, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    back = cv2.resize(distance, inside.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(back * np.float32(finest), np.float32)
+
+
+def _thinned(box: Box, strides: tuple[int, int]) -> Box:
+    """Return a box of which only some rows and columns count."""
+    rows, columns = box
+    return slice(rows.start, rows.stop, strides[0]), slice(columns.start, columns.stop, strides[1])
+
+
+def _ring(field: _Field, hole: _Hole, width: float) -> _Ring | None:
     """Return the known pixels around a hole, in a box; farther out where they span too few terraces."""
+    down, across = (
+        max(1, int(hole.radius / (_SAMPLES * step)), length // _MOST_SAMPLES)
+        for step, length in zip(field.spacing, _size(hole.box), strict=True)
+    )
+    apart = field.spacing[0] * down, field.spacing[1] * across
     while True:
-        reach = max(width * radius, _LEAST_RING * max(field.spacing))
-        box = _box(field, number, reach)
-        hole = field.labels[box] == number
-        bounded = np.isfinite(field.low[box]) & np.isfinite(field.high[box])
-        distance = ndimage.distance_transform_edt(~hole, sampling=field.spacing)
-        groups, _ = ndimage.label(bounded, _SQUARE)
-        next_to = np.unique(groups[ndimage.binary_dilation(hole, _SQUARE)])
-        known = bounded & (distance <= reach) & np.isin(groups, next_to[next_to > 0])
+        reach = max(width * hole.radius, _LEAST_RING * max(field.spacing))
+        box = hole.around(reach, field.spacing)
+        thin = _thinned(box, (down, across))
+        inside = hole.within(thin)
+        low, high = field.part(thin).intervals(inside)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        count, groups = cv2.connectedComponents(bounded.view(np.uint8), connectivity=8)
+        beside = np.zeros(count, bool)
+        beside[groups[cv2.dilate(inside.view(np.uint8), _SQUARE) > 0]] = True
+        beside[0] = False
+        known = beside[groups] & (_distance(~inside, apart) <= reach)
         if not known.any():
             return None
-        terrace = np.median((field.high[box] - field.low[box])[known])
-        if np.ptp(field.height[box][known]) >= _TERRACES * terrace or width >= _WIDEST:
-            return box, known
+        terrace = np.median((high - low)[known])
+        if np.ptp(low[known]) >= _TERRACES * terrace or width >= _WIDEST:
+            return _Ring(box, (down, across), inside, np.where(known | inside, low, np.nan), high)
         width *= _WIDER
 
 
-def _box(field: _Field, number: int, reach: float) -> Box:
-    """Return the part of the map that holds a hole and what is within reach of it."""
-    rows, columns = field.boxes[number - 1]
-    down, across = (math.ceil(reach / step) for step in field.spacing)
-    return (
-        slice(max(rows.start - down, 0), rows.stop + down),
-        slice(max(columns.start - across, 0), columns.stop + across),
+def _size(box: Box) -> tuple[int, int]:
+    return box[0].stop - box[0].start, box[1].stop - box[1].start
+
+
+def _cells(shape: tuple[int, int], spacing: tuple[float, float], radius: float) -> tuple[int, int] | None:
+    """Return the splines' cells along y and x; None if the box is too small, or the hole too thin for it."""
+    down, across = (
+        math.ceil((count - 1) * step / radius) for count, step in zip(shape, spacing, strict=True)
+    )
+    return (down, across) if min(down, across) >= 1 and max(down, across) <= _MOST_CELLS else None
+
+
+def _span(field: _Field, hole: _Hole, ring: _Ring, cells: tuple[int, int], steepest: float) -> Doubles | None:
+    """Return the smoothest surface within a ring's intervals, over the hole's box, if it is dark there."""
+    spacing = field.spacing[0] / hole.radius, field.spacing[1] / hole.radius
+    spline = Spline(_size(ring.box), spacing, cells, ring.strides)
+    bounded = np.isfinite(ring.low) & np.isfinite(ring.high)
+    resolution = np.median((ring.high - ring.low)[bounded]) / 2 / (_DEPTH * hole.radius)
+    fit = fit_within(spline, ring.low, ring.high, _STIFFNESS * float(resolution) ** 2)
+    apart = (step * stride for step, stride in zip(field.spacing, ring.strides, strict=True))
+    slopes = np.hypot(*np.gradient(fit.height, *apart))
+    if fit.misfit > _MISFIT or np.mean(slopes[ring.hole] > steepest) > _STEEP_SHARE:
+        return None
+    (own_rows, own_columns), (rows, columns) = hole.box, ring.box
+    return spline.over(
+        fit.factors,
+        (
+            slice(own_rows.start - rows.start, own_rows.stop - rows.start),
+            slice(own_columns.start - columns.start, own_columns.stop - columns.start),
+        ),
     )
 
 
-def _cells(shape: tuple[int, ...], spacing: tuple[float, float], radius: float) -> tuple[int, int] | None:
-    """Return the splines' cells along y and x; None if the box is too small, or the hole too thin for it."""
-    if min(shape) < 2:
-        return None
-    spans = [(length - 1) * step for length, step in zip(shape, spacing, strict=True)]
-    down, across = (min(math.ceil(_CELLS * span / radius), _MOST_CELLS) for span in spans)
-    coarsest = max(spans[0] / down, spans[1] / across)
-    return (down, across) if coarsest * _LEAST_CELLS <= radius else None
-
-
-def _span(
-    field: _Field,
-    number: int,
-    box: Box,
-    known: Mask,
-    cells: tuple[int, int],
-    radius: float,
-    steepest: float,
-) -> Doubles | None:
-    """Return the smoothest surface within the known pixels' intervals, if one is dark in the hole."""
-    hole = field.labels[box] == number
-    low, high = np.where(known | hole, field.low[box], np.nan), field.high[box]
-    spline = Spline(low.shape, (field.spacing[0] / radius, field.spacing[1] / radius), cells)
-    resolution = np.median((high - low)[known]) / 2 / (_DEPTH * radius)
-    fit = fit_within(spline, low, high, _STIFFNESS * float(resolution) ** 2)
-    slopes = np.hypot(*np.gradient(fit.height, *field.spacing))
-    dark = np.mean(slopes[hole] > steepest) <= _STEEP_SHARE
-    return fit.height if fit.misfit <= _MISFIT and dark else None
-
-
-def _stretch_over(field: _Field, height: Doubles, holes: Mask) -> Doubles:
-    """Return the heights with membranes over some holes, which nowhere lie deeper than is known."""
-    answered = np.isfinite(field.height)
-    stretched = stretch(height, answered, holes, field.spacing)
-    deeper = holes & (stretched < field.low)
-    if not deeper.any():
-        return stretched
-    fixed = np.where(deeper, field.low, height)
-    return stretch(fixed, answered | deeper, holes & ~deeper, field.spacing)
-
-
-def _step(field: _Field, filled: Mask) -> float:
-    """Return the usual width of the intervals at the rims of holes, mm."""
-    rim = ndimage.binary_dilation(filled) & np.isfinite(field.height) & np.isfinite(field.low)
-    return float(np.median((field.high - field.low)[rim])) if rim.any() else 0.0
-
-
-def stretch(height: Doubles, known: Mask, unknown: Mask, spacing: tuple[float, float]) -> Doubles:
-    """Solve Laplace's equation: each unknown pixel is the mean of its four neighbours.
-
-    It reproduces planes, and never leaves the range of the known heights. Each group of unknown pixels
-    touches a known one; at pixels that are neither the membrane is free.
-    """
-    if not unknown.any():
-        return height
-    datum = float(np.mean(height[known]))
-    matrix, right = _equations(np.where(known, height - datum, 0.0), known, unknown, spacing)
-    if len(right) <= _DIRECT:
-        found = spsolve(matrix.tocsc(), right, permc_spec="MMD_AT_PLUS_A")
-    else:
-        start = _coarse(height - datum, known, unknown, spacing)[unknown]
-        found = _iterate(matrix, right, start)
-    stretched = height.copy()
-    stretched[unknown] = found + datum
-    return stretched
-
-
-def _equations(
-    height: Doubles, known: Mask, unknown: Mask, spacing: tuple[float, float]
-) -> tuple[sparse.csr_matrix, Doubles]:
-    """Return the matrix and the right side for the unknown pixels, in reading order."""
-    count = int(np.count_nonzero(unknown))
-    number = np.full(unknown.shape, -1)
-    number[unknown] = np.arange(count)
-    diagonal, right = np.zeros(count), np.zeros(count)
-    rows, columns, values = [np.arange(count)], [np.arange(count)], [diagonal]
-    links = (np.s_[:-1], np.s_[1:], spacing[0] ** -2), (np.s_[:, :-1], np.s_[:, 1:], spacing[1] ** -2)
-    for one, other, weight in links:
-        for here, there in ((one, other), (other, one)):
-            fixed = unknown[here] & known[there]
-            free = unknown[here] & unknown[there]
-            np.add.at(diagonal, number[here][fixed | free], weight)
-            np.add.at(right, number[here][fixed], weight * height[there][fixed])
-            rows.append(number[here][free])
-            columns.append(number[there][free])
-            values.append(np.full(len(rows[-1]), -weight))
-    places = np.concatenate(rows), np.concatenate(columns)
-    return sparse.csr_matrix((np.concatenate(values), places), shape=(count, count)), right
-
-
-def _coarse(height: Doubles, known: Mask, unknown: Mask, spacing: tuple[float, float]) -> Doubles:
-    """Return a first guess: the membrane on pixels of twice the size, which are known if any part is."""
-    rows, columns = height.shape
-    blocks = -(-rows // 2), 2, -(-columns // 2), 2
-    border = ((0, -rows % 2), (0, -columns % 2))
-    parts = np.pad(known, border).reshape(blocks).sum(axis=(1, 3))
-    sums = np.pad(np.where(known, height, 0.0), border).reshape(blocks).sum(axis=(1, 3))
-    wanted = np.pad(unknown, border).reshape(blocks).any(axis=(1, 3)) & (parts == 0)
-    large = stretch(sums / np.maximum(parts, 1), parts > 0, wanted, (2 * spacing[0], 2 * spacing[1]))
-    return np.repeat(np.repeat(large, 2, axis=0), 2, axis=1)[:rows, :columns]
-
-
-def _iterate(matrix: sparse.csr_matrix, right: Doubles, start: Doubles) -> Doubles:
-    """Solve by conjugate gradients; SciPy's own use BLAS, whose threads wait for each other."""
-    found, rest = start, right - matrix @ start
-    direction, square = rest, float(np.sum(rest * rest))
-    enough = _TOLERANCE**2 * float(np.sum(right * right))
-    for _ in range(_ITERATIONS):
-        if square <= enough:
-            break
-        image = matrix @ direction
-        length = square / float(np.sum(direction * image))
-        found, rest = found + length * direction, rest - length * image
-        before, square = square, float(np.sum(rest * rest))
-        direction = rest + square / before * direction
-    return found
+def _stretch_over(field: _Field, answered: Mask, holes: Bytes, result: Floats) -> None:
+    """Put membranes over holes, which nowhere lie deeper than is known."""
+    # Rows and columns without a hole or its rim are left out.
+    rows, columns = (np.flatnonzero(np.convolve(holes.any(axis=axis), np.ones(3), "same")) for axis in (1, 0))
+    if not rows.size:
+        return
+    part = np.ix_(rows, columns)
+    known, unknown, above = answered[part], holes[part] > 0, field.above[part]
+    height = field.height[part]
+    stretched = stretch(height, known, unknown, field.spacing)
+    deeper = unknown & (stretched < above)
+    if deeper.any():
+        fixed = np.where(deeper, above, height)
+        stretched = stretch(fixed, known | deeper, unknown & ~deeper, field.spacing)
+    result[holes > 0] = stretched[unknown]

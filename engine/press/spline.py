@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 Doubles = NDArray[np.float64]
 
@@ -27,9 +30,13 @@ _RIDGE = 1e-13  # of the diagonal, so that rounding leaves no matrix singular
 
 
 class Fit(NamedTuple):
-    """A smooth surface, (H, W), and the RMS by which it leaves its intervals, in their half-widths."""
+    """A smooth surface at the samples, its splines' factors, and by how much it leaves its intervals.
+
+    The last is an RMS in half-widths.
+    """
 
     height: Doubles
+    factors: Doubles
     misfit: float
 
 
@@ -44,29 +51,33 @@ class Spline:
         Distance of rows, and of columns, in any unit.
     cells : (int, int)
         Between knots, along y and x.
+    strides : (int, int)
+        Rows and columns from one sample to the next; the first pixel is one.
     """
 
-    def __init__(self, shape: tuple[int, int], spacing: tuple[float, float], cells: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        spacing: tuple[float, float],
+        cells: tuple[int, int],
+        strides: tuple[int, int] = (1, 1),
+    ) -> None:
         self._spans = [(length - 1) * step for length, step in zip(shape, spacing, strict=True)]
         self._cells = cells
-        y, x = (
+        self._all = [
             spline_values(np.linspace(0, count, length), count)
             for length, count in zip(shape, cells, strict=True)
-        )
-        rows, columns = y.shape[1], x.shape[1]
-        self._down, self._across = _overlapping(rows), _overlapping(columns)
-        first, second = (
-            np.add.outer(down * columns, across).ravel()
-            for down, across in zip(self._down, self._across, strict=True)
-        )
-        self._order = np.lexsort((first, second))
-        self._rows = first[self._order]
-        self._starts = np.searchsorted(second[self._order], np.arange(rows * columns + 1))
-        # All is sparse, also because that needs no BLAS, whose threads wait for each other on small tasks.
-        self._y, self._x = sparse.csr_matrix(y), sparse.csr_matrix(x)
+        ]
+        self._y, self._x = (values[::stride] for values, stride in zip(self._all, strides, strict=True))
+        self._down, self._across = (_overlapping(values.shape[1]) for values in (self._y, self._x))
         self._pairs_y, self._pairs_x = (
-            sparse.csr_matrix(values[:, first] * values[:, second])
-            for values, (first, second) in ((y, self._down), (x, self._across))
+            values[:, first] * values[:, second]
+            for values, (first, second) in ((self._y, self._down), (self._x, self._across))
+        )
+        columns = self._x.shape[1]
+        self._entries = tuple(
+            np.add.outer(down * columns, across)
+            for down, across in zip(self._down, self._across, strict=True)
         )
 
     def roughness(self) -> Doubles:
@@ -83,17 +94,24 @@ class Spline:
         return np.asarray(np.sum(parts, axis=0))
 
     def squares(self, weights: Doubles) -> Doubles:
-        """Return the form of the sum over pixels of weights, (H, W), times the squared surface."""
-        return np.asarray(self._pairs_y.T @ (weights @ self._pairs_x))
+        """Return the form of the sum over samples of weights times the squared surface."""
+        return _product(self._pairs_y.T, _product(weights, self._pairs_x))
 
     def lowest(self, form: Doubles, values: Doubles) -> Doubles:
-        """Return the surface u, (H, W), where half a form of it less the sum of values times u is lowest."""
-        entries = np.ravel(form)[self._order], self._rows, self._starts
-        matrix = sparse.csc_matrix(entries, shape=(len(self._starts) - 1,) * 2)
-        matrix.setdiag((1 + _RIDGE) * matrix.diagonal())
-        solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        factors = solver.solve(np.ravel(self._y.T @ (values @ self._x)))
-        return np.asarray((self._y @ factors.reshape(self._y.shape[1], -1)) @ self._x.T)
+        """Return the factors for which half a form less the sum of values times the surface is lowest."""
+        right = _product(self._y.T, _product(values, self._x))
+        matrix = np.zeros((right.size,) * 2)
+        matrix[self._entries] = form
+        matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
+        return _solve_banded(matrix, right.ravel(), _ORDER * right.shape[1]).reshape(right.shape)
+
+    def at_samples(self, factors: Doubles) -> Doubles:
+        """Return the surface of factors at the samples."""
+        return _product(_product(self._y, factors), self._x.T)
+
+    def over(self, factors: Doubles, part: tuple[slice, slice]) -> Doubles:
+        """Return the surface of factors at all pixels of a part of the box."""
+        return _product(_product(self._all[0][part[0]], factors), self._all[1][part[1]].T)
 
 
 class CellSplines:
@@ -115,6 +133,8 @@ class CellSplines:
     """
 
     def __init__(self, shape: tuple[int, int], spacing: tuple[float, float]) -> None:
+        from scipy import sparse
+
         self._shape = shape
         self._spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
         size = math.sqrt(self._spans[0] * self._spans[1]) / _SPLINES
@@ -149,6 +169,8 @@ class CellSplines:
 
     def _values(self, places: Doubles, axis: int, order: int = 0) -> sparse.csr_matrix:
         """Return an axis' splines, or their derivatives, 1/mm, at places in cells."""
+        from scipy import sparse
+
         count, pieces = self._shape[axis], self._pieces[axis]
         values = spline_values(places * pieces / (count - 1), pieces, order)
         return sparse.csr_matrix(values * (pieces / self._spans[axis]) ** order)
@@ -178,13 +200,14 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
         draw = np.where(excess > 0, weights / np.maximum(excess, 1.0), 0.0)
         ends = np.where(excess > 0, np.clip(height, low, high), 0.0)
         before = height
-        height = spline.lowest(rough + spline.squares(pull + draw), pull * middle + draw * ends)
+        factors = spline.lowest(rough + spline.squares(pull + draw), pull * middle + draw * ends)
+        height = spline.at_samples(factors)
         excess = np.abs(np.clip(height, low, high) - height) / half
         moved = np.max(np.abs(height - before)[known]) / typical
         if step and (moved < _SETTLED or (step >= _PATIENCE and _misfit(excess[known]) > _FAR)):
             break
         pull = np.where(both, _PULL * weights, 0.0)
-    return Fit(height + datum, _misfit(excess[known]))
+    return Fit(height + datum, factors + datum, _misfit(excess[known]))  # splines add up to 1
 
 
 def _misfit(excess: Doubles) -> float:
@@ -214,6 +237,28 @@ def spline_products(pieces: int, order: int) -> Doubles:
     for piece in range(pieces):
         matrix[piece : piece + 4, piece : piece + 4] += one
     return matrix
+
+
+def _solve_banded(matrix: Doubles, right: Doubles, size: int) -> Doubles:
+    """Solve equations whose matrix is zero except in blocks of a size on its diagonal and beside it."""
+    blocks = [slice(start, start + size) for start in range(0, len(right), size)]
+    pivot, rest = matrix[blocks[0], blocks[0]], right[blocks[0]]
+    reduced = []
+    for block, following in pairwise([*blocks, slice(0, 0)]):
+        reduced.append(np.linalg.solve(pivot, np.column_stack([matrix[block, following], rest])))
+        if following.stop:
+            below = _product(matrix[following, block], reduced[-1])
+            pivot, rest = matrix[following, following] - below[:, :-1], right[following] - below[:, -1]
+    parts = [reduced[-1][:, -1]]
+    for part in reduced[-2::-1]:
+        parts.append(part[:, -1] - part[:, :-1] @ parts[-1])
+    return np.concatenate(parts[::-1])
+
+
+def _product(one: NDArray[Any], other: NDArray[Any]) -> Doubles:
+    """Return a product of matrices on one core: threads would wait for each other longer than it takes."""
+    nothing: Any = None
+    return np.asarray(cv2.gemm(one, other, 1.0, nothing, 0.0))
 
 
 def _overlapping(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -6,7 +6,8 @@ import pytest
 from stacks import ball
 
 from mirrorskin import engine
-from mirrorskin.engine.press.holes import fill_holes, stretch
+from mirrorskin.engine.press.holes import fill_holes
+from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.io import InputError
 
 PIXEL = 0.05
@@ -243,7 +244,6 @@ def a_hole(shape, radius):
     return np.hypot(row - shape[0] / 2, column - shape[1] / 2) < radius
 
 
-# Above 10 000 unknown pixels the solver is another one.
 @pytest.mark.parametrize(("shape", "radius"), [((31, 28), 12), ((170, 151), 70)])
 @pytest.mark.parametrize("spacing", [(1.0, 1.0), (0.1, 0.05)])
 def test_planes_and_saddles_are_repeated(shape, radius, spacing):
@@ -253,8 +253,8 @@ def test_planes_and_saddles_are_repeated(shape, radius, spacing):
     for exact in (3 + 0.2 * x - 0.7 * y, x**2 - y**2 + x * y):
         given = np.where(unknown, np.nan, exact)
         found = stretch(given, ~unknown, unknown, spacing)
-        assert np.max(np.abs(found - exact)) <= 2e-4 * np.ptp(exact)
-        np.testing.assert_array_equal(found[~unknown], exact[~unknown])
+        assert np.max(np.abs(found - exact)) <= 1e-3 * np.ptp(exact)
+        np.testing.assert_array_equal(found[~unknown], exact[~unknown].astype(np.float32))
 
 
 def test_any_rim_is_met_as_a_dense_solver_meets_it():
@@ -269,7 +269,7 @@ def test_any_rim_is_met_as_a_dense_solver_meets_it():
             matrix[here, there] -= 0.25
     exact = np.linalg.solve(matrix, right).reshape(unknown.shape)
     found = stretch(np.where(unknown, np.nan, height), ~unknown, unknown, (0.3, 0.3))
-    np.testing.assert_allclose(found, exact, atol=1e-12)
+    np.testing.assert_allclose(found, exact, atol=1e-3 * np.ptp(height))
 
 
 def test_what_is_neither_known_nor_wanted_leaves_it_free():
