@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,44 +101,28 @@ def _likeness(values: NDArray[Any] | str | None) -> object:
     return (values.shape, values.dtype.str) if isinstance(values, np.ndarray) else values
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """A file's bytes but those of its large datasets, in pieces, and where its datasets lie.
-
-    ``pieces`` are places in the file and bytes; of each dataset, ``places`` has the number of its piece and
-    the place in it, or -1 and the place in the file.
-    """
+class _Layout(NamedTuple):
+    """How a file is laid out: its bytes but those of large datasets, and where its datasets begin."""
 
     pieces: list[tuple[int, bytes]]
-    places: list[tuple[int, int]]
+    places: list[int | None]
 
     @classmethod
-    def of(cls, descriptor: int, offsets: Sequence[int | None], arrays: Sequence[NDArray[Any]]) -> _Layout:
-        """Read how a file is laid out whose datasets begin at certain bytes; None for empty ones."""
-        size = os.fstat(descriptor).st_size
-        known = [
-            (-1 if at is None else at, values.nbytes) for at, values in zip(offsets, arrays, strict=True)
-        ]
-        large = sorted((at, at + length) for at, length in known if length >= _LARGE)
-        gaps = zip([0, *(end for _, end in large)], [*(start for start, _ in large), size], strict=True)
-        pieces = [(start, os.pread(descriptor, end - start, start)) for start, end in gaps if start < end]
-        places = []
-        for at, length in known:
-            inside = [n for n, (start, piece) in enumerate(pieces) if start <= at < start + len(piece)]
-            small = inside and length < _LARGE
-            places.append((inside[0], at - pieces[inside[0]][0]) if small else (-1, at))
-        return cls(pieces, places)
+    def of(cls, descriptor: int, places: list[int | None], arrays: Sequence[NDArray[Any]]) -> _Layout:
+        """Read how a file is laid out whose datasets begin at certain bytes."""
+        known = [(at, at + one.nbytes) for at, one in zip(places, arrays, strict=True) if at is not None]
+        large = sorted((start, end) for start, end in known if end - start >= _LARGE)
+        starts, ends = [0, *(end for _, end in large)], [start for start, _ in large]
+        gaps = zip(starts, [*ends, os.fstat(descriptor).st_size], strict=True)
+        return cls([(start, os.pread(descriptor, end - start, start)) for start, end in gaps], places)
 
     def write(self, descriptor: int, arrays: Sequence[NDArray[Any]]) -> None:
         """Write a file of other values."""
-        pieces = [bytearray(piece) for _, piece in self.pieces]
-        for (number, at), values in zip(self.places, arrays, strict=True):
-            if number >= 0:
-                pieces[number][at : at + values.nbytes] = values.tobytes()
-            elif values.size:
-                _write(descriptor, values.reshape(-1).view(np.uint8).data, at)
-        for (start, _), piece in zip(self.pieces, pieces, strict=True):
+        for start, piece in self.pieces:
             _write(descriptor, memoryview(piece), start)
+        for at, values in zip(self.places, arrays, strict=True):
+            if at is not None:
+                _write(descriptor, values.reshape(-1).view(np.uint8).data, at)
 
 
 _layouts: dict[str, _Layout] = {}
