@@ -5,6 +5,7 @@ It knows no algorithm. Nothing here touches OpenCL before the first call.
 
 from __future__ import annotations
 
+import copy
 import functools
 import logging
 import os
@@ -147,10 +148,7 @@ class Device:
         self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
         self.tuned = False
         self.context = cl.Context([device])
-        self.queue, self.copies = (
-            cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
-            for _ in range(2)
-        )
+        self.queue, self.copies = _queues(self.context)
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
@@ -260,6 +258,16 @@ class Device:
             options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
             made[key] = self._make_kernel(file, name, options)
         return made[key]
+
+    def beside(self) -> Device:
+        """Return the same device with queues of its own, whose kernels need not wait for those before.
+
+        Arrays may be passed from one to the other; what a kernel must wait for is their ``arrived``.
+        """
+        other = copy.copy(self)
+        other.queue, other.copies = _queues(self.context)
+        other._kernels = _ThreadKernels()
+        return other
 
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
@@ -385,6 +393,12 @@ class _ThreadKernels(threading.local):
 
     def __init__(self) -> None:
         self.made: dict[tuple[object, ...], Kernel] = {}
+
+
+def _queues(context: cl.Context) -> list[cl.CommandQueue]:
+    """Return a queue for kernels and one for copies."""
+    profiling = cl.command_queue_properties.PROFILING_ENABLE
+    return [cl.CommandQueue(context, properties=profiling) for _ in range(2)]
 
 
 def _find() -> list[cl.Device]:

@@ -49,8 +49,8 @@ class LiveEstimator(Estimator, Protocol):
     def warm(self) -> None:
         """Compile and try all kernels, so that the first frames need not wait for that; then reset."""
 
-    def maps(self) -> Maps:
-        """Return what is known by now."""
+    def maps(self, seconds: float = math.inf, /) -> Maps:
+        """Return what is known by now; what takes longer than that may be of an earlier update."""
 
     def spare(self, seconds: float) -> None:
         """Do what can wait, for so long at most."""
@@ -112,6 +112,7 @@ class Loop:
         self._newest: tuple[float, float, NDArray[Any]] | None = None  # its time, position and picture
         self._pending = False
         self._times: deque[float] = deque(maxlen=_INTERVALS)
+        self._arrived: deque[float] = deque(maxlen=_INTERVALS)  # when the newest frames of updates did
 
     @property
     def status(self) -> Status:
@@ -157,14 +158,16 @@ class Loop:
             return
         begun = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
-        maps = self._estimator.maps()
+        maps = self._estimator.maps(max(0.0, self._idle()))
         update = Update(frames, at, self._source.motion, position, picture.copy(), **maps)
         done = self._source.now()
         self._updated, self._pending = begun, False
         self._monitor.updated()
         self._monitor.time(UPDATED, done - begun)
+        self._arrived.append(self._taken)
         if update.height is not None or update.normals is not None:
-            self._monitor.time(SHOWN, done - self._taken)
+            lag = min(update.height_lag, len(self._arrived) - 1)
+            self._monitor.time(SHOWN, done - self._arrived[-1 - lag])
         if self._on_update is not None:
             self._on_update(update, self._monitor.status())
 

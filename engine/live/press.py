@@ -93,7 +93,7 @@ class LivePress:
         """Take in the next frames; see `OnsetSearch.push`."""
         self._search.push(frames, travel=travel, lent=lent)
 
-    def maps(self) -> Maps:
+    def maps(self, seconds: float = math.inf, /) -> Maps:
         """Return the heights so far; none before the second frame."""
         if len(self._search.travel) < 2:
             return {}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
+from mirrorskin.engine.live.heights import HeightFollower
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.provenance import attach_provenance, level_origin, naming, parameter_origin
@@ -23,7 +23,7 @@ from mirrorskin.engine.rotation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.edges import EdgeDrawing, find_edges
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import NormalMethod, options_from
-from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, integrate_normals
+from mirrorskin.engine.rotation.normals_to_height import integrate_normals
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.response import initial_response, wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
@@ -72,9 +72,10 @@ class LiveRotation:
     Where the source's calibration says how bright a wall makes pixels look, that is used; how high the object
     stands is then estimated from the heights so far, now and then.
 
-    Heights follow the normals by one step of a solver for each update: their error stays near what changes
-    from one update to the next. Edges are drawn in the time that is left. Without a zenith gain there are
-    correlations only, and without a pixel size no heights.
+    Heights follow the normals in a thread of their own, by one step of a solver for each update for which
+    there is time: their error stays near what changes from one to the next, and they never hold up normals.
+    Edges are drawn in the time that is left. Without a zenith gain there are correlations only, and without
+    a pixel size no heights.
 
     Parameters
     ----------
@@ -129,10 +130,9 @@ class LiveRotation:
         self._normals = self._window if isinstance(self._window, NormalWindow) else None
         self.device = self._window.device
         self._edges = SpareEdges(self.device, shape) if edges and known else None
-        self._slopes = self._heights = None
+        self._heights = None
         if integrate and known and header.pixel_size is not None:
-            self._slopes = SlopeKernels(self.device, shape)
-            self._heights = WarmStartIntegrator(self.device, shape, header.pixel_size)
+            self._heights = HeightFollower(self.device, shape, header.pixel_size)
         self.reset()
 
     @property
@@ -157,22 +157,27 @@ class LiveRotation:
         with naming(self._source):
             self._window.push(frames, phase=phase, lent=lent)
 
-    def maps(self) -> Maps:
-        """Return the maps of the last window; none until one is full."""
+    def maps(self, seconds: float = math.inf, /) -> Maps:
+        """Return the maps of the last window; none until one is full. Its heights may take so long."""
         normals = self._normals
         if normals is None or not normals.is_full:
             return {}
         with naming(self._source):
             normals.estimate()
-        self._start_heights(normals)
+        begun, heights = time.perf_counter(), self._heights
+        if heights is not None:
+            heights.follow(normals)
         self._has_estimate = True
         vectors, contact = (normals.fetch_early(name) for name in ("vectors", "contact"))
-        height = None if self._heights is None else self._heights.result()  # found meanwhile
+        if heights is not None:
+            heights.wait(seconds - (time.perf_counter() - begun))
+        height = None if heights is None else heights.height
         self._updates += 1
         if height is not None and self._updates % _PLACED == 1:
             self._place(height)
         return {
             "height": height,
+            "height_lag": 0 if heights is None else heights.lag,
             "normals": vectors,
             "contact": contact,
             "edges": None if self._edges is None else self._edges.lines,
@@ -255,14 +260,6 @@ class LiveRotation:
         self._normals.place(coarse_heights(*maps, header.pixel_size, header.press, self.device))
         return self.normals()
 
-    def _start_heights(self, normals: NormalWindow) -> None:
-        """Begin a step towards the heights of the normals that are being estimated."""
-        if self._slopes is None or self._heights is None:
-            return
-        maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
-        self._slopes.find(normals.tilt, maps, self._heights.maps)
-        self._heights.push(self._slopes.typical)
-
     def _plane(self, phase: float) -> NDArray[Any]:
         """Return a frame of a plane whose zenith lies in the middle of what can be seen."""
         header, (rows, columns), dtype = self._header, self._source.shape[1:], self._source.dtype
@@ -305,8 +302,7 @@ class LiveRotation:
             self._normals.place(self._response.planes[4])
         if self._edges is not None:
             self._edges.reset()
-        if self._slopes is not None and self._heights is not None:
-            self._slopes.typical = math.nan
+        if self._heights is not None:
             self._heights.reset()
 
 

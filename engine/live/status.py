@@ -15,8 +15,8 @@ from mirrorskin.io import Motion
 
 WAITED, PUSHED, UPDATED, SHOWN = "waited", "push", "update", "frame to map"
 STAGES = (WAITED, PUSHED, UPDATED, SHOWN)
-"""What is timed: a frame from its arrival until it was taken, a push of frames, an update, and from the
-newest frame's arrival until the maps that it is in."""
+"""What is timed: a frame from its arrival until it was taken, a push of frames, an update, and from a
+frame's arrival until the maps of which it is the newest, heights last."""
 
 _KEPT = 4096  # times of a stage
 _LATELY = 1.0  # seconds over which a rate is counted
@@ -31,6 +31,7 @@ class Maps(TypedDict, total=False):
     contact: NDArray[np.uint8] | None
     edges: NDArray[np.uint8] | None
     contact_area: float | None
+    height_lag: int
     offset_unknown: bool
 
 
@@ -54,6 +55,8 @@ class Update:
         The newest frame, raw counts.
     height : ndarray, (H, W), float32
         Millimetres; NaN where there is no answer.
+    height_lag : int
+        Updates since the one whose frames the heights are of.
     normals : ndarray, (H, W, 3), float32
         Unit vectors; NaN where there is no answer.
     contact : ndarray, (H, W), uint8
@@ -76,6 +79,7 @@ class Update:
     contact: NDArray[np.uint8] | None = None
     edges: NDArray[np.uint8] | None = None
     contact_area: float | None = None
+    height_lag: int = 0
     offset_unknown: bool = False
 
 

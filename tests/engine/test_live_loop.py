@@ -37,7 +37,7 @@ class Slow:
         self.pushed += frames[:, 0, 0].tolist()
         self.clock.now += self.push_time
 
-    def maps(self):
+    def maps(self, seconds):
         self.clock.now += self.update_time
         self.updates.append(len(self.pushed))
         return {"height": np.zeros((2, 3), np.float32)}

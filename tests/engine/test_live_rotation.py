@@ -1,6 +1,7 @@
 """A rotation while it goes on: normals of its last turn, heights that follow, edges now and then."""
 
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, 
 
 from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
+from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveRotation, Loop, choose_window
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
 from mirrorskin.io import InputError, open_result, save_result
@@ -66,6 +68,26 @@ def test_heights_follow_those_that_fit_best(device):
         np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
         off = (update["height"] - best)[np.isfinite(best)]
         assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[np.isfinite(best)])
+
+
+def test_heights_that_take_long_hold_up_no_normals(monkeypatch):
+    frames, live = make()
+    live.push(frames[:WINDOW], phase=PHASE[:WINDOW])
+    before = live.maps()["height"]
+    go_on, find = threading.Event(), WarmStartIntegrator.result
+    monkeypatch.setattr(WarmStartIntegrator, "result", lambda self: (go_on.wait(), find(self))[1])
+    for number in range(WINDOW, SHAPE[0]):
+        live.push(frames[[number]], phase=PHASE[[number]])
+        update = live.maps(0.0)
+        assert update["height"] is before
+    assert update["height_lag"] == SHAPE[0] - WINDOW
+    known = {"tilt": TILT, "gain": GAIN, "offset": OFFSET, "noise": NOISE}
+    np.testing.assert_array_equal(
+        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **known).vectors
+    )
+    go_on.set()
+    live.maps()
+    assert live.maps()["height_lag"] == 0
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
