@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand
+from mirrorskin.kernels import memory
+from mirrorskin.kernels.array import SLACK, Array, BorrowedBuffer, Operand
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.device import free_memory as free_memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
@@ -20,6 +23,7 @@ MEMORY_LIMIT = 256_000_000
 
 _MOST_PIXELS = 2**30  # kernels number those of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
+_PIECE = 64_000_000  # bytes that a device of its own memory is sent at once: enough for its speed
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +68,9 @@ class Band:
     stride : int
         Pixels from plane to plane.
     maps : dict of Array, (rows, W), or (count, stride) for `Planes`
-    frames : Array, (n, rows, W)
+        They hold anything at first.
+    length : int
+        Frames that there is room for.
     """
 
     def __init__(
@@ -78,7 +84,7 @@ class Band:
         least: int,
     ) -> None:
         self._shape = shape = (rows.stop - rows.start, columns)
-        self._device, self._kinds = device, maps
+        self._device, self._kinds, self._dtype = device, maps, dtype
         self.rows, self.pixels = rows, shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride = -(-self.pixels // word) * word
@@ -87,11 +93,24 @@ class Band:
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
         self.maps = {name: self._make(name) for name in maps}
-        self.frames = _longest(device, length, least, shape, dtype)
-        self._other = _second(device, self.frames)
+        self._most = device.max_allocation // (
+            self.pixels * dtype.itemsize
+        )  # frames that kernels see at once
+        if self._most < least:
+            raise DeviceMemoryError(f"{device.info.title} has no room for {least} frames")
+        self.length = min(length, self._most)
+        self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
         self._borrowed: BorrowedBuffer | None = None
         self._only = True  # band of the picture
         self._resident = False
+        self._blank = set(maps)  # maps that nothing was written to
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Where frames may be written, (length, rows, W)."""
+        nbytes = self.length * self.pixels * self._dtype.itemsize
+        place = memory.take(nbytes + SLACK, zeroed=False)[:nbytes]
+        return place.view(self._dtype).reshape(self.length, *self._shape)
 
     def share_device(self) -> None:
         """Leave the device to other bands whenever this one is not at work."""
@@ -104,6 +123,7 @@ class Band:
         if plane is not None and self._resident:
             array.download()  # the other planes
         array.claim()
+        self._blank.discard(name)
         target = array.host if plane is None else self.plane(name, plane)
         target[:] = values
         if self._resident:
@@ -124,70 +144,65 @@ class Band:
     def resident(self) -> Iterator[None]:
         """Have the maps on the device for a while."""
         if not self._resident:
-            for array in self.maps.values():
-                array.upload()
+            for name, array in self.maps.items():
+                if name in self._blank:
+                    array.reserve()
+                else:
+                    array.upload()
+            self._blank.clear()
             self._resident = True
         yield
         if not self._only:
             self._park()
 
-    def stage(self, frames: NDArray[Any], lent: bool = False) -> Iterator[Staged]:
+    def stage(self, frames: NDArray[Any], lent: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Bring frames, (n, H, W), to the device, piece by piece; give each to its kernels before the next.
 
-        Nothing is copied where the device shares the host's memory and the frames are lent (nobody writes to
-        them as long as they are referred to), or lie in the room already. A device of its own memory takes
-        them beside the kernels on those before. When all are through, the frames' memory may be written anew,
-        unless it is lent.
+        Nothing is copied where the device shares the host's memory, as long as frames lie there as kernels
+        need them. A device of its own memory takes them beside the kernels on those before. When all are
+        through, the frames' memory may be written anew, unless it is lent (nobody writes to it as long as it
+        is referred to): then kernels may still be at work. ``whole`` frames, at most ``length`` of them, come
+        in one piece.
         """
-        if len(frames) == 0:
-            return
         frames = frames[:, self.rows]
-        contiguous, shared = frames.flags.c_contiguous, self._device.info.shares_memory
-        borrowed = self._device.borrow("frames", frames) if lent and contiguous and shared else None
-        if borrowed is not None:
-            yield from self._borrow(borrowed)
-        elif contiguous and not shared:
-            yield from self._bring(frames)
-        else:
-            yield from self._copy(frames)
+        start = 0
+        while start < len(frames):
+            rest = frames[start:]
+            if self._places:
+                yield (staged := self._bring(rest, start))
+                self._places[0].wait()
+            else:
+                yield (staged := self._see(rest[: self._most], start, whole))
+                assert self._borrowed is not None
+                if not (lent and np.may_share_memory(self._borrowed.host, rest)):
+                    self._borrowed.wait()
+            start = staged.frames.stop
 
-    def _borrow(self, borrowed: BorrowedBuffer) -> Iterator[Staged]:
-        """Work on frames where they lie."""
-        before, self._borrowed = self._borrowed, borrowed
-        address = borrowed.host.ctypes.data
-        aligned = self._full_words and address % (4 * self._device.layout.lanes) == 0
-        yield Staged(borrowed, slice(0, len(borrowed.host)), aligned)
-        # It waits for its kernels: when more frames are read, only these here can still be under way.
-        del before
+    def _see(self, frames: NDArray[Any], start: int, whole: bool) -> Staged:
+        """Let the device see frames where they lie, or copies of some."""
+        borrowed = self._device.borrow("frames", frames)
+        if borrowed is None and not whole and frames.flags.c_contiguous and len(frames) > 1:
+            borrowed = self._device.borrow("frames", frames[:-1])  # the memory may end behind the last
+        if borrowed is None:
+            room = self.room[: len(frames)]
+            room[...] = frames[: len(room)]
+            borrowed = BorrowedBuffer(self._device, "frames", room)
+        # The one before waits for its kernels: when more frames are read, only these here can be under way.
+        self._borrowed = borrowed
+        aligned = self._full_words and borrowed.host.ctypes.data % (4 * self._device.layout.lanes) == 0
+        return Staged(borrowed, slice(start, start + len(borrowed.host)), aligned)
 
-    def _bring(self, frames: NDArray[Any]) -> Iterator[Staged]:
-        """Copy frames in turns to two places on the device, one while kernels work on the other."""
-        step = len(self.frames.host)
-        for start in range(0, len(frames), step):
-            if self._other is not None:
-                self.frames, self._other = self._other, self.frames
-            part = frames[start : start + step]
-            self.frames.upload_async(part)
-            yield Staged(self.frames, slice(start, start + len(part)), self._full_words)
-            self.frames.wait()
-
-    def _copy(self, frames: NDArray[Any]) -> Iterator[Staged]:
-        """Copy frames to the room, unless they are there."""
-        room = self.frames.host
-        there = frames.ctypes.data == room.ctypes.data and frames.flags.c_contiguous
-        step = max(1, len(frames) if there and len(frames) <= len(room) else len(room))
-        for start in range(0, len(frames), step):
-            part = frames[start : start + step]
-            if not there:
-                room[: len(part)] = part
-            self.frames.upload(len(part))
-            yield Staged(self.frames, slice(start, start + len(part)), self._full_words)
-            self.frames.claim()
+    def _bring(self, frames: NDArray[Any], start: int) -> Staged:
+        """Begin to copy frames to one of two places on the device, while kernels work on the other."""
+        self._places.reverse()
+        part = np.ascontiguousarray(frames[: self._places[0].shape[0]])
+        self._places[0].upload_async(part)
+        return Staged(self._places[0], slice(start, start + len(part)), self._full_words)
 
     @property
     def _full_words(self) -> bool:
         """Whether each frame is as long as some words."""
-        return bool(self.pixels * self.frames.host.itemsize % (4 * self._device.layout.lanes) == 0)
+        return bool(self.pixels * self._dtype.itemsize % (4 * self._device.layout.lanes) == 0)
 
     def _make(self, name: str) -> Array:
         kind = self._kinds[name]
@@ -196,11 +211,13 @@ class Band:
         return self._device.array(name, self._shape, kind, zeroed=False)
 
     def _park(self) -> None:
-        for array in self.maps.values():
-            array.evict()
-        for room in (self.frames, self._other):
-            if room is not None:
-                room.discard()
+        for name, array in self.maps.items():
+            if name in self._blank:
+                array.discard()
+            else:
+                array.evict()
+        for place in self._places:
+            place.discard()
         self._resident = False
 
 
@@ -238,10 +255,10 @@ def cut_into_bands(
 
 def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
     """Return where frames may be written: a single band's room, or host memory for so many frames."""
-    frames = bands[0].frames.host
+    room = bands[0].room
     if len(bands) == 1:
-        return frames
-    return np.empty((length, bands[-1].rows.stop, frames.shape[2]), frames.dtype)
+        return room
+    return np.empty((length, bands[-1].rows.stop, room.shape[2]), room.dtype)
 
 
 def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -249,22 +266,19 @@ def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _second(device: Device, first: Array) -> Array | None:
-    """Make as much room again on a device of its own memory, if it has that."""
-    if device.info.shares_memory:
-        return None
-    try:
-        return device.array(first.name, first.host.shape, first.host.dtype, zeroed=False)
-    except DeviceMemoryError:
-        return None
-
-
-def _longest(device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
-    """Make room for as many frames as fit, up to a length."""
-    while True:
+def _places(
+    device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]
+) -> list[Array]:
+    """Make two places on a device for as many frames as fit, up to a length; one, where two do not."""
+    length = max(least, min(length, _PIECE // (math.prod(shape) * dtype.itemsize)))
+    places: list[Array] = []
+    while len(places) < 2:
         try:
-            return device.array("frames", (length, *shape), dtype, zeroed=False)
+            places.append(device.array("frames", (length, *shape), dtype, zeroed=False))
         except DeviceMemoryError:
+            if places:
+                break
             if length <= least:
                 raise
             length = max(least, length // 2)
+    return places

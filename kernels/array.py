@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from mirrorskin.kernels import memory
@@ -17,8 +19,10 @@ from mirrorskin.kernels.errors import DeviceMemoryError
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
 
+SLACK = 64
+"""Bytes behind an array that a kernel may load with its last word."""
+
 _READ_WRITE = cl.map_flags.READ | cl.map_flags.WRITE
-_SLACK = 64  # bytes behind an array, so that a kernel may load its last word whole
 _NO_ROOM = {
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
     cl.status_code.OUT_OF_HOST_MEMORY,
@@ -37,7 +41,8 @@ class Array:
     Attributes
     ----------
     name : str
-    host : ndarray
+    shape : tuple of int
+    nbytes : int
     arrived : pyopencl.Event or None
         A copy under way that kernels have to wait for.
     last_use : pyopencl.Event or None
@@ -45,7 +50,7 @@ class Array:
     """
 
     def __init__(
-        self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], zeroed: bool = True
+        self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], zeroed: bool
     ) -> None:
         self.name = name
         self.arrived: cl.Event | None = None
@@ -55,32 +60,42 @@ class Array:
         self._shared = device.info.shares_memory
         self._mapped: cl.MemoryMap | None = None
         self._buffer: cl.Buffer | None = None
-        nbytes = math.prod(shape) * dtype.itemsize
-        if nbytes > device.max_allocation:
-            raise DeviceMemoryError(_no_room(device, name, nbytes))
-        try:
-            self._memory = memory.take(nbytes + _SLACK, zeroed)
-            self.host = self._memory[:nbytes].view(dtype).reshape(shape)
-        except MemoryError as error:
-            raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
-        self._allocate()
-        self.claim()
+        self.shape, self._dtype, self._zeroed = shape, dtype, zeroed
+        self.nbytes = math.prod(shape) * dtype.itemsize
+        if self.nbytes > device.max_allocation:
+            raise DeviceMemoryError(_no_room(device, name, self.nbytes))
+        # A device that shares memory sees it from its first kernel on, with what the host wrote before.
+        if not self._shared:
+            self._allocate()
+        else:
+            try:
+                _ = self.host
+            except MemoryError as error:
+                raise DeviceMemoryError(_no_room(device, name, self.nbytes)) from error
+
+    @cached_property
+    def host(self) -> NDArray[Any]:
+        """The host's side."""
+        return self._memory[: self.nbytes].view(self._dtype).reshape(self.shape)
+
+    @cached_property
+    def _memory(self) -> NDArray[np.uint8]:
+        return memory.take(self.nbytes + SLACK, self._zeroed)
 
     def __del__(self) -> None:
-        # A kernel may still be at work in this memory.
-        if self._shared and self._buffer is not None:
-            self._device.finish()
+        # A kernel may still be at work in this memory, which others have next.
+        if self._shared and self.last_use is not None:
+            self.last_use.wait()
 
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
-        if self._shared and self._mapped is None:
-            self._mapped = _map(self._device.queue, self.buffer, self.host, _READ_WRITE).base
+        if self._shared and self._mapped is None and self._buffer is not None:
+            self._mapped = _map(self._device.queue, self._buffer, self.host, _READ_WRITE).base
 
     def upload(self, rows: int | None = None) -> None:
         """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
-        if self._buffer is None:
-            self._allocate()
         if not self._shared:
+            self.reserve()
             part = self.host[:rows]
             event = cl.enqueue_copy(self._device.queue, self.buffer, part)
             self._device.profile.wait("upload", self.name, event, part.nbytes)
@@ -101,8 +116,7 @@ class Array:
 
         The device has memory of its own, and the values stay as they are until ``wait``.
         """
-        if self._buffer is None:
-            self._allocate()
+        self.reserve()
         self._arriving = values.nbytes
         after = [] if self.last_use is None else [self.last_use]
         self._device.queue.flush()  # where that kernel waits
@@ -163,11 +177,19 @@ class Array:
             self._buffer.release()
             self._buffer = None
 
+    def reserve(self) -> None:
+        """Have room on the device, which holds anything if there was none."""
+        if self._buffer is None:
+            self._allocate()
+
     @property
     def buffer(self) -> cl.Buffer:
         """The device's side, for kernels; the host must not write while they run."""
         if self._buffer is None:
-            raise RuntimeError(f"{self.name} was evicted: upload it first")
+            if not self._shared:
+                raise RuntimeError(f"{self.name} was evicted: upload it first")
+            self._allocate()
+            assert self._buffer is not None
         if self._mapped is not None:
             self._mapped.release()
             self._mapped = None
@@ -175,13 +197,13 @@ class Array:
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        with _naming(self._device, self.name, self.host.nbytes):
+        with _naming(self._device, self.name, self.nbytes):
             if self._shared:
                 self._buffer = cl.Buffer(
                     self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
                 )
             else:
-                self._buffer = cl.Buffer(self._device.context, flags, size=self._memory.nbytes)
+                self._buffer = cl.Buffer(self._device.context, flags, size=self.nbytes + SLACK)
                 # Drivers allocate at first use; a migration makes a lack of memory show here.
                 undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
                 cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
@@ -199,11 +221,31 @@ class BorrowedBuffer:
         self.name, self.host = name, values
         self.last_use: cl.Event | None = None
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
-        self.buffer = cl.Buffer(device.context, flags, hostbuf=values)
+        loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
+        self.buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
 
     def __del__(self) -> None:
+        self.wait()
+
+    def wait(self) -> None:
+        """Wait until no kernel reads it."""
         if self.last_use is not None:
             self.last_use.wait()
+
+
+def can_be_borrowed(values: NDArray[Any]) -> bool:
+    """Whether kernels can read values where they lie: in C order, aligned, and followed by what may be read.
+
+    Kernels load their last word whole. The array that the values are a part of may go on behind them, and
+    memory is there in whole pages.
+    """
+    if not (values.flags.c_contiguous and values.flags.aligned):
+        return False
+    whole = values
+    while isinstance(whole.base, np.ndarray) and whole.base.flags.c_contiguous:
+        whole = whole.base
+    end, last = (array.ctypes.data + array.nbytes for array in (values, whole))
+    return bool(-(-last // memory.PAGE) * memory.PAGE - end >= SLACK)
 
 
 Operand = Array | BorrowedBuffer

@@ -21,7 +21,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import embedded, memory
-from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, pinned
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, pinned
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 from mirrorskin.kernels.profile import Profile
@@ -200,16 +200,18 @@ class Device:
     def borrow(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
         """Let kernels read another owner's memory in place; the device must share the host's memory.
 
-        None where a device refuses memory that may only be read, such as a file's.
+        None where that cannot be: values that are not in C order, or at no multiple of their item size, or
+        behind which 64 bytes cannot be read; or a device that refuses memory such as a file's.
 
         Parameters
         ----------
         name : str
             What the profile calls it.
         values : ndarray
-            In C order, at a multiple of its item size, and followed by 64 bytes that may be read; nobody may
-            write to it as long as it is borrowed.
+            Nobody may write to it as long as it is borrowed.
         """
+        if not can_be_borrowed(values):
+            return None
         try:
             return BorrowedBuffer(self, name, values)
         except cl.Error as error:

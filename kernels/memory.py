@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 KEPT = 2**29
 """Bytes that are kept at most while nobody uses them."""
 
-_PAGE = 4096
+PAGE = 4096
+"""Bytes of the smallest pages that there are."""
+
 _LEAST = 2**16  # bytes, below which memory is not worth keeping
 
 _lock = threading.Lock()
@@ -24,8 +26,8 @@ class _Block:
 
     def __init__(self, raw: NDArray[np.uint8]) -> None:
         self._raw = raw
-        start = -raw.ctypes.data % _PAGE
-        self.__array_interface__ = raw[start : len(raw) - _PAGE + start].__array_interface__
+        start = -raw.ctypes.data % PAGE
+        self.__array_interface__ = raw[start : len(raw) - PAGE + start].__array_interface__
 
     def __del__(self) -> None:
         _given_back.append(self._raw)
@@ -38,16 +40,16 @@ def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
     It holds zeros, or anything. MemoryError: there is none.
     """
     if nbytes < _LEAST:
-        raw = np.zeros(nbytes + _PAGE, np.uint8)
-        start = -raw.ctypes.data % _PAGE
+        raw = np.zeros(nbytes + PAGE, np.uint8)
+        start = -raw.ctypes.data % PAGE
         return raw[start : start + nbytes]
     with _lock:
-        most = nbytes + nbytes // 8 + _PAGE
-        fitting = [place for place, raw in enumerate(_kept) if nbytes + _PAGE <= len(raw) <= most]
+        most = nbytes + nbytes // 8 + PAGE
+        fitting = [place for place, raw in enumerate(_kept) if nbytes + PAGE <= len(raw) <= most]
         raw = _kept.pop(min(fitting, key=lambda place: (len(_kept[place]), -place))) if fitting else None
     _tidy()
     if raw is None:
-        return np.asarray(_Block(np.zeros(nbytes + _PAGE, np.uint8)))[:nbytes]
+        return np.asarray(_Block(np.zeros(nbytes + PAGE, np.uint8)))[:nbytes]
     found = np.asarray(_Block(raw))[:nbytes]
     if zeroed:
         found.fill(0)

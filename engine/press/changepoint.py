@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -146,9 +147,8 @@ class ChangePointSearch:
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.passes = 2 if dark is None or bright is None else 1
         self.device = open_device(device)
-        length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, self._dtype, self._maps(), length)
-        self.room = room_of(self._bands, length)
+        self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
+        self._bands = cut_into_bands(self.device, shape, self._dtype, self._maps(), self._length)
         # A release is a change as well, from bright to dark: its first level is the bright one.
         self._level = 1 - threshold if self._release else threshold
         self._travel: list[float] = []
@@ -159,6 +159,11 @@ class ChangePointSearch:
             self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
         self.reset()
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        return room_of(self._bands, self._length)
 
     def _maps(self) -> dict[str, DTypeLike]:
         """Return what is kept of each pixel."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -166,9 +167,8 @@ class OnsetSearch:
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.device = open_device(device)
         choose_layout(self.device, _trial)
-        length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), length)
-        self.room = room_of(self._bands, length)
+        self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
+        self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), self._length)
         self._travel = _TravelTable(self.device)
         # The plateau that a run comes from: no reference says how light a pixel was before its release.
         self._own_dark = self._release or dark is None
@@ -182,6 +182,11 @@ class OnsetSearch:
         self._noise_of_bounds: float | None = None
         self._set_levels(*reference_maps(dark, bright, shape, self._dtype), threshold)
         self.reset()
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        return room_of(self._bands, self._length)
 
     def _planes(self) -> dict[str, Planes]:
         """Return what is kept of each pixel."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -254,11 +255,16 @@ class _Sums:
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
         answers = dict.fromkeys(_ANSWERS.values(), np.float32)
         self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length, least)
-        self.room = room_of(self.bands, length)
+        self._length = length
         self._place = device.array("place", (_BATCH,), np.int32)
         self._steps = device.array("basis", (3 * _BATCH,), np.int32)
         self._floats = device.array("basis", (3 * _BATCH,), np.float32)
         self._fit = device.array("fit", (28,), np.float32)
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        return room_of(self.bands, self._length)
 
     @property
     def frames(self) -> tuple[Doubles, Doubles]:
@@ -286,11 +292,11 @@ class _Sums:
         steps = np.array([1, self._step, self._step])
         return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * steps), 0)
 
-    def _stage(self, frames: NDArray[Any], lent: bool) -> Iterator[tuple[Band, Staged]]:
+    def _stage(self, frames: NDArray[Any], lent: bool, whole: bool = False) -> Iterator[tuple[Band, Staged]]:
         """Have each band at work on its rows of the frames; yield which of these are on the device."""
         for band in self.bands:
             with band.resident():
-                for staged in band.stage(frames, lent):
+                for staged in band.stage(frames, lent, whole):
                     yield band, staged
 
     def _run(self, band: Band, name: str, moved: int, **arguments: Any) -> None:
@@ -341,7 +347,7 @@ class StackSums(_Sums):
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
         """Sum all frames, which stay as they are until the result is there."""
         self._phase, self._weight = phase, weight
-        for band, staged in self._stage(frames, lent=True):
+        for band, staged in self._stage(frames, lent=True, whole=True):
             self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
 
     def _solve(self) -> None:

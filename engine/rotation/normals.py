@@ -28,7 +28,7 @@ from mirrorskin.engine.rotation.normals_kernel import (
     TurnModel,
 )
 from mirrorskin.engine.rotation.response import Response
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.device import Device
@@ -249,14 +249,14 @@ class NormalEstimator:
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         planes = self._kernel.planes
         self._bands = cut_into_bands(self.device, shape, self._dtype, planes, length, self._longest + 1)
-        self._alone = len(self._bands) == 1
-        if self._alone:
-            self._buffer = self._bands[0].frames.host
-        else:
-            self._buffer = np.empty((min(len(band.frames.host) for band in self._bands), *shape), self._dtype)
         for band in self._bands:
             self._kernel.write_scale(band)
         self.reset()
+
+    @cached_property
+    def _buffer(self) -> NDArray[Any]:
+        """The frames of the open turn, and room for more."""
+        return room_of(self._bands, min(band.length for band in self._bands))
 
     def reset(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
@@ -356,15 +356,11 @@ class NormalEstimator:
     def _estimate(self, turns: list[slice]) -> None:
         """Estimate the normals of turns in the buffer."""
         fitted = self._fitted([self._close_up(turn) for turn in turns])
-        if self._alone:
-            self._bands[0].frames.upload(len(self._phase))
         for start in range(0, len(fitted), self._kernel.tables_at_once):
             group = fitted[start : start + self._kernel.tables_at_once]
             self._kernel.write_tables([fit for _, fit in group])
             for turn, fit in group:
                 self._estimate_turn(turn, fit)
-        if self._alone:
-            self._bands[0].frames.claim()
 
     def _close_up(self, turn: slice) -> slice:
         """Move the frames of a turn that are not missing to its begin, and return where they are."""
@@ -394,14 +390,9 @@ class NormalEstimator:
         self._frames += count
         turns = 1 if self._per_turn else self._turns
         for band in self._bands:
-            start = turn.start
-            if not self._alone:
-                band.frames.claim()
-                band.frames.host[:count] = self._buffer[turn, band.rows]
-                band.frames.upload(count)
-                start = 0
             with band.resident():
-                self._kernel.run(band, Samples(band.frames, start, count), fit, self._model, turns)
+                for staged in band.stage(self._buffer[turn], whole=True):
+                    self._kernel.run(band, Samples(staged.array, 0, count), fit, self._model, turns)
         if self._per_turn:
             self._each.append(self._take_maps())
 

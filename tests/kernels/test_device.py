@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.kernels import device as device_layer
-from mirrorskin.kernels import embedded, memory
+from mirrorskin.kernels import embedded
 from mirrorskin.kernels.device import list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
 from mirrorskin.kernels.signature import read_signatures
@@ -158,7 +158,6 @@ def test_a_lack_of_memory_is_told_apart(small_device):
 def test_a_drivers_own_lack_of_memory_is_told_apart(small_device, monkeypatch):
     small_device.max_allocation = 2**60
     monkeypatch.setattr(small_device, "info", replace(small_device.info, shares_memory=False))
-    monkeypatch.setattr(memory, "take", lambda nbytes, zeroed: np.broadcast_to(np.uint8(0), nbytes))
     with pytest.raises(DeviceMemoryError, match="no room for maps"):
         small_device.array("maps", (2**50,), np.uint8)
 
