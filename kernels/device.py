@@ -132,9 +132,7 @@ class Device:
     max_allocation : int
         Bytes that one array may take.
     layout : Layout
-        How work is cut for it; a guess by its kind until it was tuned.
-    tuned : bool
-        Whether the layout was measured.
+        How work is cut for it: for the cores of a CPU, or for the lanes of anything else.
     spare : dict of str to object
         What callers keep on it from one call to the next, taken out while in use.
     """
@@ -146,7 +144,6 @@ class Device:
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
         self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
-        self.tuned = False
         self.context = cl.Context([device])
         self.queue, self.copies = _queues(self.context)
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}

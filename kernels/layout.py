@@ -29,4 +29,3 @@ class Layout:
 
 CPU_LAYOUT = Layout(lanes=16, words=128, tile=1024, group=1)
 GPU_LAYOUT = Layout(lanes=4, words=1, tile=1, group=128)
-LAYOUTS = (CPU_LAYOUT, GPU_LAYOUT)

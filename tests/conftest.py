@@ -54,7 +54,7 @@ def device(request):
     number, shared, layout = request.param
     opened = Device(device_layer._find()[number])
     opened.info = dataclasses.replace(opened.info, shares_memory=shared)
-    opened.layout, opened.tuned = LAYOUTS[layout], True
+    opened.layout = LAYOUTS[layout]
     return opened
 
 

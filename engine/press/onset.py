@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -10,12 +9,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.autotune import choose_layout
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_travel
-from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
@@ -26,6 +23,7 @@ _PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it s
 _SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
 _ROUNDING = 1e-12  # a threshold such as 0.55 is not exact: counts that reach it but for rounding are light
 _INT_MAX = np.iinfo(np.int32).max
+_TILE = 4096  # pixels of a core's item: of long rows more is read at once, in 0.8 of the time of 1024
 _LONGEST = 2**30  # no stack is as long, and sums with frames' numbers stay in range
 
 
@@ -164,9 +162,9 @@ class OnsetSearch:
             )
         self._shape, self._dtype = shape, check_dtype(dtype)
         self._release, self._subframe = check_event(event) == "release", subframe
+        self._hold = min(hold, _LONGEST)
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.device = open_device(device)
-        choose_layout(self.device, _trial)
         self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), self._length)
         self._travel = _TravelTable(self.device)
@@ -175,9 +173,6 @@ class OnsetSearch:
         self._macros: dict[str, str | int] = {
             "FRAME": C_TYPES[self._dtype.name],
             "BITS": 8 * self._dtype.itemsize,
-            "HOLD": min(hold, _LONGEST),
-            "SAMPLES": int(subframe),
-            "RELEASE": int(self._release),
         }
         self._noise_of_bounds: float | None = None
         self._set_levels(*reference_maps(dark, bright, shape, self._dtype), threshold)
@@ -193,8 +188,7 @@ class OnsetSearch:
         return {
             "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
             "marks": Planes(2, self._dtype),  # the smallest sample that is light, and not surely dark
-            "closed": Planes(2, f"u{self._dtype.itemsize}"),  # onset decided; never to be decided
-            "busy": Planes(1, np.uint8),  # of each word: a run is open
+            "left": Planes(1, f"u{self._dtype.itemsize}"),  # frames after which nothing can change
             "times": Planes(2, np.int32),  # frame at which the run began; the last surely dark one before
             "answers": Planes(2, np.float32),  # height and sigma
             "status": Planes(1, np.uint8),
@@ -210,8 +204,8 @@ class OnsetSearch:
                 band.write("levels", values[band.rows] if values.ndim else values, plane=plane)
             with band.resident():
                 self._launch(
-                    band, "onset_levels", "levels marks closed",
-                    pixels=band.pixels, share=coarse, share_rest=share - coarse,
+                    band, "onset_levels", "levels marks",
+                    release=self._release, share=coarse, share_rest=share - coarse,
                 )  # fmt: skip
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
@@ -245,38 +239,29 @@ class OnsetSearch:
                 self._launch(band, "onset_sure", "levels marks", tolerance=_SURELY * noise)
 
     def _scan(self, band: Band, staged: Staged, first: int) -> None:
-        maps, known = "marks closed busy times", {}
-        if self._subframe:
-            maps += " levels samples answers status"
-            # From one frame no noise is estimated, and none is needed: it is taken for dark.
-            known = self._travel.arguments | self._tolerances(self._noise.value or 0.0)
-        self._launch(band, "onset_scan", maps, staged=staged, pixels=band.pixels, first=first, **known)
+        # From one frame no noise is estimated, and none is needed: it is taken for dark.
+        known = self._travel.arguments | self._tolerances(self._noise.value or 0.0)
+        known |= {"hold": self._hold, "release": self._release, "subframe": self._subframe, "first": first}
+        known |= {"frames": staged.array, "count": staged.count, "samples": band.maps.get("samples")}
+        moved = staged.count * band.pixels * self._dtype.itemsize
+        self._launch(band, "onset_scan", "marks left times levels answers status", moved, **known)
 
     def result(self) -> Onset:
         """Return the maps of the frames so far; more may follow."""
         noise = self._noise.value
         if noise is None or self._travel.count == 0:
             raise InputError(f"a press of {self._travel.count} frames has no onset: at least 2 are needed")
-        maps = [self._finish(band, noise) for band in self._bands]
+        maps = [self._finish(band) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         return Onset(height, sigma, status, np.maximum(frame, DARK, out=frame), noise)
 
-    def _finish(self, band: Band, noise: float) -> list[NDArray[Any]]:
-        """Return height, sigma, status and frame of a band's rows as if no frame followed."""
-        maps, known = "times answers status", self._travel.arguments
-        if self._subframe:
-            maps += " busy samples levels"
-            known |= {"count": self._travel.count, **self._tolerances(noise)}
-            known["undo"] = 0
-        planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
+    def _finish(self, band: Band) -> list[NDArray[Any]]:
+        """Return height, sigma, status and frame of a band's rows."""
         with band.resident():
-            self._launch(band, "onset_heights", maps, **known)
             for name in ("answers", "status", "times"):
                 band.maps[name].download()
-            found = [band.plane(*plane).copy() for plane in planes]
-            if self._subframe:  # what is not final is taken back
-                self._launch(band, "onset_heights", maps, **known | {"undo": 1})
-        return found
+            planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
+            return [band.plane(*plane).copy() for plane in planes]
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""
@@ -294,21 +279,16 @@ class OnsetSearch:
         dark = light if self._own_dark else _PLATEAU * noise
         return {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
 
-    def _launch(
-        self, band: Band, name: str, maps: str, *, staged: Staged | None = None, **arguments: Any
-    ) -> None:
-        """Run a kernel over a band, or over staged frames of it; ``maps`` names those that it takes."""
-        arguments |= {one: band.maps[one] for one in maps.split()}
-        if staged is None:
-            moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Operand))
-        else:
-            arguments |= {"frames": staged.array, "count": staged.count}
-            moved = staged.count * band.pixels * self._dtype.itemsize
-        aligned = staged is None or staged.aligned
-        kernel = self.device.kernel("onset", name, **self._macros, ALIGNED=int(aligned))
-        layout = self.device.layout
-        words = band.stride * self._dtype.itemsize // (4 * layout.lanes)
-        kernel(-(-words // layout.words), stride=band.stride, **arguments, moved=moved)
+    def _launch(self, band: Band, name: str, maps: str, moved: int = 0, **arguments: Any) -> None:
+        """Run a kernel over a band; ``maps`` names those that it takes, ``moved`` the bytes of frames."""
+        tile = _TILE if self.device.layout.tile > 1 else 1
+        arguments |= {
+            "pixels": band.pixels,
+            "stride": band.stride,
+            **{one: band.maps[one] for one in maps.split()},
+        }
+        kernel = self.device.kernel("onset", name, **self._macros, TILE=tile)
+        kernel(-(-band.pixels // tile), **arguments, moved=moved)
 
 
 class _TravelTable:
@@ -358,22 +338,3 @@ def check_event(event: Event) -> Event:
     if event not in EVENTS:
         raise InputError(f"unknown event {event!r}; known are {', '.join(EVENTS)}")
     return event
-
-
-def _trial(device: Device) -> Callable[[], None]:
-    """Prepare a press that shows which layout a device runs fastest with: a front that passes all pixels."""
-    count, shape = 32, (512, 1024)
-    search = OnsetSearch(
-        shape, np.uint8, noise=1.0, device=device, memory_limit=2 * count * shape[0] * shape[1]
-    )
-    front = np.linspace(1, count, shape[0])[:, np.newaxis]
-    press, travel = search.room[:count], np.arange(count, dtype=np.float64)
-    for number, frame in enumerate(press):
-        frame[:] = np.where(front <= number, 200, 20)
-
-    def run() -> None:
-        search.reset()
-        search.push(press, travel=travel)
-        device.finish()
-
-    return run

@@ -134,7 +134,7 @@ def test_half_cycles_in_one_pass_do_what_single_passes_do(kind, anchored):
     for shape in (CPU_LAYOUT, GPU_LAYOUT):
         device = Device(device_layer._find()[0])
         device.info = dataclasses.replace(device.info, shares_memory=False)
-        device.layout, device.tuned = shape, True
+        device.layout = shape
         links = links_of(device, graph)
         hierarchy = Hierarchy(graph.right.shape, anchored, device)
         hierarchy.build(links)
