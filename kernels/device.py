@@ -275,7 +275,7 @@ class Device:
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
             program, signatures = self._program(file, options)
-            return Kernel(self, name, cl.Kernel(program, name), signatures[name], self.layout.group)
+            return Kernel(self, name, cl.Kernel(program, name), signatures[name])
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
@@ -309,16 +309,14 @@ class Kernel:
         Names of its arguments, in the order of the source.
     """
 
-    def __init__(
-        self, device: Device, name: str, kernel: cl.Kernel, signature: Signature, group: int
-    ) -> None:
+    def __init__(self, device: Device, name: str, kernel: cl.Kernel, signature: Signature) -> None:
         self.name = name
         self._device = device
         self._kernel = kernel
         self._signature = signature
         self.arguments = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self._group = group
+        self._group = _group_of(kernel, *device.context.devices, device.layout.group)
 
     def __call__(
         self,
@@ -385,6 +383,15 @@ class Kernel:
                     raise TypeError(f"{self.name}: {name} cannot be {value!r}: {error}") from error
             values.append(value)
         return tuple(values)
+
+
+def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
+    """Return the work-items of a group: as many as wanted, unless the kernel or the device allows fewer."""
+    ask = cl.kernel_work_group_info
+    allowed = kernel.get_work_group_info(ask.WORK_GROUP_SIZE, device)
+    most = min(wanted, allowed, device.max_work_item_sizes[0])
+    lanes = kernel.get_work_group_info(ask.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device)
+    return most // lanes * lanes or most
 
 
 class _ThreadKernels(threading.local):

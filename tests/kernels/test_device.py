@@ -1,6 +1,9 @@
 """The device layer: the choice, arrays in both kinds of memory, builds that fail, profiles."""
 
 import doctest
+import os
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -189,6 +192,29 @@ def test_the_profile_stays_bounded(device):
     assert len(device.profile._pending) < 1024
     runs = {record.name: record.runs for record in device.profile.records()}
     assert runs["copy_all"] == 2500
+
+
+PRESSED = """
+import numpy as np
+from mirrorskin import engine
+from mirrorskin.kernels.device import open_device
+from mirrorskin.kernels.layout import GPU_LAYOUT
+
+device = open_device("Portable Computing")
+device.layout = GPU_LAYOUT
+frames = np.where(np.arange(9) < 5, 20, 200).astype(np.uint8)[:, None, None] * np.ones((1, 300), np.uint8)
+found = engine.find_onset(frames, np.arange(9.0), device=device)
+print(device.context.devices[0].max_work_group_size, np.isfinite(found.height).all())
+"""
+
+
+def test_work_groups_are_no_larger_than_the_device_allows():
+    if not any("Portable Computing" in info.platform for info in list_devices()):
+        pytest.skip("only PoCL can be told a limit")
+    limited = {**os.environ, "POCL_MAX_WORK_GROUP_SIZE": "64"}
+    command = [sys.executable, "-P", "-c", PRESSED]
+    child = subprocess.run(command, env=limited, capture_output=True, text=True)
+    assert child.stdout == "64 True\n", child.stderr
 
 
 def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
