@@ -12,9 +12,10 @@ import os
 import re
 import threading
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pyopencl as cl
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import embedded, memory
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, pinned
+from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 from mirrorskin.kernels.profile import Profile
@@ -35,6 +37,7 @@ _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _opened: list[Device] = []
+_KINDS = ("gpu", "cpu")  # in the order in which they are taken
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 
 
@@ -98,7 +101,13 @@ def open_device(choice: str | Device | None = None) -> Device:
     if isinstance(choice, Device):
         return choice
     with _opening:
-        return _open(_choose(choice))
+        *others, last = _choose(choice)
+        for device in others:
+            try:
+                return _open(device)
+            except DeviceError as error:
+                _log.warning("%s is left out: %s", _describe(device).title, error)
+        return _open(last)
 
 
 def free_memory() -> None:
@@ -140,7 +149,7 @@ class Device:
     def __init__(self, device: cl.Device) -> None:
         self.info = _describe(device)
         if _is_pocl(device):
-            embedded.verify()
+            embedded.verify(device)
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
         self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
@@ -275,28 +284,63 @@ class Device:
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
             program, signatures = self._program(file, options)
-            return Kernel(self, name, cl.Kernel(program, name), signatures[name])
+            try:
+                kernel = cl.Kernel(program, name)
+            except cl.LogicError:  # what the driver keeps of built programs is damaged: the source has it
+                program, signatures = self._program(file, options, "__constant int again = 0;\n")
+                kernel = cl.Kernel(program, name)
+            return Kernel(self, name, kernel, signatures[name])
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
 
-    def _program(self, file: str | Path, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
+    def _program(
+        self, file: str | Path, options: tuple[str, ...], more: str = ""
+    ) -> tuple[cl.Program, dict[str, Signature]]:
         with self._lock:
-            if (file, options) not in self._programs:
-                self._programs[file, options] = self._build(file, options)
+            if more or (file, options) not in self._programs:
+                self._programs[file, options] = self._build(file, options, more)
             return self._programs[file, options]
 
-    def _build(self, file: str | Path, options: tuple[str, ...]) -> tuple[cl.Program, dict[str, Signature]]:
+    def _build(
+        self, file: str | Path, options: tuple[str, ...], more: str
+    ) -> tuple[cl.Program, dict[str, Signature]]:
         path = file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
-        source = _read_source(path)
+        source = _read_source(path) + more
         start = time.perf_counter()
         try:
-            program: cl.Program = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options])
+            with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+                program = self._compile(source, ["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
             raise DeviceError(_explain_build(path, str(error), self.info)) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
         defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
         return program, read_signatures(source, defines)
+
+    def _compile(self, source: str, options: list[str]) -> cl.Program:
+        """Build a program, or take from the disk what was built of this source for this device and driver.
+
+        PoCL keeps what it built by itself. Its binaries load sooner (2 against 20 ms), but to ask for one
+        compiles every kernel of the program once more, which takes seconds.
+        """
+        device, nowhere = self.context.devices[0], cast(Any, False)
+        program: cl.Program = cl.Program(self.context, source)
+        if _is_pocl(device):
+            program.build(options, cache_dir=nowhere)
+            return program
+        names = device.platform.version, device.name, device.version, device.driver_version
+        circumstances = names, options, source
+        binary = recall("program", circumstances)
+        if binary is not None:
+            try:
+                known: cl.Program = cl.Program(self.context, [device], [binary]).build(options)
+                return known
+            except cl.Error as error:
+                _log.info("a program is built anew: %s", error)
+        program.build(options, cache_dir=nowhere)
+        keep("program", circumstances, cast(list[bytes], program.get_info(cl.program_info.BINARIES))[0])
+        return program
 
 
 class Kernel:
@@ -447,7 +491,8 @@ def _is_pocl(device: cl.Device) -> bool:
     return "Portable Computing Language" in device.platform.name
 
 
-def _choose(choice: str | None) -> cl.Device:
+def _choose(choice: str | None) -> list[cl.Device]:
+    """Return the devices that a choice means, one or several of a kind: the first of them that works."""
     devices = _find()
     if not devices:
         reason = embedded.why_no_device()
@@ -455,31 +500,36 @@ def _choose(choice: str | None) -> cl.Device:
     if choice is None:
         return _default(devices)
     matches = _matching(choice, devices)
-    if len(matches) != 1:
-        known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
-        problem = "no such device" if not matches else "more than one device answers to that"
-        raise UnknownDeviceError(f"device {choice!r}: {problem}; there is {known}")
-    return matches[0]
+    titles = {_describe(device).title for device in matches}
+    if len(titles) == 1 or (titles and choice.casefold().strip() in _KINDS):
+        return matches
+    known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
+    problem = "no such device" if not matches else "more than one device answers to that"
+    reason = None if matches else embedded.why_no_device()
+    raise UnknownDeviceError(
+        f"device {choice!r}: {problem}; there is {known}{f' ({reason})' if reason else ''}"
+    )
 
 
 def _matching(choice: str, devices: list[cl.Device]) -> list[cl.Device]:
     if choice.isdecimal():
         return devices[int(choice) : int(choice) + 1]
     wanted = choice.casefold().strip()
-    if wanted in ("gpu", "cpu"):
-        return [device for device in devices if _describe(device).kind == wanted][:1]
+    if wanted in _KINDS:
+        return [device for device in devices if _describe(device).kind == wanted]
     return [device for device in devices if wanted and wanted in _describe(device).title.casefold()]
 
 
-def _default(devices: list[cl.Device]) -> cl.Device:
+def _default(devices: list[cl.Device]) -> list[cl.Device]:
     if "PYOPENCL_CTX" in os.environ:
         try:
-            return cl.create_some_context(interactive=False).devices[0]
+            return [cl.create_some_context(interactive=False).devices[0]]
         except (cl.Error, RuntimeError, ValueError, IndexError) as error:
             named = os.environ["PYOPENCL_CTX"]
             raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} names no device: {error}") from error
-    ranks = {"gpu": 0, "cpu": 1, "other": 2}
-    return min(devices, key=lambda device: ranks[_describe(device).kind])
+    kinds = [_describe(device).kind for device in devices]
+    best = next(kind for kind in (*_KINDS, "other") if kind in kinds)
+    return [device for device, kind in zip(devices, kinds, strict=True) if kind == best]
 
 
 @functools.cache

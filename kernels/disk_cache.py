@@ -1,32 +1,39 @@
-"""What was found out about this machine once, kept in the user's cache folder."""
+"""What was found out about this machine or built for it once, kept in the user's cache folder."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import os
+import threading
 from pathlib import Path
 
 import platformdirs
 
 _log = logging.getLogger("mirrorskin.kernels")
+_DIGEST = hashlib.sha256().digest_size
 
 
-def recall(topic: str, circumstances: object) -> str | None:
-    """Return what was kept of a topic under these circumstances, which their ``repr`` distinguishes."""
+def recall(topic: str, circumstances: object) -> bytes | None:
+    """Return what was kept of a topic under these circumstances, which their ``repr`` distinguishes.
+
+    None where there is nothing, or what is there is not as it was written.
+    """
     try:
-        return _record(topic, circumstances).read_text(encoding="utf-8")
-    except (OSError, ValueError):  # none, or damaged
+        kept = _record(topic, circumstances).read_bytes()
+    except OSError:
         return None
+    digest, answer = kept[:_DIGEST], kept[_DIGEST:]
+    return answer if hashlib.sha256(answer).digest() == digest else None
 
 
-def keep(topic: str, circumstances: object, answer: str) -> None:
+def keep(topic: str, circumstances: object, answer: bytes) -> None:
     """Keep an answer, whole or not at all; without a writable folder it will be found out again."""
     record = _record(topic, circumstances)
-    partial = record.with_suffix(f".{os.getpid()}")
+    partial = record.with_suffix(f".{os.getpid()}-{threading.get_native_id()}")
     try:
         record.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(answer, encoding="utf-8")
+        partial.write_bytes(hashlib.sha256(answer).digest() + answer)
         partial.replace(record)
     except OSError as error:
         _log.info("%s will be found out again next time: %s", topic, error)

@@ -25,22 +25,23 @@ from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import platformdirs
+import pyopencl as cl
 
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
 
 _log = logging.getLogger("mirrorskin.kernels")
 
-_SCHEME = 1  # version of the answers on disk
+_SCHEME = 2  # version of the answers on disk
 _TIMEOUT = 120  # seconds, for a cold disk
 _RAN = "PoCL ran a kernel"
 _SOURCE = "kernel void probe(global float *x) { const int i = get_global_id(0); x[i] = 2 * x[i] + i; }"
 
-_lock = threading.RLock()
+_lock = threading.Lock()
 _processor: str | None = None  # the name it compiles for, once prepared
 _patched = False
-_verified = False
 
 
 def prepare() -> None:
@@ -64,39 +65,53 @@ def note(driver: str) -> str:
     return f"compiles for {_processor}: its function {_NAME_FUNCTION} is patched in memory"
 
 
-def verify() -> None:
-    """Make sure that PoCL can run a kernel; call it before the first one, which else may end the process.
+@functools.cache
+def verify(device: cl.Device) -> None:
+    """Make sure that a PoCL can run a kernel; call it before its first one, which else may end the process.
 
     A child process tries, with the system's linker and then with the package ``ziglang``'s. A good answer
-    is kept in the user's cache folder.
+    is kept in the user's cache folder, for this PoCL, processor, linker and Python.
 
     Raises
     ------
     DeviceError
-        No kernel can run here; the message says what to install.
+        It can run no kernel here; the message says what to install.
     """
-    global _verified
-    with _lock:
-        library = find_library()
-        if library is not None and not _verified:
-            prepare()
-            _find_working_linker(library)
-        _verified = True
+    circumstances = _circumstances(device)
+    known = recall("pocl", circumstances)
+    if known == b"system" or (known == b"ziglang" and provide_linker()):
+        return
+    answer, problem = b"system", _probe(device.platform)
+    if problem is not None and provide_linker():
+        answer, problem = b"ziglang", _probe(device.platform)
+    if problem is not None:
+        raise DeviceError(problem)
+    keep("pocl", circumstances, answer)
 
 
 def why_no_device() -> str | None:
-    """Return in one line why OpenCL shows no device, or None where that is unknown."""
+    """Return in one line why OpenCL shows no device, or not the one wanted; None where that is unknown."""
     vendors = os.environ.get("OCL_ICD_VENDORS")
-    if vendors and not Path(vendors).exists():
+    place = Path(vendors or "/etc/OpenCL/vendors")
+    if vendors and not place.exists():
         return f"OCL_ICD_VENDORS names {vendors}, which does not exist; unset it"
-    library = find_library()
-    if library is None:
-        return None
+    files = sorted(place.glob("*.icd")) if place.is_dir() else [place] if vendors else []
+    libraries = [_named_in(file) if file.suffix == ".icd" else str(file) for file in files]
+    own = find_library()
+    for library in libraries if own is None else [*libraries, str(own)]:
+        try:
+            ctypes.CDLL(library)
+        except OSError as error:
+            return f"OpenCL's library {library} cannot be loaded: {error}"
+    return None if own is None else _why_no_cache()
+
+
+def _named_in(list_: Path) -> str:
+    """Return the library that a file of OpenCL's loader names."""
     try:
-        ctypes.CDLL(str(library))
-    except OSError as error:
-        return f"PoCL cannot be loaded: {error}"
-    return _why_no_cache()
+        return list_.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return str(list_)
 
 
 def find_library() -> Path | None:
@@ -139,7 +154,7 @@ def _ensure_name(library: Path) -> tuple[str, bool]:
     if known != "generic":
         return known, False
     version = importlib.metadata.version("pocl-binary-distribution")
-    size = _symbol_size(ask)
+    size = _look_up(_address(ask))[1]
     if (version, size) != (_PATCHABLE, _NAME_FUNCTION_SIZE):
         raise OSError(f"{_NAME_FUNCTION} of version {version} has {size} bytes, which is unknown")
     name = choose_name(_read_flags())
@@ -177,14 +192,22 @@ class _Symbol(ctypes.Structure):
     )  # fmt: skip
 
 
-def _symbol_size(function: Any) -> int:
-    """Return the bytes of a library's function by its symbol table, or 0 where nothing is known of it."""
-    found, symbol = (ctypes.c_void_p * 4)(), ctypes.POINTER(_Symbol)()
+class _Found(ctypes.Structure):
+    """What the dynamic linker knows of an address (Dl_info)."""
+
+    _fields_ = (
+        ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("name", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+    )  # fmt: skip
+
+
+def _look_up(address: int | None) -> tuple[Path | None, int]:
+    """Return the library that an address is in, and the bytes of its function there, 0 where unknown."""
+    found, symbol = _Found(), ctypes.POINTER(_Symbol)()
     search = getattr(ctypes.CDLL(None), "dladdr1", None)
-    code = ctypes.c_void_p(_address(function))
-    if search is None or not search(code, ctypes.byref(found), ctypes.byref(symbol), 1) or not symbol:
-        return 0
-    return int(symbol.contents.size)
+    if search is None or not search(ctypes.c_void_p(address), ctypes.byref(found), ctypes.byref(symbol), 1):
+        return None, 0
+    return Path(os.fsdecode(found.file)), int(symbol.contents.size) if symbol else 0
 
 
 def _take_string(address: int) -> str:
@@ -285,33 +308,27 @@ def provide_linker() -> bool:
     return True
 
 
-def _find_working_linker(library: Path) -> None:
-    circumstances = _circumstances(library)
-    known = recall("pocl", circumstances)
-    if known == "system" or (known == "ziglang" and provide_linker()):
-        return
-    answer, problem = "system", _probe()
-    if problem is not None and provide_linker():
-        answer, problem = "ziglang", _probe()
-    if problem is not None:
-        raise DeviceError(problem)
-    keep("pocl", circumstances, answer)
-
-
-def _circumstances(library: Path) -> object:
+def _circumstances(device: cl.Device) -> object:
     """Return what the answer depends on: this PoCL, this processor, this linker and this Python."""
-    ld = shutil.which("ld")
-    files = [library, Path(ld).resolve()] if ld else [library]
-    stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    return _SCHEME, _processor, sys.executable, stamps
+    # Every object of OpenCL begins with a pointer to the functions of its library.
+    functions = ctypes.cast(device.int_ptr, ctypes.POINTER(ctypes.POINTER(ctypes.c_void_p)))[0]
+    files = [_look_up(functions[1])[0], shutil.which("ld")]
+    states = [(file, Path(file).stat()) for file in files if file is not None]
+    stamps = [(str(file), state.st_size, state.st_mtime_ns) for file, state in states]
+    settings = sorted(
+        item for item in os.environ.items() if item[0].startswith("POCL_") and item[0] != "POCL_CACHE_DIR"
+    )
+    names = device.platform.version, device.driver_version, device.name, _processor
+    return _SCHEME, names, sys.executable, stamps, settings
 
 
-def _probe() -> str | None:
+def _probe(platform: cl.Platform) -> str | None:
     """Run one kernel in a child process; return None, or in one line what went wrong and what to do."""
     problem = _why_no_cache()
     if problem is not None:
         return problem
-    command = [sys.executable, "-P", "-m", "mirrorskin.kernels.embedded"]
+    number = str(cl.get_platforms().index(platform))
+    command = [sys.executable, "-P", "-m", "mirrorskin.kernels.embedded", number]
     # A cache of its own: a kernel that was linked before would hide that none can be linked now.
     with tempfile.TemporaryDirectory(dir=_kernel_cache()) as cache:
         environment = {**os.environ, "POCL_CACHE_DIR": cache}
@@ -368,20 +385,13 @@ def _why_no_cache() -> str | None:
     return None
 
 
-def _run_probe() -> None:
-    """Run one kernel on every PoCL there is: what the child process does."""
+def _run_probe(number: int) -> None:
+    """Run one kernel on each device of a platform: what the child process does."""
     import resource
-
-    import numpy as np
-    import pyopencl as cl
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     prepare()
-    platforms = [platform for platform in cl.get_platforms() if "Portable Computing" in platform.name]
-    devices = [device for platform in platforms for device in platform.get_devices()]
-    if not devices:
-        raise SystemExit("error: it shows no device")
-    for device in devices:
+    for device in cl.get_platforms()[number].get_devices():
         context = cl.Context([device])
         queue = cl.CommandQueue(context)
         kernel = cl.Program(context, _SOURCE).build().probe
@@ -396,4 +406,4 @@ def _run_probe() -> None:
 
 
 if __name__ == "__main__":
-    _run_probe()
+    _run_probe(int(sys.argv[1]))

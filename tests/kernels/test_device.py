@@ -55,6 +55,22 @@ def test_a_kernel_that_does_not_compile_is_quoted(device):
     assert "`const long item = get_global_id(0);`" in str(caught.value)
 
 
+def test_a_program_is_kept_and_a_damaged_one_is_built_again(device, tmp_path, monkeypatch):
+    monkeypatch.setattr(device_layer, "_is_pocl", lambda _: False)  # which keeps its programs by itself
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for damaged in (False, False, True):
+        opened = device_layer.Device(device.context.devices[0])
+        words = opened.given("words", np.arange(8), np.uint32)
+        opened.kernel("limits", "copy_all", **{**MACROS, "LANES": 2, "WORDS": 2})(
+            1, words=words, count=2, moved=32
+        )
+        assert words.download().tolist() == [0, 1, 2, 3] * 2
+        (file,) = (tmp_path / "mirrorskin").glob("program-*")
+        if damaged:
+            assert file.stat().st_size > 1000
+        file.write_bytes(file.read_bytes()[:1000])
+
+
 def test_a_kernel_of_ones_own_runs_and_may_use_what_ours_share(device, tmp_path):
     (tmp_path / "mine.cl").write_text(
         """#include "common.clh"

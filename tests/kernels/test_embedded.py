@@ -7,14 +7,22 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
-from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.device import open_device
+from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 
+# What is asked of a device before it is opened.
+_ASKED = [
+    *("type", "name", "platform", "driver_version", "extensions", "host_unified_memory"),
+    *("max_compute_units", "global_mem_size", "max_mem_alloc_size"),
+]
 CORE2 = {"sse2", "pni", "ssse3", "cx16", "lahf_lm"}
 SANDYBRIDGE = CORE2 | {"sse4_1", "sse4_2", "popcnt", "xsave", "avx"}
 HASWELL = SANDYBRIDGE | {"f16c", "avx2", "bmi1", "bmi2", "fma", "abm", "movbe"}
@@ -38,10 +46,16 @@ def start(tmp_path, monkeypatch):
 
     def begin():
         monkeypatch.setenv("PATH", path)
-        monkeypatch.setattr(embedded, "_verified", False)
+        embedded.verify.cache_clear()
 
     begin()
     return begin
+
+
+@pytest.fixture(scope="module")
+def pocl():
+    """The embedded device."""
+    return next(device for device in device_layer._find() if device_layer._is_pocl(device))
 
 
 @pytest.fixture
@@ -68,7 +82,7 @@ def break_linker(tmp_path, monkeypatch):
 
 
 def kept(tmp_path):
-    return [file.read_text() for file in (tmp_path / "cache" / "mirrorskin").glob("pocl-*")]
+    return [file.read_bytes()[32:] for file in (tmp_path / "cache" / "mirrorskin").glob("pocl-*")]
 
 
 def not_a_folder(tmp_path):
@@ -79,26 +93,26 @@ def not_a_folder(tmp_path):
 # --- The first kernel ------------------------------------------------------------------------------------
 
 
-def test_a_good_answer_is_kept_but_not_for_another_linker(start, tries, tmp_path, break_linker):
-    embedded.verify()
+def test_a_good_answer_is_kept_but_not_for_another_linker(pocl, start, tries, tmp_path, break_linker):
+    embedded.verify(pocl)
     first = len(tries)
     assert first >= 1
     assert len(kept(tmp_path)) == 1
     assert list((tmp_path / "cache" / "pocl" / "kcache").iterdir()) == []
     start()
-    embedded.verify()
+    embedded.verify(pocl)
     assert len(tries) == first
     start()
     break_linker()
     for number in (1, 2):
         with pytest.raises(DeviceError, match=r"no luck.*gcc libc6-dev.*mirrorskin\[linker\]'") as caught:
-            embedded.verify()
+            embedded.verify(pocl)
         assert "\n" not in str(caught.value)
         assert len(tries) == first + number
     assert len(kept(tmp_path)) == 1
 
 
-def test_ziglang_takes_over_from_a_broken_linker(tries, tmp_path, monkeypatch):
+def test_ziglang_takes_over_from_a_broken_linker(pocl, tries, tmp_path, monkeypatch):
     zig = embedded.find_zig()
     working = [str(zig), "ld.lld"] if zig else [str(shutil.which("ld"))]
     standin = script(tmp_path / "zig", f'shift\nexec {shlex.join(working)} "$@"')
@@ -106,28 +120,55 @@ def test_ziglang_takes_over_from_a_broken_linker(tries, tmp_path, monkeypatch):
     monkeypatch.setattr(embedded, "find_zig", lambda: standin)
     for _ in ("tried", "remembered"):
         monkeypatch.setenv("PATH", broken)
-        monkeypatch.setattr(embedded, "_verified", False)
-        embedded.verify()
+        embedded.verify.cache_clear()
+        embedded.verify(pocl)
         assert os.environ["PATH"].endswith(os.pathsep + broken)
-        assert kept(tmp_path) == ["ziglang"]
+        assert kept(tmp_path) == [b"ziglang"]
         assert len(tries) == 2
 
 
-def test_a_device_that_never_answers(monkeypatch):
+def test_a_device_that_never_answers(pocl, monkeypatch):
     monkeypatch.setattr(embedded, "_TIMEOUT", 0.001)
     monkeypatch.setattr(embedded, "find_zig", lambda: None)
     with pytest.raises(DeviceError, match="did not finish"):
-        embedded.verify()
+        embedded.verify(pocl)
 
 
-def test_without_the_wheel_nothing_is_done(tries, monkeypatch):
+def test_without_the_wheel_nothing_is_prepared(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     monkeypatch.setattr(embedded, "_processor", None)
     embedded.prepare()
-    embedded.verify()
     assert embedded._processor is None
     assert embedded.why_no_device() is None
-    assert tries == []
+
+
+_NEW_PROCESS = """
+import sys
+children = []
+sys.addaudithook(lambda event, args: event == "subprocess.Popen" and children.append(args))
+import numpy as np
+from mirrorskin.kernels.device import open_device
+device = open_device("portable")
+words = device.given("words", np.arange(8), np.uint32)
+device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)(1, words=words, count=2, moved=32)
+print(len(children), *words.download())
+"""
+
+
+@pytest.mark.usefixtures("pocl")
+def test_another_process_tries_no_kernel_again_and_survives_damaged_caches(tmp_path):
+    def run():
+        command = [sys.executable, "-c", _NEW_PROCESS]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    assert run() == "1 0 1 2 3 0 1 2 3\n"
+    assert run() == "0 0 1 2 3 0 1 2 3\n"
+    (answer,) = tmp_path.glob("cache/mirrorskin/pocl-*")
+    (program,) = tmp_path.glob("cache/pocl/kcache/**/program.bc")
+    for file in (answer, program):
+        os.truncate(file, 0)
+    assert run() == "1 0 1 2 3 0 1 2 3\n"
+    assert run() == "0 0 1 2 3 0 1 2 3\n"
 
 
 @pytest.mark.parametrize(
@@ -152,24 +193,24 @@ def test_other_failures_quote_what_matters(complaints, complaint):
     ("variable", "below"),
     [("POCL_CACHE_DIR", ""), ("XDG_CACHE_HOME", "pocl/kcache"), ("HOME", ".cache/pocl/kcache")],
 )
-def test_an_unwritable_cache_is_named(variable, below, tmp_path, monkeypatch):
+def test_an_unwritable_cache_is_named(pocl, variable, below, tmp_path, monkeypatch):
     folder = not_a_folder(tmp_path)
     if variable == "HOME":
         monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv(variable, str(folder))
     remedy = "POCL_CACHE_DIR" if variable == "POCL_CACHE_DIR" else "XDG_CACHE_HOME"
     with pytest.raises(DeviceError) as caught:
-        embedded.verify()
+        embedded.verify(pocl)
     assert f"PoCL cannot write its cache folder {folder / below} (Not a directory)" in str(caught.value)
     assert f"set {remedy} to a writable folder" in str(caught.value)
     assert embedded.why_no_device() == str(caught.value)
 
 
-def test_pyopencl_needs_a_cache_too(tmp_path, monkeypatch):
+def test_pyopencl_needs_a_cache_too(pocl, tmp_path, monkeypatch):
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "kernels"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(not_a_folder(tmp_path)))
     with pytest.raises(DeviceError, match=r"pyopencl cannot write .* set XDG_CACHE_HOME"):
-        embedded.verify()
+        embedded.verify(pocl)
     monkeypatch.setenv("PYOPENCL_NO_CACHE", "1")
     assert embedded.why_no_device() is None
 
@@ -179,9 +220,35 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
     assert f"OCL_ICD_VENDORS names {tmp_path / 'nowhere'}" in str(embedded.why_no_device())
     monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
     assert embedded.why_no_device() is None
-    (tmp_path / "libpocl-0.so").write_text("not a library")
-    monkeypatch.setattr(embedded, "find_library", lambda: tmp_path / "libpocl-0.so")
-    assert "PoCL cannot be loaded" in str(embedded.why_no_device())
+    broken = tmp_path / "libvendor.so"
+    broken.write_text("not a library")
+    (tmp_path / "vendor.icd").write_text(f"{broken}\n")
+    for named in (broken, tmp_path / "vendor.icd", tmp_path):
+        monkeypatch.setenv("OCL_ICD_VENDORS", str(named))
+        with pytest.raises(UnknownDeviceError, match=f"library {broken} cannot be loaded: .*file too short"):
+            open_device("vendor's")
+    monkeypatch.setattr(device_layer, "_find", list)
+    with pytest.raises(DeviceError, match=f"no OpenCL device found: OpenCL's library {broken} cannot be"):
+        open_device()
+
+
+def test_a_pocl_that_cannot_run_leaves_the_work_to_a_sound_one(pocl, monkeypatch, caplog):
+    broken = type("Broken", (), {name: getattr(pocl, name) for name in _ASKED})()
+    monkeypatch.setattr(device_layer, "_find", lambda: [broken, pocl])
+    verify = embedded.verify
+    problem = DeviceError("PoCL cannot link kernels")
+
+    def verify_each(device):
+        if device is broken:
+            raise problem
+        verify(device)
+
+    monkeypatch.setattr(embedded, "verify", verify_each)
+    for choice in (None, "cpu", device_layer._describe(pocl).title):
+        assert open_device(choice).context.devices == [pocl]
+    assert "is left out: PoCL cannot link kernels" in caplog.text
+    with pytest.raises(DeviceError, match="PoCL cannot link kernels"):
+        open_device("0")
 
 
 # --- The processor's name --------------------------------------------------------------------------------
@@ -232,7 +299,7 @@ def test_only_a_known_function_that_names_no_processor_is_patched(
     given = []
     monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libc if name is None else library)
     monkeypatch.setattr(importlib.metadata, "version", lambda _: version)
-    monkeypatch.setattr(embedded, "_symbol_size", lambda _: size)
+    monkeypatch.setattr(embedded, "_look_up", lambda _: (None, size))
     monkeypatch.setattr(embedded, "_read_flags", lambda: SKYLAKE)
     monkeypatch.setattr(embedded, "_answer_with", lambda _, name: given.append(name))
     monkeypatch.setattr(embedded, "_processor", None)
@@ -243,10 +310,13 @@ def test_only_a_known_function_that_names_no_processor_is_patched(
     assert ("which is unknown" in caplog.text) == (known == "generic" and patched is None)
 
 
-def test_the_size_of_a_function_is_read_from_its_library():
-    library = ctypes.CDLL(str(embedded.find_library()))
-    assert embedded._symbol_size(library.pocl_get_llvm_cpu_name) > 22  # what is written over it
-    assert embedded._symbol_size(ctypes.CFUNCTYPE(None)(lambda: None)) == 0
+def test_the_library_and_the_size_of_a_function_are_looked_up():
+    path = embedded.find_library()
+    function = ctypes.CDLL(str(path)).pocl_get_llvm_cpu_name
+    file, size = embedded._look_up(embedded._address(function))
+    assert file.samefile(path)
+    assert size > 22  # what is written over it
+    assert embedded._look_up(embedded._address(ctypes.CFUNCTYPE(None)(lambda: None))) == (None, 0)
 
 
 # --- The linker ------------------------------------------------------------------------------------------
