@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,18 @@ class Staged:
         return int(self.frames.stop - self.frames.start)
 
 
+class _Maps(dict[str, Array]):
+    """Arrays by name, each made anew when it is asked for after it was given away."""
+
+    def __init__(self, make: Callable[[str], Array], names: Iterable[str]) -> None:
+        super().__init__((name, make(name)) for name in names)
+        self._make = make
+
+    def __missing__(self, name: str) -> Array:
+        made = self[name] = self._make(name)
+        return made
+
+
 class Band:
     """Some rows of a picture on a device: named maps, and room for some frames.
 
@@ -92,7 +104,7 @@ class Band:
             raise DeviceMemoryError(
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
-        self.maps = {name: self._make(name) for name in maps}
+        self.maps = _Maps(self._make, maps)
         self._most = device.max_allocation // (
             self.pixels * dtype.itemsize
         )  # frames that kernels see at once
@@ -124,21 +136,18 @@ class Band:
             array.download()  # the other planes
         array.claim()
         self._blank.discard(name)
-        target = array.host if plane is None else self.plane(name, plane)
+        target = array.host if plane is None else self.picture(array.host[plane])
         target[:] = values
         if self._resident:
             array.upload()
 
-    def plane(self, name: str, plane: int) -> NDArray[Any]:
-        """Return one of several planes, (rows, W), as the host sees it."""
-        found: NDArray[Any] = self.maps[name].host[plane, : self.pixels].reshape(self._shape)
-        return found
+    def picture(self, plane: NDArray[Any]) -> NDArray[Any]:
+        """Return a plane, (stride,), without its padding, (rows, W)."""
+        return plane[: self.pixels].reshape(self._shape)
 
     def detach(self, name: str) -> NDArray[Any]:
-        """Give away what a map holds, (count, stride) or (rows, W), without a copy, and make a new one."""
-        given = self.maps[name].detach()
-        self.maps[name] = self._make(name)
-        return given
+        """Give away what a map holds, (count, stride) or (rows, W), without a copy; it is blank then."""
+        return self.maps.pop(name).detach()
 
     @contextmanager
     def resident(self) -> Iterator[None]:

@@ -289,7 +289,8 @@ class ChangePointSearch:
                 **maps,
                 moved=sum(array.host.nbytes for array in maps.values()),
             )
-            return [maps[name].download().copy() for name in ("height", "sigma", "status", "start")]
+            answers = [band.detach(name) for name in ("height", "sigma", "status")]
+            return [*answers, maps["start"].download().copy()]
 
     def _travel_pairs(self) -> Array:
         """Hand the travel to the device as (T, 2) floats, whose sums are as good as float64."""

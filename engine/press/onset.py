@@ -119,7 +119,7 @@ def find_onset(
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
     search.push(frames, travel=travel)
-    return search.result()
+    return search.finish()
 
 
 class OnsetSearch:
@@ -248,20 +248,29 @@ class OnsetSearch:
 
     def result(self) -> Onset:
         """Return the maps of the frames so far; more may follow."""
+        return self._found(last=False)
+
+    def finish(self) -> Onset:
+        """Return the maps of all frames, without copies of them; only ``reset`` may follow."""
+        return self._found(last=True)
+
+    def _found(self, last: bool) -> Onset:
         noise = self._noise.value
         if noise is None or self._travel.count == 0:
             raise InputError(f"a press of {self._travel.count} frames has no onset: at least 2 are needed")
-        maps = [self._finish(band) for band in self._bands]
+        maps = [self._answers(band, last) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         return Onset(height, sigma, status, np.maximum(frame, DARK, out=frame), noise)
 
-    def _finish(self, band: Band) -> list[NDArray[Any]]:
+    def _answers(self, band: Band, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
         with band.resident():
-            for name in ("answers", "status", "times"):
-                band.maps[name].download()
-            planes = ("answers", 0), ("answers", 1), ("status", 0), ("times", 0)
-            return [band.plane(*plane).copy() for plane in planes]
+            answers, status, times = (
+                band.detach(name) if last else band.maps[name].download()
+                for name in ("answers", "status", "times")
+            )
+            found = [band.picture(plane) for plane in (answers[0], answers[1], status[0], times[0])]
+            return found if last else [plane.copy() for plane in found]
 
     def reset(self) -> None:
         """Forget the frames so far, and be ready for another press with the same references."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, room_of
+from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array import Array, Operand
@@ -279,8 +279,8 @@ class _Sums:
         parts = []
         for band in self.bands:
             with band.resident():
-                parts.append([band.maps[answer].download() for answer in _ANSWERS.values()])
-        mean, cosine, sine, residual = (np.concatenate(part) for part in zip(*parts, strict=True))  # copies
+                parts.append([band.detach(answer) for answer in _ANSWERS.values()])
+        mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
         return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
 
     def _solve(self) -> None:

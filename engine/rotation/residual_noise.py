@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -108,6 +109,7 @@ def _share_beyond(freedom: int, square: float) -> float:
     return float(first + np.sum(term * np.cumprod(half / powers)))
 
 
+@functools.cache
 def _chi_square_beyond(freedom: int, share: float) -> float:
     """Return the value that chi^2 exceeds with this probability, to a double's last digits, by bisection."""
     low, high = 0.0, 1.0

@@ -352,15 +352,15 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
             bright, dark, threshold - 1e-12, np.dtype(dtype), release=event == "release"
         )
         alive = np.isfinite(level)
-        np.testing.assert_array_equal(band.plane("left", 0) > 0, alive)
+        np.testing.assert_array_equal(band.picture(band.maps["left"].host[0]) > 0, alive)
         # A level that is 0 but for rounding is so in float64, too.
         zero = np.abs(level) < 1e-6
         np.testing.assert_array_equal(levels[0][alive & ~zero], level[alive & ~zero])
         np.testing.assert_allclose(levels[0][alive & zero], level[alive & zero], rtol=0, atol=1e-9)
         np.testing.assert_array_equal(levels[1][alive], plateau[alive])
-        np.testing.assert_array_equal(band.plane("marks", 0)[alive], light[alive])
+        np.testing.assert_array_equal(band.picture(band.maps["marks"].host[0])[alive], light[alive])
         sure = reference.onset_sure(level, light, 6 * noise)
-        np.testing.assert_array_equal(band.plane("marks", 1)[alive], sure[alive])
+        np.testing.assert_array_equal(band.picture(band.maps["marks"].host[1])[alive], sure[alive])
 
 
 def test_the_whole_range_of_uint16(device):
