@@ -33,6 +33,7 @@ from mirrorskin.bench.files import (
     make_turns,
     new_folder,
     record,
+    shared_memory,
     sync,
     to_new_results,
     to_result,
@@ -103,7 +104,7 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
                 KERNEL: push,
                 IN_MEMORY: find,
                 PATH: to_new_results(path, folder / "result.h5", device),
-                READ: partial(_fetch, recording),
+                READ: partial(_fetch, recording, _room(recording)),
                 H5PY: partial(_read_with_h5py, path, recording.dataset),
             }
 
@@ -154,7 +155,7 @@ def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, qui
             works: dict[str, Work] = {
                 kernels: partial(answer, estimator(), turns.block, 1),
                 PATH: to_new_results(path, folder / "result.h5", device, **options),
-                READ: partial(_fetch, recording),
+                READ: partial(_fetch, recording, _room(recording)),
                 H5PY: partial(_read_with_h5py, path, recording.dataset),
             }
             beside = {cached: partial(answer, estimator(), turns.first(_CACHED).block, _REPEATS)}
@@ -191,10 +192,14 @@ def _size(shape: Shape) -> str:
     return f"{' x '.join(map(str, shape))} uint8"
 
 
-def _fetch(recording: io.Recording) -> None:
-    """Read all frames, of those that are lent one byte a page, into as much room as a reconstruction has."""
+def _room(recording: io.Recording) -> NDArray[Any]:
+    """Return as much room for frames as a reconstruction has, and keeps for the next one."""
     length = MEMORY_LIMIT // (2 * math.prod(recording.shape[1:]) * recording.dtype.itemsize)
-    room = np.zeros((min(max(1, length), recording.shape[0]), *recording.shape[1:]), recording.dtype)
+    return shared_memory((min(max(1, length), recording.shape[0]), *recording.shape[1:]), recording.dtype)
+
+
+def _fetch(recording: io.Recording, room: NDArray[Any]) -> None:
+    """Read all frames, of those that are lent one byte a page."""
     recording.rewind()
     while (block := recording.read(room)) is not None:
         if block.lent:
