@@ -142,11 +142,10 @@ __kernel void correlation_convert(
 
 // --- Sums of any samples less their references --------------------------------------------------------------------
 
-#define CHUNK (TILE < 256 ? TILE : 256)  // pixels whose sums stay in a core's nearest memory
 enum { TOTAL, COSINE, SINE, SQUARE, SUMS };
 
 typedef struct {
-    float reference[CHUNK], high[SUMS][CHUNK], rest[SUMS][CHUNK];
+    float reference[TILE], high[SUMS][TILE], rest[SUMS][TILE];
 } Sums;
 
 #define GET(k) ((Pair){sums->high[k][p], sums->rest[k][p]})
@@ -157,15 +156,18 @@ typedef struct {
         sums->rest[k][p] = pair.rest; \
     }
 
-// Adds frames; where there are no sums yet, the first sample is the reference of all.
-void add(
+// Adds frames; where there are no sums yet, the first sample is the reference of all. Inlined, or else a GPU's lane
+// would keep its sums in memory.
+__attribute__((always_inline)) void add(
     Sums *restrict sums, const int fresh, const int width, __global const FRAME *restrict frames, const int count,
     const int stride, __global const int *restrict place, MAP basis)
 {
-    if (fresh) {
-        for (int p = 0; p < width; ++p) sums->reference[p] = frames[(size_t)place[0] * stride + p];
-        for (int k = 0; k < SUMS; ++k)
-            for (int p = 0; p < width; ++p) sums->high[k][p] = sums->rest[k][p] = 0;
+    for (int p = 0; p < width && fresh; ++p) {
+        sums->reference[p] = frames[(size_t)place[0] * stride + p];
+        SET(TOTAL, ((Pair){0, 0}))
+        SET(COSINE, ((Pair){0, 0}))
+        SET(SINE, ((Pair){0, 0}))
+        SET(SQUARE, ((Pair){0, 0}))
     }
     for (int t = 0; t < count; ++t) {
         __global const FRAME *restrict frame = frames + (size_t)place[t] * stride;
@@ -190,25 +192,22 @@ __kernel void correlation_sum(
     __global const int *restrict place, MAP basis, const int fresh, OUT reference, __global float2 *restrict total,
     __global float2 *restrict cosine, __global float2 *restrict sine, __global float2 *restrict square)
 {
-    const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
-    for (int low = base; low < end; low += CHUNK) {
-        const int width = min(CHUNK, end - low);
-        Sums here, *sums = &here;
-        for (int p = 0; p < width && !fresh; ++p) {
-            sums->reference[p] = reference[low + p];
-            SET(TOTAL, PAIR(total[low + p]))
-            SET(COSINE, PAIR(cosine[low + p]))
-            SET(SINE, PAIR(sine[low + p]))
-            SET(SQUARE, PAIR(square[low + p]))
-        }
-        add(sums, fresh, width, frames + low, count, stride, place, basis);
-        for (int p = 0; p < width; ++p) {
-            reference[low + p] = sums->reference[p];
-            total[low + p] = (float2)(sums->high[TOTAL][p], sums->rest[TOTAL][p]);
-            cosine[low + p] = (float2)(sums->high[COSINE][p], sums->rest[COSINE][p]);
-            sine[low + p] = (float2)(sums->high[SINE][p], sums->rest[SINE][p]);
-            square[low + p] = (float2)(sums->high[SQUARE][p], sums->rest[SQUARE][p]);
-        }
+    const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
+    Sums here, *sums = &here;
+    for (int p = 0; p < width && !fresh; ++p) {
+        sums->reference[p] = reference[low + p];
+        SET(TOTAL, PAIR(total[low + p]))
+        SET(COSINE, PAIR(cosine[low + p]))
+        SET(SINE, PAIR(sine[low + p]))
+        SET(SQUARE, PAIR(square[low + p]))
+    }
+    add(sums, fresh, width, frames + low, count, stride, place, basis);
+    for (int p = 0; p < width; ++p) {
+        reference[low + p] = sums->reference[p];
+        total[low + p] = (float2)(sums->high[TOTAL][p], sums->rest[TOTAL][p]);
+        cosine[low + p] = (float2)(sums->high[COSINE][p], sums->rest[COSINE][p]);
+        sine[low + p] = (float2)(sums->high[SINE][p], sums->rest[SINE][p]);
+        square[low + p] = (float2)(sums->high[SQUARE][p], sums->rest[SQUARE][p]);
     }
 }
 
@@ -227,12 +226,9 @@ __kernel void correlation_window_pairs(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
     __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine_part, OUT sine_part, OUT residual)
 {
-    const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
-    for (int low = base; low < end; low += CHUNK) {
-        const int width = min(CHUNK, end - low);
-        Sums here, *sums = &here;
-        add(sums, 1, width, frames + low, count, stride, place, basis);
-        for (int p = 0; p < width; ++p)
-            ANSWER(low + p, sums->reference[p], GET(TOTAL), GET(COSINE), GET(SINE), GET(SQUARE))
-    }
+    const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
+    Sums here, *sums = &here;
+    add(sums, 1, width, frames + low, count, stride, place, basis);
+    for (int p = 0; p < width; ++p)
+        ANSWER(low + p, sums->reference[p], GET(TOTAL), GET(COSINE), GET(SINE), GET(SQUARE))
 }
