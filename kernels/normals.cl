@@ -78,17 +78,16 @@ INLINE Direction begin_at(const Samples of, const I usable, const float cos_tilt
 // The normal equations at a direction, of samples that are all there and all within range; the last ones with the tilt. u1
 // and u2 make a unit vector, as do u3 and u2 by the share of the tilt in the zenith.
 INLINE Sums look(
-    const Direction at, const Samples of, const Wave wave, const float cos_tilt, const float sin_tilt, const int last)
+    const Direction at, const Samples of, const Wave wave, const float weights, const float cos_tilt, const float sin_tilt,
+    const int last)
 {
     Sums sums = {0};
-    float weights = 0.0f;
     const Pose pose = pose_of(at, cos_tilt, sin_tilt);
     for (int k = 0; k < of.count; ++k) {
         const F zenith = zenith_of(of, raw_of(of, k));
         const float root = entry(of, ROOT_WEIGHT, k);
         const Expected seen = expect(pose, of, k);
         const F error = root * (zenith - seen.zenith);
-        weights += root * root;
         sums.m12 += seen.u1 * seen.u2;
         sums.m22 += seen.u2 * seen.u2;
         sums.b1 += seen.u1 * error;
@@ -127,6 +126,11 @@ Sums look_closely(
 __kernel void normals_exact(ARGUMENTS)
 {
     GATHER_ARGUMENTS
+    float weights = 0.0f;
+    for (int k = 0; k < count; ++k) {
+        const float root = tables[(table * PLANES + ROOT_WEIGHT) * ROOM + k];
+        weights += root * root;
+    }
     for (int from = first; from < end; from += PART * LANES) {
         Samples of[PART];
         Known known[PART];
@@ -138,9 +142,9 @@ __kernel void normals_exact(ARGUMENTS)
             known[i] = survey(of[i], noise);
         }
         for (int i = 0; i < PART; ++i) begin[i] = begin_at(of[i], known[i].usable, cos_tilt, sin_tilt);
-        for (int i = 0; i < PART; ++i) sums[i] = look(begin[i], of[i], known[i].wave, cos_tilt, sin_tilt, 0);
+        for (int i = 0; i < PART; ++i) sums[i] = look(begin[i], of[i], known[i].wave, weights, cos_tilt, sin_tilt, 0);
         for (int i = 0; i < PART; ++i) nearer[i] = step(begin[i], sums[i]);
-        for (int i = 0; i < PART; ++i) sums[i] = look(nearer[i], of[i], known[i].wave, cos_tilt, sin_tilt, 1);
+        for (int i = 0; i < PART; ++i) sums[i] = look(nearer[i], of[i], known[i].wave, weights, cos_tilt, sin_tilt, 1);
         for (int i = 0; i < PART; ++i) {
             const int p = from + i * LANES;
             if (p >= end) break;
