@@ -99,7 +99,8 @@ def fuse(
         getattr(normals, "turns", 1),
     )
     press = PressHeights.of(onset.height, onset.sigma, wanted)
-    return FusionSolver(press, slopes, pixel_size, robust, open_device(device)).surface()
+    solver = FusionSolver(press, pixel_size, robust, open_device(device))
+    return solver.filled(solver.surface(slopes))
 
 
 def _check_shapes(onset: Onset, normals: Normals, mask: ArrayLike | None) -> Mask:
@@ -181,7 +182,8 @@ def fuse_sources(
     if not np.isfinite(heights.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     onset, known = PressHeights.of(heights.height, heights.height_sigma), heights.height
-    for number in range(_passes(axial, register)):
+    solver, passes = FusionSolver(onset, pixel_size, robust, opened), _passes(axial, register)
+    for number in range(passes):
         found = estimate_rotation(
             axial,
             **rotation,
@@ -189,12 +191,15 @@ def fuse_sources(
             progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
             **common,
         )
-        solver = FusionSolver(onset, _slopes_of(found), pixel_size, robust, opened)
-        before, known = fill_with_nearest(known), solver.heights()
+        # The first of several surfaces is hardly ever the last.
+        surface = solver.surface(_slopes_of(found), sigma=number > 0 or passes == 1)
+        before, known = fill_with_nearest(known), surface.height
         moved = _moved(before, known, found.normals.tilt, pixel_size)
         if moved <= _STILL:
             break
-    surface = solver.surface()
+    if surface.sigma is None:
+        surface = solver.surface(_slopes_of(found))
+    surface = solver.filled(surface)
     if progress:
         progress(frames_to_read(vertical, axial, register))
     turned = attach_provenance(Result(), axial, opened, found.process)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -66,43 +67,45 @@ class PressHeights:
 class FusionSolver:
     """Integrates heights and slopes in three passes: as given, with the slopes of heights, with intervals.
 
-    InputError where there is neither a height nor a slope, or the pixel size cannot be; NotConverged where a
-    surface was not found.
+    Slopes that are nearly those before, of frames that were registered anew, are integrated in one: the last
+    surface takes the place of the first two. `surface` raises InputError where there is neither a height nor
+    a slope, or the pixel size cannot be; NotConverged where a surface was not found.
     """
 
-    def __init__(
-        self, press: PressHeights, slopes: Slopes, pixel_size: ArrayLike, robust: bool, device: Device
-    ) -> None:
+    def __init__(self, press: PressHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
+        self._press, self._pixel_size = press, check_pixel_size(pixel_size)
+        self._robust, self._device = robust, device
+        self._near: Surface | None = None
+
+    def surface(self, slopes: Slopes, *, sigma: bool = True) -> Surface:
+        """Return the surface of the press and of slopes."""
+        press, near = self._press, self._near
         if not (slopes.known | press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
-        self._slopes, self._pixel_size = slopes, check_pixel_size(pixel_size)
-        self._robust, self._device = robust, device
-        first = self._solve(press.height, press.weight, sigma=False)
-        press = _correct_overstated(press, first, slopes)
-        extended = _extend(slopes, first, press, self._pixel_size)
-        if extended is not slopes:
-            self._slopes = extended
-            first = self._solve(press.height, press.weight, initial_heights=first.height, sigma=False)
-        self._start = first.height
-        self._height, self._weight = _use_intervals(first, press, slopes)
+        if near is None:
+            near = self._solve(slopes, press.height, press.weight, sigma=False)
+        press = _correct_overstated(press, near, slopes)
+        extended = _extend(slopes, near, press, self._pixel_size)
+        if self._near is None and extended is not slopes:
+            start = near.height
+            near = self._solve(extended, press.height, press.weight, initial_heights=start, sigma=False)
+        height, weight = _use_intervals(near, press, slopes)
+        found = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
+        # Heights that are mistakes are left out of the surface, but may count next time.
+        self._near = replace(near, height=np.where(found.component < 0, near.height, found.height))
+        return found if found.sigma is None else _set_sigma_of_lone_pixels(found, weight)
 
-    def heights(self) -> NDArray[np.float32]:
-        """Return the heights alone, which is faster."""
-        self._start = self._solve(self._height, self._weight, initial_heights=self._start, sigma=False).height
-        return self._start
+    def filled(self, surface: Surface) -> Surface:
+        """Return a surface with its holes filled."""
+        return _join(_fill(surface, self._pixel_size))
 
-    def surface(self) -> Surface:
-        """Return the surface, its holes filled."""
-        surface = self._solve(self._height, self._weight, initial_heights=self._start)
-        return _join(_fill(_set_sigma_of_lone_pixels(surface, self._weight), self._pixel_size))
-
-    def _solve(self, height: Doubles, weight: Doubles, **options: Any) -> Surface:
+    def _solve(self, slopes: Slopes, height: Doubles, weight: Doubles, **options: Any) -> Surface:
         return integrate(
-            self._slopes.dz_dx,
-            self._slopes.dz_dy,
+            slopes.dz_dx,
+            slopes.dz_dy,
             self._pixel_size,
-            mask=self._slopes.known | (weight > 0),
-            slope_weights=self._slopes.weights,
+            mask=slopes.known | (weight > 0),
+            slope_weights=slopes.weights,
             known_heights=np.where(weight > 0, height, np.nan),
             known_height_weights=weight,
             robust=self._robust,
@@ -130,17 +133,16 @@ def _extend(slopes: Slopes, surface: Surface, press: PressHeights, pixel_size: t
     The window spans a terrace or more. Neighbours share data, so each slope counts only for its part of a
     window. Where heights do not fit a smooth surface, there are no slopes.
     """
-    from scipy import ndimage
-
     gaps = press.known & ~slopes.known
     if not gaps.any() or not slopes.known.any():
         return slopes
     sigma = float(np.median(press.sigma[press.known]))
     width = _window(slopes, sigma, min(pixel_size))
     size = 2 * int(_NEAR * width) + 1
-    gaps &= ndimage.uniform_filter(slopes.known.astype(np.float32), size, mode="constant") > 0
-    weight = np.where(slopes.known, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
-    height = surface.height.astype(np.float64)
+    gaps &= cv2.dilate(slopes.known.view(np.uint8), np.ones((size, size), np.uint8)) > 0
+    height = np.where(gaps, press.height, surface.height)
+    firm = slopes.known & np.isfinite(height)
+    weight = np.where(firm, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
     trend = fit_paraboloids(height, weight, gaps, width)
     off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
     if off.any():  # mistakes count only once
@@ -170,8 +172,6 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
     at rims and often late, in a component that has others. A component of which no height is near an end of
     its interval lies on one terrace: then all of its heights together count as one.
     """
-    from scipy import ndimage
-
     size = _sizes(surface)
     joined = press.known & (size[surface.component] > 1)
     both = joined & slopes.known
@@ -183,7 +183,7 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
     label, half = surface.component[joined], _UNIFORM * press.sigma[joined]
     middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
     # The mean that a solver finds is moved by mistakes, the median is not.
-    lift = np.asarray(ndimage.median(middle - shape, label, np.arange(size.size)))
+    lift = _medians(middle - shape, label, size.size)
     half *= _share_used(middle - shape - lift[label], half, shape)
     for _ in range(_ITERATIONS):
         at = shape + lift[label]
@@ -200,6 +200,15 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
     height[joined] = np.where(ends, inside.height, middle)
     weight[joined] = np.where(ends, inside.weight, plain)
     return height, weight
+
+
+def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
+    """Return the median of each label's values, 0 where there is none."""
+    ordered = np.append(values[np.lexsort((values, label))], 0.0)
+    members = np.bincount(label, minlength=count)
+    first = np.cumsum(members) - members
+    middles = (ordered[first + (members - 1) // 2 * (members > 0)] + ordered[first + members // 2]) / 2
+    return np.where(members, middles, 0.0)
 
 
 def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
@@ -244,11 +253,9 @@ def _relative(surface: Surface) -> Mask:
 
 def _join(surface: Surface) -> Surface:
     """Make one component of neighbours whose heights are all absolute, though no slope leads across."""
-    from scipy import ndimage
-
     answered = (surface.component >= 0) | (surface.filled > 0)
     relative = _relative(surface)
-    labels, count = ndimage.label(answered & ~relative)
+    count, labels = cv2.connectedComponents((answered & ~relative).view(np.uint8), connectivity=4)
     names = np.where(relative, count + surface.component, labels - 1)
     _, first, rank = np.unique(names[answered], return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))

@@ -260,7 +260,7 @@ def _bytes(level: Level, arguments: dict[str, Any]) -> int:
 def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.floating]) -> NDArray[np.float64]:
     """Invert a matrix whose components' offsets are free, but for those that have an anchor."""
     label = _components(matrix)
-    count = int(label.max()) + 1
+    count = int(label.max(initial=-1)) + 1
     members = np.bincount(label, minlength=count)
     free = np.bincount(label, anchor, count) <= _LEAST * np.bincount(label, np.diagonal(matrix), count)
     typical = np.bincount(label, np.diagonal(matrix), count) / members
