@@ -16,6 +16,7 @@ SAMPLES = 65536
 QUANTUM = 1 / math.sqrt(12)
 """The least noise of integer counts: that of their rounding."""
 
+_AT_ONCE = 65536  # pixels
 _CLIP = 4.0  # sigma
 _MEDIAN = 0.6745  # of the magnitude of a normal variate
 
@@ -103,12 +104,7 @@ def reference_maps(
     top = 0 if dtype.kind == "f" else np.iinfo(dtype).max
     low = _as_map("dark", 0 if dark is None else dark, shape)
     high = _as_map("bright", top if bright is None else bright, shape)
-    with np.errstate(invalid="ignore", over="ignore"):
-        span = high - low
-    if np.min(span) > 0 and np.max(span) < np.inf:  # that of good references is quick
-        return low, high
-    known = np.count_nonzero(np.isfinite(span))
-    usable = np.count_nonzero(_usable(low, high))
+    known, usable = _count_usable(low, high)
     if known == 0:
         raise InputError("no pixel has a dark and a bright that are numbers: take the references again")
     if 2 * usable <= known:
@@ -130,6 +126,21 @@ def reference_pair(
         np.broadcast_to(np.where(usable, part.astype(np.float64), np.nan), shape) for part in (low, high)
     )
     return dark_map, bright_map
+
+
+def _count_usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> tuple[int, int]:
+    """Return at how many pixels both are numbers, and bright is above dark as well."""
+    known = usable = 0
+    if dark.ndim == bright.ndim == 0:
+        dark, bright = np.atleast_1d(dark, bright)
+    dark, bright = np.broadcast_arrays(dark, bright)
+    step = max(1, _AT_ONCE // (dark[0].size))
+    for start in range(0, len(dark), step):  # parts that stay in the cache
+        with np.errstate(invalid="ignore", over="ignore"):
+            span = bright[start : start + step] - dark[start : start + step]
+        known += int(np.count_nonzero(np.isfinite(span)))
+        usable += int(np.count_nonzero(span > 0) - np.count_nonzero(span == np.inf))
+    return known, usable
 
 
 def _usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> NDArray[np.bool_]:

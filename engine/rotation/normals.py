@@ -384,7 +384,7 @@ class NormalEstimator:
         """Take a turn into the maps."""
         count = turn.stop - turn.start
         if self._model is None:
-            samples = self._buffer[turn].reshape(count, -1)[:, :: thinning(self._shape)]
+            samples = np.ascontiguousarray(self._buffer[turn].reshape(count, -1)[:, :: thinning(self._shape)])
             self._model = self._kernel.estimate_model(samples, fit)
         self._turns += 1
         self._frames += count

@@ -141,8 +141,8 @@ class NormalKernel:
         noise, tilt = self._noise, self._tilt
         if noise is None:
             with np.errstate(invalid="ignore"):
-                clear = self._scale.clear_pixels(fit.matrix @ samples, self._step)
-            steep = samples[:, clear]
+                clear = self._scale.clear_pixels(fit.matrix @ samples.astype(np.float64), self._step)
+            steep = samples.compress(clear, axis=1)
             noise = residual_noise(steep if steep.shape[1] >= _ENOUGH else samples, fit.phase, fit.weights)
         if tilt is None:
             if self._wall is not None:

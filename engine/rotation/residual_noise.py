@@ -18,6 +18,7 @@ _FLOAT_NOISE = 1e-6  # of the greatest count: the least noise that float frames 
 _FRAMES_OF_TWO = 7  # least frames to fit a second wave with the first
 _MAX_CONDITION = 100.0  # of both
 _BINS, _BIN_PIXELS = 16, 200  # bins of brightness at most, and pixels of one at least
+_AT_ONCE = 4096  # pixels, which stay in the cache
 _ROUNDS, _OUTLYING = 10, 0.2  # of the line's robust fit, and share by which a variance may miss it
 _BEYOND = 1e-3  # share of the pixels whose sum of squares is that large by noise alone
 
@@ -61,14 +62,23 @@ def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> C
         raise InputError(
             "too few samples are valid to estimate the noise: give a sample's standard deviation, in counts"
         )
-    counts, phase, weights = samples[frames][:, pixels].astype(np.float64), phase[frames], weights[frames]
-    floor = quantum * (1.0 if samples.dtype.kind == "u" else float(np.max(np.abs(counts))))
+    integer = samples.dtype.kind == "u"
+    counts, phase, weights = samples[frames].compress(pixels, axis=1), phase[frames], weights[frames]
+    total = counts.sum(axis=0, dtype=np.uint32 if integer else np.float64)
+    level = total / len(counts)
+    floor = quantum * (1.0 if integer else float(np.max(np.abs(counts))))
     root = np.sqrt(weights)[:, np.newaxis]
     waves = root * _waves(phase)
-    residual = root * counts - waves @ (np.linalg.pinv(waves) @ (root * counts))
-    squares, level = np.sum(residual**2, axis=0), counts.mean(axis=0)
     freedom = len(counts) - waves.shape[1]
-    order = np.argsort(level, kind="stable")
+    # Of an orthonormal base, the directions that are no waves.
+    beside = np.linalg.qr(waves, mode="complete").Q[:, waves.shape[1] :]
+    squares = np.empty(len(level))
+    for start in range(0, len(level), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        residual = beside.T @ (root * counts[:, part])
+        np.einsum("ij,ij->j", residual, residual, out=squares[part])
+    # Integers of 16 bits are sorted in one pass.
+    order = np.argsort(total.astype(np.uint16) if integer and total.max() < 2**16 else total, kind="stable")
     bins = np.array_split(order, max(1, min(_BINS, len(order) // _BIN_PIXELS)))
     variances = np.array([_variance(squares[one], freedom) for one in bins])
     levels = np.array([level[one].mean() for one in bins])
