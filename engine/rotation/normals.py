@@ -189,7 +189,7 @@ def estimate_normals(
         device=device,
         memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
     )
-    estimator.push(frames, phase=alpha, frame_weights=frame_weights)
+    estimator.look_at(frames, alpha, check_weights(frame_weights, len(frames)))
     return estimator.result()
 
 
@@ -305,6 +305,14 @@ class NormalEstimator:
             self._take(frames[part], alpha[part], weights[part])
             start = part.stop
 
+    def look_at(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
+        """Take in all frames at once; they stay as they are until the result is there, and are not copied."""
+        if np.all(weights > 0):  # else frames are moved
+            self._cut(phase)
+            self._buffer, self._phase, self._weights = frames, phase, weights
+        else:
+            self.push(frames, phase=phase, frame_weights=weights)
+
     def result(self) -> Normals:
         """Return the maps of all turns, the last of which is taken to end here.
 
@@ -337,11 +345,7 @@ class NormalEstimator:
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
         """Take in frames that fit into the buffer, and estimate the turns that are then over."""
-        turns = cut_into_turns(np.concatenate([self._phase, phase]))
-        longest = max(turn.stop - turn.start for turn in turns)
-        if longest > self._longest:
-            given = f"a turn of {longest} frames or more: normals take {self._longest} at most"
-            raise InputError(f"{given}; leave some out, or use 'mirrorskin correlate'")
+        turns = self._cut(np.concatenate([self._phase, phase]))
         here = self.room[: len(frames)]
         if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
             here[:] = frames
@@ -352,6 +356,15 @@ class NormalEstimator:
             end, frame_count = turns[-1].start, len(self._phase)
             self._buffer[: frame_count - end] = self._buffer[end:frame_count].copy()
             self._phase, self._weights = self._phase[end:], self._weights[end:]
+
+    def _cut(self, phase: Doubles) -> list[slice]:
+        """Cut frames into turns, none of which may be too long."""
+        turns = cut_into_turns(phase)
+        longest = max(turn.stop - turn.start for turn in turns)
+        if longest > self._longest:
+            given = f"a turn of {longest} frames or more: normals take {self._longest} at most"
+            raise InputError(f"{given}; leave some out, or use 'mirrorskin correlate'")
+        return turns
 
     def _estimate(self, turns: list[slice]) -> None:
         """Estimate the normals of turns in the buffer."""
@@ -384,7 +397,7 @@ class NormalEstimator:
         """Take a turn into the maps."""
         count = turn.stop - turn.start
         if self._model is None:
-            samples = np.ascontiguousarray(self._buffer[turn].reshape(count, -1)[:, :: thinning(self._shape)])
+            samples = np.stack([frame.reshape(-1)[:: thinning(self._shape)] for frame in self._buffer[turn]])
             self._model = self._kernel.estimate_model(samples, fit)
         self._turns += 1
         self._frames += count
