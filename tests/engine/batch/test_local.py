@@ -63,12 +63,12 @@ def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, dev
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
             time.sleep(0.5)
 
-    outcomes = run_local(jobs, Plan(memory_limit=4 * 5 * 7), [device], interrupt)
+    outcomes = run_local(jobs, Plan(memory_limit=5 * 7), [device], interrupt)
     with pytest.raises(KeyboardInterrupt):
         done.extend(outcomes)
     assert io.open_result(jobs[0].target).height is not None
     assert [path.name for path in jobs[0].target.parent.iterdir()] == [jobs[0].target.name]
-    states = [one.state for one in run_local(jobs, Plan(memory_limit=4 * 5 * 7), [device])]
+    states = [one.state for one in run_local(jobs, Plan(memory_limit=5 * 7), [device])]
     assert states == ["kept", "done", "done", "done"]
 
 
