@@ -43,13 +43,10 @@ class Staged:
     array : Array or BorrowedBuffer, (n, rows, W)
     frames : slice
         Which of the frames these are.
-    aligned : bool
-        Whether each begins at a multiple of a word.
     """
 
     array: Operand
     frames: slice
-    aligned: bool
 
     @property
     def count(self) -> int:
@@ -198,20 +195,14 @@ class Band:
             borrowed = BorrowedBuffer(self._device, "frames", room)
         # The one before waits for its kernels: when more frames are read, only these here can be under way.
         self._borrowed = borrowed
-        aligned = self._full_words and borrowed.host.ctypes.data % (4 * self._device.layout.lanes) == 0
-        return Staged(borrowed, slice(start, start + len(borrowed.host)), aligned)
+        return Staged(borrowed, slice(start, start + len(borrowed.host)))
 
     def _bring(self, frames: NDArray[Any], start: int) -> Staged:
         """Begin to copy frames to one of two places on the device, while kernels work on the other."""
         self._places.reverse()
         part = np.ascontiguousarray(frames[: self._places[0].shape[0]])
         self._places[0].upload_async(part)
-        return Staged(self._places[0], slice(start, start + len(part)), self._full_words)
-
-    @property
-    def _full_words(self) -> bool:
-        """Whether each frame is as long as some words."""
-        return bool(self.pixels * self._dtype.itemsize % (4 * self._device.layout.lanes) == 0)
+        return Staged(self._places[0], slice(start, start + len(part)))
 
     def _make(self, name: str) -> Array:
         kind = self._kinds[name]

@@ -244,7 +244,7 @@ class Device:
         name : str
             The function in it.
         **defines : str or int
-            Macros to set; ``LANES``, ``WORDS`` and ``TILE`` are those of the device's layout otherwise.
+            Macros to set; ``WORDS`` and ``TILE`` are those of the device's layout otherwise.
 
         Raises
         ------
@@ -262,7 +262,7 @@ class Device:
         """
         made, key = self._kernels.made, (file, name, self.layout, *defines.items())
         if key not in made:
-            cut = {"LANES": self.layout.lanes, "WORDS": self.layout.words, "TILE": self.layout.tile}
+            cut = {"WORDS": self.layout.words, "TILE": self.layout.tile}
             options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
             made[key] = self._make_kernel(file, name, options)
         return made[key]

@@ -11,21 +11,18 @@ class Layout:
 
     Attributes
     ----------
-    lanes : int
-        32-bit lanes of a word, which a kernel loads at once.
     words : int
-        Words of one work-item.
+        Words of one work-item, in kernels that take pixels side by side.
     tile : int
         Pixels of one work-item, in kernels that take them one by one.
     group : int
         Work-items of a work-group.
     """
 
-    lanes: int
     words: int
     tile: int
     group: int
 
 
-CPU_LAYOUT = Layout(lanes=16, words=128, tile=1024, group=1)
-GPU_LAYOUT = Layout(lanes=4, words=1, tile=1, group=128)
+CPU_LAYOUT = Layout(words=128, tile=1024, group=1)
+GPU_LAYOUT = Layout(words=1, tile=1, group=128)
