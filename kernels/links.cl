@@ -298,24 +298,3 @@ __kernel void links_misfit(GRAPH, MAP relief, OUT sums)
     for (int i = 0; i < end - begin; ++i) sum += squares[i];
     sums[item] = sum;
 }
-
-// What comes along a link, but not from where the height is known to where it is not, or back.
-#define GAIN(linked, p, other)                                                                         \
-    chosen(((linked) != 0) & (((flags[p] ^ flags[other]) & KNOWN) == 0), values[other] - values[p])
-#define SMOOTH(column, left, bit) {                                                                    \
-    const int p = first + (column);                                                                    \
-    const float x = GAIN(flags[p] & RIGHT, p, p + 1) + GAIN(flags[left] & (bit), p, left);             \
-    const float y = GAIN(flags[p] & DOWN, p, p + next) + GAIN(flags[p - before] & line, p, p - before); \
-    smoothed[p] = values[p] + 0.2f * (x + y);                                                          \
-}
-
-__kernel void links_smooth(
-    const int rows, const int columns, __global const uchar *restrict flags, MAP values, OUT smoothed)
-{
-    PIECE(1)
-    if (top >= rows) return;
-    const int first = top * columns;
-    NEIGHBOURS(top)
-    SMOOTH(begin, GREATER(first + begin - 1, 0), begin > 0 ? RIGHT : 0)
-    for (int column = begin + 1; column < end; ++column) SMOOTH(column, p - 1, RIGHT)
-}

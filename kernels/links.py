@@ -153,20 +153,6 @@ def links_misfit(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | Non
     return float(sum(sums))
 
 
-def links_smooth(flags: Flags, values: Array) -> Doubles:
-    """Return values, (H, W), each with a fifth of the way to each linked neighbour's gone.
-
-    Pixels whose heights are known and such whose heights are not give each other nothing.
-    """
-    smoothed, known = values.astype(np.float64), flags & KNOWN
-    for bit, axis in ((RIGHT, 1), (DOWN, 0)):
-        alike = (flags & bit != 0) & (known == np.roll(known, -1, axis))
-        with np.errstate(invalid="ignore"):
-            flow = np.where(alike, np.roll(values, -1, axis) - values.astype(np.float64), 0.0) / 5
-        smoothed += flow - np.roll(flow, 1, axis)
-    return smoothed
-
-
 def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, weight_y: Array | None,
            weights: Triple, size: tuple[float, float], plane: Triple,
            owned: bool) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]]:  # fmt: skip

@@ -288,33 +288,91 @@ __kernel void multigrid_prolong(
     }
 }
 
-// The coarse links and anchors, and 1 where a block's nodes do not hang together by strong links.
-#define STRENGTH 0.25f
+// The coarse links and anchors, and 1 where a block's nodes do not hang together by links of at least `strength` of the
+// geometric mean of their nodes' greatest ones. A link stands for a way
+// from the middle of its block to that of the next: in either goes on by half a link that lies behind it, or around by
+// the other row's; where neither is, by half a link as well.
 #define GREATEST(PICK, i)                                                                                  \
     GREATER(GREATER(PICK(right + (i)), PICK(right + (i) - 1)), GREATER(PICK(down + (i)), PICK(down + (i) - stride)))
-#define IN_SERIES(w, g, h) ((w) > 0 ? 1 / (1 / (w) + 0.5f / (g) + 0.5f / (h)) : 0)
+#define GO_ON(w, behind, across, beside)                                                                   \
+    ((behind) > 0 ? 1 / ((w) + (behind)) : (((across) > 0) & ((beside) > 0)) ? 1 / (beside) : 0.5f / (w))
+#define IN_SERIES(w, before, after) ((w) > 0 ? 1 / (1 / (w) + (before) + (after)) : 0)
 #define COUNT(condition) ((condition) ? (reals)1 : (reals)0)
-#define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= STRENGTH * STRENGTH * (g) * (h)))
+#define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= strength * strength * (g) * (h)))
 __kernel void multigrid_coarsen(
-    BETWEEN_ARGS, GRAPH_ARGS, OUT coarse_right, OUT coarse_down, OUT coarse_anchor, OUT split)
+    BETWEEN_ARGS, const float strength, GRAPH_ARGS, OUT coarse_right, OUT coarse_down, OUT coarse_anchor, OUT split)
 {
     const int row = get_global_id(0);
     if (row >= coarse_rows) return;
     EACH_BLOCK {
         const reals a = GREATEST(EVEN, I), b = GREATEST(ODD, I), c = GREATEST(EVEN, K), d = GREATEST(ODD, K);
-        const reals after_b = GREATEST(EVEN, I + 2), after_d = GREATEST(EVEN, K + 2);
-        const reals below_c = GREATEST(EVEN, K + stride), below_d = GREATEST(ODD, K + stride);
         const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
         const reals from_b = ODD(right + I), from_d = ODD(right + K), under_c = EVEN(down + K), under_d = ODD(down + K);
+        const reals next_ab = EVEN(right + I + 2), next_cd = EVEN(right + K + 2), next_ac = EVEN(down + I + 2);
+        const int M = K + stride;
+        const reals low_ab = EVEN(right + M), low_ac = EVEN(down + M), low_bd = ODD(down + M);
         const reals live = COUNT(a > 0) + COUNT(b > 0) + COUNT(c > 0) + COUNT(d > 0);
         const reals joined = STRONG(ab, a, b) + STRONG(cd, c, d) + STRONG(ac, a, c) + STRONG(bd, b, d);
-        PUT(coarse_right + J) = IN_SERIES(from_b, b, after_b) + IN_SERIES(from_d, d, after_d);
-        PUT(coarse_down + J) = IN_SERIES(under_c, c, below_c) + IN_SERIES(under_d, d, below_d);
+        PUT(coarse_right + J)
+            = IN_SERIES(from_b, GO_ON(from_b, ab, bd, cd), GO_ON(from_b, next_ab, next_ac, next_cd))
+            + IN_SERIES(from_d, GO_ON(from_d, cd, bd, ab), GO_ON(from_d, next_cd, next_ac, next_ab));
+        PUT(coarse_down + J)
+            = IN_SERIES(under_c, GO_ON(under_c, ac, cd, bd), GO_ON(under_c, low_ac, low_ab, low_bd))
+            + IN_SERIES(under_d, GO_ON(under_d, bd, cd, ac), GO_ON(under_d, low_bd, low_ab, low_ac));
 #if ANCHORED
         PUT(coarse_anchor + J) = (COUNT(a > 0) * EVEN(anchor + I) + COUNT(b > 0) * ODD(anchor + I))
             + (COUNT(c > 0) * EVEN(anchor + K) + COUNT(d > 0) * ODD(anchor + K));
 #endif
         PUT(split + J) = COUNT(joined < live - 1);
+    }
+}
+
+// The links, scaled along both axes so that those along x weigh as much on average as those along y.
+#define MEAN(a, b) (((a) + (b)) * ((((a) > 0) & ((b) > 0)) ? (reals)0.5f : (reals)1))
+#define EVENED_LINKS                                                                                       \
+    LINKS                                                                                                  \
+    const reals along_x = MEAN(to_right, to_left), along_y = MEAN(to_below, to_above);                     \
+    const reals both = sqrt(along_x * along_y), one = (reals)1;                                            \
+    const reals by_x = both > 0 ? both / along_x : one, by_y = both > 0 ? both / along_y : one;            \
+    const reals go_right = by_x * to_right, go_left = by_x * to_left;                                      \
+    const reals go_below = by_y * to_below, go_above = by_y * to_above;
+
+// One over the diagonal of these.
+__kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_LINKS
+        const reals diagonal = (go_right + go_left) + (go_below + go_above) WITH_ANCHOR(AT(anchor + i));
+        PUT(evened + i) = INVERSE(diagonal);
+    }
+}
+
+// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps.
+__kernel void multigrid_returns(LEVEL_ARGS, MAP right, MAP down, MAP evened, OUT returns)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_LINKS
+        PUT(returns + i) = AT(evened + i)
+            * ((go_right * go_right * AT(evened + i + 1) + go_left * go_left * AT(evened + i - 1))
+               + (go_below * go_below * AT(evened + i + stride) + go_above * go_above * AT(evened + i - stride)));
+    }
+}
+
+// What a node's variance has that the coarse one does not.
+#define BESIDE(i) (AT(evened + (i)) * (c[3] + c[4] * AT(returns + (i))) + here * AT(returns + (i)))
+__kernel void multigrid_local(
+    LEVEL_ARGS, MAP right, MAP down, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_LINKS
+        const reals here = c[2] * AT(evened + i);
+        const reals odd = both > 0 ? 1 - 2 * both / (along_x + along_y) : 1 - one;
+        PUT(local_part + i) = AT(evened + i)
+            * ((c[0] + c[1] * AT(returns + i) + c[5] * odd) + (go_right * BESIDE(i + 1) + go_left * BESIDE(i - 1))
+               + (go_below * BESIDE(i + stride) + go_above * BESIDE(i - stride)));
     }
 }
 
@@ -423,6 +481,26 @@ __kernel void multigrid_prolong_extra(
 {
     ITEMS_EXTRA
     prolong_extra(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
+}
+
+__kernel void multigrid_returns_extra(const int at, const int count, TABLE_ARGS, MAP evened, OUT returns)
+{
+    ITEMS_EXTRA
+    EACH_EXTRA {
+        SUM(back, w * w * evened[j])
+        returns[node[k]] = evened[node[k]] * back;
+    }
+}
+
+__kernel void multigrid_local_extra(
+    const int at, const int count, TABLE_ARGS, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
+{
+    ITEMS_EXTRA
+    EACH_EXTRA {
+        const int i = node[k];
+        SUM(beside, w * (evened[j] * (c[3] + c[4] * returns[j]) + c[2] * evened[i] * returns[j]))
+        local_part[i] = evened[i] * (c[0] + c[1] * returns[i] + beside);
+    }
 }
 
 // The coarsest level: the pseudo-inverse of its matrix, times the right side of its nodes.
@@ -779,5 +857,20 @@ __kernel void multigrid_release(const int rows, const int columns, const int str
     if (row >= rows) return;
     for (int c = 0; c < columns; ++c) {
         map[row * columns + c] = level[(row + 1) * stride + c];
+    }
+}
+
+// Standard deviations: the roots of variances, of which each has its least share of one over the diagonal; no number
+// where no flag of `wanted` is.
+__kernel void multigrid_deviation(
+    const int rows, const int columns, const int stride, const float factor, const float least, const int wanted,
+    __global const uchar *restrict flags, MAP inverse, MAP variance, OUT map)
+{
+    const int row = get_global_id(0);
+    if (row >= rows) return;
+    for (int c = 0; c < columns; ++c) {
+        const int i = (row + 1) * stride + c;
+        const float found = factor * GREATER(variance[i], least * inverse[i]);
+        map[row * columns + c] = flags[row * columns + c] & wanted ? sqrt(found) : NAN;
     }
 }

@@ -9,8 +9,16 @@ anchors a. A V-cycle solves it nearly:
 - *restrict*: the coarse level, of a node for each block of two by two, has the right side P^T (b - A x).
 - *prolong*: x += P e, the coarse answer e brought to each block's nodes and spread by a step of Jacobi's
   method, so P = D^-1 W I, where I gives a node what its block has.
-- *coarsen*: a coarse link's weight is the sum over those that it stands for of 1 / (1/w + 0.5/g + 0.5/h),
-  where g and h are the greatest weights of its two nodes: of links that are all alike, the mean of two.
+- *even*, *returns*, *local*: what a node's variance, an element of A's inverse, has beyond that of the coarse
+  nodes that it is prolonged from, by six numbers c. With w the weights of its links, scaled so that those
+  along x and y have the same mean (over those that there are), d one over their sum and the anchor, and
+  r = d sum w^2 d_j, how likely a walk along these links is back after two steps, that is
+  d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j),
+  o one less the geometric over the arithmetic mean of both axes' mean weights.
+- *coarsen*: a coarse link's weight is the sum over those that it stands for of 1 / (1/w + r + s), where r and
+  s are the ways from the link to the middles of both blocks: 1 / (w + b), half a link, if one of weight b
+  goes on behind it; else 1 / c, where the block's other row or column has a link c, and a link leads there;
+  else 1 / 2 w. Of links that are all alike that is the mean of two.
 
 All arrays are flat. A level's picture of `rows` by `stride` nodes lies at `base`, with a row of none before
 and behind it. Arguments are those of the kernels; of functions for extra nodes, rows `at` to `at` + `count`
@@ -31,7 +39,6 @@ Array = NDArray[Any]
 Table = tuple[Array, Array, Array, Array]
 
 INDEPENDENT = 1e-4  # share of the products' determinant from which on two directions are two
-STRENGTH = 0.25  # a link is strong from this share of the geometric mean of its nodes' greatest ones on
 
 
 def _picture(base: int, rows: int, stride: int) -> slice:
@@ -115,6 +122,47 @@ def multigrid_scaled_residual(base: int, rows: int, stride: int, right: Array, d
     residual[part] = rest * _inverse(_diagonal(part, stride, right, down, anchor))
 
 
+def _evened(part: slice, stride: int, right: Array, down: Array) -> tuple[list[Doubles], Doubles]:
+    """Return the weights of `_sides`, scaled to the same mean along both axes, and how uneven these were."""
+    links = [w for w, _ in _sides(part, stride, right, down)]
+    x, y = ((one + two) * np.where((one > 0) & (two > 0), 0.5, 1) for one, two in (links[:2], links[2:]))
+    both = np.sqrt(x * y)
+    by_x, by_y = (np.where(both > 0, both * _inverse(mean), 1) for mean in (x, y))
+    uneven = np.where(both > 0, 1 - 2 * both * _inverse(x + y), 0)
+    return [links[0] * by_x, links[1] * by_x, links[2] * by_y, links[3] * by_y], uneven
+
+
+def multigrid_even(
+    base: int, rows: int, stride: int, right: Array, down: Array, anchor: Array, evened: Array
+) -> None:
+    """Write one over the diagonal of evened links."""
+    part = _picture(base, rows, stride)
+    links, _ = _evened(part, stride, right, down)
+    evened[part] = _inverse(sum(links) + _double(anchor, part))
+
+
+def multigrid_returns(
+    base: int, rows: int, stride: int, right: Array, down: Array, evened: Array, returns: Array
+) -> None:
+    """Write how likely a walk along evened links is back after two steps."""
+    part = _picture(base, rows, stride)
+    links, _ = _evened(part, stride, right, down)
+    others = (other for _, other in _sides(part, stride, right, down))
+    returns[part] = evened[part] * sum(w**2 * evened[other] for w, other in zip(links, others, strict=True))
+
+
+def multigrid_local(base: int, rows: int, stride: int, right: Array, down: Array, evened: Array,
+                    returns: Array, c: Array, local_part: Array) -> None:  # fmt: skip
+    """Write what a node's variance has that the coarse one does not."""
+    part = _picture(base, rows, stride)
+    links, uneven = _evened(part, stride, right, down)
+    here, whole = _double(evened, part), c[0] + c[1] * _double(returns, part) + c[5] * uneven
+    for w, (_, other) in zip(links, _sides(part, stride, right, down), strict=True):
+        beside, back = _double(evened, other), _double(returns, other)
+        whole = whole + w * (beside * (c[3] + c[4] * back) + c[2] * here * back)
+    local_part[part] = here * whole
+
+
 def multigrid_keep(
     base: int, rows: int, stride: int, residual: Array, x: Array, b: Array, kept: Array
 ) -> None:
@@ -193,8 +241,8 @@ def multigrid_prolong(base: int, stride: int, coarse_base: int, coarse_rows: int
 
 
 def multigrid_coarsen(base: int, stride: int, coarse_base: int, coarse_rows: int, coarse_stride: int,
-                      right: Array, down: Array, anchor: Array, coarse_right: Array, coarse_down: Array,
-                      coarse_anchor: Array, split: Array) -> None:  # fmt: skip
+                      strength: float, right: Array, down: Array, anchor: Array, coarse_right: Array,
+                      coarse_down: Array, coarse_anchor: Array, split: Array) -> None:  # fmt: skip
     """Write the coarse links and anchors, and 1 where a block does not hang together by strong links."""
     corner, _ = _blocks(base, stride, coarse_rows)
     a, b, c, d = corner, corner + 1, corner + stride, corner + stride + 1
@@ -203,20 +251,25 @@ def multigrid_coarsen(base: int, stride: int, coarse_base: int, coarse_rows: int
         most: Doubles = np.max([w for w, _ in _neighbours(node, stride, right, down)], axis=0)
         return most
 
-    def joint(weights: Array, node: Array, other: Array) -> Doubles:
-        w = weights[node].astype(np.float64)
-        real = w > 0
-        w, g, h = (np.where(real, value, 1) for value in (w, greatest(node), greatest(other)))
-        return np.where(real, 1 / (1 / w + 0.5 / g + 0.5 / h), 0)
+    def go_on(w: Doubles, behind: Doubles, across: Doubles, beside: Doubles) -> Doubles:
+        around = np.where((across > 0) & (beside > 0), _inverse(beside), 0.5 * _inverse(w))
+        return np.where(behind > 0, _inverse(w + behind), around)
+
+    def joint(along: Array, across: Array, node: Array, step: int, aside: int) -> Doubles:
+        """Return what the link of a node to that a step on stands for; aside lies the block's other line."""
+        w, link = along.astype(np.float64)[node], np.minimum(node, node + aside)
+        before = go_on(w, along[node - step], across[link], along[node - step + aside])
+        after = go_on(w, along[node + step], across[link + step], along[node + step + aside])
+        return np.where(w > 0, _inverse(_inverse(w) + before + after), 0)
 
     def strong(weights: Array, node: Array, other: Array) -> Array:
         w = weights[node].astype(np.float64)
-        bound: Array = w >= STRENGTH * np.sqrt(greatest(node) * greatest(other))
+        bound: Array = w >= strength * np.sqrt(greatest(node) * greatest(other))
         return (w > 0) & bound
 
     to = _coarse(coarse_base, coarse_rows, coarse_stride, stride // 2)
-    coarse_right[to] = joint(right, b, b + 1) + joint(right, d, d + 1)
-    coarse_down[to] = joint(down, c, c + stride) + joint(down, d, d + stride)
+    coarse_right[to] = joint(right, down, b, 1, stride) + joint(right, down, d, 1, -stride)
+    coarse_down[to] = joint(down, right, c, stride, 1) + joint(down, right, d, stride, -1)
     coarse_anchor[to] = sum(np.where(greatest(node) > 0, anchor[node], 0) for node in (a, b, c, d))
     live = sum((greatest(node) > 0).astype(int) for node in (a, b, c, d))
     links = (right, a, b), (right, c, d), (down, a, c), (down, b, d)
@@ -285,6 +338,22 @@ def multigrid_prolong_extra(at: int, count: int, node: Array, start: Array, colu
     i = node[at : at + count]
     correction = _rows(at, count, (node, start, column, weight), e)
     corrected[i] = keep * x[i].astype(np.float64) + inverse[i] * correction
+
+
+def multigrid_returns_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                            evened: Array, returns: Array) -> None:  # fmt: skip
+    """Write how likely a walk from extra nodes is back after two steps."""
+    i = node[at : at + count]
+    returns[i] = evened[i] * _rows(at, count, (node, start, column, weight**2), evened)
+
+
+def multigrid_local_extra(at: int, count: int, node: Array, start: Array, column: Array, weight: Array,
+                          evened: Array, returns: Array, c: Array, local_part: Array) -> None:  # fmt: skip
+    """Write what extra nodes' variance has that the coarse one does not."""
+    i, table = node[at : at + count], (node, start, column, weight)
+    beside = _rows(at, count, table, evened * (c[3] + c[4] * returns))
+    around = c[2] * evened[i] * _rows(at, count, table, returns)
+    local_part[i] = evened[i] * (c[0] + c[1] * returns[i] + beside + around)
 
 
 def multigrid_solve(count: int, bottom: Array, matrix: Array, b: Array, x: Array) -> None:
@@ -363,3 +432,13 @@ def multigrid_admit(rows: int, columns: int, stride: int, map_: Array, level: Ar
 def multigrid_release(rows: int, columns: int, stride: int, level: Array, map_: Array) -> None:
     """Copy the finest level to a picture."""
     map_.reshape(rows, columns)[...] = level[stride : stride * (rows + 1)].reshape(rows, stride)[:, :columns]
+
+
+def multigrid_deviation(rows: int, columns: int, stride: int, factor: float, least: float, wanted: int,
+                        flags: Array, inverse: Array, variance: Array, map_: Array) -> None:  # fmt: skip
+    """Write the roots of variances, at least that share of one over the diagonal, where a flag is wanted."""
+    part = _picture(0, rows, stride)
+    found = factor * np.maximum(_double(variance, part), least * _double(inverse, part))
+    map_.reshape(rows, columns)[...] = np.where(
+        flags.reshape(rows, columns) & wanted, np.sqrt(found).reshape(rows, stride)[:, :columns], np.nan
+    )

@@ -127,22 +127,6 @@ class PixelGraph:
         self._run("links_misfit", _weighted(links), **problem, relief=relief, sums=sums)
         return float(sums.download().sum(dtype=np.float64)) / self.scale
 
-    def smooth(self, values: Floats, steps: int) -> Floats:
-        """Return values, (H, W), averaged along links: of each step a fifth goes to each linked neighbour."""
-        here, there = self.put("values", values), self.array("smoothed")
-        for _ in range(steps):
-            self._run("links_smooth", {}, flags=self.flags, values=here, smoothed=there)
-            here, there = there, here
-        smoothed: Floats = here.download().copy()
-        return smoothed
-
-    def replace_by_noise(self, x: Floats, y: Floats, z: Floats) -> None:
-        """Put noise, (H, W), in place of the slopes and, where there are any, of the known heights."""
-        self.put("dz_dx", x)
-        self.put("dz_dy", y)
-        if self.known_heights:
-            self.put("heights", z)
-
     def _problem(self, plane: Plane, links: Links | None) -> dict[str, Any]:
         """Return the arguments of the passes over links."""
         inputs = self._inputs

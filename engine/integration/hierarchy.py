@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,9 @@ from mirrorskin.kernels.device import Device, Kernel
 
 WIDTH = 8
 """Nodes side by side in a kernel's vectors."""
+
+STRENGTH = 0.25
+"""Of links that join what cycles move as one."""
 
 _LEAST = 1e-12  # of a component's links: anchors that are weaker leave its offset free
 
@@ -40,6 +44,8 @@ class ExtraRows:
     # To the next level's split aggregates, and from them.
     restrict: Rows = field(default_factory=Rows)
     prolong: Rows = field(default_factory=Rows)
+    # The split blocks that its extra nodes come from; None where it has none.
+    step: Coarsening | None = None
 
 
 class Hierarchy:
@@ -69,8 +75,13 @@ class Hierarchy:
         array.upload()
         return array
 
-    def build(self, links: Links, *, plain: bool = False) -> None:
-        """Take a graph of this shape; a plain one joins all that a block of pixels has."""
+    def build(self, links: Links, *, plain: bool = False, strength: float = STRENGTH) -> None:
+        """Take a graph of this shape; a plain one joins all that a block of pixels has.
+
+        Else links join that have at least that ``strength``, a share of the geometric mean of their nodes'
+        greatest ones.
+        """
+        self._strength = strength
         self._admit_graph(links)
         self._coarsen(range(1, len(self.levels)))
         self.extra, self.table = [ExtraRows() for _ in self.levels], self._no_table
@@ -94,6 +105,45 @@ class Hierarchy:
             self._invert()
         else:
             self.over_grid("invert", self.levels[0], **self.graph, inverse=self.inverse)
+
+    @contextmanager
+    def on_host(self) -> Iterator[tuple[NDArray[np.float32], ...]]:
+        """Lend the host all links to the right and down, and anchors, to read."""
+        yield tuple(array.download() for array in self.graph.values())
+        for array in self.graph.values():
+            array.upload()
+
+    def spread_variance(
+        self,
+        nodes: Ints,
+        coarse: NDArray[np.float64],
+        local: list[NDArray[np.float32]],
+        rooms: tuple[Array, Array, Array, Array],
+    ) -> None:
+        """Bring the variance of a level's nodes to the finest, with what each level adds.
+
+        ``local`` are the numbers of the local part of each finer level. The first of ``rooms``, of all nodes,
+        gets the variance.
+        """
+        variance, evened, returns, part = rooms
+        variance.claim()
+        variance.host[...] = 0
+        variance.host[nodes] = coarse
+        variance.upload()
+        links = {name: self.graph[name] for name in ("right", "down")}
+        for fine in reversed(range(len(local))):
+            level, rows = self.levels[fine], self.extra[fine].graph
+            self.over_grid("even", level, **self.graph, evened=evened)
+            self.over_rows("invert", rows, anchor=self.anchor, inverse=evened)
+            known = {"evened": evened, "returns": returns}
+            self.over_grid("returns", level, **links, **known)
+            self.over_rows("returns", rows, **known)
+            known |= {"c": self.device.given("local", local[fine]), "local_part": part}
+            self.over_grid("local", level, **links, **known)
+            self.over_rows("local", rows, **known)
+            spread = {"keep": 1.0, "inverse": self.inverse, "e": variance, "x": part, "corrected": variance}
+            self.over_blocks("prolong", fine, **links, **spread)
+            self.over_rows("prolong", self.extra[fine].prolong, **spread)
 
     def kernel(self, name: str) -> Kernel:
         """Return a pass."""
@@ -156,7 +206,9 @@ class Hierarchy:
     def _coarsen(self, numbers: Iterable[int]) -> None:
         coarse = {f"coarse_{name}": array for name, array in self.graph.items()}
         for number in numbers:
-            self.over_blocks("coarsen", number - 1, **self.graph, **coarse, split=self._split)
+            self.over_blocks(
+                "coarsen", number - 1, strength=self._strength, **self.graph, **coarse, split=self._split
+            )
 
     def _invert(self) -> None:
         for level in self.levels:
@@ -174,8 +226,11 @@ class Hierarchy:
         for number in range(1, len(self.levels)):
             fine, coarse = (Grid(level, right, down) for level in self.levels[number - 1 : number + 1])
             marked = np.flatnonzero(split[coarse.level.base : coarse.level.end]) + coarse.level.base
-            step = Coarsening.of(fine, extra, changed, coarse, marked, following, self._lookup)
+            step = Coarsening.of(
+                fine, extra, changed, coarse, marked, following, self._lookup, self._strength
+            )
             changed, extra = step.blocks, step.extra
+            self.extra[number].step = step
             room = -(-len(extra.node) // WIDTH) * WIDTH
             self.extra[number].nodes = Rows(following, room)
             following += room

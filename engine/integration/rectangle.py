@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.integration.height_variance import find_rectangle_variance
+from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
@@ -178,6 +180,16 @@ class Rectangle:
             name: device.given("chirp", part) for name, part in chirps.items() if part.size
         }
         self._screening: float | None = None
+        self._shape, self._held = shape, 0.0
+        self._deviation: Floats | None = None
+
+    def deviation(self, screening: float = 0.0) -> Floats:
+        """Return the standard deviation of heights, (H, W), where weights are inverse variances; kept."""
+        if screening != self._held or self._deviation is None:
+            weights = (self._along, self._across) if self._is_along else (self._across, self._along)
+            self._held = screening
+            self._deviation = np.sqrt(find_rectangle_variance(self._shape, weights, screening))
+        return self._deviation
 
     def solve(self, source: Array, screening: float = 0.0) -> Array:
         """Return heights, (H, W), for a right side b and a screening, in an array that the next call reuses.

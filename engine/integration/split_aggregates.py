@@ -17,7 +17,6 @@ from mirrorskin.engine.integration.levels import Level
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
-_STRONG = 0.25  # of the geometric mean of its nodes' greatest links, from which on a link is strong
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,12 +180,14 @@ class Coarsening:
         split: Ints,
         following: int,
         lookup: Lookup,
+        strength: float,
     ) -> Coarsening:
         """Split aggregates, and correct the coarse grid's links around them in place.
 
         ``extra`` are the fine level's, ``changed`` the nodes of the fine grid whose links are others than the
         device's pass knew, ``split`` the nodes of the coarse grid whose blocks have several parts by their
-        links in the grid, and ``following`` the number of the first extra node of the coarse level.
+        links in the grid, ``following`` the number of the first extra node of the coarse level, and
+        ``strength`` what a link has of the geometric mean of its nodes' greatest ones if it is strong.
         """
         blocks = split
         if len(extra.node) or len(changed):
@@ -194,7 +195,7 @@ class Coarsening:
         if not len(blocks):
             none = ExtraNodes.none()
             return cls(none, none.node, (none.node, none.node), none.links, none.links, none.links)
-        parts = _Parts(fine, extra, coarse.level, blocks, following, lookup)
+        parts = _Parts(fine, extra, coarse.level, blocks, following, lookup, strength)
         links = _write_grid(coarse, blocks, parts.coarse_links())
         row, column = coarse.place(parts.extra_block)
         found = ExtraNodes(parts.extra_node, np.stack([row, column], axis=1), links)
@@ -242,7 +243,14 @@ class _Parts:
     """To which coarse nodes the fine ones of split blocks belong; arguments as for `Coarsening.of`."""
 
     def __init__(
-        self, fine: Grid, extra: ExtraNodes, coarse: Level, blocks: Ints, following: int, lookup: Lookup
+        self,
+        fine: Grid,
+        extra: ExtraNodes,
+        coarse: Level,
+        blocks: Ints,
+        following: int,
+        lookup: Lookup,
+        strength: float,
     ) -> None:
         self._fine, self._extra, self._level, self._lookup = fine, extra, coarse, lookup
         self.links = Pairs.join(fine.blocks(coarse, blocks), extra.links)
@@ -252,7 +260,7 @@ class _Parts:
         self._block = self._block_of(self.nodes)
         self.within = _marks(coarse, blocks)[self._block - coarse.base]
         self._greatest = self._greatest_links()
-        self._number(self._label(), following)
+        self._number(self._label(strength), following)
 
     def _greatest_links(self) -> Floats:
         greatest = np.zeros(len(self.nodes), np.float32)
@@ -262,9 +270,9 @@ class _Parts:
             np.maximum.at(greatest, self._lookup.find(ends)[0], self._extra.links.weight)
         return greatest
 
-    def _label(self) -> Ints:
+    def _label(self, strength: float) -> Ints:
         """Label the parts of split blocks: what strong links within them connect."""
-        bound = _STRONG * np.sqrt(self._greatest[self._a] * self._greatest[self._b])
+        bound = strength * np.sqrt(self._greatest[self._a] * self._greatest[self._b])
         same = self.within[self._a] & (self._block[self._a] == self._block[self._b])
         strong = same & (self.links.weight >= bound)
         return _first_connected(len(self.nodes), self._a[strong], self._b[strong])
@@ -282,12 +290,17 @@ class _Parts:
         self._coarse = number[label]
         self.extra_node, self.extra_block = number[others], self._block[others]
 
-    def _block_of(self, nodes: Ints) -> Ints:
-        """Return the coarse grid's node of the blocks that nodes lie in."""
+    def _place(self, nodes: Ints) -> tuple[Ints, Ints]:
+        """Return the rows and columns of nodes; extra ones are where their blocks are."""
         row, column = self._fine.place(nodes)
         if len(self._extra.node):
             extra = ~self._fine.holds(nodes)
             row[extra], column[extra] = self._extra.block[nodes[extra] - self._extra.node[0]].T
+        return row, column
+
+    def _block_of(self, nodes: Ints) -> Ints:
+        """Return the coarse grid's node of the blocks that nodes lie in."""
+        row, column = self._place(nodes)
         return self._level.first + (row // 2) * self._level.stride + column // 2
 
     def members(self) -> tuple[Ints, Ints]:
@@ -298,8 +311,7 @@ class _Parts:
         """Return the coarse links that split blocks have, each once."""
         a, b = self._coarse[self._a], self._coarse[self._b]
         crossing = np.flatnonzero(a != b)
-        ends = 0.5 / self._greatest[self._a[crossing]] + 0.5 / self._greatest[self._b[crossing]]
-        weight = 1 / (1 / self.links.weight[crossing] + ends)
+        weight = self._in_series(self.links.where(crossing), self._inner_links(a == b))
         low, high = np.minimum(a[crossing], b[crossing]), np.maximum(a[crossing], b[crossing])
         key = low << 32 | high
         order = np.argsort(key)
@@ -307,6 +319,38 @@ class _Parts:
         first = np.flatnonzero(np.diff(key, prepend=-1))
         total = np.add.reduceat(weight[order], first) if len(first) else weight
         return Pairs(key[first] >> 32, key[first] & 0xFFFFFFFF, total.astype(np.float32))
+
+    def _inner_links(self, same: Mask) -> Pairs:
+        """Return the links within parts of split blocks, and within the blocks beside these."""
+        beside = self._fine.blocks(self._level, self._lookup.distinct(self._block[~self.within]))
+        inner = self._block_of(beside.a) == self._block_of(beside.b)
+        return Pairs.join(self.links.where(same), beside.where(inner))
+
+    def _in_series(self, links: Pairs, inner: Pairs) -> Floats:
+        """Return the weights of links with the ways to the middles of their nodes' parts; see coarsen."""
+        self._lookup.take(self._lookup.distinct(np.concatenate([inner.a, inner.b, links.a, links.b])))
+        count = len(self._lookup.nodes)
+
+        def find(pairs: Pairs) -> tuple[Ints, Ints, Ints]:
+            """Return the numbers of both ends, and where those of the pairs' axis begin."""
+            steep = self._place(pairs.a)[0] != self._place(pairs.b)[0]
+            return self._lookup.find(pairs.a)[0], self._lookup.find(pairs.b)[0], count * steep
+
+        def sums(at: Ints, values: Floats) -> Floats:
+            return np.asarray(np.bincount(at, values, 2 * count), np.float32)
+
+        a, b, axis = find(inner)
+        behind = sums(axis + a, inner.weight) + sums(axis + b, inner.weight)
+        other = count - axis
+        beside = sums(other + a, behind[other + b]) + sums(other + b, behind[other + a])
+        with np.errstate(divide="ignore"):
+            resistance = 1 / links.weight
+            a, b, axis = find(links)
+            for end in (axis + a, axis + b):
+                around = np.where(beside[end] > 0, 1 / beside[end], 0.5 / links.weight)
+                resistance += np.where(behind[end] > 0, 1 / (links.weight + behind[end]), around)
+        self._lookup.take(self.nodes)
+        return np.asarray(1 / resistance, np.float32)
 
     def restriction(self) -> Pairs:
         """Return what the coarse nodes of split blocks take from fine ones: complete rows."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from mirrorskin.engine.integration.graph import (
     Plane,
     find_components,
 )
-from mirrorskin.engine.integration.height_variance import find_sigma
+from mirrorskin.engine.integration.height_variance import expected_misfit
 from mirrorskin.engine.integration.rectangle import Rectangle
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
@@ -27,11 +28,12 @@ from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import KNOWN, LOST, SLOPE
+from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 IntegrationMethod = Literal["direct", "multigrid", "robust"]
 
 _STIFF = 100.0  # times a link's that known heights weigh, above which the direct solver loses too many digits
+_UNEVEN = 2.0  # weights of links to the right over those down, or back, that the multigrid may split
 _GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
 
 
@@ -258,19 +260,45 @@ class SurfaceSolver:
         return self._components
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
-        links, graph = relief.links, self._graph
-        solver = (
-            self._multigrid if links is None else Multigrid(replace(links, source=graph.source(links=links)))
-        )
+        factor, graph = self._graph.scale, self._graph
+        if not inputs.weights_given:
+            factor *= self._excess(inputs, relief, components)
+        if relief.method == "direct":
+            return self._find_rectangle(inputs).deviation(self._screening(inputs)) * np.float32(factor**0.5)
+        solver = self._multigrid
+        if relief.flags is not None:  # links are as sure as their pixels' weights, or broken
+            graph.flags.claim()
+            graph.flags.host[...] = relief.flags
+            graph.flags.upload()
+            solver = Multigrid(graph.links())
+        assert solver is not None
+        uneven = inputs.weight_x is not None or max(ends := self._link_weights(inputs)) > _UNEVEN * min(ends)
+        if uneven:
+            self._key = None
+        return solver.deviation(components.labels >= 0, graph.flags, factor, uneven)
 
-        def solve() -> Array:
-            source = graph.source(links=links)
-            if relief.method == "direct" or solver is None:
-                return self._find_rectangle(inputs).solve(source, self._screening(inputs))
-            return solver.solve(tolerance=None).height
+    def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
+        """Return how much worse slopes fit than noise of variance 1 would; NaN where nothing tells."""
+        flags, ends = self._flags if relief.flags is None else relief.flags, self._link_weights(inputs)
+        count = {bit: int(np.count_nonzero(flags & bit)) for bit in (RIGHT, DOWN, KNOWN, SLOPE | KNOWN)}
+        links, share = count[RIGHT] + count[DOWN], 1.0
+        if relief.links is not None:  # which have that share of their full weight
+            maps = relief.links.right, relief.links.down
+            whole = sum(
+                float(one.download().sum(dtype=np.float64)) / w for one, w in zip(maps, ends, strict=True)
+            )
+            share = whole / max(1, links)
+            for one in maps:
+                one.upload()
+        free = int(np.count_nonzero(components.offset_unknown))
+        unit = share * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
+        misfit = self._graph.misfit(relief.height, relief.plane, relief.links)
+        return misfit / unit if unit > 0 else math.nan
 
-        misfit = None if inputs.weights_given else graph.misfit(relief.height, relief.plane, links)
-        return find_sigma(inputs, graph, self._levelling, components.labels, solve, links, misfit)
+    def _link_weights(self, inputs: Inputs) -> tuple[float, float]:
+        """Return the weights of links to the right and down whose pixels weigh 1."""
+        width, height = inputs.pixel_size
+        return self._graph.scale / width**2, self._graph.scale / height**2
 
 
 def explain(iterations: int, residual: float, tolerance: float | None) -> str:

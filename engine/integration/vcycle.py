@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.graph import Links
-from mirrorskin.engine.integration.hierarchy import Hierarchy, part_of
+from mirrorskin.engine.integration.height_variance import JOINED, LEAST, find_graph_variance
+from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, part_of
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.links import KNOWN, SLOPE
 
 _OMEGA, _THEN = 1.3896, 0.5617  # steps of Jacobi's method: Chebyshev's polynomial over the upper spectrum
 _TWICE = range(2, 5)  # levels that are gone through a second time, for what the first left over
@@ -57,7 +60,7 @@ class Multigrid:
         self._cycle = VCycle(h)
         self.rebuild(links, plain=plain)
 
-    def rebuild(self, links: Links, *, plain: bool = False) -> None:
+    def rebuild(self, links: Links, *, plain: bool = False, strength: float = STRENGTH) -> None:
         """Take another graph of the same shape; what was allocated is used again.
 
         A plain one splits no aggregates: solutions take more cycles where there are cuts.
@@ -66,7 +69,7 @@ class Multigrid:
             self._hierarchy = Hierarchy(links.shape, links.anchor is not None, links.device)
             self._cycle = VCycle(self._hierarchy)
         self._links = links
-        self._hierarchy.build(links, plain=plain)
+        self._hierarchy.build(links, plain=plain, strength=strength)
         self._cycle.prepare()
 
     def solve(
@@ -118,6 +121,26 @@ class Multigrid:
         h.over_grid("follow", h.levels[0], **products, count=count, parts=self._products, **step, x=self._x)
         h.copy_picture("release", self._x, self._height)
         return self._height
+
+    def deviation(
+        self, answered: NDArray[np.bool_], flags: Array, factor: float, uneven: bool
+    ) -> NDArray[np.float32]:
+        """Return the heights' standard deviation, (H, W), where the weights are ``factor`` over a variance.
+
+        ``answered`` are the pixels with heights, as ``flags`` say on the device. Of links that are
+        ``uneven``, the graph must be built anew before the next solution.
+        """
+        if uneven:
+            self.rebuild(self._links, strength=JOINED)
+        h = self._hierarchy
+        find_graph_variance(h, answered, self._cycle.rooms)
+        finest, found = h.levels[0], self._device.array("sigma", self._links.shape, np.float32)
+        sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
+        numbers: dict[str, Any] = {"factor": factor, "least": LEAST, "wanted": SLOPE | KNOWN}
+        maps: dict[str, Any] = {"flags": flags, "inverse": h.inverse, "variance": self._cycle.x, "map": found}
+        h.kernel("deviation")(finest.rows, **sizes, **numbers, **maps, moved=13 * finest.nodes)
+        deviation: NDArray[np.float32] = found.detach()
+        return deviation
 
     def gap(self) -> float:
         """Return how far heights were from the solution before the last step; see ``Solution.residual``."""
@@ -258,6 +281,11 @@ class VCycle:
         starts = np.searchsorted(nodes, first) + rows.at
         h.table["node"].upload()
         return h.device.given("rows", starts, np.int32)
+
+    @property
+    def rooms(self) -> tuple[Array, Array, Array, Array]:
+        """Arrays of all nodes, that no cycle needs between two solutions."""
+        return self.x, self.b, self._t, self._kept
 
     def start(self, to: Array) -> None:
         """Make heights of the finest level by full multigrid, but for its own cycle, of ``full_b``."""

@@ -129,18 +129,6 @@ def test_links_may_have_weights_of_their_own(device):
     assert room.misfit(put(room, relief), PLANE, joined) * room.scale == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_kernel_and_reference_smooth_alike(device, shape):
-    inputs, room = SCENES["heights"].inputs(shape), PixelGraph(device, shape)
-    flags = room.upload(inputs).copy()
-    values = np.random.default_rng(1).random(shape).astype(np.float32)
-    exact = values
-    for _ in range(3):
-        exact = links.links_smooth(flags, exact)
-    near(room.smooth(values, 3), exact)
-    assert np.sum(exact) == pytest.approx(np.sum(values, dtype=float), rel=1e-12)
-
-
 def grid(shape):
     row, column = np.indices(shape)
     return column * SIZE[0], -row * SIZE[1]

@@ -50,6 +50,9 @@ class Arrays:
         self.matrix = rng.normal(size=900)
         self.map_ = rng.normal(size=13 * 21)
         self.level = np.zeros(NODES)
+        self.returns, self.evened = np.abs(rng.normal(size=NODES)), np.zeros(NODES)
+        self.c = rng.normal(size=6)
+        self.flags = rng.choice([1, 4, 6, 8], 13 * 21)
 
     def all(self):
         return vars(self)
@@ -70,7 +73,7 @@ PASSES = {
     "restrict": (PAIR, "right", "down", "residual", "b"),
     "gather": (PAIR, "e", "b"),
     "prolong": (PAIR, 1.0, "right", "down", "inverse", "e", "x", "smoother"),
-    "coarsen": (PAIR, *GRAPH, *GRAPH, "split"),
+    "coarsen": (PAIR, 0.25, *GRAPH, *GRAPH, "split"),
     "invert_extra": ((1, 7), *TABLE, "anchor", "inverse"),
     "begin_extra": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
     "smooth_extra": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
@@ -85,17 +88,23 @@ PASSES = {
     "follow along one": (FINE, 5, "weight_at", PARTS, "same", "z", "before", "x"),
     "dot": (FINE, "e", "x", "parts"),
     "weigh": (FINE, "weight_at", "x", "parts"),
+    "even": (FINE, *GRAPH, "evened"),
+    "returns": (FINE, "right", "down", "inverse", "smoother"),
+    "returns_extra": ((1, 7), *TABLE, "inverse", "smoother"),
+    "local": (FINE, "right", "down", "inverse", "returns", "c", "evened"),
+    "local_extra": ((1, 7), *TABLE, "inverse", "returns", "c", "evened"),
+    "deviation": ((13, 21, 32), 1.5, 0.12, 12, "flags", "inverse", "returns", "map_"),
     "admit": ((13, 21, 32), "map_", "level"),
     "release": ((13, 21, 32), "x", "map_"),
 }
-INTEGERS = {"node", "start", "column", "bottom"}
+TYPES = dict.fromkeys(("node", "start", "column", "bottom"), np.int32) | {"flags": np.uint8}
 SUMS = "direct", "advance", "curve", "dot", "weigh"  # in parts of 64 nodes here, so that there are several
 
 
 def items_of(name, device):
     if name in ("restrict", "gather", "prolong", "coarsen"):
         return COARSE[1]
-    if name in ("admit", "release"):
+    if name in ("admit", "release", "deviation"):
         return FINE[1]
     if name == "solve":
         return 30
@@ -111,7 +120,7 @@ def test_a_pass_does_what_its_reference_says(device, name, anchored):
     sizes, *arguments = PASSES[name]
     name = name.split()[0]
     arrays = Arrays(anchored).all()
-    arrays = {key: value.astype(np.int32 if key in INTEGERS else np.float32) for key, value in arrays.items()}
+    arrays = {key: value.astype(TYPES.get(key, np.float32)) for key, value in arrays.items()}
     on_device = {}
     for key, value in arrays.items():
         on_device[key] = device.array(key, value.shape, value.dtype)

@@ -45,7 +45,7 @@ def test_heights_are_those_of_a_sparse_direct_solver(device, kind, anchored):
     found = Multigrid(links_of(device, graph)).solve(tolerance=1e-6)
     assert found.converged
     assert found.residual <= 1e-6
-    assert error_of(graph, heights_of(found)) < 5e-6
+    assert error_of(graph, heights_of(found)) < 2e-5  # it is the energy that is within 1e-6
     assert 2 <= found.iterations <= 16
 
 
