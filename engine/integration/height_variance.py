@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.hierarchy import Hierarchy
-from mirrorskin.engine.integration.split_aggregates import Grid, Ints, Pairs
+from mirrorskin.engine.integration.split_aggregates import Grid, Ints, Pairs, first_connected
 from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
 
@@ -96,9 +96,9 @@ def find_rectangle_variance(shape: tuple[int, int], weights: tuple[float, float]
     if not screening:
         diagonal[0, 0] = 1
     power /= diagonal * diagonal
-    for axis in (0, 1):
-        power = _sum_squares(power, axis)
-    return power
+    quarter = _sum_squares(_sum_squares(power).T).T
+    half = np.concatenate([quarter, quarter[: rows // 2][::-1]])
+    return np.concatenate([half, half[:, : columns // 2][:, ::-1]], axis=1)
 
 
 def _modes(length: int) -> tuple[Floats, Floats]:
@@ -112,21 +112,16 @@ def _modes(length: int) -> tuple[Floats, Floats]:
     )
 
 
-def _sum_squares(power: Floats, axis: int) -> Floats:
-    """Return the sums of the squares of cosine modes, each times its power."""
-    from scipy import fft
-
-    length = power.shape[axis]
-    power = np.moveaxis(power, axis, -1)
-    whole = power.sum(axis=-1, keepdims=True)
+def _sum_squares(power: Floats) -> Floats:
+    """Return sums of the squares of cosine modes times their power, (n, m), in the first half of n points."""
+    length = len(power)
+    half = (length + 1) // 2
+    waves = np.zeros((length // 2 + 1, power.shape[1]), np.complex64)
+    waves[0] = power.sum(axis=0)
     # The square of mode k is 1 and mode 2 k, which is less mode 2 (length - k).
-    waves, half = np.zeros_like(power), (length + 1) // 2
-    waves[..., 2 : 2 * half : 2] = power[..., 1:half] - power[..., :-half:-1]
-    transformed = fft.dct(waves, type=3, axis=-1, workers=2, overwrite_x=True)
-    transformed *= np.float32(0.5)
-    transformed += whole
-    transformed /= np.float32(length)
-    return np.moveaxis(transformed, -1, axis)
+    turns = np.exp(1j * np.pi / length * np.arange(1, half)).astype(np.complex64) / 2
+    waves[1:half] = turns[:, np.newaxis] * (power[1:half] - power[:-half:-1])
+    return np.asarray(np.fft.irfft(waves, length, axis=0)[:half], np.float32)
 
 
 def _plane(weight: float, axis: int) -> tuple[Doubles, Doubles]:
@@ -170,9 +165,6 @@ def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> F
 
 def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints, Doubles]:
     """Return a level's nodes, and the diagonal of the inverse of its matrix."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     level, step = hierarchy.levels[number], hierarchy.extra[number].step
     with hierarchy.on_host() as (right, down, anchor):
         grid, inside = Grid(level, right, down), np.arange(level.first, level.end - level.stride)
@@ -196,12 +188,12 @@ def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints,
     index[node] = np.arange(len(node))
     a, b, weight = index[links.a], index[links.b], links.weight.astype(np.float64)
     count = len(node)
-    parts, label = connected_components(coo_array((weight, (a, b)), (count, count)), directed=False)
+    parts, label = count, first_connected(count, a, b)
     diagonal = _add_up(a, weight, count) + _add_up(b, weight, count)
     free = np.bincount(label, pull, parts) <= 0
     share = np.maximum(mass[node], 1).astype(np.float64)
     whole, typical = np.bincount(label, share, parts), np.bincount(label, diagonal, parts)
-    held = _LOOSE * typical / whole
+    held = _LOOSE * typical / np.maximum(whole, 1)
     diagonal += pull + (held * free)[label] * share
     offset = np.where(free, 1 / np.where(held > 0, held * whole, 1), 0)
     return node, invert_diagonal(line, diagonal, a, b, weight) - offset[label]

@@ -275,7 +275,7 @@ class _Parts:
         bound = strength * np.sqrt(self._greatest[self._a] * self._greatest[self._b])
         same = self.within[self._a] & (self._block[self._a] == self._block[self._b])
         strong = same & (self.links.weight >= bound)
-        return _first_connected(len(self.nodes), self._a[strong], self._b[strong])
+        return first_connected(len(self.nodes), self._a[strong], self._b[strong])
 
     def _number(self, label: Ints, following: int) -> None:
         """Give the largest part of a block its place, and numbers to the others."""
@@ -374,8 +374,8 @@ class _Parts:
         return Pairs.join(taken, Pairs(around.a, coarse, around.weight))
 
 
-def _first_connected(count: int, a: Ints, b: Ints) -> Ints:
-    """Return of each node the first that it is connected with; chains of links are short."""
+def first_connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return of each node the first that it is connected with; quickly where chains of links are short."""
     label = np.arange(count)
     while True:
         lower = np.minimum(label[a], label[b])
