@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-browser|docs|lint|types|bench|portability|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-browser|docs|lint|types|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-browser docs lint types bench portability clean
+.PHONY: demo test test-all test-browser docs lint types bench portability gpu-check gpu clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -53,6 +53,14 @@ bench: $(READY)
 portability: $(READY)
 	@$(BIN)/python tests/portability/portability.py
 
+# What kernels take on GPUs that are not here: clang and libclc come from the system, ptxas from the package index.
+gpu-check: .venv/.ptxas
+	@$(BIN)/python tests/portability/gpu_check.py
+
+# The day that a GPU is there: tests, answers and limits, in gpu.json and gpu.md.
+gpu: $(READY)
+	@$(BIN)/python tests/portability/gpu.py
+
 clean:
 	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache
 	find . -name .git -prune -o -type d \( -name __pycache__ -o -name '.*_cache' \) -prune -exec rm -rf {} +
@@ -88,6 +96,6 @@ $(READY): pyproject.toml
 	touch $@
 
 # What only some need comes with the first of them.
-.venv/.browser .venv/.docs: $(READY)
+.venv/.browser .venv/.docs .venv/.ptxas: $(READY)
 	@$(PIP) install --editable '.[$(@F:.%=%)]'
 	touch $@

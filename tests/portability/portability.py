@@ -1,26 +1,33 @@
-"""Run the device tests on OpenCL implementations other than the embedded one: ``make portability``.
+"""Run the device tests on every OpenCL implementation that is here: ``make portability``.
 
-Each runs in a process of its own that sees no other device (docs/decisions/0009-other-opencl.md).
+``portability.py [--whole] [NAME...]``: every device test, not the part that takes 20 minutes; only those with
+one of these in their names. Each runs in a process of its own that sees no other device. Intel's runtime, and
+a root of Debian's testing that holds Mesa and a younger PoCL, are looked for in the folder
+MIRRORSKIN_PORTABILITY, else in the user's cache (docs/decisions/0009-other-opencl.md).
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
 import tempfile
+import time
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import platformdirs
 from faults import FAULTS, NEVER_SET
 
 ROOT = Path(__file__).resolve().parents[2]
-ROW = "{:<18} {:<16} {:<24} {}"
+ROW = "| {:<32} | {:<30} | {:<18} | {:<7} | {:>5} |"
+PLACE = Path(os.environ.get("MIRRORSKIN_PORTABILITY", platformdirs.user_cache_path("mirrorskin-portability")))
+TESTING = PLACE / "testing"  # with an environment for Python in /env
 
-
-OCLGRIND = "usr/lib/oclgrind/liboclgrind-rt-icd.so"
+OCLGRIND = "/usr/lib/oclgrind/liboclgrind-rt-icd.so"
 # It keeps records of all memory at each launch: with its usual 128 MB a launch takes a second.
 LITTLE_MEMORY = {"OCLGRIND_GLOBAL_MEM_SIZE": "8000000"}
 
@@ -39,43 +46,66 @@ SMALL = "odd_sizes or references_of_each_pixel or used_again or is_light or touc
 
 @dataclass(frozen=True)
 class Check:
-    """An OpenCL implementation as Debian has it, what it is told, and the tests that it is given."""
+    """An OpenCL implementation, what it is told, and the tests that it is given."""
 
     name: str
-    package: str
-    library: str  # a pattern below /
+    remedy: str  # where it is missing
+    library: str  # a pattern
     tests: str = ""  # of those marked "device", as pytest's -k has it
-    folders: tuple[str, ...] = ("tests",)
+    folders: tuple[str, ...] = ("tests",)  # of the whole
+    part: tuple[str, ...] = ("tests/kernels",)  # of what is run without being asked for the whole
     faults: tuple[str, ...] = ()  # that it must report
     told: Mapping[str, str] = field(default_factory=dict)
 
     def find(self) -> Path | None:
-        return next(iter(sorted(Path("/").glob(self.library))), None)
+        return next(iter(sorted(Path("/").glob(self.library.removeprefix("/")))), None)
 
+
+RACES = tuple(name for name in FAULTS if name != NEVER_SET)
+BUILT = "make the root of Debian's testing that docs/decisions/0009-other-opencl.md tells of"
 
 CHECKS = (
-    Check("PoCL", "pocl-opencl-icd", "usr/lib/*/libpocl.so.2"),
+    Check(
+        "PoCL, the wheel",
+        "pip install pocl-binary-distribution",
+        f"{sys.prefix}/lib/*/*/pyopencl/.libs/libpocl-*.so",
+    ),
+    Check("PoCL, the system's", BUILT, "/usr/lib/*/libpocl.so.2"),
+    Check(
+        "rusticl, llvmpipe", BUILT, "/usr/lib/*/libRusticlOpenCL.so.1", told={"RUSTICL_ENABLE": "llvmpipe"}
+    ),
+    Check(
+        "Intel",
+        f"python3 -m venv {PLACE}/intel; {PLACE}/intel/bin/pip install intel-opencl-rt intel-cmplr-lib-rt",
+        f"{PLACE}/intel/lib/libintelocl.so",
+    ),
     Check(
         "Oclgrind: races",
-        "oclgrind",
+        "apt install oclgrind",
         OCLGRIND,
         tests=f"not ({STATISTICS} or {VECTORS})",
         folders=KERNELS,
-        faults=tuple(name for name in FAULTS if name != NEVER_SET),
+        part=(
+            "tests/kernels/test_multigrid.py",
+            "tests/kernels/test_links.py",
+            "tests/kernels/test_edges.py",
+        ),
+        faults=RACES,
         told={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
     ),
     Check(
         "Oclgrind: races between vectors",
-        "oclgrind",
+        "apt install oclgrind",
         OCLGRIND,
         tests=f"({VECTORS}) and not ({STATISTICS})",
         folders=KERNELS,
-        faults=tuple(name for name in FAULTS if name != NEVER_SET),
+        part=("tests/kernels/test_normals_wall.py",),
+        faults=RACES,
         told={"OCLGRIND_DATA_RACES": "1", **UNOPTIMISED, **LITTLE_MEMORY},
     ),
     Check(
         "Oclgrind: unset",
-        "oclgrind",
+        "apt install oclgrind",
         OCLGRIND,
         tests=SMALL,
         folders=KERNELS,
@@ -96,23 +126,51 @@ class Finding:
     details: tuple[str, ...] = ()
 
 
-def main() -> int:
-    """Print one row a check; 0 where all is well, 1 where not, 2 where a package is missing."""
-    missing = sorted({check.package for check in CHECKS if check.find() is None})
-    if missing:
-        print(f"make portability: install Debian's {' and '.join(missing)} first", file=sys.stderr)
-        return 2
-    print(ROW.format("implementation", "version", "tests", "reports"), flush=True)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print one row a check; 0 where all is well, 1 where not, 2 where one is missing."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="only these, such as Intel or PoCL")
+    parser.add_argument("--whole", action="store_true", help="all tests, which take hours")
+    parser.add_argument("--inside", action="store_true", help="in a root of its own: run what is there")
+    words = parser.parse_args(arguments)
+    checks = [one for one in CHECKS if not words.names or any(name in one.name for name in words.names)]
+    here = [check for check in checks if check.find() is not None]
+    if not words.inside:
+        print(ROW.format("implementation", "version", "device tests passed", "reports", "min"))
+        print("|---" * 5 + "|", flush=True)
     details: list[str] = []
-    for check in CHECKS:
-        finding = examine(check)
-        print(ROW.format(check.name, finding.version, finding.tests, finding.reports), flush=True)
+    for check in here:
+        begin = time.monotonic()
+        finding = examine(check, words.whole)
+        row = check.name, finding.version, finding.tests, finding.reports
+        print(ROW.format(*row, f"{(time.monotonic() - begin) / 60:.1f}"), flush=True)
         details += finding.details
-    print(*details, sep="\n", end="\n" * bool(details), file=sys.stderr)
-    return 1 if details else 0
+    wrong = bool(details)
+    print(*details, sep="\n", end="\n" * wrong, file=sys.stderr)
+    if words.inside:
+        return wrong
+    elsewhere = TESTING.is_dir()
+    if elsewhere:
+        wrong |= inside(TESTING, words.names, words.whole) != 0
+    missing = {c.remedy for c in checks if c not in here and not (elsewhere and c.remedy == BUILT)}
+    if missing:
+        print(f"make portability: not all are here: {'; '.join(sorted(missing))}", file=sys.stderr)
+    return 1 if wrong else 2 if missing else 0
 
 
-def examine(check: Check) -> Finding:
+def inside(root: Path, names: Sequence[str], whole: bool) -> int:
+    """Run the checks of what another root holds there, on a copy of this tree; return their status."""
+    tree = root / "mirrorskin"
+    files = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], check=True, capture_output=True).stdout
+    copy = f"rm -rf {tree} && mkdir {tree} && tar -C {ROOT} --null --files-from=- -c | tar -x -C {tree}"
+    subprocess.run(copy, shell=True, input=files, check=True)
+    words = ["tests/portability/portability.py", "--inside", *["--whole"] * whole, *names]
+    return subprocess.run(
+        ["chroot", str(root), "sh", "-c", f"cd /mirrorskin && /env/bin/python {' '.join(words)}"]
+    ).returncode
+
+
+def examine(check: Check, whole: bool = False) -> Finding:
     """See that it is sound, that it reports what it should, and what the device tests make of it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = environment_for(check, Path(folder))
@@ -123,7 +181,7 @@ def examine(check: Check) -> Finding:
         missed = missed_faults(check.faults, environment, log)
         if missed:
             return Finding(child.stdout.strip(), "-", "-", (f"not reported: {', '.join(missed)}",))
-        tests, details = run_tests(check, environment, Path(folder, "tests.xml"))
+        tests, details = run_tests(check, environment, Path(folder, "tests.xml"), whole)
         reports = reports_in(log)
         if reports:
             details += (read(log),)
@@ -160,16 +218,19 @@ def run_kernel(environment: Mapping[str, str], *fault: str) -> subprocess.Comple
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
-def run_tests(check: Check, environment: Mapping[str, str], record: Path) -> tuple[str, tuple[str, ...]]:
+def run_tests(
+    check: Check, environment: Mapping[str, str], record: Path, whole: bool = True
+) -> tuple[str, tuple[str, ...]]:
     """Run a check's tests marked ``device``; return how many pass, and what pytest says if not all do."""
-    options = ["-m", "device", "-k", check.tests, "-q", "-p", "no:cacheprovider", f"--junitxml={record}"]
-    command = [sys.executable, "-P", "-m", "pytest", *options, *check.folders]
+    marked = "device" if whole else "device and not slow"
+    options = ["-m", marked, "-k", check.tests, "-q", "-p", "no:cacheprovider", f"--junitxml={record}"]
+    command = [sys.executable, "-P", "-m", "pytest", *options, *(check.folders if whole else check.part)]
     child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if not record.exists():
         return f"ended with {child.returncode}", (child.stdout, child.stderr)
     tests, passed = count_tests(record)
     details = () if child.returncode == 0 and passed == tests > 0 else (child.stdout, child.stderr)
-    return f"{passed} of {tests} passed", details
+    return f"{passed} of {tests}", details
 
 
 def count_tests(record: Path) -> tuple[int, int]:
