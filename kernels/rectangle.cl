@@ -168,14 +168,17 @@ void step(WORK, const int from, const int count, __global const int *restrict pl
     const int radix = plan[0], q = plan[1], some = radix > 5 ? 2 * radix : 0;
     MAP roots = factors + plan[2];
     work = AT(from);
-#define TAKE(steps, ...)                                                                               \
-    if (q > 1) steps(MINE, count, q, 2 * STRIDE, 2 * STRIDE * q, roots + some, way __VA_ARGS__);         \
-    else steps(MINE, 1, count, 2 * STRIDE * radix, 2 * STRIDE, roots + some, LEVEL __VA_ARGS__);
-    if (radix == 4) { TAKE(step_4) }
-    else if (radix == 2) { TAKE(step_2) }
-    else if (radix == 3) { TAKE(step_3) }
-    else if (radix == 5) { TAKE(step_5) }
-    else { TAKE(step_odd, , radix, roots) }
+#define TAKE(blocks, inner, next, far, way)                                                            \
+    if (radix == 4) step_4(MINE, blocks, inner, next, far, roots + some, way);                         \
+    else if (radix == 2) step_2(MINE, blocks, inner, next, far, roots + some, way);                    \
+    else if (radix == 3) step_3(MINE, blocks, inner, next, far, roots + some, way);                    \
+    else if (radix == 5) step_5(MINE, blocks, inner, next, far, roots + some, way);                    \
+    else step_odd(MINE, blocks, inner, next, far, roots + some, way, radix, roots);
+    if (q > 1) {
+        TAKE(count, q, 2 * STRIDE, 2 * STRIDE * q, way)
+    } else {
+        TAKE(1, count, 2 * STRIDE * radix, 2 * STRIDE, LEVEL)
+    }
 }
 
 // The parts that the first step makes go one after the other through all others, while they are in the nearest cache.
@@ -246,12 +249,12 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // a line begins an
 #define STORE(to, given) (((__global Loose *)(to))->values = (given))
 #define EACH(i) for (int i = 0; i < 8; ++i)
 
-#define PICK(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#define SINGLES(a, b, c, d) \
-    const F c = PICK(a, b, 0, 8, 1, 9, 4, 12, 5, 13), d = PICK(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
-#define PAIRS(a, b, c, d) \
-    const F c = PICK(a, b, 0, 1, 8, 9, 4, 5, 12, 13), d = PICK(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
-#define QUADS(a, b, c, d) c = PICK(a, b, 0, 1, 2, 3, 8, 9, 10, 11), d = PICK(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+#define SINGLES(a, b, c, d)                                                              \
+    const F c = (F)(a.s0, b.s0, a.s1, b.s1, a.s4, b.s4, a.s5, b.s5);                     \
+    const F d = (F)(a.s2, b.s2, a.s3, b.s3, a.s6, b.s6, a.s7, b.s7);
+#define PAIRS(a, b, c, d)                                                                \
+    const F c = (F)(a.s01, b.s01, a.s45, b.s45), d = (F)(a.s23, b.s23, a.s67, b.s67);
+#define QUADS(a, b, c, d) c = (F)(a.s0123, b.s0123), d = (F)(a.s4567, b.s4567);
 #define TRANSPOSE(v)                                                                     \
     {                                                                                    \
         SINGLES(v[0], v[1], a0, a1) SINGLES(v[2], v[3], a2, a3)                          \
