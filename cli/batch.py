@@ -16,9 +16,10 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -36,28 +37,28 @@ _OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pix
 def command(
     recordings: Annotated[
         list[str],
-        typer.Argument(metavar="FILE...", help="Recordings; '*' and '**' are understood, quoted as well."),
+        Argument(metavar="FILE...", help="Recordings; '*' and '**' are understood, quoted as well."),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for results, made if missing.")
+        Path, Option("--output", "-o", metavar="DIR", help="Folder for results, made if missing.")
     ],
     settings: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation]."),
+        Option(metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation]."),
     ] = None,
     device: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME",
             help="Number or part of the name, as in 'mirrorskin devices'; may be given again.",
             show_default="the default one, or all GPUs",
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Use so many processes of this machine (Dask).")
+        int | None, Option(metavar="N", min=1, help="Use so many processes of this machine (Dask).")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Use a Dask cluster: tcp://node1:8786.")
+        str | None, Option(metavar="ADDRESS", help="Use a Dask cluster: tcp://node1:8786.")
     ] = None,
     memory: options.Memory = "256MB",
     as_json: options.Json = False,
@@ -82,7 +83,7 @@ def command(
             outcomes.append(outcome)
             show.ended(outcome)
     _report(outcomes, output, time.perf_counter() - start, as_json)
-    raise typer.Exit(int(any(outcome.state == "failed" for outcome in outcomes)))
+    raise click.exceptions.Exit(int(any(outcome.state == "failed" for outcome in outcomes)))
 
 
 def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: str | None) -> None:
@@ -113,7 +114,7 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
     if not recordings:
         raise InputError(f"{words[0]}: nothing but results: name recordings")
     if len(recordings) < len(found):
-        typer.echo(f"left out, as results: {len(found) - len(recordings)} files", err=True)
+        click.echo(f"left out, as results: {len(found) - len(recordings)} files", err=True)
     return recordings
 
 
@@ -180,7 +181,7 @@ def _reporting_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator
     try:
         yield
     except (KeyboardInterrupt, SystemExit):
-        typer.echo(f"ended after {len(outcomes)} of {total}: the same command goes on from there", err=True)
+        click.echo(f"ended after {len(outcomes)} of {total}: the same command goes on from there", err=True)
         raise
 
 
@@ -197,10 +198,10 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
         return
     for outcome in outcomes:
         if outcome.state == "failed":
-            typer.echo(f"failed: {_problem(outcome)}")
+            click.echo(f"failed: {_problem(outcome)}")
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
-    typer.echo(f"{_printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
+    click.echo(f"{_printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:
@@ -256,7 +257,7 @@ class _Show:
             line = f"failed: {_problem(outcome)}"
         elif outcome.state == "done":
             line += f" in {outcome.seconds:.3g} s, {_speed(outcome)} MB/s: {outcome.message}"
-        typer.echo(line)
+        click.echo(line)
 
 
 class _Table(_Show):

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Group
+from mirrorskin.cli.groups import Argument, Group, Option, make_command
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,30 +23,27 @@ if TYPE_CHECKING:
 _RUN = "RUN.json"
 _WIDTH = 100  # a pipe has 80, which would cut the names
 
-app = typer.Typer(cls=Group, invoke_without_command=True)
 
-
-@app.callback()
 def measure(
-    context: typer.Context,
+    context: click.Context,
     case: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Only this case, or those like 'full-*'; may be given again."),
+        Option(metavar="NAME", help="Only this case, or those like 'full-*'; may be given again."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Small stacks, to see that all agree; the times mean nothing.")
+        bool, Option("--quick", help="Small stacks, to see that all agree; the times mean nothing.")
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar=_RUN, help="Write JSON there, and a table beside it."),
+        Option("--output", "-o", metavar=_RUN, help="Write JSON there, and a table beside it."),
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
     folder: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="For files of 2 GB; else among temporary files."),
+        Option(metavar="DIR", help="For files of 2 GB; else among temporary files."),
     ] = None,
-    list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
+    list_: Annotated[bool, Option("--list", help="Name the cases, and run none.")] = False,
 ) -> None:
     """Time the kernels and whole paths against the limits and against others; check their accuracy."""
     from mirrorskin.bench import run, suite
@@ -58,7 +55,7 @@ def measure(
         return
     names = suite.choose(case or suite.NAMES)
     if list_:
-        typer.echo(json.dumps(names, indent=2) if as_json else "\n".join(names))
+        click.echo(json.dumps(names, indent=2) if as_json else "\n".join(names))
         return
     page = _check(output)
     opened = open_device(device)
@@ -78,10 +75,12 @@ def measure(
     suite.check_accuracy(cases)
 
 
-@app.command("compare")
+app: Group = make_command(None, measure, Group, invoke_without_command=True)
+
+
 def compare_runs(
-    before: Annotated[Path, typer.Argument(metavar="A.json", help="A run that 'mirrorskin bench -o' wrote.")],
-    after: Annotated[Path, typer.Argument(metavar="B.json", help="Another, later one.")],
+    before: Annotated[Path, Argument(metavar="A.json", help="A run that 'mirrorskin bench -o' wrote.")],
+    after: Annotated[Path, Argument(metavar="B.json", help="Another, later one.")],
     as_json: options.Json = False,
 ) -> None:
     """Compare two runs, work by work: what changed by more than its turns vary."""
@@ -91,7 +90,7 @@ def compare_runs(
     runs = run.open_run(before), run.open_run(after)
     found = comparing.compare(*runs)
     if as_json:
-        typer.echo(json.dumps(comparing.as_data(found, *runs), indent=2))
+        click.echo(json.dumps(comparing.as_data(found, *runs), indent=2))
         return
     console = _console()
     titles = (f"{word}: {report.as_title(one)}" for word, one in zip("AB", runs, strict=True))
@@ -102,12 +101,14 @@ def compare_runs(
     console.print("", *found.targets, *found.apart, *found.summary, sep="\n", markup=False)
 
 
-@app.command("report")
+app.add(compare_runs, "compare")
+
+
 def make_report(
-    runs: Annotated[list[Path], typer.Argument(metavar=_RUN, help="Runs that 'mirrorskin bench -o' wrote.")],
+    runs: Annotated[list[Path], Argument(metavar=_RUN, help="Runs that 'mirrorskin bench -o' wrote.")],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="PAGE.md", help="Page to write; its picture goes to images."),
+        Option("--output", "-o", metavar="PAGE.md", help="Page to write; its picture goes to images."),
     ],
 ) -> None:
     """Make a page of runs: aims, a summary, a roofline, and every case. Needs no device."""
@@ -120,10 +121,13 @@ def make_report(
     view.check_drawing()
     io.check_output(output, *runs)
     write_page({path: open_run(path) for path in runs}, output)
-    typer.echo(f"written to {output}", err=True)
+    click.echo(f"written to {output}", err=True)
 
 
-def _refuse_options(context: typer.Context) -> None:
+app.add(make_report, "report")
+
+
+def _refuse_options(context: click.Context) -> None:
     """Refuse options of a run before the name of another command, where they would do nothing."""
     from mirrorskin import io
 
@@ -176,13 +180,13 @@ def _tell(data: Mapping[str, Any], output: Path | None, page: Path | None, as_js
 
     text = json.dumps(data, indent=2)
     if as_json:
-        typer.echo(text)
+        click.echo(text)
     else:
         _print(data)
     for path, content in ((output, text + "\n"), (page, as_markdown(data))):
         if path is not None:
             write_text(path, content)
-            typer.echo(f"written to {path}", err=True)
+            click.echo(f"written to {path}", err=True)
 
 
 def _print(data: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 from mirrorskin.cli import options, scans
 
@@ -17,7 +17,7 @@ _TOGETHER = 64
 
 
 def command(
-    context: typer.Context,
+    context: click.Context,
     motion: scans.Motion,
     rig_file: scans.RigFile,
     output: options.NewRecording,
@@ -51,7 +51,7 @@ def command(
         recorder = io.StreamRecorder(scan, output, compression.value, calibration=known)
         with scans.kept(recorder):
             _drain(recorder)
-        typer.echo(f"{output}: {_summary(scan)}")
+        click.echo(f"{output}: {_summary(scan)}")
 
 
 def _drain(recorder: StreamRecorder) -> None:

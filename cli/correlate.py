@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 
 def command(
-    stack: Annotated[Path, typer.Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
+    stack: Annotated[Path, Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
     output: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="STACK-correlation.h5"
         ),
     ] = None,

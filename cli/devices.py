@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.output import print_json, print_table
@@ -32,4 +32,4 @@ def command(as_json: options.Json = False) -> None:
         for number, device in enumerate(devices)
     ]
     print_table(["", "number", "kind", "name", "driver", "units", "memory", "note"], rows)
-    typer.echo("* is the default; choose another with --device NUMBER or a part of its name")
+    click.echo("* is the default; choose another with --device NUMBER or a part of its name")

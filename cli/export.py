@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,7 +22,7 @@ def command(
     result: options.ResultFile,
     output: Annotated[
         list[Path],
-        typer.Option(
+        Option(
             "--output",
             "-o",
             metavar="FILE",
@@ -31,7 +32,7 @@ def command(
     ],
     turn: options.Turn = None,
     section: options.Section = None,
-    points: Annotated[bool, typer.Option("--points", help="A .ply of points, without triangles.")] = False,
+    points: Annotated[bool, Option("--points", help="A .ply of points, without triangles.")] = False,
 ) -> None:
     """Write a result as meshes, points, pictures, tables or arrays."""
     from mirrorskin import io
@@ -52,7 +53,7 @@ def command(
         check_export(found, path)
     columns = _section(found, ends) if ".csv" in suffixes else None
     for path in output:
-        typer.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
+        click.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
 
 
 def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDArray[Any]]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
@@ -15,16 +14,14 @@ if TYPE_CHECKING:
 
 
 def command(
-    vertical: Annotated[Path, typer.Argument(metavar="VERTICAL", help="Recording of a press, in HDF5.")],
-    axial: Annotated[Path, typer.Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
+    vertical: Annotated[Path, Argument(metavar="VERTICAL", help="Recording of a press, in HDF5.")],
+    axial: Annotated[Path, Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="VERTICAL-fused.h5"
-        ),
+        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="VERTICAL-fused.h5"),
     ] = None,
     dataset: Annotated[
-        str | None, typer.Option(metavar="PATH", help="The stack in others' files, of one name in both.")
+        str | None, Option(metavar="PATH", help="The stack in others' files, of one name in both.")
     ] = None,
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
@@ -39,9 +36,7 @@ def command(
     robust: options.Robust = False,
     register: Annotated[
         bool,
-        typer.Option(
-            help="Let the rotation's frames follow the object; without it, they need no press and pivot."
-        ),
+        Option(help="Let the rotation's frames follow the object; without it, they need no press and pivot."),
     ] = True,
     memory: options.Memory = "256MB",
     device: options.Device = None,

@@ -1,49 +1,115 @@
-"""Groups of commands that are imported when they are named."""
+"""Commands made of functions with annotated parameters, and groups that import them when they are named."""
 
 from __future__ import annotations
 
+import inspect
 import keyword
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from enum import StrEnum
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args, get_origin, get_type_hints
 
-import typer
-from typer.core import TyperGroup
+import click
 
 
-class Group(TyperGroup):
-    """A group whose help says in full what its commands are for."""
+class Option:
+    """What is said of an option, in click's settings: ``Annotated[float, Option("--rate", help=...)]``."""
 
-    def get_help_option(self, ctx: Any) -> Any:
-        """Give it a default: for None, typer imports pydantic."""
-        option = super().get_help_option(ctx)
-        if option is not None:
-            option.default = False
-        return option
+    def __init__(self, *names: str, **settings: Any) -> None:
+        self.names, self.settings = names, settings
+
+
+class Argument(Option):
+    """What is said of an argument."""
+
+
+class Group(click.Group):
+    """A group whose help says in full, and in the order given, what its commands are for."""
+
+    def add(self, function: Callable[..., Any], name: str | None = None) -> Callable[..., Any]:
+        """Make a command of a function; also as a decorator."""
+        self.add_command(make_command(name or function.__name__, function))
+        return function
 
     def purposes(self) -> Mapping[str, str]:
         """Return what each command is for."""
         return {name: (command.help or "").split("\n\n")[0] for name, command in self.commands.items()}
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """List the commands."""
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names, in the order of the help."""
+        return list(self.commands)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List options and commands."""
+        _list_parameters(self, ctx, formatter)
         with formatter.section("Commands"):
             formatter.write_dl(list(self.purposes().items()))
 
 
-def lazy_group(package: str, purposes: Mapping[str, str]) -> type[TyperGroup]:
-    """Return the class of a group whose commands are modules with a function ``command``, or an ``app``."""
+class LazyGroup(Group):
+    """A group whose commands are modules of a package, with a function ``command`` or a group ``app``."""
 
-    class LazyGroup(Group):
-        def __init__(self, **given: Any) -> None:
-            super().__init__(**given)
-            self.commands: Any = _Commands(package, tuple(purposes))
+    def __init__(self, package: str, purposes: Mapping[str, str], **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = _Commands(package, tuple(purposes))
+        self._purposes = purposes
 
-        def purposes(self) -> Mapping[str, str]:
-            """Return what was given: no command is needed for it."""
-            return purposes
+    def purposes(self) -> Mapping[str, str]:
+        """Return what was given: no command is needed for it."""
+        return self._purposes
 
-    return LazyGroup
+
+def make_command(
+    name: str | None, function: Callable[..., Any], kind: Callable[..., Any] | None = None, **settings: Any
+) -> Any:
+    """Return a command, or a group of this kind, that calls a function.
+
+    A parameter of the type ``click.Context`` gets the context. The docstring is the help.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    given = {parameter.name: parameter for parameter in inspect.signature(function).parameters.values()}
+    context = next((name for name in given if hints[name] is click.Context), None)
+    if context is not None:
+        del given[context]
+
+    def call(**values: Any) -> Any:
+        for name, value in values.items():
+            if isinstance(value, tuple):
+                values[name] = list(value) or given[name].default
+        return function(**values, **({context: click.get_current_context()} if context else {}))
+
+    parameters = [_parameter(parameter, hints[name]) for name, parameter in given.items()]
+    made = _Command if kind is None else kind
+    return made(name=name, params=parameters, callback=call, help=inspect.getdoc(function) or "", **settings)
+
+
+class _Command(click.Command):
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        _list_parameters(self, ctx, formatter)
+
+
+class _Argument(click.Argument):
+    """An argument that the help tells of."""
+
+    def __init__(self, name: str, settings: dict[str, Any]) -> None:
+        self._help = settings.pop("help")
+        super().__init__([name], **settings)
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
+        return self.make_metavar(ctx), f"{self._help}{'  [required]' if self.required else ''}"
+
+
+class _Words(click.Choice[Any]):
+    """The values of an enumeration."""
+
+    def __init__(self, kind: type[StrEnum]) -> None:
+        super().__init__([one.value for one in kind])
+        self._kind = kind
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return self._kind(super().convert(str(value), param, ctx))
 
 
 class _Commands(Mapping[str, Any]):
@@ -58,7 +124,9 @@ class _Commands(Mapping[str, Any]):
             raise KeyError(name)
         if name not in self._made:
             place = f"{name}_" if keyword.iskeyword(name) else name
-            self._made[name] = _make(name, import_module(f"{self._package}.{place}"))
+            module = import_module(f"{self._package}.{place}")
+            self._made[name] = getattr(module, "app", None) or make_command(name, module.command)
+            self._made[name].name = name
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -68,12 +136,41 @@ class _Commands(Mapping[str, Any]):
         return len(self._names)
 
 
-def _make(name: str, module: Any) -> Any:
-    """Make a module's command as typer makes it in a group of all."""
-    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    if hasattr(module, "app"):
-        alone.add_typer(module.app, name=name)
-        group: Any = typer.main.get_command(alone)
-        return group.commands[name]
-    alone.command(name)(module.command)
-    return typer.main.get_command(alone)
+def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
+    """Return a parameter of click's: its type from the annotation, its name from the function."""
+    kind, said = get_args(hint)[:2]
+    kind = next((one for one in get_args(kind) if NoneType in get_args(kind) and one is not NoneType), kind)
+    many = get_origin(kind) is list
+    kind = get_args(kind)[0] if many else kind
+    settings = dict(said.settings)
+    bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
+    settings["type"] = _type(kind, bounds)
+    settings["required"] = parameter.default is parameter.empty
+    if parameter.default is not parameter.empty and not many:
+        default = parameter.default
+        settings["default"] = default.value if isinstance(default, StrEnum) else default
+    if isinstance(said, Argument):
+        return _Argument(parameter.name, {**settings, "nargs": -1 if many else 1})
+    names = said.names
+    if kind is bool:
+        settings = {**settings, "is_flag": True, "type": None}
+    if not names:
+        plain = parameter.name.replace("_", "-")
+        names = (f"--{plain}/--no-{plain}" if kind is bool else f"--{plain}",)
+    return click.Option([*names, parameter.name], multiple=many, **{"show_default": True, **settings})
+
+
+def _type(kind: Any, bounds: dict[str, Any]) -> Any:
+    if bounds:
+        return (click.IntRange if kind is int else click.FloatRange)(**bounds)
+    if kind is Path:
+        return click.Path(path_type=Path)
+    return _Words(kind) if issubclass(kind, StrEnum) else kind
+
+
+def _list_parameters(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    for title, kind in (("Arguments", click.Argument), ("Options", click.Option)):
+        records = [one.get_help_record(ctx) for one in command.get_params(ctx) if isinstance(one, kind)]
+        if any(records):
+            with formatter.section(title):
+                formatter.write_dl([record for record in records if record is not None])

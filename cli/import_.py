@@ -5,17 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 
 def command(
     frames: Annotated[
-        Path, typer.Argument(metavar="VIDEO-OR-FOLDER", help="AVI, MP4, or numbered PNG/TIFF pictures.")
+        Path, Argument(metavar="VIDEO-OR-FOLDER", help="AVI, MP4, or numbered PNG/TIFF pictures.")
     ],
     output: options.NewRecording,
-    motion: Annotated[options.MotionName, typer.Option(help="How the body moved.")],
+    motion: Annotated[options.MotionName, Option(help="How the body moved.")],
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
     phase_step: options.PhaseStep = None,
@@ -48,6 +49,6 @@ def command(
     ):
         recorder.drain(show)
     for name in source.left_out:
-        typer.echo(f"left out: {name}", err=True)
+        click.echo(f"left out: {name}", err=True)
     count, rows, columns = source.shape
-    typer.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")
+    click.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")

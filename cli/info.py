@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument
 from mirrorskin.cli.output import print_fields, print_json
 
 
 def command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording, result, or any HDF5 file.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="Recording, result, or any HDF5 file.")],
     as_json: options.Json = False,
 ) -> None:
     """Tell what a file holds."""

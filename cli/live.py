@@ -10,9 +10,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options, scans
+from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
@@ -33,39 +34,39 @@ _REMEDIES = {
 
 
 def command(
-    context: typer.Context,
+    context: click.Context,
     motion: scans.Motion,
     rig_file: scans.RigFile,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
+        Path | None, Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="RES.h5", help="Result to write at the end.")
+        Path | None, Option("--output", "-o", metavar="RES.h5", help="Result to write at the end.")
     ] = None,
     view: Annotated[
         str | None,
-        typer.Option(metavar="WHERE", help="Show pictures in a 'window', a 'browser', or write a FILE.rrd."),
+        Option(metavar="WHERE", help="Show pictures in a 'window', a 'browser', or write a FILE.rrd."),
     ] = None,
     window: Annotated[
         int | None,
-        typer.Option(min=3, max=64, help="Axial: frames of a turn to use.", show_default="all, up to 64"),
+        Option(min=3, max=64, help="Axial: frames of a turn to use.", show_default="all, up to 64"),
     ] = None,
     latency: Annotated[
-        str, typer.Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
+        str, Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
     ] = _LATENCY,
     threshold: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="Vertical: share of the way from dark to bright that is light.", show_default=str(_THRESHOLD)
         ),
     ] = None,
     hold: Annotated[
         int | None,
-        typer.Option(help="Vertical: light frames in a row that make an onset.", show_default=str(_HOLD)),
+        Option(help="Vertical: light frames in a row that make an onset.", show_default=str(_HOLD)),
     ] = None,
     noise: Annotated[
         float | None,
-        typer.Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
+        Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
     ] = None,
     start: scans.Start = None,
     stop: scans.Stop = None,
@@ -117,14 +118,14 @@ class _Live:
             self._reconstruct()
         except (HardwareError, InputError, KeyboardInterrupt, SystemExit):
             if self._loop is not None and self._loop.status.used > 0:
-                typer.echo(f"{name}: cut short: {summary(self._loop.status)}", err=True)
+                click.echo(f"{name}: cut short: {summary(self._loop.status)}", err=True)
                 try:
                     self._save()
                 except InputError as lacking:  # why it ended matters more
-                    typer.echo(f"no result: {lacking}", err=True)
+                    click.echo(f"no result: {lacking}", err=True)
             raise
         assert self._loop is not None
-        typer.echo(f"{name}: {summary(self._loop.status)}")
+        click.echo(f"{name}: {summary(self._loop.status)}")
         self._save()
 
     def _reconstruct(self) -> None:
@@ -248,4 +249,4 @@ def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterat
     finally:
         viewer.close()
         if viewer.error is not None:
-            typer.echo(f"the pictures ended early: {viewer.error}", err=True)
+            click.echo(f"the pictures ended early: {viewer.error}", err=True)

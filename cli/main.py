@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Annotated
 
-import typer
+import click
 
-from mirrorskin.cli.groups import lazy_group
+from mirrorskin.cli.groups import LazyGroup, Option, make_command
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
@@ -46,25 +46,26 @@ PURPOSES = {
 }
 """What the commands are for, in the order of the help; each stands in the module of its name."""
 
-app = typer.Typer(
-    name="mirrorskin",
-    cls=lazy_group("mirrorskin.cli", PURPOSES),
-    help="Shape from active tactile sensors with a mirror-like skin.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
 
-
-@app.callback()
 def _common(
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks, and what is logged.")] = False,
+    debug: Annotated[bool, Option("--debug", help="Show tracebacks, and what is logged.")] = False,
 ) -> None:
     import logging
 
     _OneLine.debug = debug
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
+
+
+app: LazyGroup = make_command(
+    "mirrorskin",
+    _common,
+    LazyGroup,
+    package="mirrorskin.cli",
+    purposes=PURPOSES,
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.help = "Shape from active tactile sensors with a mirror-like skin."
 
 
 class _OneLine:
@@ -77,7 +78,7 @@ class _OneLine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, KeyboardInterrupt | typer.Abort):
+        if isinstance(error, KeyboardInterrupt | click.Abort):
             sys.exit(_INTERRUPTED)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
         code = getattr(error, "exit_code", None)
@@ -127,7 +128,12 @@ def main() -> None:
     """Run the command line."""
     words = sys.argv[1:] or ["--help"]
     with _ended_by_signals(), _OneLine():
-        sys.exit(app(words, standalone_mode=False) or 0)
+        try:
+            with app.make_context("mirrorskin", words) as context:
+                app.invoke(context)
+        except click.exceptions.Exit as ended:
+            sys.exit(ended.exit_code)
+        sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_fields, print_json
 
 
@@ -25,18 +26,18 @@ def command(
     region: options.Region = None,
     form: Annotated[
         FormName | None,
-        typer.Option(
+        Option(
             help="What to fit, and to measure roughness from.",
             show_default="sphere where it fits much better, else plane",
         ),
     ] = None,
     cutoff: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help="Leave waves longer than that out of the roughness: 0.8mm."),
+        Option(metavar="LENGTH", help="Leave waves longer than that out of the roughness: 0.8mm."),
     ] = None,
     section: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="X1,Y1:X2,Y2",
             help="Measure lengths, slope and step between two points, from the picture's centre:"
             " -2mm,0mm:2mm,0mm.",
@@ -60,6 +61,6 @@ def command(
         print_json(measures)
         return
     print_fields(measures.quantities)
-    typer.echo()
+    click.echo()
     for note in measures.notes:
-        typer.echo(note)
+        click.echo(note)

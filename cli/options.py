@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from mirrorskin.cli.groups import Argument, Option
 
 
 class MotionName(StrEnum):
@@ -28,64 +28,60 @@ class CompressionName(StrEnum):
     lzf = "lzf"
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable output.")]
+Json = Annotated[bool, Option("--json", help="Print machine-readable output.")]
 Device = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
+    str | None, Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
 ]
-Motion = Annotated[MotionName | None, typer.Option(help="How the body moved, if the file does not say.")]
-TravelStep = Annotated[str | None, typer.Option(metavar="LENGTH", help="Travel from frame to frame: 0.1mm.")]
+Motion = Annotated[MotionName | None, Option(help="How the body moved, if the file does not say.")]
+TravelStep = Annotated[str | None, Option(metavar="LENGTH", help="Travel from frame to frame: 0.1mm.")]
 TravelStart = Annotated[
-    str | None, typer.Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
+    str | None, Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
 ]
-PhaseStep = Annotated[str | None, typer.Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
+PhaseStep = Annotated[str | None, Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
 Phases = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Phases of all frames, a text of angles: 178.1deg 220.8deg ..."),
+    Option(metavar="FILE", help="Phases of all frames, a text of angles: 178.1deg 220.8deg ..."),
 ]
-Tilt = Annotated[str | None, typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
+Tilt = Annotated[str | None, Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
 ZenithGain = Annotated[
     str | None,
-    typer.Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
+    Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
 ]
-ZenithOffset = Annotated[
-    float | None, typer.Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")
-]
+ZenithOffset = Annotated[float | None, Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")]
 Robust = Annotated[
     bool,
-    typer.Option("--robust", help="Rotation: find where the surface breaks, and do not smooth that over."),
+    Option("--robust", help="Rotation: find where the surface breaks, and do not smooth that over."),
 ]
 PixelSize = Annotated[
-    str | None, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
+    str | None, Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
 ]
 Region = Annotated[
     str | None,
-    typer.Option(metavar="X,Y,WxH", help="Only so many pixels, from column X and row Y on: 100,50,640x480."),
+    Option(metavar="X,Y,WxH", help="Only so many pixels, from column X and row Y on: 100,50,640x480."),
 ]
-Frames = Annotated[
-    str | None, typer.Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")
-]
-ResultFile = Annotated[Path, typer.Argument(metavar="RES.h5", help="Result to take.")]
+Frames = Annotated[str | None, Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")]
+ResultFile = Annotated[Path, Argument(metavar="RES.h5", help="Result to take.")]
 Turn = Annotated[
     int | None,
-    typer.Option(metavar="N", min=0, help="Of a result of each turn: which one, from 0."),
+    Option(metavar="N", min=0, help="Of a result of each turn: which one, from 0."),
 ]
 Section = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="X1,Y1:X2,Y2",
         help="Cut between two points, from the picture's centre: -2mm,0mm:2mm,0mm.",
         show_default="across the apex",
     ),
 ]
-Dataset = Annotated[str | None, typer.Option(metavar="PATH", help="The stack in another's file.")]
+Dataset = Annotated[str | None, Option(metavar="PATH", help="The stack in another's file.")]
 Calibration = Annotated[
     Path | None,
-    typer.Option(metavar="CAL.h5", help="What is known of the sensor; see docs/calibration.md."),
+    Option(metavar="CAL.h5", help="What is known of the sensor; see docs/calibration.md."),
 ]
-Memory = Annotated[str, typer.Option(metavar="SIZE", help="Memory for frames on the move.")]
-Compression = Annotated[CompressionName, typer.Option(help="How to pack the frames.")]
-NewRecording = Annotated[Path, typer.Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]
+Memory = Annotated[str, Option(metavar="SIZE", help="Memory for frames on the move.")]
+Compression = Annotated[CompressionName, Option(help="How to pack the frames.")]
+NewRecording = Annotated[Path, Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]
 LearnedCalibration = Annotated[
-    Path, typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
+    Path, Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
 ]
-Ball = Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")]
+Ball = Annotated[str, Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")]

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
 if TYPE_CHECKING:
     from mirrorskin.io import Result
@@ -33,7 +33,7 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
         facts = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
-        typer.echo(", ".join([f"{path}: {summary}", *_words(**pieces)]))
+        click.echo(", ".join([f"{path}: {summary}", *_words(**pieces)]))
 
 
 def _pieces(result: Result) -> dict[str, int]:
@@ -56,21 +56,21 @@ def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
 
 def print_json(value: Any) -> None:
     """Print a value as JSON; dataclasses become objects, and what is no number null."""
-    typer.echo(json.dumps(_plain(value), indent=2))
+    click.echo(json.dumps(_plain(value), indent=2))
 
 
 def print_fields(fields: Mapping[str, object]) -> None:
     """Print names and values in two columns."""
     width = max(map(len, fields), default=0)
     for name, value in fields.items():
-        typer.echo(f"{name:<{width}}  {value}")
+        click.echo(f"{name:<{width}}  {value}")
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under their heads, in columns as wide as they need."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
-        typer.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+        click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _plain(value: Any) -> Any:
@@ -90,11 +90,11 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
     for what, remedy in remedies.items():
         said = str(process.get(what))
         if said.startswith(_UNTOLD):
-            typer.echo(f"{name}: no {what}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
+            click.echo(f"{name}: no {what}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
     gel = str(process.get("gel", ""))
     if gel and gel != _NO_GEL:
         what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
-        typer.echo(f"{name}: heights {what}", err=True)
+        click.echo(f"{name}: heights {what}", err=True)
 
 
 @contextmanager

@@ -6,9 +6,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
@@ -46,13 +47,11 @@ _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}
 
 
 def command(
-    context: typer.Context,
-    recording: Annotated[Path, typer.Argument(metavar="REC.h5", help="Frames in HDF5.")],
+    context: click.Context,
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5.")],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"
-        ),
+        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"),
     ] = None,
     dataset: options.Dataset = None,
     motion: options.Motion = None,
@@ -62,18 +61,18 @@ def command(
     phases: options.Phases = None,
     tilt: Annotated[
         str | None,
-        typer.Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg, or 'estimate'."),
+        Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg, or 'estimate'."),
     ] = None,
     pixel_size: options.PixelSize = None,
     region: options.Region = None,
     frames: options.Frames = None,
     live: Annotated[
         bool,
-        typer.Option("--live", help="Only the frames that a live run used, with the positions it had."),
+        Option("--live", help="Only the frames that a live run used, with the positions it had."),
     ] = False,
     method: Annotated[
         MethodName | None,
-        typer.Option(
+        Option(
             help="Press: first crossing of the threshold, or most likely change."
             " Rotation: most likely normal, or the paper's equations 16 to 22.",
             show_default="threshold; of a rotation exact",
@@ -81,35 +80,35 @@ def command(
     ] = None,
     noise: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="COUNTS", help="Standard deviation of a sample; by default estimated from the frames."
         ),
     ] = None,
     dark: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Press: without light; else the file's.")
+        float | None, Option(metavar="COUNTS", help="Press: without light; else the file's.")
     ] = None,
-    bright: Annotated[float | None, typer.Option(metavar="COUNTS", help="Press: with full light.")] = None,
+    bright: Annotated[float | None, Option(metavar="COUNTS", help="Press: with full light.")] = None,
     event: Annotated[
-        EventName, typer.Option(help="Press: dark to light on the way down, or light to dark on the way up.")
+        EventName, Option(help="Press: dark to light on the way down, or light to dark on the way up.")
     ] = EventName.onset,
     threshold: Annotated[
         float,
-        typer.Option(help="Press: fraction of the range from dark to bright at which a pixel is bright."),
+        Option(help="Press: fraction of the range from dark to bright at which a pixel is bright."),
     ] = 0.5,
-    hold: Annotated[int, typer.Option(help="Press: consecutive frames that confirm the event.")] = 2,
+    hold: Annotated[int, Option(help="Press: consecutive frames that confirm the event.")] = 2,
     subframe: Annotated[
-        bool, typer.Option(help="Press: interpolate between frames; without it, eq. 4 as printed.")
+        bool, Option(help="Press: interpolate between frames; without it, eq. 4 as printed.")
     ] = True,
-    fill: Annotated[bool, typer.Option(help="Press: fill holes, such as flat tops, smoothly.")] = True,
+    fill: Annotated[bool, Option(help="Press: fill holes, such as flat tops, smoothly.")] = True,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
     robust: options.Robust = False,
     per_turn: Annotated[
-        bool, typer.Option("--per-turn", help="Rotation: maps of each turn, not of all together.")
+        bool, Option("--per-turn", help="Rotation: maps of each turn, not of all together.")
     ] = False,
     heights: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="Rotation: heights (a result or a simulation) for registering the frames.",
         ),
@@ -177,7 +176,7 @@ def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) ->
     return found
 
 
-def _refuse_foreign(context: typer.Context, recording: Path, motion: str) -> None:
+def _refuse_foreign(context: click.Context, recording: Path, motion: str) -> None:
     """Refuse options that say nothing of the recording's motion, rather than ignore them."""
     from mirrorskin import io
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Option
 
 
 def command(
     result: options.ResultFile,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", metavar="PAGE.html", help="Page to write.", show_default="RES-report.html"
-        ),
+        Option("--output", "-o", metavar="PAGE.html", help="Page to write.", show_default="RES-report.html"),
     ] = None,
     section: options.Section = None,
     turn: options.Turn = None,
@@ -31,4 +30,4 @@ def command(
     page = output or result.with_name(f"{result.stem}-report.html")
     io.check_output(page, result)
     write_report(io.open_result(result), page, name=result.name, section=ends, turn=turn)
-    typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, open it in any browser")
+    click.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, open it in any browser")

@@ -8,24 +8,24 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Group
+from mirrorskin.cli.groups import Argument, Group, Option
 from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.check import Finding
     from mirrorskin.hw.rig_file import RigSettings
 
-app = typer.Typer(cls=Group, help="Look at a stage and a camera before they are used.", no_args_is_help=True)
+app = Group(help="Look at a stage and a camera before they are used.", no_args_is_help=True)
 
 _COLOURS = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
-@app.command()
+@app.add
 def new(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
 ) -> None:
     """Write a rig file to begin with; docs/rig.md tells of every key."""
     from mirrorskin.hw.rig_file import TEMPLATE
@@ -38,13 +38,13 @@ def new(
         raise InputError(f"{output} is there already; name another file with --output") from error
     except OSError as error:
         raise InputError(f"{output} cannot be written: {error.strerror}; name another file") from error
-    typer.echo(f"{output}: now set port, letters, zeros and limits, and try 'mirrorskin rig check {output}'")
+    click.echo(f"{output}: now set port, letters, zeros and limits, and try 'mirrorskin rig check {output}'")
 
 
-@app.command()
+@app.add
 def check(
-    rig: Annotated[Path, typer.Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")],
-    move: Annotated[bool, typer.Option("--move", help="Home it, and move each axis a little.")] = False,
+    rig: Annotated[Path, Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")],
+    move: Annotated[bool, Option("--move", help="Home it, and move each axis a little.")] = False,
     as_json: options.Json = False,
 ) -> None:
     """Open a rig and tell whether it is as its file says; nothing moves without --move."""

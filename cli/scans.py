@@ -8,7 +8,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
+
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
@@ -34,11 +36,11 @@ class ScanName(StrEnum):
 
 
 def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
-    return typer.Option(metavar=metavar, help=text, show_default=False if default is None else str(default))
+    return Option(metavar=metavar, help=text, show_default=False if default is None else str(default))
 
 
-Motion = Annotated[ScanName, typer.Argument(help="How the body moves.")]
-RigFile = Annotated[Path, typer.Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
+Motion = Annotated[ScanName, Argument(help="How the body moves.")]
+RigFile = Annotated[Path, Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
 Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
 Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
 Step = Annotated[str | None, _option("LENGTH", "Vertical, in steps: from place to place.")]
@@ -49,7 +51,7 @@ Turns = Annotated[float | None, _option("N", "Axial: how often it goes round.", 
 PhaseStep = Annotated[str | None, _option("ANGLE", "Axial, in steps: from place to place, 45deg.")]
 Rate = Annotated[float | None, _option("HZ", "Axial, without a halt: turns a second.")]
 Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first exposure.", SETTLE)]
-StepFrames = Annotated[int | None, typer.Option("--frames", min=1, help="In steps: at each place.")]
+StepFrames = Annotated[int | None, Option("--frames", min=1, help="In steps: at each place.")]
 
 
 # The options of one motion only; threshold, hold and window are live's.
@@ -133,7 +135,7 @@ def kept(recorder: StreamRecorder | None) -> Iterator[None]:
         raise HardwareError(f"{error}; {_remains(recorder)}") from error
     except (KeyboardInterrupt, SystemExit):
         if recorder is not None and recorder.count:
-            typer.echo(_remains(recorder), err=True)
+            click.echo(_remains(recorder), err=True)
         raise
 
 

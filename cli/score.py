@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.output import print_fields, print_json
 
 
 def command(
-    result: Annotated[Path, typer.Argument(metavar="RES.h5", help="Result to score.")],
-    truth: Annotated[Path, typer.Option(metavar="REC.h5", help="Simulated recording, with the truth.")],
+    result: Annotated[Path, Argument(metavar="RES.h5", help="Result to score.")],
+    truth: Annotated[Path, Option(metavar="REC.h5", help="Simulated recording, with the truth.")],
     as_json: options.Json = False,
 ) -> None:
     """Compare a result with a simulation's truth."""

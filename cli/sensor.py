@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated
 
-import typer
+from mirrorskin.cli.groups import Option
 
 
 class ContactName(StrEnum):
@@ -22,7 +22,7 @@ class OpticsName(StrEnum):
     cylinder = "cylinder"
 
 
-Size = Annotated[str, typer.Option(metavar="WxH", help="Pixels across and down.")]
-PixelSize = Annotated[str, typer.Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")]
-Contact = Annotated[ContactName, typer.Option(help="The sheet takes the object's shape (eq. 1), or resists.")]
-Optics = Annotated[OpticsName, typer.Option(help="Light goes by the zenith alone, or is traced to the wall.")]
+Size = Annotated[str, Option(metavar="WxH", help="Pixels across and down.")]
+PixelSize = Annotated[str, Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")]
+Contact = Annotated[ContactName, Option(help="The sheet takes the object's shape (eq. 1), or resists.")]
+Optics = Annotated[OpticsName, Option(help="Light goes by the zenith alone, or is traced to the wall.")]

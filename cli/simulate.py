@@ -8,9 +8,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options, sensor
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.hw.twin import Movement
@@ -48,7 +49,7 @@ class ReferenceName(StrEnum):
 
 def _of(motion: options.MotionName, name: str, metavar: str, text: str) -> Any:
     """Make an option that only one motion, or all but the vertical one, have."""
-    return typer.Option(metavar=metavar, help=text, show_default=DEFAULTS[motion][name])
+    return Option(metavar=metavar, help=text, show_default=DEFAULTS[motion][name])
 
 
 _VERTICAL, _AXIAL = options.MotionName.vertical, options.MotionName.axial
@@ -56,12 +57,12 @@ _HORIZONTAL, _TWIST = options.MotionName.horizontal, options.MotionName.twist
 
 
 def command(
-    context: typer.Context,
-    motion: Annotated[options.MotionName, typer.Argument(help="How the body moves.")],
+    context: click.Context,
+    motion: Annotated[options.MotionName, Argument(help="How the body moves.")],
     output: options.NewRecording,
     thing: Annotated[
         str,
-        typer.Option(
+        Option(
             "--object",
             metavar="NAME",
             help="sphere, cone, cylinder, plane, step, texture, coin, or a file:"
@@ -72,9 +73,7 @@ def command(
     pixel_size: sensor.PixelSize = "0.025mm",
     frames: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=FRAMES_MAX, help="Frames to take.", show_default="30; of a rotation one turn"
-        ),
+        Option(min=1, max=FRAMES_MAX, help="Frames to take.", show_default="30; of a rotation one turn"),
     ] = None,
     travel_step: Annotated[
         str | None,
@@ -84,7 +83,7 @@ def command(
         str | None, _of(_VERTICAL, "travel-start", "LENGTH", "Vertical: travel of the first frame.")
     ] = None,
     release: Annotated[
-        bool, typer.Option("--release", help="Vertical: then lift it by the same steps, frames - 1 more.")
+        bool, Option("--release", help="Vertical: then lift it by the same steps, frames - 1 more.")
     ] = False,
     compliance: Annotated[
         str | None,
@@ -114,37 +113,35 @@ def command(
     contact: sensor.Contact = sensor.ContactName.conform,
     optics: sensor.Optics = sensor.OpticsName.ideal,
     pattern: Annotated[
-        str, typer.Option(metavar="NAME", help="Of the wall: uniform, linear in the zenith, or a picture.")
+        str, Option(metavar="NAME", help="Of the wall: uniform, linear in the zenith, or a picture.")
     ] = "uniform",
-    air_gap: Annotated[str, typer.Option(metavar="LENGTH", help="Between body and wall.")] = "0mm",
-    asymmetry: Annotated[float, typer.Option(help="Of the lamps, as a share of their light.")] = 0.0,
-    scatter: Annotated[str, typer.Option(metavar="ANGLE", help="Of the sheet's flakes.")] = "3deg",
-    friction: Annotated[float, typer.Option(help="Coefficient, between sheet and object.")] = 0.8,
+    air_gap: Annotated[str, Option(metavar="LENGTH", help="Between body and wall.")] = "0mm",
+    asymmetry: Annotated[float, Option(help="Of the lamps, as a share of their light.")] = 0.0,
+    scatter: Annotated[str, Option(metavar="ANGLE", help="Of the sheet's flakes.")] = "3deg",
+    friction: Annotated[float, Option(help="Coefficient, between sheet and object.")] = 0.8,
     camera_distance: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
+        Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
     ] = None,
-    point_spread: Annotated[float, typer.Option(metavar="PIXELS", help="Of the lens, one sigma.")] = 0.0,
-    dtype: Annotated[FrameType, typer.Option(help="Type of a sample.")] = FrameType.uint8,
-    bits: Annotated[
-        int | None, typer.Option(help="Of a uint16 sample: 10, 12 or 16.", show_default="12")
-    ] = None,
-    noise: Annotated[float, typer.Option(metavar="COUNTS", help="Read noise, one sigma.")] = 1.5,
+    point_spread: Annotated[float, Option(metavar="PIXELS", help="Of the lens, one sigma.")] = 0.0,
+    dtype: Annotated[FrameType, Option(help="Type of a sample.")] = FrameType.uint8,
+    bits: Annotated[int | None, Option(help="Of a uint16 sample: 10, 12 or 16.", show_default="12")] = None,
+    noise: Annotated[float, Option(metavar="COUNTS", help="Read noise, one sigma.")] = 1.5,
     electrons: Annotated[
-        float | None, typer.Option(metavar="N", help="In one count of these bits, for shot noise.")
+        float | None, Option(metavar="N", help="In one count of these bits, for shot noise.")
     ] = None,
-    gain_deviation: Annotated[float, typer.Option(help="Of the pixels' gains, one sigma.")] = 0.0,
+    gain_deviation: Annotated[float, Option(help="Of the pixels' gains, one sigma.")] = 0.0,
     offset_deviation: Annotated[
-        float, typer.Option(metavar="COUNTS", help="Of the pixels' offsets, one sigma.")
+        float, Option(metavar="COUNTS", help="Of the pixels' offsets, one sigma.")
     ] = 0.0,
-    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 30.0,
+    frame_rate: Annotated[float, Option(metavar="HZ", help="Frames a second.")] = 30.0,
     exposure: Annotated[
-        str, typer.Option(metavar="TIME", help="Exposure during which the body moves; 0: it stands still.")
+        str, Option(metavar="TIME", help="Exposure during which the body moves; 0: it stands still.")
     ] = "0s",
     references: Annotated[
-        ReferenceName, typer.Option(help="Dark and bright: taken with a ball, as in a lab, or exact.")
+        ReferenceName, Option(help="Dark and bright: taken with a ball, as in a lab, or exact.")
     ] = ReferenceName.ball,
-    seed: Annotated[int, typer.Option(help="The same seed, the same recording.")] = 0,
+    seed: Annotated[int, Option(help="The same seed, the same recording.")] = 0,
     compression: options.Compression = options.CompressionName.raw,
     device: options.Device = None,
 ) -> None:
@@ -198,7 +195,7 @@ def command(
         progress("simulating", count) as show,
     ):
         recorder.drain(show)
-    typer.echo(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}")
+    click.echo(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}")
 
 
 def make_movement(

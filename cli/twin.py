@@ -6,48 +6,41 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options, sensor
-from mirrorskin.cli.groups import Group
+from mirrorskin.cli.groups import Group, Option
 
 _LOOK = 0.2  # seconds from one look whether all is well to the next
 _PRESS = "vertical --stop 1.5mm --speed 0.5mm/s"
 _TURN = "axial --press 1mm --rate 0.5"  # which needs the zenith's scale
 
-app = typer.Typer(cls=Group, no_args_is_help=True)
+app = Group(help="Emulate a whole rig: its stage and its camera.", no_args_is_help=True)
 
 
-@app.callback()
-def _group() -> None:
-    """Emulate a whole rig: its stage and its camera."""
-
-
-@app.command()
+@app.add
 def serve(
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Where to write the rig file.")
+        Path, Option("--output", "-o", metavar="DIR", help="Where to write the rig file.")
     ] = Path("emulated-rig"),
     thing: Annotated[
         str,
-        typer.Option("--object", metavar="NAME", help="What to press on, as in 'mirrorskin simulate'."),
+        Option("--object", metavar="NAME", help="What to press on, as in 'mirrorskin simulate'."),
     ] = "sphere",
     size: sensor.Size = "320x240",
     pixel_size: sensor.PixelSize = "0.04mm",
     pattern: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="NAME", help="Of the wall: uniform, for presses; linear, for rotations; or a picture."
         ),
     ] = "uniform",
     contact: sensor.Contact = sensor.ContactName.conform,
     optics: sensor.Optics = sensor.OpticsName.ideal,
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 20.0,
-    delay: Annotated[
-        str, typer.Option(metavar="TIME", help="From a frame's exposure to its sending.")
-    ] = "50ms",
-    jitter: Annotated[str, typer.Option(metavar="TIME", help="Of that delay, one sigma.")] = "0s",
-    seed: Annotated[int, typer.Option(help="Of noise and jitter.")] = 0,
+    rate: Annotated[float, Option(metavar="HZ", help="Frames a second.")] = 20.0,
+    delay: Annotated[str, Option(metavar="TIME", help="From a frame's exposure to its sending.")] = "50ms",
+    jitter: Annotated[str, Option(metavar="TIME", help="Of that delay, one sigma.")] = "0s",
+    seed: Annotated[int, Option(help="Of noise and jitter.")] = 0,
     device: options.Device = None,
 ) -> None:
     """Run an emulated rig: a stage behind a serial port, and the twin as its camera, until Ctrl-C."""
@@ -72,15 +65,15 @@ def serve(
     with rig, rig.serve() as server:
         path = rig.write(output, server.url)
         what = f"{thing} under {columns} x {rows} pixels at {rate:g} frames a second"
-        typer.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")
+        click.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")
         scale = rig.settings.camera.zenith_gain
-        typer.echo(_tell(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
+        click.echo(_tell(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
         try:
             while rig.camera.error is None:
                 time.sleep(_LOOK)
             raise rig.camera.error
         except KeyboardInterrupt:
-            typer.echo("the rig has ended")
+            click.echo("the rig has ended")
 
 
 def _tell(rig: Path, movements: list[str]) -> str:

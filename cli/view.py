@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.io import Result
@@ -20,7 +21,7 @@ def command(
     result: options.ResultFile,
     map_: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--map",
             metavar="NAME",
             help="Only height, section, normals, edges, status, sigma, histogram, azimuth or modulation;"
@@ -32,7 +33,7 @@ def command(
     turn: options.Turn = None,
     output: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--output",
             "-o",
             metavar="PICTURE.png|DIR",
@@ -42,7 +43,7 @@ def command(
     ] = None,
     space: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--3d",
             metavar="WHERE",
             help="Show the surface in space instead, in a 'window', a 'browser', or write a FILE.rrd.",
@@ -85,7 +86,7 @@ def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
         io.check_output(Path(where), path)
     show_surface(io.select_turn(io.open_result(path), turn), where, name)
     if kept:
-        typer.echo(f"written to {where}: 'rerun {where}' shows it")
+        click.echo(f"written to {where}: 'rerun {where}' shows it")
 
 
 def _is_picture(output: Path) -> bool:
@@ -128,10 +129,10 @@ def _show(
         figures = {output / f"{which}{_PICTURE}": figure for which, figure in each.items()}
         _make_folder(output)
     if no_screen:
-        typer.echo("there is no screen for a window", err=True)
+        click.echo("there is no screen for a window", err=True)
     for target, figure in figures.items():
         write_figure(figure, target)
-        typer.echo(f"written to {target}")
+        click.echo(f"written to {target}")
 
 
 def _make_folder(folder: Path) -> None:

@@ -8,7 +8,6 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-import typer
 from commands import run
 
 from mirrorskin.cli.main import app
@@ -37,7 +36,7 @@ STEPS = commands_of(DOCS / "start.md")
 FILLED_IN = re.compile(
     r"\.\.\.|[:;,] |[()'\"]| of mean|horizontal|PoCL|pyopencl|NAME.cl|/dev/videoN|[A-Z]+_[A-Z_]+|\b[NM]\b|\d+"
 )
-COMMAND = typer.main.get_command(app)
+COMMAND = app
 
 
 @pytest.fixture

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import typer
-
 from mirrorskin.cli.calibrate import check, elastic, references, scale, show, tilt, zenith
 from mirrorskin.cli.groups import Group
 
-app = typer.Typer(
-    cls=Group,
+app = Group(
     help="Find out what a sensor's counts and pixels mean; docs/calibration.md tells in which order.",
     no_args_is_help=True,
 )
@@ -26,4 +23,4 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "show": show.command,
 }
 for name, command in _COMMANDS.items():
-    app.command(name)(command)
+    app.add(command, name)

@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 
 def command(
     recording: Annotated[
-        Path, typer.Argument(metavar="REC.h5", help="A ball pressed, or rotated about, that was not used.")
+        Path, Argument(metavar="REC.h5", help="A ball pressed, or rotated about, that was not used.")
     ],
-    calibration: Annotated[Path, typer.Option(metavar="CAL.h5", help="Calibration to check.")],
-    ball: Annotated[str, typer.Option(metavar="LENGTH", help="Diameter of the ball: 6mm.")],
-    cells: Annotated[int, typer.Option(metavar="N", help="Cells a side into which the field is cut.")] = 8,
+    calibration: Annotated[Path, Option(metavar="CAL.h5", help="Calibration to check.")],
+    ball: Annotated[str, Option(metavar="LENGTH", help="Diameter of the ball: 6mm.")],
+    cells: Annotated[int, Option(metavar="N", help="Cells a side into which the field is cut.")] = 8,
     picture: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="PNG", help="Picture of the errors to write.")
+        Path | None, Option("--output", "-o", metavar="PNG", help="Picture of the errors to write.")
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -45,5 +46,5 @@ def command(
     head = ("what", "when", "rms", "bias", "worst cell's rms", "expected", "pixels")
     print_table(head, found.table())
     for note in found.notes():
-        typer.echo(note)
-    typer.echo(f"ball of {found.ball:g} mm found at {found.place[0]:.3f}, {found.place[1]:.3f} mm")
+        click.echo(note)
+    click.echo(f"ball of {found.ball:g} mm found at {found.place[0]:.3f}, {found.place[1]:.3f} mm")

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.gel import BallOnset, GelFit
@@ -24,10 +25,10 @@ def command(
     ball: options.Ball,
     presses: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="REC.h5...", help="Vertical recordings of the ball, at one place or more."),
+        Argument(metavar="REC.h5...", help="Vertical recordings of the ball, at one place or more."),
     ] = None,
     sheet: Annotated[
-        str, typer.Option(metavar="LENGTH", help="Thickness of what lies between mirror and ball.")
+        str, Option(metavar="LENGTH", help="Thickness of what lies between mirror and ball.")
     ] = "0.05mm",
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
@@ -109,9 +110,9 @@ def _report(output: Path, fit: GelFit, as_json: bool) -> None:
         f"met at a travel of {gel.travel_zero:.3f} +- {sigma['travel_zero']:.3f} mm",
         f"{gel.error:.3f} mm left",
     ]
-    typer.echo(f"{output}: {', '.join(parts)}")
+    click.echo(f"{output}: {', '.join(parts)}")
     for name in fit.undetermined:
-        typer.echo(
+        click.echo(
             f"{name}: not determined by the presses, 0 is kept; press deeper, at more places or larger balls",
             err=True,
         )

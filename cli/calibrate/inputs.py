@@ -8,9 +8,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+import click
 
 from mirrorskin.cli import scans
+from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
@@ -26,17 +27,15 @@ _STILL = 0.05  # mm that the body moves in a recording of it at rest: a press ha
 
 OptionalRig = Annotated[
     Path | None,
-    typer.Option(
-        "--rig", metavar="RIG.toml", help="Take what is needed first, on this rig; see docs/rig.md."
-    ),
+    Option("--rig", metavar="RIG.toml", help="Take what is needed first, on this rig; see docs/rig.md."),
 ]
 Settle = scans.Settle
-Places = Annotated[int, typer.Option(min=1, help="With --rig: of the ball.")]
+Places = Annotated[int, Option(min=1, help="With --rig: of the ball.")]
 
 
 def press_option(example: str) -> Any:
     """Return the option of how deep a rig presses."""
-    return typer.Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {example}.")
+    return Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {example}.")
 
 
 def check_call(
@@ -203,9 +202,9 @@ def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
     in_steps = place.plan.in_steps
     scan = scans.make_scan(rig, place.plan, settle if in_steps else None, place.frames if in_steps else None)
     scan.lift()
-    typer.echo(f"{place.prompt}, then press Enter", err=True)
+    click.echo(f"{place.prompt}, then press Enter", err=True)
     if not sys.stdin.readline():  # nobody is there
-        raise typer.Abort
+        raise click.Abort
     recorder = io.StreamRecorder(scan, path)
     with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
         room = np.empty((_BLOCK, *recorder.shape[1:]), recorder.dtype)

@@ -8,10 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.references import Measured
@@ -32,31 +33,27 @@ def command(
     output: options.LearnedCalibration,
     dark: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="REC.h5", help="Recording or folder of pictures of a sheet that touches nothing."
-        ),
+        Option(metavar="REC.h5", help="Recording or folder of pictures of a sheet that touches nothing."),
     ] = None,
     bright: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.h5", help="The same in full light. Both may be given several times."),
+        Option(metavar="REC.h5", help="The same in full light. Both may be given several times."),
     ] = None,
     rolled: Annotated[
         bool,
-        typer.Option(
-            "--rolled", help="Bright: a ball rolled about, so that all are in full light sometimes."
-        ),
+        Option("--rolled", help="Bright: a ball rolled about, so that all are in full light sometimes."),
     ] = False,
     noise: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1.")
+        float | None, Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1.")
     ] = None,
     rig: inputs.OptionalRig = None,
     frames: Annotated[
-        int, typer.Option(min=2, help="With --rig: of each level, or of the ball at each place.")
+        int, Option(min=2, help="With --rig: of each level, or of the ball at each place.")
     ] = _FRAMES,
-    places: Annotated[int, typer.Option(min=1, help="With --rig and --rolled: of the ball.")] = _PLACES,
+    places: Annotated[int, Option(min=1, help="With --rig and --rolled: of the ball.")] = _PLACES,
     press: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help="With --rig and --rolled: how far the body is lowered: 2mm."),
+        Option(metavar="LENGTH", help="With --rig and --rolled: how far the body is lowered: 2mm."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -190,12 +187,12 @@ def _report(output: Path, measured: Measured, as_json: bool) -> None:
                 f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
             )
         counts = ", ".join(f"{count} {name}" for name, count in defects.items())
-        typer.echo(f"{output}: {'; '.join(parts)}; {counts}")
+        click.echo(f"{output}: {'; '.join(parts)}; {counts}")
     for name, level in levels.items():
         if abs(level.drift) > level.sigma:
-            typer.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
+            click.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
         if level.clipped:
-            typer.echo(
+            click.echo(
                 f"{name}: samples of {level.clipped} pixels lie on the end of the scale; their mean was"
                 f" corrected for it; better {_REMEDIES[name]}",
                 err=True,

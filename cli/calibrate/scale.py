@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _SHOTS = 8
 
 BoardText = Annotated[
     str,
-    typer.Option(
+    Option(
         metavar="BOARD",
         help="charuco:COLUMNSxROWS:SQUARE:MARKER, as in charuco:7x5:2mm:1.5mm, or"
         " dots:COLUMNSxROWS:PITCH, as in dots:11x9:1mm.",
@@ -49,9 +50,9 @@ def board_of(text: str) -> Board:
 
 
 def board_command(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="BOARD.png", help="Picture to write.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="BOARD.png", help="Picture to write.")],
     board: BoardText,
-    dpi: Annotated[float, typer.Option(help="Pixels per inch, to be printed at that.")] = 2540.0,
+    dpi: Annotated[float, Option(help="Pixels per inch, to be printed at that.")] = 2540.0,
 ) -> None:
     """Paint a board for printing, in its true size."""
     from mirrorskin.engine.calibration.board import paint_board
@@ -68,7 +69,7 @@ def board_command(
     save_print(picture, output, dpi)
     rows, columns = picture.shape
     width, height = (side * 25.4 / dpi for side in (columns, rows))
-    typer.echo(
+    click.echo(
         f"{output}: {kind}, {columns} x {rows} pixels at {dpi:g} dpi, {width:.2f} x {height:.2f} mm"
         " with its margin: print it at 100 %, and measure it"
     )
@@ -79,13 +80,13 @@ def command(
     board: BoardText,
     pictures: Annotated[
         list[Path] | None,
-        typer.Argument(
+        Argument(
             metavar="PICTURE-OR-RECORDING...",
             help="Of the board, flat on the sheet, at several places and turned.",
         ),
     ] = None,
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, typer.Option(min=1, help="With --rig: of the board.")] = _PLACES,
+    places: Annotated[int, Option(min=1, help="With --rig: of the board.")] = _PLACES,
     as_json: options.Json = False,
 ) -> None:
     """Find millimetres per pixel, perspective and distortion from a board on the sheet.
@@ -121,7 +122,7 @@ def command(
     _report(output, fit, paths, as_json)
     old = [GROUPS[part] for part, _ in outdated(calibration, fit.lens.pixel_size)]
     if old:
-        typer.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
+        click.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
 
 
 def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
@@ -165,7 +166,7 @@ def _report(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) ->
         rest = {"distortion": lens.distortion.tolist(), "pictures": each}
         print_json({"output": str(output), **sizes, **errors, **rest})
         return
-    typer.echo(
+    click.echo(
         f"{output}: {1000 * size:.4f} +- {1000 * size * lens.scale_sigma:.2g} um a pixel"
         f" ({lens.scale_sigma:.2%}); {sum(fit.marks)} marks in {len(paths)} pictures are off by"
         f" {lens.error:.3f} pixels RMS, {fit.worst:.2f} at most; near its corners the map is known to"

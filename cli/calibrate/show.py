@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.view.calibration_table import Row
@@ -20,11 +21,11 @@ _NUMBERS = "value", "standard error"
 
 def command(
     calibration: Annotated[
-        Path, typer.Argument(metavar="CAL.h5", help="Calibration, or a recording or result that has one.")
+        Path, Argument(metavar="CAL.h5", help="Calibration, or a recording or result that has one.")
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder to draw pictures of all maps into."),
+        Option("--output", "-o", metavar="DIR", help="Folder to draw pictures of all maps into."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -52,7 +53,7 @@ def command(
         return
     _print(str(calibration), rows)
     if output is not None:
-        typer.echo(f"{output}: {', '.join(path.name for path in pictures) or 'nothing to draw'}")
+        click.echo(f"{output}: {', '.join(path.name for path in pictures) or 'nothing to draw'}")
 
 
 def _print(name: str, rows: Sequence[Row]) -> None:

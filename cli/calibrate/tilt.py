@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.brightness import Brightness
@@ -27,15 +28,15 @@ def command(
     ball: options.Ball,
     balls: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="REC.h5...", help="Axial recordings of the ball, at one place or more."),
+        Argument(metavar="REC.h5...", help="Axial recordings of the ball, at one place or more."),
     ] = None,
     flat: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.h5", help="Axial recording of a level plate; may be given again."),
+        Option(metavar="REC.h5", help="Axial recording of a level plate; may be given again."),
     ] = None,
     wedge: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REC.h5", help="Axial recording of an inclined plate; may be given again."),
+        Option(metavar="REC.h5", help="Axial recording of an inclined plate; may be given again."),
     ] = None,
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
@@ -46,7 +47,7 @@ def command(
     places: inputs.Places = 5,
     press: Annotated[str | None, inputs.press_option("0.5mm")] = None,
     tilt: Annotated[
-        str | None, typer.Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {inputs.TILT}.")
+        str | None, Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {inputs.TILT}.")
     ] = None,
     settle: inputs.Settle = None,
     as_json: options.Json = False,
@@ -147,13 +148,13 @@ def _report(output: Path, fit: PrecessionFit, as_json: bool) -> None:
         return f"{values[name]:.{digits}f} +- {errors[name]:.2g}{unit}"
 
     way = "counter-clockwise" if found.direction > 0 else "clockwise"
-    typer.echo(
+    click.echo(
         f"{output}: half-angle {words('tilt', 4, ' deg')}, {way} from {words('phase_offset', 3, ' deg')},"
         f" ellipticity {words('ellipticity', 4)}, pivot at "
         + ", ".join(f"{axis} {words(f'pivot_{axis}', 3, ' mm')}" for axis in "xyz")
     )
     for note in notes:
-        typer.echo(f"note: {note}", err=True)
+        click.echo(f"note: {note}", err=True)
 
 
 def warnings(found: Precession) -> Iterator[str]:

@@ -6,10 +6,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
@@ -28,27 +29,27 @@ class PatternName(StrEnum):
 def command(
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="CAL.h5", help="Calibration to add to; it has references."),
+        Option("--output", "-o", metavar="CAL.h5", help="Calibration to add to; it has references."),
     ],
     ball: options.Ball,
     presses: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="REC.h5...", help="Axial recordings of one ball at five places or more."),
+        Argument(metavar="REC.h5...", help="Axial recordings of one ball at five places or more."),
     ] = None,
     pattern: Annotated[
-        PatternName, typer.Option(help="Whether the wall's brightness changes with its height.")
+        PatternName, Option(help="Whether the wall's brightness changes with its height.")
     ] = PatternName.graded,
     body_radius: Annotated[
-        str, typer.Option(metavar="LENGTH", help="Nominal radius of the body, right within a tenth.")
+        str, Option(metavar="LENGTH", help="Nominal radius of the body, right within a tenth.")
     ] = "17.5mm",
     body_height: Annotated[
-        str, typer.Option(metavar="LENGTH", help="Nominal height of the wall, right within a tenth.")
+        str, Option(metavar="LENGTH", help="Nominal height of the wall, right within a tenth.")
     ] = "40mm",
     tilt: options.Tilt = None,
     phase_step: options.PhaseStep = None,
     pixel_size: options.PixelSize = None,
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, typer.Option(min=5, help="With --rig: of the ball.")] = 9,
+    places: Annotated[int, Option(min=5, help="With --rig: of the ball.")] = 9,
     press: Annotated[str | None, inputs.press_option("0.4mm for 4 mm")] = None,
     settle: inputs.Settle = None,
     as_json: options.Json = False,
@@ -95,7 +96,7 @@ def _precession(known: Calibration, source: Source) -> Precession | None:
     size = source.header.pixel_size
     if known.precession is None or size is None or not list(outdated(known, size, ["precession"])):
         return known.precession
-    typer.echo(
+    click.echo(
         "the calibrated tilt is left out: it was made with another pixel size; learn it again", err=True
     )
     return None
@@ -112,7 +113,7 @@ def _report(output: Path, response: WallResponse, as_json: bool) -> None:
     middle, worst = (float(np.median(sigma)), float(sigma.max())) if sigma.size else (np.nan, np.nan)
     most = float(np.degrees(response.error))
     if middle > _DOUBTFUL:
-        typer.echo(
+        click.echo(
             f"depth not determined, zenith known within {middle:.2g} deg only: press less, so that the touch"
             " ends within what the wall shows",
             err=True,
@@ -125,7 +126,7 @@ def _report(output: Path, response: WallResponse, as_json: bool) -> None:
         degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "left_on_balls": most}
         print_json({"output": str(output), "pattern": response.pattern, "found": found, "degrees": degrees})
         return
-    typer.echo(
+    click.echo(
         f"{output}: wall {response.radius:.2f} +- {errors['radius']:.2g} mm from the axis and"
         f" {response.rim:.1f} +- {errors['rim']:.2g} mm high (noise alone), axis at {response.axis[0]:.2f},"
         f" {response.axis[1]:.2f} mm; zenith known within"

@@ -5,17 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.demo import presses, rotation, shapes
+from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for all files.")
-    ] = Path("demo"),
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for all files.")] = Path(
+        "demo"
+    ),
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
@@ -36,9 +37,9 @@ def command(
         print_json({**pressed, **turned, **shaped})
         return
     presses.print_outcomes(pressed)
-    typer.echo()
+    click.echo()
     rotation.print_outcomes(turned)
-    typer.echo()
+    click.echo()
     shapes.print_outcomes(shaped)
     first = presses.EXPERIMENTS[0].name
-    typer.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")
+    click.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

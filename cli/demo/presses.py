@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import typer
+import click
 
 from mirrorskin.cli.output import print_table
 
@@ -114,7 +114,7 @@ def record(twin: hw.Twin, path: Path, doing: str) -> io.Truth:
 def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:
     """Print the errors of all presses, and what the columns are."""
     print_table(_HEAD, [row for name, by_sensor in outcomes.items() for row in _rows(name, by_sensor)])
-    typer.echo(_LEGEND)
+    click.echo(_LEGEND)
 
 
 def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 from mirrorskin.cli.demo.presses import lab_camera, record
 from mirrorskin.cli.output import print_table
@@ -109,7 +109,7 @@ def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:
         for method, score in by_method.items()
     ]
     print_table(_HEAD, rows)
-    typer.echo(_LEGEND)
+    click.echo(_LEGEND)
 
 
 def _cells(score: Score) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 from mirrorskin.cli.output import print_table
 
@@ -101,7 +101,7 @@ def print_outcomes(outcomes: Outcomes) -> None:
         _HEAD,
         [[name, way, *_cells(shape)] for name, by_way in outcomes.items() for way, shape in by_way.items()],
     )
-    typer.echo(_LEGEND)
+    click.echo(_LEGEND)
 
 
 def _cells(shape: Shape) -> list[str]:

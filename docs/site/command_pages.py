@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-import typer
+import click
 
 from mirrorskin.cli.main import app
 
@@ -20,8 +20,8 @@ _PAGE = re.compile(r"docs/(\w+\.md)")
 @functools.cache
 def pages() -> dict[str, str]:
     """Return a page for each command, by its name in the site; groups have theirs on one page."""
-    whole: Any = typer.main.get_command(app)
-    context = typer.Context(whole, info_name=_PROGRAM)
+    whole: Any = app
+    context = click.Context(whole, info_name=_PROGRAM)
     commands = {name: whole.get_command(context, name) for name in whole.list_commands(context)}
     rows = [
         f"| [`{_PROGRAM} {name}`]({name}.md) | {_linked(_first(command))} |"
@@ -55,7 +55,7 @@ def _text(command: Any) -> str:
 
 def _page(command: Any, above: Any, name: str, level: int) -> Iterator[str]:
     """Return the lines on a command, and on those below it."""
-    context = typer.Context(command, info_name=name, parent=above)
+    context = click.Context(command, info_name=name, parent=above)
     yield f"{'#' * level} {context.command_path}\n"
     yield f"{_linked(_text(command))}\n"
     is_group = hasattr(command, "list_commands")

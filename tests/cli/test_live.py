@@ -8,12 +8,12 @@ import time
 
 import numpy as np
 import pytest
-import typer
+from click.testing import CliRunner
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
-from typer.testing import CliRunner
 
 from mirrorskin import io
 from mirrorskin.cli import live
+from mirrorskin.cli.groups import make_command
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.engine.streaming import push_block
@@ -26,8 +26,7 @@ OFFSET, GAIN = 20.0, 200.0
 PRESS = ["vertical", "--stop", "1mm", "--speed", "2mm/s"]
 TURN = ["axial", "--press", "1mm", "--tilt", "2.5deg", "--rate", "2.5", "--turns", "2"]
 
-app = typer.Typer()
-app.command()(live.command)
+app = make_command(None, live.command)
 
 
 def slanted(shape=SHAPE):

@@ -94,11 +94,9 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
 
 
 def test_every_key_is_an_option_of_reconstruct_too(settings):
-    import typer
-
     from mirrorskin.cli.main import app
 
-    command = typer.main.get_command(app).commands["reconstruct"]
+    command = app.commands["reconstruct"]
     options = {name.removeprefix("--") for one in command.params for name in (*one.opts, *one.secondary_opts)}
     assert set(re.findall(r"^([a-z-]+) =", EVERYTHING, re.MULTILINE)) <= options
 

@@ -3,17 +3,16 @@
 import cv2
 import numpy as np
 import pytest
-import typer
+from click.testing import CliRunner
 from shown import ball
-from typer.testing import CliRunner
 
 from mirrorskin import io
 from mirrorskin.cli import view as command
+from mirrorskin.cli.groups import make_command
 from mirrorskin.view import canvas, space, viewer
 from mirrorskin.view.result.figures import MAPS
 
-app = typer.Typer()
-app.command()(command.command)
+app = make_command(None, command.command)
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import re
 import sys
 
 import pytest
-import typer
 from calibrations import a_calibration
 from commands import run
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import show
+from mirrorskin.cli.groups import make_command
 
 
 class Terminal(texts.StringIO):
@@ -49,9 +49,7 @@ def test_a_terminal_gets_a_table_without_repeated_words(saved, monkeypatch):
     terminal = Terminal()
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr(sys, "stdout", terminal)
-    app = typer.Typer()
-    app.command()(show.command)
-    app([str(saved)], standalone_mode=False)
+    make_command(None, show.command)([str(saved)], standalone_mode=False)
     shown = re.sub("\x1b.*?m", "", terminal.getvalue())
     lines = [line.split() for line in shown.splitlines()]
     assert ["tilt", "half-angle", "2.2918", "0.0057", "deg"] in lines
