@@ -12,7 +12,7 @@ from mirrorskin import engine
 from mirrorskin.io import InputError
 from mirrorskin.kernels import memory
 
-SHAPE = 16, 64, 64
+SHAPE = 16, 61, 67
 TRAVEL, PHASE = 0.1 * np.arange(16), 2 * np.pi * np.arange(16) / 16
 WORK = {
     "find_onset": lambda frames, device: engine.find_onset(frames, TRAVEL, device=device, **REFERENCES),
