@@ -19,9 +19,10 @@ class Estimator(Protocol):
     """Takes frames as they come, and returns maps of those so far.
 
     ``push(frames, travel=...)`` takes the next frames of a press, ``push(frames, phase=...)`` those of a
-    rotation: frames (n, H, W) as a plain array and one position a frame, mm or radians, as a keyword. The
-    keyword ``lent=True`` says that nobody writes to the frames' memory as long as it is referred to, so that
-    a device may read them where they lie. Frames that were read into ``room`` are not copied either. The same
+    rotation: frames (n, H, W) as a plain array and one position a frame, mm or radians, as a keyword. A
+    device that shares the host's memory reads them where they lie, and ``push`` waits until it has; the
+    keyword ``lent=True`` says that nobody writes to their memory as long as it is referred to, so it need not
+    wait. Only what kernels cannot read in place is copied, such as frames that are not in C order. The same
     frames give the same result, bit by bit, however they are cut into pushes.
 
     ``result()`` returns the maps of the frames so far as plain arrays in a data class. It changes nothing: it

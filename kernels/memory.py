@@ -40,9 +40,9 @@ def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
     It holds zeros, or anything. MemoryError: there is none.
     """
     if nbytes < _LEAST:
-        raw = np.zeros(nbytes + PAGE, np.uint8)
-        start = -raw.ctypes.data % PAGE
-        return raw[start : start + nbytes]
+        small = np.zeros(nbytes + PAGE, np.uint8)
+        start = -small.ctypes.data % PAGE
+        return small[start : start + nbytes]
     with _lock:
         most = nbytes + nbytes // 8 + PAGE
         fitting = [place for place, raw in enumerate(_kept) if nbytes + PAGE <= len(raw) <= most]
