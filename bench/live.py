@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mirrorskin.bench.files import shared_memory
 from mirrorskin.bench.harness import Case, Cases, Target
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
-from mirrorskin.engine.live import SHOWN, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
+from mirrorskin.engine.live import RAISED, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
@@ -210,7 +210,7 @@ def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
 
 def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
     """Judge updates, how late they were, and how near the heights are to those that fit best."""
-    rate, shown = ran.status.updates / ran.seconds, ran.status.latency[SHOWN]
+    rate, shown = ran.status.updates / ran.seconds, ran.status.latency[RAISED]
     median, p99 = 1e3 * shown.median, 1e3 * shown.p99
     what = "frame in to height out"
     return (

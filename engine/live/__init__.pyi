@@ -1,11 +1,12 @@
 from .loop import LATENCY, LiveEstimator, Loop
 from .press import LivePress
 from .rotation import LiveRotation, choose_window
-from .status import PUSHED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
+from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
 
 __all__ = [
     "LATENCY",
     "PUSHED",
+    "RAISED",
     "SHOWN",
     "STAGES",
     "UPDATED",

@@ -11,7 +11,17 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.live.status import PUSHED, SHOWN, UPDATED, WAITED, Maps, Monitor, Status, Update
+from mirrorskin.engine.live.status import (
+    PUSHED,
+    RAISED,
+    SHOWN,
+    UPDATED,
+    WAITED,
+    Maps,
+    Monitor,
+    Status,
+    Update,
+)
 from mirrorskin.engine.streaming import Estimator, push_block
 from mirrorskin.io import Block, InputError, LiveSource
 
@@ -22,6 +32,7 @@ OnUpdate = Callable[[Update, Status], None]
 Mark = Callable[[int, NDArray[np.bool_]], None]
 
 _INTERVALS = 32  # between frames, from which the next one's time is expected
+_PATIENCE = 0.01  # seconds that an update waits at least for maps that take long
 _MARGIN = 0.001  # seconds before that, in which nothing is begun any more
 
 
@@ -158,7 +169,7 @@ class Loop:
             return
         begun = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
-        maps = self._estimator.maps(max(0.0, self._idle()))
+        maps = self._estimator.maps(max(_PATIENCE, self._idle()))
         update = Update(frames, at, self._source.motion, position, picture.copy(), **maps)
         done = self._source.now()
         self._updated, self._pending = begun, False
@@ -166,8 +177,10 @@ class Loop:
         self._monitor.time(UPDATED, done - begun)
         self._arrived.append(self._taken)
         if update.height is not None or update.normals is not None:
+            self._monitor.time(SHOWN, done - self._taken)
+        if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)
-            self._monitor.time(SHOWN, done - self._arrived[-1 - lag])
+            self._monitor.time(RAISED, done - self._arrived[-1 - lag])
         if self._on_update is not None:
             self._on_update(update, self._monitor.status())
 

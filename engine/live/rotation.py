@@ -73,7 +73,7 @@ class LiveRotation:
     stands is then estimated from the heights so far, now and then.
 
     Heights follow the normals in a thread of their own, by one step of a solver for each update for which
-    there is time: their error stays near what changes from one to the next, and they never hold up normals.
+    there is time: their error stays near what changes from one to the next, and normals wait for none.
     Edges are drawn in the time that is left. Without a zenith gain there are correlations only, and without
     a pixel size no heights.
 

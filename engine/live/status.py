@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Motion
 
-WAITED, PUSHED, UPDATED, SHOWN = "waited", "push", "update", "frame to map"
-STAGES = (WAITED, PUSHED, UPDATED, SHOWN)
-"""What is timed: a frame from its arrival until it was taken, a push of frames, an update, and from a
-frame's arrival until the maps of which it is the newest, heights last."""
+WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
+STAGES = (WAITED, PUSHED, UPDATED, SHOWN, RAISED)
+"""What is timed: a frame from its arrival until it was taken, a push of frames, an update, and from the
+newest frame's arrival until the maps that it is in; of heights, which may be of an earlier one, from that."""
 
 _KEPT = 4096  # times of a stage
 _LATELY = 1.0  # seconds over which a rate is counted

@@ -5,7 +5,7 @@ import pytest
 from live_frames import Clock, paced, phases, turn_frames, turn_header
 
 from mirrorskin.bench.live import Ran, judge_press, judge_rotation
-from mirrorskin.engine.live import SHOWN, Latency, Status, Update
+from mirrorskin.engine.live import RAISED, Latency, Status, Update
 
 SHAPE = (20, 5, 7)
 
@@ -14,7 +14,7 @@ def ran(**status):
     counts = {"frames": 600, "used": 600, "updates": 600, **status}
     picture = np.zeros((2, 2), np.uint8)
     update = Update(600, 1.0, "axial", 0.0, picture)
-    return Ran(Status(**counts, latency={SHOWN: Latency(0.014, 0.029)}), 10.0, update, 0.5)
+    return Ran(Status(**counts, latency={RAISED: Latency(0.014, 0.029)}), 10.0, update, 0.5)
 
 
 def test_targets_are_judged_by_what_was_counted():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from live_frames import Clock, paced, turn_header
 
-from mirrorskin.engine.live import PUSHED, SHOWN, UPDATED, WAITED, Loop
+from mirrorskin.engine.live import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Loop
 from mirrorskin.engine.live.status import Monitor
 from mirrorskin.io import InputError
 
@@ -63,6 +63,7 @@ def test_a_quick_estimator_gets_each_frame_at_once_and_updates_each_time():
     assert status.latency[PUSHED].p99 == pytest.approx(0.001)
     assert status.latency[UPDATED].p99 == pytest.approx(0.002)
     assert status.latency[SHOWN].median == pytest.approx(0.003)
+    assert status.latency[RAISED].median == pytest.approx(0.003)
 
 
 def test_a_slow_one_gets_all_that_waited_together():
