@@ -81,8 +81,7 @@ def integrate(
     bilateral_sharpness : float
         How sharply these choose a side, 1/pixel^2: k of Cao et al., Bilateral normal integration, 2022.
     sigma : bool
-        Whether to estimate the standard deviation of the heights; this takes as long as 80 low-accuracy
-        solutions.
+        Whether to find the standard deviation of the heights, in about the time of the heights themselves.
     initial_heights : array_like, (H, W), optional
         Heights to begin with, NaN where there is none.
     tolerance : float or None
