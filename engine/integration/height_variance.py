@@ -8,14 +8,18 @@ its spacing. So it is found
 - on the first of the multigrid's levels that has at most `COARSE` nodes a side, exactly: the diagonal of the
   inverse of a block tridiagonal matrix, line by line (the recursive Green's function). What hangs together
   without a known height has its mean weight 0.
-- from there on down, level by level, as what coarse nodes have, prolonged, and a local part. With d one over
-  the diagonal of A, w the weights of a node's links, j their other ends, and r = d sum w^2 d_j the
-  probability that a walk along links is back after two steps, that is ::
+- from there on down, level by level, as what coarse nodes have, prolonged, and a local part. With w the
+  weights of a node's links, scaled so that those along x weigh as much on average as those along y, d one
+  over their sum and that of a known height, j the links' other ends, r = d sum w^2 d_j the probability that a
+  walk along links is back after two steps, and o how uneven the axes were, that is ::
 
-      d (c0 + c1 r + c2 d sum w r_j) + d sum w d_j (c3 + c4 r_j).
+      d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j).
 
   The numbers c are fitted to exact covariances; c0 is such that a plane has what it must. On the finest level
   they hold what the averages along links take out.
+
+Levels for uneven weights join links that are too weak for a solver's: weights differ along x and y as a rule,
+and that breaks no surface.
 
 A full rectangle with even weights has cosine modes k, l that know nothing of each other: with m = 4 sin^2(pi
 k / 2n) along each axis, and t the average of a link's slope as it acts on a mode ::
@@ -25,7 +29,12 @@ k / 2n) along each axis, and t the average of a link's slope as it acts on a mod
 u and v the modes of unit norm; of (u_k v_l)^2 the sum is a cosine transform again.
 
 Where weights are relative, all slopes are as noisy as they fit worse than noise of variance 1 would: that
-would leave `_share_left` of each loop of links.
+leaves a share of each loop of links (`expected_misfit`).
+
+Exact variances over these, of pictures of 64 x 64 pixels, are 0.98 to 1.00 in the mean, and within 1.0 +- 0.1
+for all of a rectangle's pixels, and all but 1 % of a disc's, 3 % of an annulus', 3 % around cuts, 2 % where
+heights are known on one side. Where a fifth of the pixels are missing at random, the mean is 0.91, 40 % are
+off by more than a tenth and 5 % by more than a fifth. docs/method/heights.md has the table.
 """
 
 from __future__ import annotations
