@@ -181,22 +181,23 @@ def fuse_sources(
     assert heights.height_sigma is not None
     if not np.isfinite(heights.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
-    onset, known = PressHeights.of(heights.height, heights.height_sigma), heights.height
+    onset = PressHeights.of(heights.height, heights.height_sigma)
+    before = fill_with_nearest(heights.height)
     solver, passes = FusionSolver(onset, pixel_size, robust, opened), _passes(axial, register)
     for number in range(passes):
         found = estimate_rotation(
             axial,
             **rotation,
-            heights=fill_with_nearest(known) if register else None,
+            heights=before if register else None,
             progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
             **common,
         )
         # The first of several surfaces is hardly ever the last.
         surface = solver.surface(_slopes_of(found), sigma=number > 0 or passes == 1)
-        before, known = fill_with_nearest(known), surface.height
-        moved = _moved(before, known, found.normals.tilt, pixel_size)
+        moved = _moved(before, surface.height, found.normals.tilt, pixel_size)
         if moved <= _STILL:
             break
+        before = fill_with_nearest(surface.height)
     if surface.sigma is None:
         surface = solver.surface(_slopes_of(found))
     surface = solver.filled(surface)

@@ -34,6 +34,7 @@ _SEVERAL = 6.0  # half intervals that heights go over, for their errors to be sp
 _NEARLY_ALL = 0.9  # of all heights: the quantile that shows how much of their intervals errors use
 _LEAST_USED = 0.5
 _ITERATIONS = 5  # of where the intervals lift a component
+_SETTLED = 1e-3  # of half an interval, that it may still move
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +191,10 @@ def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tup
         spread = estimate_interval_errors(middle - at, half)
         inside = interval_evidence(at, middle, half, spread)
         firm = np.bincount(label, inside.weight, size.size)
-        lift += np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
+        move = np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
+        lift += move
+        if np.max(np.abs(move)) < _SETTLED * float(np.median(half)):
+            break
     weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
     weight[has_both[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
     near = inside.weight > 0

@@ -1,4 +1,4 @@
-"""Maps without gaps: each pixel without a number takes that of the nearest one with it."""
+"""Maps without gaps: each pixel without a number takes that of about the nearest one with it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from numpy.typing import NDArray
 
 
 def fill_with_nearest(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map, (H, W), whose NaN are replaced by the nearest number."""
-    from scipy import ndimage
+    """Return a map, (H, W), whose NaN are replaced by the nearest number, but for 2 % of distance."""
+    import cv2
 
-    nearest = ndimage.distance_transform_edt(
-        ~np.isfinite(values), return_distances=False, return_indices=True
-    )
-    return np.asarray(values[tuple(nearest)])
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    gaps = (~known).view(np.uint8)
+    _, label = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    numbers = np.full(label.max() + 1, np.nan, values.dtype)
+    numbers[label[known]] = values[known]
+    return np.asarray(numbers[label])
