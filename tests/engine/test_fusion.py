@@ -18,13 +18,6 @@ NAN = np.float32(np.nan)
 RADIUS = 5.0
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    """Tell sigma from a few draws of noise, which is enough to hold it against errors, and much faster."""
-    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.DRAWS", 6)
-    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.WAVES", 4)
-
-
 def press(shape, pixel, step=0.1, depth=3.0, **changes):
     """As in Figure 5 of the paper: on a ball of 10 mm, in steps of 0.1 mm."""
     travel = step * np.arange(1, round(depth / step) + 1)

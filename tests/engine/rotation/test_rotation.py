@@ -35,13 +35,6 @@ DOME_HEIGHT = np.log(np.cos(np.radians(8) + RATE * np.hypot(X, Y))) / RATE
 FLAT = np.full(SHAPE, -1.0, np.float32)  # as deep as the press: about a pivot in the sheet, nothing moves
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    """Take a few draws of noise for the heights' sigma: enough to hold it against errors, and faster."""
-    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.DRAWS", 6)
-    monkeypatch.setattr("mirrorskin.engine.integration.height_variance.WAVES", 4)
-
-
 @cache
 def frames():
     return rotations.expose(DOME, replace(SETUP, phase=tuple(PHASE)), seed=3)
