@@ -224,6 +224,11 @@ class Device:
             _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
             return None
 
+    def seen(self, name: str, values: NDArray[Any]) -> Operand:
+        """Let kernels read values in place, or else a copy; nobody may write to them meanwhile."""
+        borrowed = self.borrow(name, values) if self.info.shares_memory else None
+        return borrowed or self.given(name, values, values.dtype)
+
     def pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """Make room on the host from where copies to the device are fastest.
 

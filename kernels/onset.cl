@@ -62,14 +62,14 @@ float level_between(const float dark, const float bright, const float share, con
     return level.rest > 0 ? next_up(level.high) : level.high;
 }
 
-// Turns bright and dark, in the planes of `levels`, into level and dark, and finds what is light.
+// Turns bright and dark, maps of step 1 or single numbers of step 0, into level and dark, and finds what is light.
 __kernel void onset_levels(
-    const int pixels, const int stride, const int release, const float share, const float share_rest, OUT levels,
-    __global FRAME *restrict marks)
+    const int pixels, const int stride, const int release, const float share, const float share_rest, MAP brights,
+    const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
     for (int p = base; p < end; ++p) {
-        const float bright = levels[p], dark = levels[stride + p], range = bright - dark;
+        const float bright = brights[p * bright_step], dark = darks[p * dark_step], range = bright - dark;
         const int usable = (range > 0) & (range - range == 0);  // the last: finite
         const float between = level_between(dark, bright, share, share_rest), level = usable ? between : NAN;
 #if BITS == 32

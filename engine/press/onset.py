@@ -200,12 +200,14 @@ class OnsetSearch:
         share = threshold - _ROUNDING
         coarse = float(np.float32(share))
         for band in self._bands:
-            for plane, values in enumerate((bright, dark)):
-                band.write("levels", values[band.rows] if values.ndim else values, plane=plane)
+            known: dict[str, Any] = {}
+            for name, values in (("bright", bright), ("dark", dark)):
+                rows = values[band.rows] if values.ndim else values.reshape(1)
+                known |= {f"{name}s": self.device.seen(name, rows), f"{name}_step": values.ndim // 2}
             with band.resident():
                 self._launch(
                     band, "onset_levels", "levels marks",
-                    release=self._release, share=coarse, share_rest=share - coarse,
+                    release=self._release, share=coarse, share_rest=share - coarse, **known,
                 )  # fmt: skip
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
