@@ -863,14 +863,14 @@ __kernel void multigrid_release(const int rows, const int columns, const int str
 // Standard deviations: the roots of variances, of which each has its least share of one over the diagonal; no number
 // where no flag of `wanted` is.
 __kernel void multigrid_deviation(
-    const int rows, const int columns, const int stride, const float factor, const float least, const int wanted,
+    const int rows, const int columns, const int stride, const float least, const int wanted,
     __global const uchar *restrict flags, MAP inverse, MAP variance, OUT map)
 {
     const int row = get_global_id(0);
     if (row >= rows) return;
     for (int c = 0; c < columns; ++c) {
         const int i = (row + 1) * stride + c;
-        const float found = factor * GREATER(variance[i], least * inverse[i]);
+        const float found = GREATER(variance[i], least * inverse[i]);
         map[row * columns + c] = flags[row * columns + c] & wanted ? sqrt(found) : NAN;
     }
 }

@@ -434,11 +434,11 @@ def multigrid_release(rows: int, columns: int, stride: int, level: Array, map_: 
     map_.reshape(rows, columns)[...] = level[stride : stride * (rows + 1)].reshape(rows, stride)[:, :columns]
 
 
-def multigrid_deviation(rows: int, columns: int, stride: int, factor: float, least: float, wanted: int,
+def multigrid_deviation(rows: int, columns: int, stride: int, least: float, wanted: int,
                         flags: Array, inverse: Array, variance: Array, map_: Array) -> None:  # fmt: skip
     """Write the roots of variances, at least that share of one over the diagonal, where a flag is wanted."""
     part = _picture(0, rows, stride)
-    found = factor * np.maximum(_double(variance, part), least * _double(inverse, part))
+    found = np.maximum(_double(variance, part), least * _double(inverse, part))
     map_.reshape(rows, columns)[...] = np.where(
         flags.reshape(rows, columns) & wanted, np.sqrt(found).reshape(rows, stride)[:, :columns], np.nan
     )

@@ -121,13 +121,14 @@ class SurfaceSolver:
         self._key: tuple[object, ...] | None = None
         self._next_key: tuple[object, ...] | None = None
         self._components: Components | None = None
+        self._deviation: Floats | None = None  # of heights, for slopes of variance 1
         self._plane: Plane | None = None
         self._last: Array | None = None
         self._finishing = 0.0  # seconds that the last picture took after its solution
 
     def reset(self) -> None:
-        """Forget the last picture and its heights."""
-        self._last = self._plane = self._components = self._key = None
+        """Forget the last picture's heights; a next one with the same pixels still has its levels."""
+        self._last = self._plane = None
 
     def solve(
         self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
@@ -153,7 +154,7 @@ class SurfaceSolver:
         same = even and key == self._key and np.array_equal(flags, self._flags)
         self._key, self._next_key = None, key if even else None
         if not same:
-            self._flags = flags.copy()
+            self._flags, self._deviation = flags.copy(), None
         return same
 
     def _find(
@@ -260,22 +261,31 @@ class SurfaceSolver:
         return self._components
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
-        factor, graph = self._graph.scale, self._graph
+        factor = self._graph.scale
         if not inputs.weights_given:
             factor *= self._excess(inputs, relief, components)
         if relief.method == "direct":
             return self._find_rectangle(inputs).deviation(self._screening(inputs)) * np.float32(factor**0.5)
-        solver = self._multigrid
+        deviation = self._deviation if relief.flags is None else None
+        if deviation is None:
+            deviation = self._find_deviation(inputs, relief, components)
+            self._deviation = deviation if self._key else None  # for the next picture of these pixels
+        return deviation * np.float32(factor**0.5)
+
+    def _find_deviation(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
+        solver, graph = self._multigrid, self._graph
         if relief.flags is not None:  # links are as sure as their pixels' weights, or broken
             graph.flags.claim()
             graph.flags.host[...] = relief.flags
             graph.flags.upload()
             solver = Multigrid(graph.links())
         assert solver is not None
-        uneven = inputs.weight_x is not None or max(ends := self._link_weights(inputs)) > _UNEVEN * min(ends)
-        if uneven:
+        ends = self._link_weights(inputs)
+        uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
+        found = solver.deviation(components.labels >= 0, graph.flags, uneven)
+        if uneven and solver is self._multigrid:
             self._key = None
-        return solver.deviation(components.labels >= 0, graph.flags, factor, uneven)
+        return found
 
     def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
         """Return how much worse slopes fit than noise of variance 1 would; NaN where nothing tells."""

@@ -122,10 +122,8 @@ class Multigrid:
         h.copy_picture("release", self._x, self._height)
         return self._height
 
-    def deviation(
-        self, answered: NDArray[np.bool_], flags: Array, factor: float, uneven: bool
-    ) -> NDArray[np.float32]:
-        """Return the heights' standard deviation, (H, W), where the weights are ``factor`` over a variance.
+    def deviation(self, answered: NDArray[np.bool_], flags: Array, uneven: bool) -> NDArray[np.float32]:
+        """Return the heights' standard deviation, (H, W), where the weights are one over a variance.
 
         ``answered`` are the pixels with heights, as ``flags`` say on the device. Of links that are
         ``uneven``, the graph must be built anew before the next solution.
@@ -136,7 +134,7 @@ class Multigrid:
         find_graph_variance(h, answered, self._cycle.rooms)
         finest, found = h.levels[0], self._device.array("sigma", self._links.shape, np.float32)
         sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
-        numbers: dict[str, Any] = {"factor": factor, "least": LEAST, "wanted": SLOPE | KNOWN}
+        numbers: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN}
         maps: dict[str, Any] = {"flags": flags, "inverse": h.inverse, "variance": self._cycle.x, "map": found}
         h.kernel("deviation")(finest.rows, **sizes, **numbers, **maps, moved=13 * finest.nodes)
         deviation: NDArray[np.float32] = found.detach()

@@ -93,7 +93,7 @@ PASSES = {
     "returns_extra": ((1, 7), *TABLE, "inverse", "smoother"),
     "local": (FINE, "right", "down", "inverse", "returns", "c", "evened"),
     "local_extra": ((1, 7), *TABLE, "inverse", "returns", "c", "evened"),
-    "deviation": ((13, 21, 32), 1.5, 0.12, 12, "flags", "inverse", "returns", "map_"),
+    "deviation": ((13, 21, 32), 0.12, 12, "flags", "inverse", "returns", "map_"),
     "admit": ((13, 21, 32), "map_", "level"),
     "release": ((13, 21, 32), "x", "map_"),
 }

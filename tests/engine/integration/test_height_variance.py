@@ -99,3 +99,23 @@ def test_sigma_goes_with_pixel_size_and_noise():
     line = np.ones((1, 9))
     assert np.isnan(engine.integrate(line, line, 1.0).sigma).all()  # no loop, so no misfit
     assert np.isfinite(engine.integrate(line, line, 1.0, slope_weights=4.0).sigma).all()
+
+
+def test_sigma_is_that_of_the_picture_not_of_the_one_before():
+    disc, ring = DISTANCE < 15, (DISTANCE < 15) & (DISTANCE > 7)
+    slopes = np.random.default_rng(2).normal(0, 0.07, (2, *SHAPE))
+    cases = [
+        {"mask": disc, "slope_weights": 1.0},
+        {"mask": ring, "slope_weights": 1.0},
+        {"mask": disc, "slope_weights": 4.0},
+        {"mask": disc, "slope_weights": 4.0, "robust": True},
+        {"mask": disc, "slope_weights": 4.0, "known_heights": LEFT},
+        {"slope_weights": 4.0},
+    ]
+    alone = []
+    for case in cases:
+        engine.integrate(*slopes[:, 1:], 1.0)  # of another shape: nothing is kept
+        alone.append(engine.integrate(*slopes, 1.0, **case).sigma)
+    for case, expected in zip(2 * cases, 2 * alone, strict=True):
+        np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **case).sigma, expected)
+    np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **cases[-1]).sigma, alone[-1])
