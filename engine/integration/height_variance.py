@@ -218,7 +218,7 @@ def invert_diagonal(line: Ints, diagonal: Doubles, a: Ints, b: Ints, weight: Dou
     The inverses of all lines so far make that of the next one; on the way back the rest is added.
     """
     order = np.argsort(line, kind="stable")
-    sizes = np.bincount(line)
+    sizes = np.bincount(line, minlength=1)
     begins = np.cumsum(sizes) - sizes
     place = np.empty(len(line), np.int64)
     place[order] = np.arange(len(line)) - begins[line[order]]
