@@ -35,7 +35,6 @@ Sums = NDArray[np.int32]
 _WINDOW, _QUICK = (64, 480, 640), (16, 48, 64)
 _MAPS = 4 * 4  # bytes of a pixel: mean, cosine, sine and residual
 _ROOM = 128  # bytes of a pixel for what all works keep
-_STATE = 4 * 4  # bytes of a pixel's sums over a window
 _UNITS = 2**17  # of a cosine in a peer's sums
 _TILE = 1024  # pixels of Numba
 _SAMPLES = 65_536  # of a tile of NumPy: more leave the cache, fewer pay for calls
@@ -67,36 +66,36 @@ def run_stack(name: str, shape: tuple[int, int, int], device: Device, quick: boo
 
 
 def run_sliding(device: Device, quick: bool) -> Case:
-    """Time a window of one turn whose frames are pushed one by one, from memory that is not the engine's.
+    """Time a window of one turn that takes in frames one by one, and answers after each, once it is full.
 
-    Bytes are, of each frame, its own, those of the frame that leaves, and those of the window's sums, once
-    read and once written. The limits are those of as many bytes as one frame moves.
+    Bytes are, of each frame, its own, those of the window's frames, and of the four maps. The limits are
+    those of as many bytes as one frame moves.
     """
     shape = _QUICK if quick else _WINDOW
-    a_frame = (2 + 2 * _STATE) * math.prod(shape[1:])
+    a_frame = (1 + STEPS + _MAPS) * math.prod(shape[1:])
     frames = np.empty(shape, np.uint8)
     fill_turns(frames)
     phase = phases(len(frames))
     correlator = Correlator(shape[1:], np.uint8, window=STEPS, device=device)
 
-    def push_all() -> None:
+    def push_all() -> object:
         for k in range(len(frames)):
             correlator.push(frames[k : k + 1], phase=phase[k : k + 1])
-        device.finish()
+            result = correlator.result() if k >= STEPS - 1 else None
+        return result
 
     absent = missing("numba")
-    peer = None if absent else _Window(frames, phase)
-
-    def check(_: dict[str, Any]) -> None:
-        if peer is not None:
-            _check("Numba", peer.wave(), correlator.result())
-
     works: dict[str, Work] = {OURS: push_all}
-    if peer is not None:
-        works["Numba"] = peer.push_all
+    if not absent:
+        works["Numba"] = _Window(frames, phase).push_all
+
+    def check(results: dict[str, Any]) -> None:
+        if not absent:
+            _check("Numba", results["Numba"], results[OURS])
+
     limits, measured = beside_limits(works, a_frame, device, quick, check, first="triad")
     rows = [Row(name, measured[name], len(frames) * a_frame, len(frames)) for name in works]
-    title = f"one new frame into a window of {STEPS}; {' x '.join(map(str, shape))} uint8"
+    title = f"one new frame into a window of {STEPS}, and its maps; {' x '.join(map(str, shape))} uint8"
     return Case("sliding", title, limits + rows, absent)
 
 
@@ -133,23 +132,20 @@ class _Window:
         rows = np.rint(basis(phase) * [1, _UNITS, _UNITS])
         self._rows = np.hstack([rows, np.roll(rows, STEPS, axis=0)]).astype(np.int32)
 
-    def push_all(self) -> None:
-        """Push a whole stack."""
-        slide, sums = _numba_kernels()[1], self._sums.reshape(4, -1)
+    def push_all(self) -> Floats:
+        """Push a whole stack; return the last of the fits that the sums give after each frame."""
+        slide, answer = _numba_kernels()[1:]
+        sums = self._sums.reshape(4, -1)
+        model, rounded = basis(self._phase), self._rows[-STEPS:, :3] / [1, _UNITS, _UNITS]
+        solve, gram = np.linalg.inv(rounded.T @ model) / [1, _UNITS, _UNITS], model.T @ model
         for number, (frame, row) in enumerate(zip(self._frames, self._rows, strict=True)):
             gone = self._ring[number % STEPS]
             slide(sums, frame.reshape(-1), gone.reshape(-1), row)
             gone[:] = frame
-
-    def wave(self) -> Floats:
-        """Return the fit that the sums give."""
-        total, cosine, sine, square = self._sums.astype(np.float64)
-        model, rounded = basis(self._phase), self._rows[-STEPS:, :3] / [1, _UNITS, _UNITS]
-        sums = np.stack([total, cosine / _UNITS, sine / _UNITS])
-        wave = np.tensordot(np.linalg.inv(rounded.T @ model), sums, 1)
-        explained = np.sum(wave * np.tensordot(model.T @ model, wave, 1), axis=0)
-        left = np.maximum(square - explained, 0)
-        return np.stack([*wave, np.sqrt(left / (STEPS - 3))]).astype(np.float32)
+            if number >= STEPS - 1:
+                maps = np.empty(self._sums.shape, np.float32)
+                answer(sums, solve, gram, 1 / (STEPS - 3), maps.reshape(4, -1))
+        return maps
 
 
 def _numpy(frames: Counts, phase: Doubles) -> Floats:
@@ -180,8 +176,8 @@ def _numba(frames: Counts, phase: Doubles) -> Floats:
 
 
 @functools.cache
-def _numba_kernels() -> tuple[Any, Any]:  # noqa: C901  # functions to compile
-    """Compile both: tiles of pixels on all cores, frame by frame so that the inner loops are vector code.
+def _numba_kernels() -> tuple[Any, Any, Any]:  # noqa: C901  # functions to compile
+    """Compile all: tiles of pixels on all cores, frame by frame so that the inner loops are vector code.
 
     What is known of a tile's pixels lies in one array, at distances that are known to the compiler: of many
     arrays it would not know that they do not overlap, and make scalar code.
@@ -260,4 +256,16 @@ def _numba_kernels() -> tuple[Any, Any]:  # noqa: C901  # functions to compile
             mine = sums[0, first:end], sums[1, first:end], sums[2, first:end], sums[3, first:end]
             move(*mine, now[first:end], gone[first:end], rows)
 
-    return numba.njit(parallel=True, **options)(correlate), numba.njit(parallel=True)(slide)
+    def answer(sums, solve, gram, share, maps):  # type: ignore[no-untyped-def]
+        for p in numba.prange(sums.shape[1]):
+            x, y, z = sums[0, p], sums[1, p], sums[2, p]
+            a = solve[0, 0] * x + solve[0, 1] * y + solve[0, 2] * z
+            b = solve[1, 0] * x + solve[1, 1] * y + solve[1, 2] * z
+            c = solve[2, 0] * x + solve[2, 1] * y + solve[2, 2] * z
+            explained = a * a * gram[0, 0] + b * b * gram[1, 1] + c * c * gram[2, 2]
+            explained += 2 * (a * b * gram[0, 1] + a * c * gram[0, 2] + b * c * gram[1, 2])
+            maps[0, p], maps[1, p], maps[2, p] = a, b, c
+            maps[3, p] = math.sqrt(max(sums[3, p] - explained, 0.0) * share)
+
+    compiled = [numba.njit(parallel=True, **options)(kernel) for kernel in (correlate, answer)]
+    return compiled[0], numba.njit(parallel=True)(slide), compiled[1]
