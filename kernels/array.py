@@ -90,7 +90,9 @@ class Array:
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
         if self._shared and self._mapped is None and self._buffer is not None:
-            self._mapped = _map(self._device.queue, self._buffer, self.host, _READ_WRITE).base
+            if self.last_use is not None:
+                self.last_use.wait()
+            self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
 
     def upload(self, rows: int | None = None) -> None:
         """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
@@ -134,7 +136,8 @@ class Array:
     def download(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote, in the host's array."""
         if self._shared:
-            self.claim()
+            if self._mapped is None and self._buffer is not None:
+                self._mapped = _map(self._device.queue, self._buffer, self.host, _READ_WRITE).base
         else:
             event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
