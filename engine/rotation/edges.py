@@ -102,7 +102,7 @@ class EdgeDrawing:
         self._maps = {name: device.array(name, *kind) for name, kind in kinds.items()}
         for array in self._maps.values():
             array.upload()
-        self._maps["doubt"] = device.given("doubt", np.ones(shape), np.uint8)
+        self._maps["doubt"] = device.given("doubt", np.ones(shape, np.uint8), np.uint8)
         self._pairs = {chosen: self._place(chosen) for chosen in (NEAR, FINE, COARSE)}
 
     def take(
