@@ -365,7 +365,7 @@ class Kernel:
         self._signature = signature
         self.arguments = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self._group = _group_of(kernel, *device.context.devices, device.layout.group)
+        self._group = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
         self,
