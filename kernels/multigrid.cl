@@ -309,7 +309,7 @@ __kernel void multigrid_coarsen(
         const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
         const reals from_b = ODD(right + I), from_d = ODD(right + K), under_c = EVEN(down + K), under_d = ODD(down + K);
         const reals next_ab = EVEN(right + I + 2), next_cd = EVEN(right + K + 2), next_ac = EVEN(down + I + 2);
-        const int M = K + stride;
+        const int M = row + 1 < coarse_rows ? K + stride : K;  // below the last row the coarse level may begin
         const reals low_ab = EVEN(right + M), low_ac = EVEN(down + M), low_bd = ODD(down + M);
         const reals live = COUNT(a > 0) + COUNT(b > 0) + COUNT(c > 0) + COUNT(d > 0);
         const reals joined = STRONG(ab, a, b) + STRONG(cd, c, d) + STRONG(ac, a, c) + STRONG(bd, b, d);
