@@ -18,7 +18,7 @@ anchors a. A V-cycle solves it nearly:
 - *coarsen*: a coarse link's weight is the sum over those that it stands for of 1 / (1/w + r + s), where r and
   s are the ways from the link to the middles of both blocks: 1 / (w + b), half a link, if one of weight b
   goes on behind it; else 1 / c, where the block's other row or column has a link c, and a link leads there;
-  else 1 / 2 w. Of links that are all alike that is the mean of two.
+  else 1 / 2 w (0 for parts of split blocks). Of links that are all alike that is the mean of two.
 
 All arrays are flat. A level's picture of `rows` by `stride` nodes lies at `base`, with a row of none before
 and behind it. Arguments are those of the kernels; of functions for extra nodes, rows `at` to `at` + `count`

@@ -253,6 +253,7 @@ class _Parts:
         strength: float,
     ) -> None:
         self._fine, self._extra, self._level, self._lookup = fine, extra, coarse, lookup
+        self._blocks = blocks
         self.links = Pairs.join(fine.blocks(coarse, blocks), extra.links)
         self.nodes = lookup.distinct(np.concatenate([self.links.a, self.links.b]))
         lookup.take(self.nodes)
@@ -343,12 +344,16 @@ class _Parts:
         behind = sums(axis + a, inner.weight) + sums(axis + b, inner.weight)
         other = count - axis
         beside = sums(other + a, behind[other + b]) + sums(other + b, behind[other + a])
+        a, b, axis = find(links)
+        whole = ~_marks(self._level, self._blocks)[self._block_of(self._lookup.nodes) - self._level.base]
         with np.errstate(divide="ignore"):
             resistance = 1 / links.weight
-            a, b, axis = find(links)
-            for end in (axis + a, axis + b):
-                around = np.where(beside[end] > 0, 1 / beside[end], 0.5 / links.weight)
-                resistance += np.where(behind[end] > 0, 1 / (links.weight + behind[end]), around)
+            for node in (a, b):
+                on, aside = behind[axis + node], beside[axis + node]
+                ends = np.where(
+                    whole[node], 0.5 / links.weight, 0
+                )  # a part of a split block ends with the link
+                resistance += np.where(on > 0, 1 / (links.weight + on), np.where(aside > 0, 1 / aside, ends))
         self._lookup.take(self.nodes)
         return np.asarray(1 / resistance, np.float32)
 
