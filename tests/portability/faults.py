@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import pyopencl as cl
 
+from mirrorskin.kernels import embedded
+
 ITEMS = 16
 SOUND = "x[i] = i;"
 NEVER_SET = "a value never set"
@@ -37,6 +39,7 @@ def build(context: cl.Context, body: str) -> cl.Kernel:
 
 
 def main() -> None:
+    embedded.prepare()
     (device,) = [device for platform in cl.get_platforms() for device in platform.get_devices()]
     context = cl.Context([device])
     queue = cl.CommandQueue(context)
