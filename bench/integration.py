@@ -190,7 +190,7 @@ def _calls(slopes: Floats, mask: Flags | None, edges: Flags | None, device: Devi
     dz_dx, dz_dy = slopes
 
     def call(sigma: bool) -> Floats:
-        known = {"mask": mask, "edges": edges, "sigma": sigma, "device": device}
+        known: dict[str, Any] = {"mask": mask, "edges": edges, "sigma": sigma, "device": device}
         return engine.integrate(dz_dx, dz_dy, PIXEL, **known).height
 
     default = partial(call, True)
