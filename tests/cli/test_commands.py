@@ -100,7 +100,7 @@ def test_options_reach_the_engine(folder):
     process = told["process"]
     assert (process["threshold"], process["hold"], process["subframe"]) == (0.3, 1, False)
     assert told["summary"]["answered"] > 1000
-    assert {record["name"] for record in told["profile"]} >= {"onset_scan", "onset_heights"}
+    assert {record["name"] for record in told["profile"]} >= {"onset_scan"}
     result = io.open_result(folder / "o.h5")
     heights = result.height[np.isfinite(result.height)]
     assert set(np.unique(heights)) <= set((-0.1 * np.arange(1, 31)).astype(np.float32))
