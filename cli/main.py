@@ -128,12 +128,7 @@ def main() -> None:
     """Run the command line."""
     words = sys.argv[1:] or ["--help"]
     with _ended_by_signals(), _OneLine():
-        try:
-            with app.make_context("mirrorskin", words) as context:
-                app.invoke(context)
-        except click.exceptions.Exit as ended:
-            sys.exit(ended.exit_code)
-        sys.exit(0)
+        sys.exit(app.main(words, "mirrorskin", standalone_mode=False) or 0)
 
 
 if __name__ == "__main__":
