@@ -6,6 +6,7 @@ must be quick.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import traceback
@@ -128,7 +129,16 @@ def main() -> None:
     """Run the command line."""
     words = sys.argv[1:] or ["--help"]
     with _ended_by_signals(), _OneLine():
-        sys.exit(app.main(words, "mirrorskin", standalone_mode=False) or 0)
+        try:
+            with app.make_context("mirrorskin", words) as context:
+                app.invoke(context)
+            sys.stdout.flush()
+        except click.exceptions.Exit as ended:
+            sys.exit(ended.exit_code)
+        except BrokenPipeError:  # nobody reads on; Python would say so once more when it ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(1)
+        sys.exit(0)
 
 
 if __name__ == "__main__":

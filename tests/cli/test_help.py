@@ -115,3 +115,11 @@ def test_a_group_alone_shows_its_help_as_it_is(group):
     ended = run(group)
     assert ended.code == 2
     assert ended.said == run(group, "--help").out
+
+
+def test_a_closed_pipe_ends_a_command_without_a_traceback():
+    command = [sys.executable, "-m", "mirrorskin.cli.main", "bench", "--list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait() == 1
