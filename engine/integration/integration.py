@@ -23,7 +23,7 @@ from mirrorskin.kernels.device import Device, open_device
 
 # The memory of the last call, some 100 bytes a pixel, stays with the device for the next one: making it takes
 # as long as a solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
-_KEPT = 2**21
+_KEPT = 2**23
 
 
 def integrate(
