@@ -43,6 +43,7 @@ from mirrorskin.engine import (
     Integrator,
     NormalEstimator,
     OnsetSearch,
+    correlate,
     find_edges,
     integrate,
 )
@@ -160,24 +161,17 @@ def _changes(device: Device, shape: Shape, kind: str, count: int, *, known: bool
 
 
 def _correlation(device: Device, shape: Shape, kind: str, count: int) -> dict[str, Job]:
-    """Return the sums over a stack, and those over a window of one turn that moves on by as much."""
-    dtype, pixels = np.dtype(kind), math.prod(shape)
-    limit = 2 * STEPS * pixels * dtype.itemsize
-    window = Correlator(shape, dtype, window=STEPS, device=device, memory_limit=limit)
-    room = window.room[:STEPS]
-    fill_turns(room)
-
-    def slide() -> None:
-        window.push(room, phase=phases(len(room)))
-        device.finish()
-
-    whole = dtype.kind == "u"  # floats are only kept here
-    state = 8 * {1: 4, 2: 8}.get(dtype.itemsize, 0) * pixels
-    moved = len(room) * pixels * (3 if whole else 2) * dtype.itemsize + state
-    operations = 2 * _WAVE * len(room) * pixels if whole else 0
+    """Return the sums over a stack, and the wave of one turn, which is summed and solved at once."""
+    dtype = np.dtype(kind)
+    turn = np.empty((STEPS, *shape), dtype)
+    fill_turns(turn)
+    moved = turn.nbytes + 16 * math.prod(shape)
+    work = partial(correlate, turn, phases(STEPS), device=device)
     return {
-        "correlation_add" if whole else "correlation_sum": correlation_job(device, shape, kind, count),
-        "correlation_slide" if whole else "correlation_keep": Job(slide, moved, len(room), operations),
+        "correlation_add" if dtype.kind == "u" else "correlation_sum": correlation_job(
+            device, shape, kind, count
+        ),
+        "correlation_window": Job(work, moved, STEPS, _WAVE * turn.size),
     }
 
 
@@ -281,7 +275,11 @@ FAMILIES = {
         140,
     ),
     "sweep-correlation": Family(
-        f"correlation.cl: sums over a stack, and over a window of {STEPS}", _correlation, _TYPES, "read", 140
+        f"correlation.cl: sums over a stack, the wave of {STEPS} frames",
+        _correlation,
+        _TYPES,
+        "read",
+        140,
     ),
     "sweep-normals": Family(f"normals.cl: exact normals of {STEPS} frames", _normals, _TYPES, "triad", 80),
     "sweep-edges": Family("edges.cl: edges of a roof, half of it noisy", _edges, _MAPS_ONLY, "triad", 110),
