@@ -80,6 +80,8 @@ class _OneLine:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, KeyboardInterrupt | click.Abort):
+            # All is said and put away: a second Ctrl-C ends the interpreter without a traceback.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             sys.exit(_INTERRUPTED)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
         code = getattr(error, "exit_code", None)
