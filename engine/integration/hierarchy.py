@@ -321,7 +321,8 @@ def _pseudo_inverse(matrix: NDArray[np.float64], anchor: NDArray[np.floating]) -
     typical = np.bincount(label, np.diagonal(matrix), count) / members
     same = (label[:, np.newaxis] == label) & free[label]
     mean = same / members[label]  # projects on what is free
-    inverse: NDArray[np.float64] = _invert(matrix + typical[label] * mean) - mean / typical[label]
+    inverse: NDArray[np.float64] = np.linalg.inv(matrix + typical[label] * mean)
+    inverse -= mean / typical[label]
     return inverse
 
 
@@ -334,16 +335,3 @@ def _components(matrix: NDArray[np.float64]) -> NDArray[np.intp]:
         least, lower = lower, np.where(linked, lower, len(nodes)).min(axis=1)
         lower = lower[lower]
     return np.unique(lower, return_inverse=True)[1]
-
-
-def _invert(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert a small positive definite matrix; OpenBLAS' threads would wait for each other much longer."""
-    inverse = matrix.copy()
-    for k in range(len(inverse)):
-        pivot = 1 / inverse[k, k]
-        row = inverse[k] * pivot
-        column = inverse[:, k].copy()
-        inverse -= np.multiply.outer(column, row)
-        inverse[k], inverse[:, k] = row, -column * pivot
-        inverse[k, k] = pivot
-    return inverse
