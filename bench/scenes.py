@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -185,17 +186,32 @@ def _angle(zenith: Floats, lean: Floats) -> Floats:
 
 def smooth_slopes(shape: Shape, seed: int = 0) -> Floats:
     """Return slopes dz/dx and dz/dy of a sum of waves, (2, H, W); y runs up the picture."""
+    slopes = np.zeros((2, *shape), np.float32)
+    for phase, _, shares in _waves(shape, seed):
+        wave = np.sin(phase).astype(np.float32)
+        for slope, share in zip(slopes, shares, strict=True):
+            slope += np.float32(share) * wave
+    return slopes
+
+
+def smooth_heights(shape: Shape, seed: int = 0) -> NDArray[np.float64]:
+    """Return the heights of the same sum of waves, (H, W), mm."""
+    heights = np.zeros(shape)
+    for phase, steepness, (along, up) in _waves(shape, seed):
+        heights -= np.hypot(along, up) / steepness * np.cos(phase)
+    return heights
+
+
+def _waves(shape: Shape, seed: int) -> Iterator[tuple[NDArray[np.floating[Any]], float, tuple[float, float]]]:
+    """Give each wave's phase, (H, W), by how much that grows in a mm, and its slopes' amplitudes."""
     generator = np.random.default_rng(seed)
     y, x = (np.arange(n, dtype=np.float32) / max(shape) for n in shape)
-    slopes = np.zeros((2, *shape), np.float32)
     for count in np.geomspace(0.7, _FINEST, _WAVES):
         angle, phase = generator.uniform(0, 2 * np.pi, 2)
         along, up = np.cos(angle), np.sin(angle)
         turns = np.float32(count * along) * x - np.float32(count * up) * y[:, np.newaxis]
-        wave = np.sin(2 * np.pi * turns + phase).astype(np.float32)
-        for slope, share in zip(slopes, (along, up), strict=True):
-            slope += np.float32(share * _SLOPE * np.sqrt(2 / _WAVES)) * wave
-    return slopes
+        size = _SLOPE * np.sqrt(2 / _WAVES)
+        yield 2 * np.pi * turns + phase, 2 * np.pi * count / (max(shape) * PIXEL), (along * size, up * size)
 
 
 def noisy_slopes(shape: Shape, seed: int = 0) -> Floats:
@@ -241,6 +257,27 @@ def large_mask(shape: Shape) -> Flags:
     coarser = -(-shape[0] // _MASK_ROWS)
     small = blob_mask((-(-shape[0] // coarser), -(-shape[1] // coarser)))
     return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def comb(shape: Shape) -> Flags:
+    """Return a comb, one pixel wide: teeth in every other column hang from the first row; 1 inside."""
+    mask = np.zeros(shape, np.uint8)
+    mask[0] = mask[:, ::2] = 1
+    return mask
+
+
+def spiral(shape: Shape) -> Flags:
+    """Return a spiral, one pixel wide, between walls of one pixel; 1 inside."""
+    mask = np.zeros(shape, np.uint8)
+    top, left, bottom, right = 0, 0, shape[0] - 1, shape[1] - 1
+    mask[top, left] = 1
+    while top <= bottom and left <= right:
+        mask[top, max(left - 2, 0) : right + 1] = 1
+        mask[top : bottom + 1, right] = 1
+        mask[bottom, left : right + 1] = bottom - top > 1
+        mask[top + 2 : bottom + 1, left] |= np.uint8(right - left > 1)
+        top, left, bottom, right = top + 2, left + 2, bottom - 2, right - 2
+    return mask
 
 
 def random_cuts(shape: Shape, count: int) -> Flags:
