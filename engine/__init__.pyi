@@ -1,5 +1,6 @@
 from .errors import NotConverged
 from .fusion import fuse
+from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
@@ -14,6 +15,7 @@ from .scoring import Score, score
 from .tiling import free_memory
 
 __all__ = [
+    "Camera",
     "ChangePointSearch",
     "Correlation",
     "Correlator",

@@ -6,10 +6,13 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.surface import SolverOptions, Surface, SurfaceSolver
 from mirrorskin.engine.integration.validation import (
     Inputs,
@@ -17,6 +20,7 @@ from mirrorskin.engine.integration.validation import (
     check_inputs,
     check_map,
     check_pixel_size,
+    logarithm,
 )
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device, open_device
@@ -25,12 +29,16 @@ from mirrorskin.kernels.device import Device, open_device
 # as long as a solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
 _KEPT = 2**23
 
+T = TypeVar("T", bound=np.generic)
+
 
 def integrate(
-    dz_dx: ArrayLike,
-    dz_dy: ArrayLike,
-    pixel_size: ArrayLike,
+    dz_dx: ArrayLike | None = None,
+    dz_dy: ArrayLike | None = None,
+    pixel_size: ArrayLike | None = None,
     *,
+    normals: ArrayLike | None = None,
+    camera: Camera | None = None,
     mask: ArrayLike | None = None,
     slope_weights: ArrayLike | None = None,
     edges: ArrayLike | None = None,
@@ -58,24 +66,35 @@ def integrate(
 
     Parameters
     ----------
-    dz_dx, dz_dy : array_like, (H, W)
+    dz_dx, dz_dy : array_like, (H, W), optional
         Slopes along x (to the right) and along y, which runs up the picture. Not finite where there is none.
-    pixel_size : array_like
-        Millimetres, one number or (x, y).
+    pixel_size : array_like, optional
+        Millimetres, one number or (x, y). Left out with a camera.
+    normals : array_like, (H, W, 3), optional
+        Surface normals in place of slopes: along x, y and z, which runs towards the camera; of any length.
+        Not finite or 0 where there is none; where the surface faces away there is none either.
+    camera : mirrorskin.engine.Camera, optional
+        What saw the normals; by default one so far away that all lines of sight are along z. With a camera,
+        ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical
+        axis, which grow away from the camera. The logarithm of Z is integrated: a pixel to the right it rises
+        by n_x / (n . v) over the focal length, a pixel up by n_y / (n . v), v = (x, y, 1) along the line of
+        sight to the camera. No normal says how large things are: a component without a known depth has the
+        geometric mean 1.
     mask : array_like, (H, W), optional
         0 where no answer is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
-        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where there is none. By default all are
-        equally noisy, and ``sigma`` is estimated from how well they fit together. What is below 1e-4 or above
-        1e3 of their median counts as that; what is 0 in float32, as 0.
+        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where there is none. Slopes that normals
+        make are n_x / n_z, or n_x / (n . v) with a camera. By default all are equally noisy, and ``sigma`` is
+        estimated from how well they fit together. What is below 1e-4 or above 1e3 of their median counts as
+        that; what is 0 in float32, as 0.
     edges : array_like, (H, W), optional
         Not 0 on pixels where the surface breaks: they keep but one link, to that neighbour off the edge whose
         slopes are the most similar, and so never join two sides.
     known_heights : array_like, (H, W), optional
-        Known heights, mm; NaN elsewhere. They need no slope.
+        Known heights, mm, or depths in any unit; NaN elsewhere. They need no slope.
     known_height_weights : array_like, scalar or (H, W), optional
-        Their inverse variances, 1/mm^2; 0 where nothing is known. 1 by default. What is above 1e4 of a link's
-        weight w counts as that.
+        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit); 0 where nothing is known. 1
+        by default. What is above 1e4 of a link's weight w counts as that.
     robust : bool
         Whether to look for discontinuities beyond ``edges``, by bilateral weights.
     bilateral_sharpness : float
@@ -116,19 +135,16 @@ def integrate(
     """
     began = time.perf_counter()
     inputs = check_inputs(
-        dz_dx,
-        dz_dy,
-        pixel_size,
-        mask=mask,
-        slope_weights=slope_weights,
-        edges=edges,
-        known_heights=known_heights,
-        known_height_weights=known_height_weights,
+        *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
+        normals=normals,
+        camera=camera,
+        crop=True,
     )
     check_above_zero(bilateral_sharpness=bilateral_sharpness, tolerance=tolerance, budget=budget)
     start = None
     if initial_heights is not None:
-        start = check_map("initial_heights", initial_heights, inputs.shape).astype(np.float64)
+        start = check_map("initial_heights", initial_heights, inputs.picture)[inputs.box]
+        start = start.astype(np.float64) if camera is None else logarithm("initial_heights", start)
     options = SolverOptions(
         tolerance=tolerance,
         deadline=None if budget is None else began + budget,
@@ -136,7 +152,31 @@ def integrate(
         sigma=sigma,
     )
     with _borrowed_solver(open_device(device), inputs) as solver:
-        return solver.solve(inputs, options, start)
+        surface = solver.solve(inputs, options, start)
+    if camera is not None:
+        depth = np.exp(surface.height)
+        deviation = None if surface.sigma is None else depth * surface.sigma
+        surface = replace(surface, height=depth, sigma=deviation)
+    return surface if inputs.shape == inputs.picture else _put_back(surface, inputs)
+
+
+def _put_back(surface: Surface, inputs: Inputs) -> Surface:
+    """Return the surface of the picture that a box was cut out of."""
+
+    def whole(part: NDArray[T], rest: float) -> NDArray[T]:
+        picture = np.full(inputs.picture, rest, part.dtype)
+        picture[inputs.box] = part
+        return picture
+
+    return replace(
+        surface,
+        height=whole(surface.height, np.nan),
+        sigma=None if surface.sigma is None else whole(surface.sigma, np.nan),
+        component=whole(surface.component, -1),
+        filled=whole(surface.filled, 0),
+        edges=None if surface.edges is None else whole(surface.edges, 0),
+        invalid=surface.invalid + inputs.lost,
+    )
 
 
 @contextmanager
@@ -217,14 +257,7 @@ class Integrator:
         """
         began = time.perf_counter()
         inputs = check_inputs(
-            dz_dx,
-            dz_dy,
-            self._pixel_size,
-            mask=mask,
-            slope_weights=slope_weights,
-            edges=edges,
-            known_heights=known_heights,
-            known_height_weights=known_height_weights,
+            dz_dx, dz_dy, self._pixel_size, mask, slope_weights, edges, known_heights, known_height_weights
         )
         if inputs.shape != self._shape:
             raise InputError(f"slopes have shape {inputs.shape}, not {self._shape}: make another Integrator")

@@ -305,10 +305,13 @@ class _Bound:
         x, y = inputs.dz_dx, inputs.dz_dy
         good = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(good, x, np.float32(0)), np.where(good, y, np.float32(0))
+        steep = (
+            1 / (1 + x * x + y * y) if inputs.steep is None else np.where(good, inputs.steep, np.float32(0))
+        )
         return {
             "slope_x": self._device.given("slope x", x - np.float32(plane[0])),
             "slope_y": self._device.given("slope y", np.float32(plane[1]) - y),
-            "steep": self._device.given("steep", 1 / (1 + x * x + y * y)),
+            "steep": self._device.given("steep", steep),
         }
 
     def _find_confidence(self, inputs: Inputs) -> dict[str, Array]:

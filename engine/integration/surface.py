@@ -44,7 +44,7 @@ class Surface:
     Attributes
     ----------
     height : ndarray, (H, W), float32
-        Millimetres; NaN where there is no answer.
+        Millimetres; with a camera the depth, in the unit of known ones. NaN where there is no answer.
     sigma : ndarray, (H, W), float32, or None
         Expected standard deviation of the height, mm: about the mean of its component where that has no known
         height. NaN where there is no answer, and where the noise of the slopes cannot be estimated.
@@ -52,7 +52,7 @@ class Surface:
         The connected component of a pixel, numbered in reading order of their first pixels; -1 where there is
         no answer.
     offset_unknown : ndarray, (components,), bool
-        Whether a component has no known height: its mean is 0.
+        Whether a component has no known height: its mean is 0, or the geometric mean of its depth 1.
     filled : ndarray, (H, W), uint8
         1 where a height was not measured but filled in.
     edges : ndarray, (H, W), uint8, or None

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.integration.camera import Camera, Slopes, find_slopes
+from mirrorskin.engine.integration.crop import Box, Mask, find_box
 from mirrorskin.io import InputError
 
 Floats = NDArray[np.float32]
@@ -44,6 +47,12 @@ class Inputs:
     known_height_weights: Floats | None = None
     known_height_weight: float = 1.0  # that same weight, else 1
     datum: float = 0.0  # what the known heights are relative to, mm
+    # (H, W), float32: squared cosine of the angle between normal and line of sight; None where the slopes say
+    # it.
+    steep: Floats | None = None
+    picture: tuple[int, int] = (0, 0)  # rows and columns of the picture that they are a box of
+    box: Box = (slice(None), slice(None))  # of the picture that the maps show
+    lost: int = 0  # pixels outside the box that slopes are wanted of
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -53,56 +62,128 @@ class Inputs:
 
 
 def check_inputs(
-    dz_dx: ArrayLike,
-    dz_dy: ArrayLike,
-    pixel_size: ArrayLike,
-    *,
+    dz_dx: ArrayLike | None = None,
+    dz_dy: ArrayLike | None = None,
+    pixel_size: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     slope_weights: ArrayLike | None = None,
     edges: ArrayLike | None = None,
     known_heights: ArrayLike | None = None,
     known_height_weights: ArrayLike | None = None,
+    *,
+    normals: ArrayLike | None = None,
+    camera: Camera | None = None,
+    crop: bool = False,
 ) -> Inputs:
-    """Return the arguments of ``integrate`` as maps of one size; InputError where they cannot be."""
-    x, y = np.asarray(dz_dx), np.asarray(dz_dy)
-    if x.ndim != 2 or x.shape != y.shape or 0 in x.shape:
-        raise InputError(
-            f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W) are needed"
-        )
-    shape, size = x.shape, check_pixel_size(pixel_size)
+    """Return the arguments of ``integrate`` as maps of one size; InputError where they cannot be.
+
+    With a camera, heights are logarithms of depths. ``crop``: only the box of the pixels that may have an
+    answer is kept.
+    """
+    shape, slopes = _find_source(dz_dx, dz_dy, normals, camera)
+    if camera is not None and pixel_size is not None:
+        raise InputError(f"pixel_size {pixel_size!r}: a camera says it; leave one of the two out")
+    size = check_pixel_size(pixel_size) if camera is None else camera.pixel_size
     weight, planes = _split_weights("slope_weights", slope_weights, shape)
     height_weight, height_planes = _split_weights("known_height_weights", known_height_weights, shape, 1)
-    known, datum = None, 0.0
-    if known_heights is not None and height_weight:
-        counted = np.ones(shape, bool) if mask is None else check_map("mask", mask, shape) != 0
-        for plane in height_planes:
-            counted &= plane > 0
-        known, datum = _relative(check_map("known_heights", known_heights, shape), counted)
+    marks, cuts = _marks("mask", mask, shape), _marks("edges", edges, shape)
+    heights = None if known_heights is None else check_map("known_heights", known_heights, shape)
     if not weight:
         planes = [np.zeros(shape, np.float32)]
     typical = _median(planes) if planes else weight
-    planes = [_bounded(plane, typical * LEAST, typical * MOST) for plane in planes]
+    box, lost = (slice(0, shape[0]), slice(0, shape[1])), 0
+    if crop:
+        whole, box = box, find_box(shape, lambda part: _may_answer(slopes(part), part, marks, heights))
+        lost = 0 if box == whole else _count(whole, marks, planes) - _count(box, marks, planes)
+    marks, cuts = (None if one is None else one[box] for one in (marks, cuts))
+    height_planes = [plane[box] for plane in height_planes]
+    known, datum = None, 0.0
+    if heights is not None and height_weight:
+        exact = np.asarray(heights[box], np.float64)
+        if camera is not None:
+            height_planes = [
+                np.asarray(one * exact**2, np.float32) for one in height_planes or [np.ones(1, np.float32)]
+            ]
+            exact = logarithm("known_heights", exact)
+        counted = np.isfinite(exact) if marks is None else np.isfinite(exact) & (marks != 0)
+        for plane in height_planes:
+            counted &= plane > 0
+        known, datum = _relative(exact, counted)
     firmest = _FIRMEST * typical / min(size) ** 2
+    planes = [_bounded(plane[box], typical * LEAST, typical * MOST) for plane in planes]
     height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
+    x, y, steep = slopes(box)
     return Inputs(
-        dz_dx=np.asarray(x, np.float32),
-        dz_dy=np.asarray(y, np.float32),
+        dz_dx=x,
+        dz_dy=y,
         pixel_size=size,
-        mask=_marks("mask", mask, shape),
-        edges=_marks("edges", edges, shape),
+        mask=marks,
+        edges=cuts,
         weight_x=planes[0] if planes else None,
         weight_y=planes[1] if len(planes) > 1 else None,
         weight=weight or 1.0,
         typical_weight=typical,
         weights_given=slope_weights is not None,
+        steep=steep,
         known_heights=known,
         known_height_weights=height_planes[0] if height_planes and known is not None else None,
         known_height_weight=min(height_weight, firmest),
         datum=datum,
+        picture=shape,
+        box=box,
+        lost=lost,
     )
 
 
-def check_pixel_size(pixel_size: ArrayLike) -> tuple[float, float]:
+def _find_source(
+    dz_dx: ArrayLike | None, dz_dy: ArrayLike | None, normals: ArrayLike | None, camera: Camera | None
+) -> tuple[tuple[int, int], Callable[[Box], Slopes]]:
+    """Return rows and columns of the picture, and what gives the slopes within a box."""
+    if normals is not None:
+        if dz_dx is not None or dz_dy is not None:
+            raise InputError("both slopes and normals are given: leave one of the two out")
+        given = np.asarray(normals)
+        if given.ndim != 3 or given.shape[2] != 3 or 0 in given.shape:
+            raise InputError(f"normals: shape {given.shape}; vectors (H, W, 3) are needed")
+        return (given.shape[0], given.shape[1]), lambda box: find_slopes(given, camera, box)
+    if camera is not None:
+        raise InputError("a camera needs normals: give normals=, (H, W, 3), instead of slopes")
+    if dz_dx is None or dz_dy is None:
+        raise InputError("there are no slopes: give dz_dx and dz_dy, or normals=")
+    x, y = np.asarray(dz_dx), np.asarray(dz_dy)
+    if x.ndim != 2 or x.shape != y.shape or 0 in x.shape:
+        raise InputError(
+            f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W) are needed"
+        )
+    shape = x.shape[0], x.shape[1]
+    return shape, lambda box: (np.asarray(x[box], np.float32), np.asarray(y[box], np.float32), None)
+
+
+def _may_answer(slopes: Slopes, box: Box, mask: Flags | None, heights: NDArray[Any] | None) -> Mask:
+    """Tell which pixels of a box have slopes or a known height."""
+    found = np.isfinite(slopes[0]) & np.isfinite(slopes[1])
+    if heights is not None:
+        found |= np.isfinite(heights[box])
+    return np.asarray(found if mask is None else found & (mask[box] != 0))
+
+
+def _count(box: Box, mask: Flags | None, weights: list[Floats]) -> int:
+    """Count the pixels of a box whose slopes are wanted."""
+    wanted = np.ones([part.stop - part.start for part in box], bool) if mask is None else mask[box] != 0
+    if weights:
+        wanted = wanted & np.logical_or.reduce([plane[box] > 0 for plane in weights])
+    return int(np.count_nonzero(wanted))
+
+
+def logarithm(name: str, depths: NDArray[Any]) -> NDArray[np.float64]:
+    """Return logarithms of depths, NaN where there is none."""
+    exact = np.asarray(depths, np.float64)
+    if np.any(exact <= 0):
+        raise InputError(f"{name}: some are not above 0; with a camera give depths, NaN where there is none")
+    return np.log(exact)
+
+
+def check_pixel_size(pixel_size: ArrayLike | None) -> tuple[float, float]:
     """Return width and height of a pixel, mm, of one number or both."""
     size = np.asarray(pixel_size, np.float64)
     if size.shape not in ((), (2,)) or not np.all((size > 0) & (size < np.inf)):
@@ -174,14 +255,12 @@ def _bounded(plane: Floats, least: float, most: float) -> Floats:
     return np.where(positive, np.clip(plane, least, most), 0).astype(np.float32)
 
 
-def _relative(heights: NDArray[Any], counted: NDArray[np.bool_]) -> tuple[Floats | None, float]:
+def _relative(heights: NDArray[np.float64], counted: Mask) -> tuple[Floats | None, float]:
     """Return heights less the mean of those that count, which would cost float32 its digits, and that mean.
 
     Others are NaN; None where none counts.
     """
-    exact = np.asarray(heights, np.float64)
-    known = np.isfinite(exact) & counted
-    if not known.any():
+    if not counted.any():
         return None, 0.0
-    datum = float(np.mean(exact, where=known))
-    return np.where(known, exact - datum, np.nan).astype(np.float32), datum
+    datum = float(np.mean(heights, where=counted))
+    return np.where(counted, heights - datum, np.nan).astype(np.float32), datum

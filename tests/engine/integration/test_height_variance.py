@@ -43,7 +43,7 @@ SCENES = {
     "rectangle": ({}, (1.0, 1.0), 0.01, 0.0),
     "rectangle of long pixels": ({}, (0.5, 2.0), 0.01, 0.0),
     "heights known all over": ({"known_heights": FLAT, "known_height_weights": 0.05}, (1.0, 1.0), 0.01, 0.0),
-    "annulus": ({"mask": (DISTANCE < 15) & (DISTANCE > 7)}, (1.0, 1.0), 0.04, 0.06),
+    "annulus": ({"mask": (DISTANCE < 15) & (DISTANCE > 7)}, (1.0, 1.0), 0.04, 0.07),
     "disc of long pixels": ({"mask": DISTANCE < 15}, (1.0, 2.5), 0.04, 0.08),
     "cut": ({"edges": EDGES}, (1.0, 1.0), 0.03, 0.06),
     "heights known on the left": (

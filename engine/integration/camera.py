@@ -1,0 +1,102 @@
+"""A pinhole camera, and what surface normals that it sees say about the depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.integration.crop import Box
+from mirrorskin.io import InputError
+
+Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
+"""Slopes along x and y, and the squared cosine of the angle between normal and line of sight, (H, W)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera without distortion, for `mirrorskin.engine.integrate`.
+
+    The pixel in column c and row r shows the point ::
+
+        Z ((c - c0) / f_x, -(r - r0) / f_y, -1)
+
+    in axes of the camera: x to the right, y up the picture, z towards the camera, from the pinhole. Z is the
+    depth: the distance from the pinhole along the optical axis.
+
+    Parameters
+    ----------
+    focal_length : float or (float, float)
+        f, or f_x and f_y, pixels.
+    principal_point : (float, float), optional
+        Column c0 and row r0 where the optical axis meets the picture, pixels from the middle of the top left
+        pixel. By default the middle of the picture.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Numbers that cannot be a camera's.
+
+    Examples
+    --------
+    A plane turned by 45 degrees, whose right end is 1.25 / 0.75 times as far away as its left end.
+
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> normals = np.broadcast_to([1.0, 0.0, 1.0], (9, 101, 3))
+    >>> camera = engine.Camera(focal_length=200.0)
+    >>> depth = engine.integrate(normals=normals, camera=camera).height
+    >>> round(float(depth[4, 100] / depth[4, 0]), 4)
+    1.6667
+    """
+
+    focal_length: float | tuple[float, float]
+    principal_point: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        focal = np.asarray(self.focal_length, np.float64)
+        if focal.shape not in ((), (2,)) or not np.all((focal > 0) & (focal < np.inf)):
+            raise InputError(
+                f"focal length {self.focal_length!r}: pixels above 0 are needed, one number or (x, y)"
+            )
+        point = self.principal_point
+        if point is not None and (np.shape(point) != (2,) or not np.isfinite(point).all()):
+            raise InputError(f"principal point {point!r}: column and row are needed, in pixels")
+
+    @property
+    def pixel_size(self) -> tuple[float, float]:
+        """Width and height of a pixel at depth 1."""
+        width, height = (1 / np.broadcast_to(np.asarray(self.focal_length, np.float64), 2)).tolist()
+        return width, height
+
+    def sight(self, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return x, (W,), and y, (H, 1), of vectors (x, y, 1) from what pixels show to the camera."""
+        rows, columns = shape
+        column, row = self.principal_point or ((columns - 1) / 2, (rows - 1) / 2)
+        width, height = self.pixel_size
+        x, y = (column - np.arange(columns)) * width, (np.arange(rows) - row) * height
+        return x.astype(np.float32), y.astype(np.float32)[:, np.newaxis]
+
+
+def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slopes:
+    """Return slopes along x and y within a box, and how squarely the surface is seen there.
+
+    Without a camera, which is then far away, the slopes are those of the height, -n_x / n_z and -n_y / n_z.
+    With one they are those of the logarithm of the depth, by the pixel size at depth 1: a step along x
+    changes the point Z r by Z (r d(ln Z) + dr), which n is across to, so that they are n_x / (n . v) and
+    n_y / (n . v), v = -r. The third map is (n . v)^2 of unit normals then. Where the surface faces away, or
+    the normal is no number, the slopes are NaN.
+    """
+    x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
+    if camera is not None:
+        across, up = camera.sight((normals.shape[0], normals.shape[1]))
+        facing = z + x * across[box[1]] + y * up[box[0]]
+    else:
+        facing = z.copy()
+    facing[~(facing > 0)] = np.nan
+    with np.errstate(all="ignore"):
+        if camera is None:
+            return -x / facing, -y / facing, None
+        return x / facing, y / facing, facing**2 / (x * x + y * y + z * z)

@@ -1,0 +1,133 @@
+"""Depths from the normals that a pinhole camera sees: against spheres and planes, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+
+SHAPE = 61, 96
+FOCAL, POINT = (50.0, 40.0), (51.0, 27.5)  # the corners are seen at 47 to 54 degrees from the axis
+CAMERA = engine.Camera(FOCAL, POINT)
+
+
+def rays(shape=SHAPE, focal=FOCAL, point=POINT):
+    """Return the point at depth 1 that each pixel shows."""
+    row, column = np.indices(shape)
+    return np.stack([(column - point[0]) / focal[0], (point[1] - row) / focal[1], -np.ones(shape)], axis=-1)
+
+
+def plane(normal, distance, **camera):
+    """Return depth and normals, of any length, of a plane."""
+    seen = rays(**camera)
+    return -distance / (seen @ np.array(normal)), np.broadcast_to(normal, seen.shape)
+
+
+def sphere(centre, radius, scale=1):
+    """Return depth, normals and where they are of a sphere, of a camera with that many times the pixels."""
+    focal, point = np.multiply(FOCAL, scale), scale * (np.array(POINT) + 0.5) - 0.5
+    seen = rays((SHAPE[0] * scale, SHAPE[1] * scale), focal, point)
+    along, square = seen @ np.array(centre), np.sum(seen**2, axis=-1)
+    root = along**2 - square * (np.dot(centre, centre) - radius**2)
+    depth = (along - np.sqrt(np.where(root > 0, root, np.nan))) / square
+    normals = (seen * depth[..., np.newaxis] - centre) / radius
+    slant = -np.sum(normals * seen, axis=-1) / np.sqrt(square)
+    return depth, normals, slant > 0.3, engine.Camera(tuple(focal), tuple(point))
+
+
+def apart(found, depth, mask):
+    """Return the largest error of the depth as a share of it, where the scale is free."""
+    error = np.log(found / depth)[mask]
+    return np.abs(error - error.mean()).max()
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (3.0, 1.0, 6.0), (-0.2, 0.5, 0.8)])
+def test_planes_are_exact_at_oblique_rays(device, normal):
+    shape, focal = (244, 384), (200.0, 160.0)
+    depth, normals = plane(normal, 300.0, shape=shape, focal=focal, point=(204.0, 110.0))
+    camera = engine.Camera(focal, (204.0, 110.0))
+    found = engine.integrate(normals=normals, camera=camera, device=device)
+    assert found.method == "direct"
+    assert apart(found.height, depth, np.ones(shape, bool)) < 2e-6
+    assert np.mean(np.log(found.height)) == pytest.approx(0, abs=1e-6)
+    assert found.offset_unknown.tolist() == [True]
+
+
+def test_a_sphere_seen_from_near_converges_with_the_second_order():
+    errors = []
+    for scale in (1, 2, 4):
+        depth, normals, mask, camera = sphere((6.0, -3.0, -55.0), 25.0, scale)
+        found = engine.integrate(normals=normals, camera=camera, mask=mask, sigma=False)
+        errors.append(apart(found.height, depth, mask))
+    assert errors[0] < 2e-3
+    assert (np.divide(errors[:-1], errors[1:]) > 4).all(), errors
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_known_depths_tell_the_scale_of_what_they_are_in(device, robust):
+    depth, normals, mask, camera = sphere((6.0, -3.0, -55.0), 25.0, 2)
+    upper, middle = mask.copy(), mask.shape[0] // 2
+    upper[middle:] = False
+    mask[middle : middle + 2] = False
+    known = np.where(upper, depth, np.nan)
+    asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "robust": robust}
+    found = engine.integrate(**asked, known_heights=known, known_height_weights=np.where(upper, 9.0, 0.0))
+    np.testing.assert_allclose(found.height[upper], depth[upper], rtol=2e-4)
+    assert found.offset_unknown.tolist() == [False, True]
+    lower = mask & ~upper
+    assert apart(found.height, depth, lower) < 1e-3
+    assert np.mean(np.log(found.height[lower])) == pytest.approx(0, abs=1e-5)
+
+
+def test_sigma_is_that_of_the_depth(device):
+    depth, normals, mask, camera = sphere((0.0, 0.0, -40.0), 15.0)
+    known = np.where(mask, depth, np.nan)
+    noisy = [np.random.default_rng(seed).normal(known, 0.5) for seed in range(30)]
+    asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "slope_weights": 1e6}
+    found = [engine.integrate(**asked, known_heights=one, known_height_weights=4.0) for one in noisy]
+    spread = np.std([one.height[mask] for one in found], axis=0)
+    np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(found[0].sigma), rtol=0.3)
+
+
+def test_without_a_camera_lines_of_sight_are_parallel(device):
+    x, y = np.random.default_rng(4).normal(0, 0.4, (2, *SHAPE)).astype(np.float32)
+    normals = 3 * np.stack([-x, -y, np.ones(SHAPE)], axis=-1)
+    normals[:9] *= -1  # faces away
+    normals[20, 20], normals[21, 20] = 0, np.nan
+    x[:9] = x[20, 20] = x[21, 20] = np.nan
+    found = engine.integrate(normals=normals, pixel_size=(0.3, 0.5), device=device)
+    expected = engine.integrate(x, y, (0.3, 0.5), device=device)
+    np.testing.assert_allclose(found.height, expected.height, atol=1e-5)
+    np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-4)
+    assert found.invalid == expected.invalid == 9 * SHAPE[1] + 2
+
+
+NORMALS, FLAT = np.broadcast_to([0.0, 0, 1], (4, 5, 3)), np.zeros((4, 5))
+BAD = {
+    "there are no slopes": {},
+    "there are no slopes: give dz_dx": {"dz_dx": FLAT},
+    "both slopes and normals": {"dz_dx": FLAT, "dz_dy": FLAT, "normals": NORMALS},
+    "a camera needs normals": {"dz_dx": FLAT, "dz_dy": FLAT, "camera": CAMERA},
+    "normals: shape (4, 5)": {"normals": FLAT, "camera": CAMERA},
+    "normals: shape (0, 5, 3)": {"normals": NORMALS[:0], "camera": CAMERA},
+    "pixel_size 0.1: a camera": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
+    "pixel size None": {"normals": NORMALS},
+    "nothing to integrate": {"normals": -NORMALS, "camera": CAMERA},
+    "known_heights: some are not above 0": {"normals": NORMALS, "camera": CAMERA, "known_heights": FLAT},
+    "initial_heights: some are not": {"normals": NORMALS, "camera": CAMERA, "initial_heights": FLAT},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_refused_in_one_line(message):
+    with pytest.raises(io.InputError) as error:
+        engine.integrate(**BAD[message])
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("numbers", [(0,), (np.nan,), ((1, 2, 3),), (5, (1,)), (5, (1, np.inf))])
+def test_numbers_that_are_no_camera_s_are_refused(numbers):
+    with pytest.raises(io.InputError, match=r"focal length|principal point"):
+        engine.Camera(*numbers)
