@@ -357,6 +357,8 @@ class Kernel:
     name : str
     arguments : tuple of str
         Names of its arguments, in the order of the source.
+    group : int
+        Work-items of a group.
     """
 
     def __init__(self, device: Device, name: str, kernel: cl.Kernel, signature: Signature) -> None:
@@ -366,7 +368,7 @@ class Kernel:
         self._signature = signature
         self.arguments = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self._group = _group_of(kernel, device.context.devices[0], device.layout.group)
+        self.group = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
         self,
@@ -397,7 +399,7 @@ class Kernel:
             An argument is missing, unknown, or no number where one is needed.
         """
         args = self._in_order(arguments)
-        group = self._group
+        group = self.group
         size = -(-items // group) * group
         values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
         arrays = [arg for arg in args if isinstance(arg, Operand)]

@@ -8,7 +8,7 @@ import scipy.sparse
 from rectangles import put, scene, solve_by_cosines, source_of
 from scipy.sparse.linalg import spsolve
 
-from mirrorskin.engine.integration.rectangle import Rectangle, are_rows_easier
+from mirrorskin.engine.integration.rectangle import Rectangle
 
 
 def solve_sparse(source, wx, wy, screening):
@@ -45,9 +45,10 @@ def test_a_picture_without_slopes_is_flat(device, shape):
     np.testing.assert_array_equal(height, 0)
 
 
-def test_a_single_pixel_is_as_high_as_its_screening_says(device):
-    height = Rectangle((1, 1), (1.0, 1.0), device).solve(put(device, np.array([[3.0]])), 1.5).download()
-    assert height == pytest.approx(2.0)
+def test_heights_have_the_mean_that_is_asked_for(device):
+    source = put(device, np.array([[3.0, 1.0]]))
+    height = Rectangle((1, 2), (1.0, 1.0), device).solve(source, 1.5, level=2.0).download()
+    np.testing.assert_allclose(height, 2 + np.array([[1, -1]]) / 3.5, atol=1e-6)
 
 
 def test_what_a_source_sums_to_changes_nothing(device):
@@ -81,11 +82,11 @@ def test_cosines_are_as_high_as_their_wave_numbers_say(device, size):
     np.testing.assert_allclose(height, np.outer(y, x), atol=5e-6)
 
 
-def test_modes_are_taken_along_the_side_of_small_factors():
-    assert are_rows_easier((1021, 1024), side_by_side=False)
-    assert not are_rows_easier((1024, 1021), side_by_side=False)
-    assert are_rows_easier((1024, 1024), side_by_side=False)
-    assert not are_rows_easier((1024, 1024), side_by_side=True)
+def test_several_pictures_are_solved_at_once(device):
+    pictures = np.random.default_rng(0).normal(size=(3, 11, 21))
+    told = [solve_by_cosines(picture) for picture in pictures]
+    found = Rectangle(pictures.shape, (1.0, 1.0), device).solve(put(device, pictures)).download()
+    np.testing.assert_allclose(found, told, atol=5e-6)
 
 
 @pytest.mark.parametrize(("shape", "lean"), [((250, 256), 0.0), ((256, 251), 30.0)])
@@ -106,10 +107,9 @@ def test_a_long_slope_stays_straight(device):
 
 
 @pytest.mark.parametrize("columns", [1531, 4800])
-def test_a_long_strip_is_solved_whether_its_columns_or_its_long_rows_are_transformed(device, columns):
-    shape = (37, columns)  # 4800 is more than an item's own memory holds
-    assert are_rows_easier(shape, side_by_side=False) == (columns == 4800)
-    source = source_of(scene(shape, 0.01, noise=0.0)).astype(np.float32)
+def test_a_long_strip_is_solved_by_a_convolution_or_outside_of_a_group_s_own_memory(device, columns):
+    shape = (37, columns)
+    source = source_of(scene(shape, 1.0, noise=0.0)).astype(np.float32)
     height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
     told = solve_by_cosines(source)
     assert np.abs(height - told).max() < 1e-6 * np.ptp(told)
