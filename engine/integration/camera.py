@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.crop import Box
 from mirrorskin.io import InputError
 
 Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
-"""Slopes along x and y, and the squared cosine of the angle between normal and line of sight, (H, W)."""
+"""Slopes along x and y, and their weight, (H, W); no weight where all have the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,22 +81,22 @@ class Camera:
 
 
 def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slopes:
-    """Return slopes along x and y within a box, and how squarely the surface is seen there.
+    """Return slopes along x and y within a box, and their weights where normals are equally noisy.
 
-    Without a camera, which is then far away, the slopes are those of the height, -n_x / n_z and -n_y / n_z.
+    Without a camera, which is then far away, they are the slopes of the height, -n_x / n_z and -n_y / n_z.
     With one they are those of the logarithm of the depth, by the pixel size at depth 1: a step along x
-    changes the point Z r by Z (r d(ln Z) + dr), which n is across to, so that they are n_x / (n . v) and
-    n_y / (n . v), v = -r. The third map is (n . v)^2 of unit normals then. Where the surface faces away, or
-    the normal is no number, the slopes are NaN.
+    changes the point Z r by Z (r d(ln Z) + dr), and n is perpendicular to that; so n_x / (n . v) and
+    n_y / (n . v), v = -r. The weight is (n . v)^2 of unit normals: a normal's errors are divided by n . v.
+    Where the surface faces away, or the normal is no number, the slopes are NaN.
     """
     x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
+    facing = z.copy()
     if camera is not None:
         across, up = camera.sight((normals.shape[0], normals.shape[1]))
-        facing = z + x * across[box[1]] + y * up[box[0]]
-    else:
-        facing = z.copy()
-    facing[~(facing > 0)] = np.nan
-    with np.errstate(all="ignore"):
-        if camera is None:
-            return -x / facing, -y / facing, None
-        return x / facing, y / facing, facing**2 / (x * x + y * y + z * z)
+        facing += x * across[box[1]] + y * up[box[0]]
+    bad = ~(facing > 0)
+    facing[bad] = np.nan
+    over = np.reciprocal(facing if camera is not None else -facing)
+    with np.errstate(invalid="ignore", over="ignore"):
+        weight: NDArray[np.float32] = np.where(bad, np.float32(1), facing * facing / (x * x + y * y + z * z))
+        return x * over, y * over, weight

@@ -83,10 +83,10 @@ def integrate(
     mask : array_like, (H, W), optional
         0 where no answer is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
-        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where there is none. Slopes that normals
-        make are n_x / n_z, or n_x / (n . v) with a camera. By default all are equally noisy, and ``sigma`` is
-        estimated from how well they fit together. What is below 1e-4 or above 1e3 of their median counts as
-        that; what is 0 in float32, as 0.
+        Inverse variances of the slopes, or of dz_dx and of dz_dy; with ``normals`` those of unit normals,
+        1/rad^2, and a slope's is (n . v)^2 of it, v = (0, 0, 1) without a camera. 0 where there is none. By
+        default all are equally noisy, and ``sigma`` is estimated from how well they fit together. What is
+        below 1e-4 or above 1e3 of the slopes' median counts as that; what is 0 in float32, as 0.
     edges : array_like, (H, W), optional
         Not 0 on pixels where the surface breaks: they keep but one link, to that neighbour off the edge whose
         slopes are the most similar, and so never join two sides.
@@ -138,6 +138,7 @@ def integrate(
         *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
         normals=normals,
         camera=camera,
+        robust=robust,
         crop=True,
     )
     check_above_zero(bilateral_sharpness=bilateral_sharpness, tolerance=tolerance, budget=budget)

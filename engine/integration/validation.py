@@ -47,8 +47,8 @@ class Inputs:
     known_height_weights: Floats | None = None
     known_height_weight: float = 1.0  # that same weight, else 1
     datum: float = 0.0  # what the known heights are relative to, mm
-    # (H, W), float32: squared cosine of the angle between normal and line of sight; None where the slopes say
-    # it.
+    # (H, W), float32: squared share of a unit normal that is along the line of sight; None where it is as the
+    # slopes say.
     steep: Floats | None = None
     picture: tuple[int, int] = (0, 0)  # rows and columns of the picture that they are a box of
     box: Box = (slice(None), slice(None))  # of the picture that the maps show
@@ -73,12 +73,13 @@ def check_inputs(
     *,
     normals: ArrayLike | None = None,
     camera: Camera | None = None,
+    robust: bool = False,
     crop: bool = False,
 ) -> Inputs:
     """Return the arguments of ``integrate`` as maps of one size; InputError where they cannot be.
 
-    With a camera, heights are logarithms of depths. ``crop``: only the box of the pixels that may have an
-    answer is kept.
+    With a camera, heights are logarithms of depths. ``robust``: weights are those of normals; else those of
+    the slopes that normals make. ``crop``: only the box of the pixels that may have an answer is kept.
     """
     shape, slopes = _find_source(dz_dx, dz_dy, normals, camera)
     if camera is not None and pixel_size is not None:
@@ -96,23 +97,27 @@ def check_inputs(
         whole, box = box, find_box(shape, lambda part: _may_answer(slopes(part), part, marks, heights))
         lost = 0 if box == whole else _count(whole, marks, planes) - _count(box, marks, planes)
     marks, cuts = (None if one is None else one[box] for one in (marks, cuts))
-    height_planes = [plane[box] for plane in height_planes]
+    planes, height_planes = ([plane[box] for plane in some] for some in (planes, height_planes))
+    x, y, steep = slopes(box)
+    if steep is not None and not robust:
+        planes = [steep * plane for plane in planes] or [np.float32(weight) * steep]
+        typical = _median(planes)
     known, datum = None, 0.0
     if heights is not None and height_weight:
         exact = np.asarray(heights[box], np.float64)
         if camera is not None:
-            height_planes = [
-                np.asarray(one * exact**2, np.float32) for one in height_planes or [np.ones(1, np.float32)]
+            squares = np.asarray(exact**2, np.float32)
+            height_planes = [plane * squares for plane in height_planes] or [
+                np.float32(height_weight) * squares
             ]
-            exact = logarithm("known_heights", exact)
+            height_weight, exact = 1.0, logarithm("known_heights", exact)
         counted = np.isfinite(exact) if marks is None else np.isfinite(exact) & (marks != 0)
         for plane in height_planes:
             counted &= plane > 0
         known, datum = _relative(exact, counted)
     firmest = _FIRMEST * typical / min(size) ** 2
-    planes = [_bounded(plane[box], typical * LEAST, typical * MOST) for plane in planes]
+    planes = [_bounded(plane, typical * LEAST, typical * MOST) for plane in planes]
     height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
-    x, y, steep = slopes(box)
     return Inputs(
         dz_dx=x,
         dz_dy=y,
@@ -121,7 +126,7 @@ def check_inputs(
         edges=cuts,
         weight_x=planes[0] if planes else None,
         weight_y=planes[1] if len(planes) > 1 else None,
-        weight=weight or 1.0,
+        weight=1.0 if planes else weight,
         typical_weight=typical,
         weights_given=slope_weights is not None,
         steep=steep,

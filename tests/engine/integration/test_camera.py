@@ -48,7 +48,6 @@ def test_planes_are_exact_at_oblique_rays(device, normal):
     depth, normals = plane(normal, 300.0, shape=shape, focal=focal, point=(204.0, 110.0))
     camera = engine.Camera(focal, (204.0, 110.0))
     found = engine.integrate(normals=normals, camera=camera, device=device)
-    assert found.method == "direct"
     assert apart(found.height, depth, np.ones(shape, bool)) < 2e-6
     assert np.mean(np.log(found.height)) == pytest.approx(0, abs=1e-6)
     assert found.offset_unknown.tolist() == [True]
@@ -90,16 +89,19 @@ def test_sigma_is_that_of_the_depth(device):
     np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(found[0].sigma), rtol=0.3)
 
 
+@pytest.mark.filterwarnings("error")
 def test_without_a_camera_lines_of_sight_are_parallel(device):
     x, y = np.random.default_rng(4).normal(0, 0.4, (2, *SHAPE)).astype(np.float32)
     normals = 3 * np.stack([-x, -y, np.ones(SHAPE)], axis=-1)
     normals[:9] *= -1  # faces away
-    normals[20, 20], normals[21, 20] = 0, np.nan
+    normals[20, 20], normals[21, 20] = 0, np.nan  # there is none
     x[:9] = x[20, 20] = x[21, 20] = np.nan
     found = engine.integrate(normals=normals, pixel_size=(0.3, 0.5), device=device)
-    expected = engine.integrate(x, y, (0.3, 0.5), device=device)
+    weights = 1 / (1 + np.nan_to_num(x**2 + y**2))  # n_z^2: normals are as noisy, not slopes
+    expected = engine.integrate(x, y, (0.3, 0.5), slope_weights=weights, device=device)
     np.testing.assert_allclose(found.height, expected.height, atol=1e-5)
-    np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-4)
+    shares = found.sigma / expected.sigma
+    np.testing.assert_allclose(shares[np.isfinite(x)], np.nanmedian(shares), rtol=1e-3)
     assert found.invalid == expected.invalid == 9 * SHAPE[1] + 2
 
 
