@@ -1,49 +1,58 @@
-// Heights on a graph of pixels, by multigrid: the passes over one level. Specification: multigrid.py.
+// Heights on a graph of pixels, by multigrid. Specification: multigrid.py.
 //
-// TILE      nodes of one work-item, a multiple of WIDTH
-// WIDTH     nodes side by side in a vector: 8, or 1 where an item is a lane
-// PART      nodes of one part of a sum
-// ANCHORED  1 where there are known heights, 0 where there are none
+// TILE       nodes of one work-item, a multiple of WIDTH, in passes over one level
+// WIDTH      nodes side by side in a vector: 8, or 1 where an item is a lane
+// ROWS       of a tile of nodes that a work-group takes in the passes that do half a cycle, and its COLUMNS
+// PART       nodes of one part of a sum
+// LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
+// ANCHORED   1 where there are known heights, 0 where there are none
 //
 // All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
-// none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has four
-// neighbours in memory, and where there is no link its weight is 0. Extra nodes, which have no place in the
-// picture because their block has more than one, lie behind all levels; whatever has to do with them is done by
-// the passes for extra nodes, row by row of a sparse matrix, over what the plain passes wrote there.
+// none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has
+// neighbours in memory, and where there is no link its weight is 0. A node's links lead to the right and down,
+// and where there are 8 along both diagonals downwards: `falling` to the right, `rising` to the left.
 
 #include "common.clh"
 
 #if WIDTH == 8
 typedef float8 reals;
+typedef int8 ints;
 typedef float8 __attribute__((aligned(4))) loose;  // somewhere in memory
+typedef float4 __attribute__((aligned(4))) half_loose;
 #define AT(p) (*(__global const loose *)(p))
+#define NEAR(p) (*(__local const loose *)(p))
 #define PUT(p) *(__global loose *)(p)
-#define EVEN(p) ((float8)(AT(p).even, AT((p) + 8).even))
-#define ODD(p) ((float8)(AT(p).odd, AT((p) + 8).odd))
-#define PUT_BOTH(p, one, two)                                                                              \
-    PUT(p) = (float8)(one.s0, two.s0, one.s1, two.s1, one.s2, two.s2, one.s3, two.s3);                     \
-    PUT((p) + 8) = (float8)(one.s4, two.s4, one.s5, two.s5, one.s6, two.s6, one.s7, two.s7);
+#define PUT_NEAR(p) *(__local loose *)(p)
+#define EVEN_OF(READ, p) ((float8)(READ(p).even, READ((p) + 8).even))
+#define ODD_OF(READ, p) ((float8)(READ(p).odd, READ((p) + 8).odd))
+#define PUT_BYTES(p, values) vstore8(convert_uchar8(values), 0, p)
 #define WHOLE(v) (((v.s0 + v.s1) + (v.s2 + v.s3)) + ((v.s4 + v.s5) + (v.s6 + v.s7)))
 #else
 typedef float reals;
+typedef int ints;
 #define AT(p) (*(p))
+#define NEAR(p) (*(p))
 #define PUT(p) *(p)
-#define EVEN(p) ((p)[0])
-#define ODD(p) ((p)[1])
-#define PUT_BOTH(p, one, two) (p)[0] = one; (p)[1] = two;
+#define PUT_NEAR(p) *(p)
+#define EVEN_OF(READ, p) ((p)[0])
+#define ODD_OF(READ, p) ((p)[1])
+#define PUT_BYTES(p, values) *(p) = values
 #define WHOLE(v) (v)
 #endif
+#define EVEN(p) EVEN_OF(AT, p)
+#define ODD(p) ODD_OF(AT, p)
 
-// Nodes from `begin` to `end`, which an item takes of a level, and blocks of a coarse row.
+#define BYTES __global const uchar *restrict
+#define COUNTS __global const int *restrict
+#define LEVEL_ARGS const int base, const int rows, const int stride
+#define COARSE_ARGS const int coarse_base, const int coarse_rows, const int coarse_stride
+#define GRAPH_ARGS MAP right, MAP down, MAP falling, MAP rising, MAP anchor
+
+// Nodes from `begin` to `end`, which an item takes of a level.
 #define ITEMS_NODES                                                                                        \
     const int begin = base + stride + (int)get_global_id(0) * TILE;                                        \
     const int end = LESSER(begin + TILE, base + stride * (rows + 1));
 #define EACH_NODE for (int i = begin; i < end; i += WIDTH)
-
-// Coarse nodes J of one row, each of the fine nodes I and I + 1 and of K and K + 1 below them.
-#define EACH_BLOCK                                                                                         \
-    for (int J = coarse_base + coarse_stride * (row + 1), I = base + stride * (2 * row + 1), K = I + stride, \
-             last = J + stride / 2; J < last; J += WIDTH, I += 2 * WIDTH, K += 2 * WIDTH)
 
 #if ANCHORED
 #define WITH_ANCHOR(value) + (value)
@@ -51,694 +60,475 @@ typedef float reals;
 #define WITH_ANCHOR(value)
 #endif
 
-#define LEVEL_ARGS const int base, const int rows, const int stride
-#define BETWEEN_ARGS const int base, const int stride, const int coarse_base, const int coarse_rows, const int coarse_stride
-#define GRAPH_ARGS MAP right, MAP down, MAP anchor
-
-#define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
-
-// The links of nodes i: to the right and left, down and up.
-#define LINKS                                                                                              \
+// The links of nodes i, their sum with the anchor, and what flows to nodes along them: -A x. READ gives heights
+// at p, in rows of s.
+#define AXES                                                                                               \
     const reals to_right = AT(right + i), to_left = AT(right + i - 1);                                     \
     const reals to_below = AT(down + i), to_above = AT(down + i - stride);
+#if LINKS == 8
+#define SIDES                                                                                              \
+    AXES                                                                                                   \
+    const reals to_fall = AT(falling + i), from_fall = AT(falling + i - stride - 1);                       \
+    const reals to_rise = AT(rising + i), from_rise = AT(rising + i - stride + 1);
+#define WITH_DIAGONALS(READ, p, s)                                                                         \
+    + ((to_fall * (READ((p) + (s) + 1) - READ(p)) + from_fall * (READ((p) - (s) - 1) - READ(p)))           \
+       + (to_rise * (READ((p) + (s) - 1) - READ(p)) + from_rise * (READ((p) - (s) + 1) - READ(p))))
+#define WITH_DIAGONAL_SUMS + ((to_fall + from_fall) + (to_rise + from_rise))
+#else
+#define SIDES AXES
+#define WITH_DIAGONALS(READ, p, s)
+#define WITH_DIAGONAL_SUMS
+#endif
+#define SUM_OF_SIDES ((to_right + to_left) + (to_below + to_above) WITH_DIAGONAL_SUMS WITH_ANCHOR(AT(anchor + i)))
+#define FLOW(READ, p, s)                                                                                   \
+    ((to_right * (READ((p) + 1) - READ(p)) + to_left * (READ((p) - 1) - READ(p)))                          \
+     + (to_below * (READ((p) + (s)) - READ(p)) + to_above * (READ((p) - (s)) - READ(p)))                   \
+     WITH_DIAGONALS(READ, p, s) WITH_ANCHOR(-AT(anchor + i) * READ(p)))
+#define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
 
-#define DIAGONAL ((to_right + to_left) + (to_below + to_above) WITH_ANCHOR(AT(anchor + i)))
+// --- Levels -----------------------------------------------------------------------------------------------------
+//
+// A coarse node stands for an aggregate of fine ones: as a rule for a block of two by two. Where the nodes of a block do
+// not hang together by strong links, as on either side of a cut, those beside its largest part go to the aggregate
+// of that neighbouring block to which their strongest link leads: `to` has 0 of a node that stays, else 1 + 3 (down + 1) +
+// (right + 1). Parts that have no link to another block's largest part stay.
 
-// What flows to nodes along their links, and to their anchors: -A x. X gives heights, of which those of the nodes,
-// above and below them lie at c, a and b.
-#define FLOW(X, a, c, b)                                                                                   \
-    ((to_right * (X(c + 1) - X(c)) + to_left * (X(c - 1) - X(c))) + (to_below * (X(b) - X(c))              \
-     + to_above * (X(a) - X(c))) WITH_ANCHOR(-AT(anchor + i) * X(c)))
-#define FLOWING(X) FLOW(X, i - stride, i, i + stride)
+#define COARSE_ITEMS                                                                                       \
+    const int pieces = (stride / 2 + TILE - 1) / TILE, row = get_global_id(0) / pieces;                    \
+    const int from = get_global_id(0) % pieces * TILE, upto = LESSER(stride / 2, from + TILE);             \
+    if (row >= coarse_rows) return;                                                                        \
+    const int first = base + stride * (2 * row + 1), coarse_first = coarse_base + coarse_stride * (row + 1);
+#define EACH_BLOCK                                                                                         \
+    for (int C = from, J = coarse_first + C, I = first + 2 * C, K = I + stride; C < upto;                  \
+         C += WIDTH, J += WIDTH, I += 2 * WIDTH, K += 2 * WIDTH)
+#define EACH_COARSE_NODE for (int C = from, J = coarse_first + from; C < upto; ++C, ++J)
 
-#define HEIGHT(i) AT(x + (i))
+// The weight of the link that leads from node i so many rows down and columns right.
+float link_of(const int i, const int stride, const int down_by, const int right_by, GRAPH_ARGS)
+{
+#if LINKS == 8
+    if (down_by > 0 && right_by) return right_by > 0 ? falling[i] : rising[i];
+    if (down_by < 0 && right_by) return right_by > 0 ? rising[i - stride + 1] : falling[i - stride - 1];
+#endif
+    return down_by ? right_by ? 0 : down[down_by > 0 ? i : i - stride] : right[right_by > 0 ? i : i - 1];
+}
+
+// A link is strong if it has a share of the geometric mean of its nodes' greatest ones along its axis.
+#define STRONG(w, g, h) (((w) > 0) & ((w) * (w) >= strength * strength * (g) * (h)))
+#define ALONG_X(PICK, i) GREATER(PICK(right + (i)), PICK(right + (i) - 1))
+#define ALONG_Y(PICK, i) GREATER(PICK(down + (i)), PICK(down + (i) - stride))
+#define BIT(condition, value) ((condition) ? (ints)(value) : (ints)0)
+#define SIZE(part) (((part) & 1) + ((part) >> 1 & 1) + ((part) >> 2 & 1) + ((part) >> 3 & 1))
+#define JOINED_TO(part)                                                                                    \
+    (part | BIT((part & 1) != 0, join_a) | BIT((part & 2) != 0, join_b) | BIT((part & 4) != 0, join_c)     \
+     | BIT((part & 8) != 0, join_d))
+#define LARGER(part) main = SIZE(part) > SIZE(main) ? part : main;
+
+// Of each block's nodes a, b and below them c, d, by bits: the largest part, and, 4 bits on, those that have links.
+__kernel void multigrid_parts(
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts, __global int *restrict touched)
+{
+    COARSE_ITEMS
+    EACH_BLOCK {
+        const reals ax = ALONG_X(EVEN, I), bx = ALONG_X(ODD, I), cx = ALONG_X(EVEN, K), dx = ALONG_X(ODD, K);
+        const reals ay = ALONG_Y(EVEN, I), by = ALONG_Y(ODD, I), cy = ALONG_Y(EVEN, K), dy = ALONG_Y(ODD, K);
+        const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
+        const ints is_ab = BIT(STRONG(ab, ax, bx), 15), is_cd = BIT(STRONG(cd, cx, dx), 15);
+        const ints is_ac = BIT(STRONG(ac, ay, cy), 15), is_bd = BIT(STRONG(bd, by, dy), 15);
+#if LINKS == 8
+        const reals ad = EVEN(falling + I), bc = ODD(rising + I);
+        const ints is_ad = BIT(STRONG(ad, GREATER(ax, ay), GREATER(dx, dy)), 15);
+        const ints is_bc = BIT(STRONG(bc, GREATER(bx, by), GREATER(cx, cy)), 15);
+#else
+        const ints is_ad = 0, is_bc = 0;
+#endif
+        const ints join_a = 1 | (is_ab & 2) | (is_ac & 4) | (is_ad & 8);
+        const ints join_b = 2 | (is_ab & 1) | (is_bc & 4) | (is_bd & 8);
+        const ints join_c = 4 | (is_ac & 1) | (is_bc & 2) | (is_cd & 8);
+        const ints join_d = 8 | (is_ad & 1) | (is_bd & 2) | (is_cd & 4);
+        const ints live = BIT(GREATER(ax, ay) > 0, 1) | BIT(GREATER(bx, by) > 0, 2) | BIT(GREATER(cx, cy) > 0, 4)
+            | BIT(GREATER(dx, dy) > 0, 8);
+        const ints a = JOINED_TO(join_a), b = JOINED_TO(join_b), c = JOINED_TO(join_c), d = JOINED_TO(join_d);
+        ints main = JOINED_TO(a) & live;
+        const ints with_b = JOINED_TO(b) & live, with_c = JOINED_TO(c) & live, with_d = JOINED_TO(d) & live;
+        LARGER(with_b)
+        LARGER(with_c)
+        LARGER(with_d)
+        PUT_BYTES(parts + J, main | live << 4);
+    }
+    EACH_COARSE_NODE touched[J] = 0;
+}
+
+// Where nodes go that are beside their block's largest part.
+__kernel void multigrid_move(
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, __global uchar *restrict to)
+{
+    COARSE_ITEMS
+    EACH_COARSE_NODE {
+        const int I = first + 2 * C, main = parts[J] & 15, live = parts[J] >> 4;
+        const int at[4] = {I, I + 1, I + stride, I + stride + 1};
+        for (int k = 0; k < 4; ++k) to[at[k]] = 0;
+        for (int rest = live & ~main; rest;) {
+            int part = rest & -rest, before = 0, target = 0;
+            float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
+            while (part != before) {  // what hangs together with it
+                before = part;
+                for (int k = 0; k < 16; ++k) {
+                    const int a = at[k / 4], b = at[k % 4], y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
+                    if (!(part >> k / 4 & 1) || !(rest >> k % 4 & 1) || k / 4 == k % 4) continue;
+                    const float w = link_of(a, stride, y, x, right, down, falling, rising, anchor);
+                    const float ax = ALONG_X(*, a), ay = ALONG_Y(*, a), bx = ALONG_X(*, b), by = ALONG_Y(*, b);
+                    const float g = y == 0 ? ax : x == 0 ? ay : GREATER(ax, ay);
+                    const float h = y == 0 ? bx : x == 0 ? by : GREATER(bx, by);
+                    if (STRONG(w, g, h)) part |= 1 << k % 4;
+                }
+            }
+            rest &= ~part;
+            for (int k = 0; k < 36; ++k) {
+                const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
+                if (!(part >> m & 1) || (v >> 1 == 0 && u >> 1 == 0)) continue;
+                if (!(parts[J + (v >> 1) * coarse_stride + (u >> 1)] >> (2 * (v & 1) + (u & 1)) & 1)) continue;
+                const int way = 3 * ((v >> 1) + 1) + (u >> 1) + 1;
+                sums[way] += link_of(at[m], stride, y, x, right, down, falling, rising, anchor);
+                if (sums[way] > most) {
+                    most = sums[way];
+                    target = 1 + way;
+                }
+            }
+            for (int k = 0; k < 4; ++k) {
+                if (part >> k & 1) to[at[k]] = target;
+            }
+        }
+    }
+}
+
+// Rows and columns from a node's block to the aggregate that it belongs to.
+#define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
+#define WENT_RIGHT(i) (to[i] ? (to[i] - 1) % 3 - 1 : 0)
+
+// Parts whose links would lead further than to the next aggregate stay with their block; the aggregates of the others are marked.
+__kernel void multigrid_settle(
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES parts, BYTES to, __global uchar *restrict settled, __global int *restrict touched,
+    const int level, __global int *restrict moves)
+{
+    COARSE_ITEMS
+    EACH_COARSE_NODE {
+        const int I = first + 2 * C, at[4] = {I, I + 1, I + stride, I + stride + 1};
+        const int gone = (parts[J] >> 4) & ~parts[J];
+        int far[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0};  // by where a part goes: all that goes there stays
+        for (int k = 0; k < 36 && gone; ++k) {
+            const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x, i = at[m];
+            if (!to[i] || link_of(i, stride, y, x, right, down, falling, rising, anchor) == 0) continue;
+            const int j = i + y * stride + x, below = (v >> 1) + WENT_DOWN(j) - WENT_DOWN(i);
+            const int beside = (u >> 1) + WENT_RIGHT(j) - WENT_RIGHT(i);
+            if (below < -1 || below > 1 || beside < -1 || beside > 1) far[to[i] - 1] = 1;
+        }
+        for (int k = 0; k < 4; ++k) {
+            const int target = gone && to[at[k]] && !far[to[at[k]] - 1] ? to[at[k]] : 0;
+            settled[at[k]] = target;
+            if (!target) continue;
+            atomic_or(touched + J, 1);
+            atomic_or(touched + J + ((target - 1) / 3 - 1) * coarse_stride + (target - 1) % 3 - 1, 1);
+            atomic_inc(moves + level);
+        }
+    }
+}
+
+// Fine nodes i of the aggregate J, whose block is at a row and a column C of the coarse level; from all blocks around.
+#define BELONGS(i, y, x)                                                                                   \
+    (to[i] ? ((y) >> 1) + WENT_DOWN(i) == row && ((x) >> 1) + WENT_RIGHT(i) == C : (y) >> 1 == row && (x) >> 1 == C)
+#define EACH_MEMBER                                                                                        \
+    for (int y = 2 * GREATER(row - 1, 0); y < 2 * LESSER(row + 2, coarse_rows); ++y)                       \
+        for (int x = GREATER(2 * C - 2, 0), i = base + stride * (y + 1) + x; x < LESSER(2 * C + 4, stride); ++x, ++i) \
+            if (BELONGS(i, y, x))
+#define IS_TOUCHED(J)                                                                                      \
+    (touched[J - coarse_stride - 1] | touched[J - coarse_stride] | touched[J - coarse_stride + 1] | touched[J - 1] \
+     | touched[J] | touched[J + 1] | touched[J + coarse_stride - 1] | touched[J + coarse_stride]           \
+     | touched[J + coarse_stride + 1])
+
+// The coarse links and anchors, and a list of the aggregates that are no blocks. A coarse link has half the weight of those that it stands for, since the way between the
+// middles of aggregates is twice as long; links further than to the next aggregate are left out.
+__kernel void multigrid_coarsen(
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES to, COUNTS touched, const int level, COUNTS moves, OUT coarse_right,
+    OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor, __global int *restrict changed,
+    __global int *restrict changes)
+{
+    COARSE_ITEMS
+    EACH_BLOCK {
+#if LINKS == 8
+        PUT(coarse_right + J) = 0.5f * ((ODD(right + I) + ODD(right + K)) + (ODD(falling + I) + EVEN(rising + I + 2)));
+        PUT(coarse_down + J) = 0.5f * ((EVEN(down + K) + ODD(down + K)) + (EVEN(falling + K) + ODD(rising + K)));
+        PUT(coarse_falling + J) = 0.5f * ODD(falling + K);
+        PUT(coarse_rising + J) = 0.5f * EVEN(rising + K);
+#else
+        PUT(coarse_right + J) = 0.5f * (ODD(right + I) + ODD(right + K));
+        PUT(coarse_down + J) = 0.5f * (EVEN(down + K) + ODD(down + K));
+        PUT(coarse_falling + J) = 0;
+        PUT(coarse_rising + J) = 0;
+#endif
+#if ANCHORED
+        PUT(coarse_anchor + J) = (EVEN(anchor + I) + ODD(anchor + I)) + (EVEN(anchor + K) + ODD(anchor + K));
+#endif
+    }
+    if (moves[level] == 0) return;
+    EACH_COARSE_NODE {
+        if (touched[J]) changed[coarse_base + atomic_inc(changes + level)] = J;
+        if (!IS_TOUCHED(J)) continue;
+        float sums[4] = {0, 0, 0, 0}, held = 0;  // of links to the right, and down to the left, below and to the right
+        EACH_MEMBER {
+#if ANCHORED
+            held += anchor[i];
+#endif
+            for (int way = 0; way < 9; ++way) {
+                const float w = way == 4 ? 0
+                    : link_of(i, stride, way / 3 - 1, way % 3 - 1, right, down, falling, rising, anchor);
+                if (w == 0) continue;
+                const int v = y + way / 3 - 1, u = x + way % 3 - 1, j = i + (way / 3 - 1) * stride + way % 3 - 1;
+                const int below = (v >> 1) + WENT_DOWN(j) - row, beside = (u >> 1) + WENT_RIGHT(j) - C;
+                if (below == 0 && beside == 1) sums[0] += w;
+                if (below == 1 && beside >= -1 && beside <= 1) sums[2 + beside] += w;
+            }
+        }
+        coarse_right[J] = 0.5f * sums[0];
+        coarse_rising[J] = 0.5f * sums[1];
+        coarse_down[J] = 0.5f * sums[2];
+        coarse_falling[J] = 0.5f * sums[3];
+#if ANCHORED
+        coarse_anchor[J] = held;
+#endif
+    }
+}
 
 // One over the diagonal.
 __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
 {
     ITEMS_NODES
     EACH_NODE {
-        LINKS
-        const reals diagonal = DIAGONAL;
+        SIDES
+        const reals diagonal = SUM_OF_SIDES;
         PUT(inverse + i) = INVERSE(diagonal);
     }
 }
 
-// Two steps of Jacobi's method from heights of zero.
-#define FIRST(i) (omega * AT(b + (i)) * AT(inverse + (i)))
-void begin_nodes(
-    const int begin, const int end, const int stride, const float omega, const float then, GRAPH_ARGS, MAP inverse,
-    MAP b, OUT x)
+// --- Cycles -----------------------------------------------------------------------------------------------------
+
+#define STEPS_ARGS const float first, const float second, const float third
+#define STEP_BY(omega, READ, p, s) (READ(p) + (omega) * AT(inverse + i) * (AT(b + i) + FLOW(READ, p, s)))
+
+// What the aggregates of nodes have, and those of fine nodes i, whose blocks are at J.
+#if WIDTH == 8
+#define SPREAD(J) ((*(__global const half_loose *)(e + (J))).s00112233)
+#else
+#define SPREAD(J) e[J]
+#endif
+reals injected(const int i, const int J, const int coarse_stride, MAP e, const int moved, BYTES to)
 {
-    EACH_NODE {
-        LINKS
-        PUT(x + i) = FIRST(i) + then * AT(inverse + i) * (AT(b + i) + FLOWING(FIRST));
+    reals found = SPREAD(J);
+    if (!moved) return found;
+#if WIDTH == 8
+    if (*(__global const ulong *)(to + i) == 0) return found;
+#endif
+    for (int k = 0; k < WIDTH; ++k) {
+        if (to[i + k]) ((float *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)];
+    }
+    return found;
+}
+
+// The sum of what the members of an aggregate have.
+float gathered(
+    const int J, const int base, const int stride, COARSE_ARGS, BYTES to, MAP values)
+{
+    const int row = (J - coarse_base) / coarse_stride - 1, C = (J - coarse_base) % coarse_stride;
+    float sum = 0;
+    EACH_MEMBER sum += values[i];
+    return sum;
+}
+
+// A group's tile of a level and SIDE nodes around it, in local memory. Beyond rows there is nothing; what lies beyond columns is
+// of other rows, to which no link leads.
+#define AROUND 3
+#define SIDE (WIDTH == 8 ? 8 : AROUND)
+#define ACROSS (COLUMNS + 2 * SIDE)
+#define TILE_ITEMS                                                                                         \
+    __local float one_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE], other_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE]; \
+    __local float *one = one_room + SIDE, *other = other_room + SIDE;                                      \
+    const int lanes = LESSER((int)get_local_size(0), COLUMNS / WIDTH), lane = get_local_id(0) % lanes;     \
+    const int lines = get_local_size(0) / lanes;                                                           \
+    const int line = (int)get_local_id(0) < lanes * lines ? (int)get_local_id(0) / lanes : ROWS + AROUND;  \
+    const int across = (stride + COLUMNS - 1) / COLUMNS, top = get_group_id(0) / across * ROWS;            \
+    const int left = get_group_id(0) % across * COLUMNS, wide = LESSER(COLUMNS, stride - left);
+#define EACH_LINE(more) for (int y = line - (more); y < ROWS + (more); y += lines)
+#define EACH_OF_LINE(more)                                                                                 \
+    for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + left + x,         \
+             p = (y + AROUND) * ACROSS + SIDE + x;                                                         \
+         x < wide + ((more) ? SIDE : 0); x += lanes * WIDTH, i += lanes * WIDTH, p += lanes * WIDTH)
+#define FILL(more, room, ...)                                                                              \
+    EACH_LINE(more) {                                                                                      \
+        if (top + y >= 0 && top + y < rows) {                                                              \
+            EACH_OF_LINE(more) {                                                                           \
+                __VA_ARGS__                                                                                \
+            }                                                                                              \
+        } else {                                                                                           \
+            EACH_OF_LINE(more) PUT_NEAR(room + p) = 0;                                                     \
+        }                                                                                                  \
+    }                                                                                                      \
+    barrier(CLK_LOCAL_MEM_FENCE);
+#define STEP_NEAR(omega, from, to) SIDES PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);
+#define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
+
+// Three steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
+// side. The residual itself is written if `keep` is 1.
+__kernel void multigrid_descend(
+    LEVEL_ARGS, COARSE_ARGS, STEPS_ARGS, GRAPH_ARGS, MAP inverse, MAP b, const int again, MAP x_before, OUT t, const int keep,
+    OUT residual, OUT coarse_b)
+{
+    TILE_ITEMS
+    if (again) {
+        FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(first, AT, x_before + i, stride);)
+    } else {
+        FILL(3, one, PUT_NEAR(one + p) = first * AT(inverse + i) * AT(b + i);)
+    }
+    FILL(2, other, STEP_NEAR(second, one, other))
+    FILL(1, one, STEP_NEAR(third, other, one) if (MINE) PUT(t + i) = NEAR(one + p);)
+    FILL(0, other, SIDES
+        const reals rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
+        PUT_NEAR(other + p) = rest;
+        if (keep) PUT(residual + i) = rest;)
+    for (int y = line; y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines) {
+        for (int x = lane * WIDTH; x < wide / 2; x += lanes * WIDTH) {
+            __local const float *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
+            PUT(coarse_b + coarse_base + coarse_stride * (top / 2 + y + 1) + left / 2 + x)
+                = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
+        }
     }
 }
 
-__kernel void multigrid_begin(LEVEL_ARGS, const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x)
+// The coarse right side of aggregates that are no blocks.
+#define SOME GREATER(TILE / 16, 1)
+__kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed, const int count, MAP residual, OUT coarse_b)
 {
-    ITEMS_NODES
-    begin_nodes(begin, end, stride, omega, then, right, down, anchor, inverse, b, x);
-}
-
-// One step of Jacobi's method.
-void smooth_nodes(
-    const int begin, const int end, const int stride, const float omega, GRAPH_ARGS, MAP b, MAP x, OUT smoother)
-{
-    EACH_NODE {
-        LINKS
-        const reals diagonal = DIAGONAL;
-        PUT(smoother + i) = HEIGHT(i) + omega * (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
+    const int begin = get_global_id(0) * SOME, end = LESSER(begin + SOME, count);
+    for (int n = begin; n < end; ++n) {
+        const int J = changed[coarse_base + n];
+        coarse_b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, residual);
     }
 }
 
-__kernel void multigrid_smooth(LEVEL_ARGS, const float omega, GRAPH_ARGS, MAP b, MAP x, OUT smoother)
+// What the aggregates have, added to t, and three steps of Jacobi's method; the sums over tiles of the heights times
+// the right side.
+__kernel void multigrid_ascend(
+    LEVEL_ARGS, COARSE_ARGS, STEPS_ARGS, GRAPH_ARGS, MAP inverse, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
+    OUT parts)
 {
-    ITEMS_NODES
-    smooth_nodes(begin, end, stride, omega, right, down, anchor, b, x, smoother);
+    TILE_ITEMS
+    FILL(3, one,
+        const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
+        PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)
+    FILL(2, other, STEP_NEAR(third, one, other))
+    FILL(1, one, STEP_NEAR(second, other, one))
+    reals sum = 0;
+    FILL(0, other, SIDES
+        const reals height = STEP_BY(first, NEAR, one + p, ACROSS);
+        PUT(x_new + i) = height;
+        sum += height * AT(b + i);)
+    other[get_local_id(0)] = WHOLE(sum);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (get_local_id(0) == 0) {
+        float total = 0;
+        for (int k = 0; k < (int)get_local_size(0); ++k) total += other[k];
+        parts[get_group_id(0)] = total;
+    }
 }
+
+// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x, from
+// heights x if `again` is 1. Levels up to `twice` are gone through twice.
+typedef struct {
+    int base, rows, stride, moved;
+} Level;
+
+#define EACH_OF_LEVEL                                                                                      \
+    for (int i = base + stride + (int)get_local_id(0) * WIDTH; i < base + stride * (rows + 1);             \
+         i += (int)get_local_size(0) * WIDTH)
+#define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride, moved = levels[l].moved;
+#define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
+#define FENCE barrier(CLK_GLOBAL_MEM_FENCE);
+#define SMOOTH(omega, from, to)                                                                            \
+    EACH_OF_LEVEL {                                                                                        \
+        SIDES                                                                                              \
+        PUT(to + i) = STEP_BY(omega, AT, from + i, stride);                                                \
+    }                                                                                                      \
+    FENCE
+__kernel void multigrid_tail(
+    const int from, const int last, const int twice, __global const Level *restrict levels, STEPS_ARGS, GRAPH_ARGS, MAP inverse,
+    BYTES to, COUNTS changed, const int again, __global float *b, __global float *x, __global float *t)
+{
+    int l = from, start = again, gone = 0;  // a bit for each level
+    do {
+        for (; l < last; ++l, start = 0) {
+            OF_LEVEL(l)
+            OF_COARSE(l + 1)
+            if (start) {
+                SMOOTH(first, x, t)
+            } else {
+                EACH_OF_LEVEL PUT(t + i) = first * AT(inverse + i) * AT(b + i);
+                FENCE
+            }
+            SMOOTH(second, t, x)
+            SMOOTH(third, x, t)
+            EACH_OF_LEVEL {
+                SIDES
+                PUT(x + i) = AT(b + i) + FLOW(AT, t + i, stride);
+            }
+            FENCE
+            const int across = stride / 2;
+            for (int n = get_local_id(0) * WIDTH; n < coarse_rows * across; n += (int)get_local_size(0) * WIDTH) {
+                const int row = n / across, C = n % across, I = base + stride * (2 * row + 1) + 2 * C, K = I + stride;
+                PUT(b + coarse_base + coarse_stride * (row + 1) + C) = (EVEN(x + I) + ODD(x + I)) + (EVEN(x + K) + ODD(x + K));
+            }
+            FENCE
+            for (int n = get_local_id(0); n < moved; n += (int)get_local_size(0)) {
+                const int J = changed[coarse_base + n];
+                b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, x);
+            }
+            FENCE
+        }
+        {
+            OF_LEVEL(last)
+            EACH_OF_LEVEL PUT(x + i) = AT(inverse + i) * AT(b + i);
+            FENCE
+        }
+        while (l > from && !start) {
+            --l;
+            OF_LEVEL(l)
+            OF_COARSE(l + 1)
+            EACH_OF_LEVEL {
+                const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
+                PUT(t + i) = AT(t + i) + injected(i, J, coarse_stride, x, moved, to);
+            }
+            FENCE
+            SMOOTH(third, t, x)
+            SMOOTH(second, x, t)
+            SMOOTH(first, t, x)
+            start = l > from && l <= twice && !(gone >> l & 1);
+            gone = start ? gone | 1 << l : gone & ~(1 << l);
+        }
+    } while (start);
+}
+
+// --- Conjugate gradients ----------------------------------------------------------------------------------------
+//
+// Sums are written in parts, for the host to add up.
 
 // The residual, b - A x.
-void residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT residual)
-{
-    EACH_NODE {
-        LINKS
-        PUT(residual + i) = AT(b + i) + FLOWING(HEIGHT);
-    }
-}
-
 __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT residual)
 {
     ITEMS_NODES
-    residual_nodes(begin, end, stride, right, down, anchor, b, x, residual);
-}
-
-// The residual becomes the right side, and the heights so far are kept.
-void keep_nodes(const int begin, const int end, MAP residual, MAP x, OUT b, OUT kept)
-{
     EACH_NODE {
-        PUT(b + i) = AT(residual + i);
-        PUT(kept + i) = HEIGHT(i);
+        SIDES
+        PUT(residual + i) = AT(b + i) + FLOW(AT, x + i, stride);
     }
 }
 
-__kernel void multigrid_keep(LEVEL_ARGS, MAP residual, MAP x, OUT b, OUT kept)
-{
-    ITEMS_NODES
-    keep_nodes(begin, end, residual, x, b, kept);
-}
-
-// The residual over the diagonal.
-void scaled_residual_nodes(const int begin, const int end, const int stride, GRAPH_ARGS, MAP b, MAP x, OUT residual)
-{
-    EACH_NODE {
-        LINKS
-        const reals diagonal = DIAGONAL;
-        PUT(residual + i) = (AT(b + i) + FLOWING(HEIGHT)) * INVERSE(diagonal);
-    }
-}
-
-__kernel void multigrid_scaled_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT residual)
-{
-    ITEMS_NODES
-    scaled_residual_nodes(begin, end, stride, right, down, anchor, b, x, residual);
-}
-
-// The residual of heights of zero, over the diagonal.
-void scale_nodes(const int begin, const int end, MAP inverse, MAP b, OUT residual)
-{
-    EACH_NODE {
-        PUT(residual + i) = AT(inverse + i) * AT(b + i);
-    }
-}
-
-__kernel void multigrid_scale(LEVEL_ARGS, MAP inverse, MAP b, OUT residual)
-{
-    ITEMS_NODES
-    scale_nodes(begin, end, inverse, b, residual);
-}
-
-// Nothing, where no pass writes what others read.
-__kernel void multigrid_clear(LEVEL_ARGS, OUT x)
-{
-    ITEMS_NODES
-    EACH_NODE {
-        PUT(x + i) = 0;
-    }
-}
-
-// Heights and others.
-void add_nodes(const int begin, const int end, MAP other, OUT x)
-{
-    EACH_NODE {
-        PUT(x + i) += AT(other + i);
-    }
-}
-
-__kernel void multigrid_add(LEVEL_ARGS, MAP other, OUT x)
-{
-    ITEMS_NODES
-    add_nodes(begin, end, other, x);
-}
-
-// The coarse right side: the residual of a block's nodes, once a step of Jacobi's method has spread it. Of each
-// link that enters the block the far end counts, and of those inside both. The residual lies, of the
-// row above the block, its own two and the one below, at `above` to `below`.
-void restrict_row(
-    const int I, const int K, const int J, const int count, const int stride, MAP right, MAP down, MAP above, MAP upper,
-    MAP lower, MAP below, OUT b)
-{
-    for (int c = 0; c < count; c += WIDTH) {
-        const int f = 2 * c, i = I + f, k = K + f;
-        const reals one = EVEN(upper + f), two = ODD(upper + f), three = EVEN(lower + f), four = ODD(lower + f);
-        const reals top = EVEN(right + i) * (one + two) + EVEN(right + i - 1) * EVEN(upper + f - 1)
-            + ODD(right + i) * ODD(upper + f + 1);
-        const reals bottom = EVEN(right + k) * (three + four) + EVEN(right + k - 1) * EVEN(lower + f - 1)
-            + ODD(right + k) * ODD(lower + f + 1);
-        const reals before = EVEN(down + i) * (one + three) + EVEN(down + i - stride) * EVEN(above + f)
-            + EVEN(down + k) * EVEN(below + f);
-        const reals after = ODD(down + i) * (two + four) + ODD(down + i - stride) * ODD(above + f)
-            + ODD(down + k) * ODD(below + f);
-        PUT(b + J + c) = (top + bottom) + (before + after);
-    }
-}
-
-#define RESTRICT_ROW                                                                                       \
-    const int I = base + stride * (2 * row + 1), K = I + stride, J = coarse_base + coarse_stride * (row + 1); \
-    restrict_row(I, K, J, stride / 2, stride, right, down, residual + I - stride, residual + I, residual + K,       \
-                 residual + K + stride, b);
-
-__kernel void multigrid_restrict(BETWEEN_ARGS, MAP right, MAP down, MAP residual, OUT b)
-{
-    const int row = get_global_id(0);
-    if (row < coarse_rows) {
-        RESTRICT_ROW
-    }
-}
-
-// The coarse right side of full multigrid, where no block is split: the sum over each block.
-void gather_row(
-    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, MAP fine, OUT b)
-{
-    EACH_BLOCK {
-        PUT(b + J) = (EVEN(fine + I) + ODD(fine + I)) + (EVEN(fine + K) + ODD(fine + K));
-    }
-}
-
-__kernel void multigrid_gather(BETWEEN_ARGS, MAP fine, OUT b)
-{
-    const int row = get_global_id(0);
-    if (row < coarse_rows) gather_row(row, base, stride, coarse_base, coarse_stride, fine, b);
-}
-
-// Heights and the coarse correction, spread by a step of Jacobi's method.
-void prolong_row(
-    const int row, const int base, const int stride, const int coarse_base, const int coarse_stride, const float keep,
-    MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT upper, OUT lower)
-{
-    EACH_BLOCK {
-        const reals here = AT(e + J), above = AT(e + J - coarse_stride), below = AT(e + J + coarse_stride);
-        const reals before = AT(e + J - 1), after = AT(e + J + 1);
-        const reals a = keep * EVEN(x + I) + EVEN(inverse + I) * (EVEN(right + I) * here
-            + EVEN(right + I - 1) * before + EVEN(down + I) * here + EVEN(down + I - stride) * above);
-        const reals b = keep * ODD(x + I) + ODD(inverse + I) * (ODD(right + I) * after
-            + EVEN(right + I) * here + ODD(down + I) * here + ODD(down + I - stride) * above);
-        const reals c = keep * EVEN(x + K) + EVEN(inverse + K) * (EVEN(right + K) * here
-            + EVEN(right + K - 1) * before + EVEN(down + K) * below + EVEN(down + I) * here);
-        const reals d = keep * ODD(x + K) + ODD(inverse + K) * (ODD(right + K) * after
-            + EVEN(right + K) * here + ODD(down + K) * below + ODD(down + I) * here);
-        PUT_BOTH(upper, a, b)
-        PUT_BOTH(lower, c, d)
-        upper += 2 * WIDTH;
-        lower += 2 * WIDTH;
-    }
-}
-
-#define PROLONG_ROW                                                                                        \
-    __global float *upper = corrected + base + stride * (2 * row + 1), *lower = upper + stride;            \
-    prolong_row(row, base, stride, coarse_base, coarse_stride, keep, right, down, inverse, e, x, upper, lower);
-
-__kernel void multigrid_prolong(
-    BETWEEN_ARGS, const float keep, MAP right, MAP down, MAP inverse, MAP e, MAP x, OUT corrected)
-{
-    const int row = get_global_id(0);
-    if (row < coarse_rows) {
-        PROLONG_ROW
-    }
-}
-
-// The coarse links and anchors, and 1 where a block's nodes do not hang together by links of at least `strength` of the
-// geometric mean of their nodes' greatest ones. A link stands for a way
-// from the middle of its block to that of the next: in either goes on by half a link that lies behind it, or around by
-// the other row's; where neither is, by half a link as well.
-#define GREATEST(PICK, i)                                                                                  \
-    GREATER(GREATER(PICK(right + (i)), PICK(right + (i) - 1)), GREATER(PICK(down + (i)), PICK(down + (i) - stride)))
-#define GO_ON(w, behind, across, beside)                                                                   \
-    ((behind) > 0 ? 1 / ((w) + (behind)) : (((across) > 0) & ((beside) > 0)) ? 1 / (beside) : 0.5f / (w))
-#define IN_SERIES(w, before, after) ((w) > 0 ? 1 / (1 / (w) + (before) + (after)) : 0)
-#define COUNT(condition) ((condition) ? (reals)1 : (reals)0)
-#define STRONG(w, g, h) COUNT(((w) > 0) & ((w) * (w) >= strength * strength * (g) * (h)))
-__kernel void multigrid_coarsen(
-    BETWEEN_ARGS, const float strength, GRAPH_ARGS, OUT coarse_right, OUT coarse_down, OUT coarse_anchor, OUT split)
-{
-    const int row = get_global_id(0);
-    if (row >= coarse_rows) return;
-    EACH_BLOCK {
-        const reals a = GREATEST(EVEN, I), b = GREATEST(ODD, I), c = GREATEST(EVEN, K), d = GREATEST(ODD, K);
-        const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
-        const reals from_b = ODD(right + I), from_d = ODD(right + K), under_c = EVEN(down + K), under_d = ODD(down + K);
-        const reals next_ab = EVEN(right + I + 2), next_cd = EVEN(right + K + 2), next_ac = EVEN(down + I + 2);
-        const int M = row + 1 < coarse_rows ? K + stride : K;  // below the last row the coarse level may begin
-        const reals low_ab = EVEN(right + M), low_ac = EVEN(down + M), low_bd = ODD(down + M);
-        const reals live = COUNT(a > 0) + COUNT(b > 0) + COUNT(c > 0) + COUNT(d > 0);
-        const reals joined = STRONG(ab, a, b) + STRONG(cd, c, d) + STRONG(ac, a, c) + STRONG(bd, b, d);
-        PUT(coarse_right + J)
-            = IN_SERIES(from_b, GO_ON(from_b, ab, bd, cd), GO_ON(from_b, next_ab, next_ac, next_cd))
-            + IN_SERIES(from_d, GO_ON(from_d, cd, bd, ab), GO_ON(from_d, next_cd, next_ac, next_ab));
-        PUT(coarse_down + J)
-            = IN_SERIES(under_c, GO_ON(under_c, ac, cd, bd), GO_ON(under_c, low_ac, low_ab, low_bd))
-            + IN_SERIES(under_d, GO_ON(under_d, bd, cd, ac), GO_ON(under_d, low_bd, low_ab, low_ac));
-#if ANCHORED
-        PUT(coarse_anchor + J) = (COUNT(a > 0) * EVEN(anchor + I) + COUNT(b > 0) * ODD(anchor + I))
-            + (COUNT(c > 0) * EVEN(anchor + K) + COUNT(d > 0) * ODD(anchor + K));
-#endif
-        PUT(split + J) = COUNT(joined < live - 1);
-    }
-}
-
-// The links, scaled along both axes so that those along x weigh as much on average as those along y.
-#define MEAN(a, b) (((a) + (b)) * ((((a) > 0) & ((b) > 0)) ? (reals)0.5f : (reals)1))
-#define EVENED_LINKS                                                                                       \
-    LINKS                                                                                                  \
-    const reals along_x = MEAN(to_right, to_left), along_y = MEAN(to_below, to_above);                     \
-    const reals both = sqrt(along_x * along_y), one = (reals)1;                                            \
-    const reals by_x = both > 0 ? both / along_x : one, by_y = both > 0 ? both / along_y : one;            \
-    const reals go_right = by_x * to_right, go_left = by_x * to_left;                                      \
-    const reals go_below = by_y * to_below, go_above = by_y * to_above;
-
-// One over the diagonal of these.
-__kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
-{
-    ITEMS_NODES
-    EACH_NODE {
-        EVENED_LINKS
-        const reals diagonal = (go_right + go_left) + (go_below + go_above) WITH_ANCHOR(AT(anchor + i));
-        PUT(evened + i) = INVERSE(diagonal);
-    }
-}
-
-// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps.
-__kernel void multigrid_returns(LEVEL_ARGS, MAP right, MAP down, MAP evened, OUT returns)
-{
-    ITEMS_NODES
-    EACH_NODE {
-        EVENED_LINKS
-        PUT(returns + i) = AT(evened + i)
-            * ((go_right * go_right * AT(evened + i + 1) + go_left * go_left * AT(evened + i - 1))
-               + (go_below * go_below * AT(evened + i + stride) + go_above * go_above * AT(evened + i - stride)));
-    }
-}
-
-// What a node's variance has that the coarse one does not.
-#define BESIDE(i) (AT(evened + (i)) * (c[3] + c[4] * AT(returns + (i))) + here * AT(returns + (i)))
-__kernel void multigrid_local(
-    LEVEL_ARGS, MAP right, MAP down, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
-{
-    ITEMS_NODES
-    EACH_NODE {
-        EVENED_LINKS
-        const reals here = c[2] * AT(evened + i);
-        const reals odd = both > 0 ? 1 - 2 * both / (along_x + along_y) : 1 - one;
-        PUT(local_part + i) = AT(evened + i)
-            * ((c[0] + c[1] * AT(returns + i) + c[5] * odd) + (go_right * BESIDE(i + 1) + go_left * BESIDE(i - 1))
-               + (go_below * BESIDE(i + stride) + go_above * BESIDE(i - stride)));
-    }
-}
-
-// The same passes for extra nodes: row k is of node[k], and SUM over its other nodes j of weight w.
-#define EXTRA_TILE GREATER(TILE / 16, 1)
-#define TABLE_ARGS __global const int *restrict node, __global const int *restrict start, __global const int *restrict column, MAP weight
-#define ITEMS_EXTRA                                                                                          \
-    const int begin = at + (int)get_global_id(0) * EXTRA_TILE, end = LESSER(begin + EXTRA_TILE, at + count);
-#define EACH_EXTRA for (int k = begin; k < end; ++k)
-#define SUM(sum, term)                                                                                     \
-    float sum = 0;                                                                                         \
-    for (int m = start[k]; m < start[k + 1]; ++m) {                                                        \
-        const int j = column[m];                                                                           \
-        const float w = weight[m];                                                                         \
-        sum += term;                                                                                       \
-    }
-
-__kernel void multigrid_invert_extra(const int at, const int count, TABLE_ARGS, MAP anchor, OUT inverse)
-{
-    ITEMS_EXTRA
-    EACH_EXTRA {
-        SUM(diagonal, w)
-        const float whole = diagonal WITH_ANCHOR(anchor[node[k]]);
-        inverse[node[k]] = INVERSE(whole);
-    }
-}
-
-#define SEED(i) (omega * b[i] * inverse[i])
-void begin_extra(
-    const int begin, const int end, TABLE_ARGS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
-{
-    EACH_EXTRA {
-        const int i = node[k];
-        SUM(flow, w * (SEED(j) - SEED(i)))
-        x[i] = SEED(i) + then * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * SEED(i)));
-    }
-}
-
-__kernel void multigrid_begin_extra(
-    const int at, const int count, TABLE_ARGS, const float omega, const float then, MAP anchor, MAP inverse, MAP b, OUT x)
-{
-    ITEMS_EXTRA
-    begin_extra(begin, end, node, start, column, weight, omega, then, anchor, inverse, b, x);
-}
-
-void smooth_extra(
-    const int begin, const int end, TABLE_ARGS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
-{
-    EACH_EXTRA {
-        const int i = node[k];
-        SUM(flow, w * (x[j] - x[i]))
-        smoother[i] = x[i] + omega * inverse[i] * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
-    }
-}
-
-__kernel void multigrid_smooth_extra(
-    const int at, const int count, TABLE_ARGS, const float omega, MAP anchor, MAP inverse, MAP b, MAP x, OUT smoother)
-{
-    ITEMS_EXTRA
-    smooth_extra(begin, end, node, start, column, weight, omega, anchor, inverse, b, x, smoother);
-}
-
-// Over the diagonal, if there is one to divide by.
-void residual_extra(
-    const int begin, const int end, TABLE_ARGS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT residual)
-{
-    EACH_EXTRA {
-        const int i = node[k];
-        SUM(flow, w * (x[j] - x[i]))
-        residual[i] = (divide ? inverse[i] : 1) * (b[i] + flow WITH_ANCHOR(-anchor[i] * x[i]));
-    }
-}
-
-__kernel void multigrid_residual_extra(
-    const int at, const int count, TABLE_ARGS, const int divide, MAP anchor, MAP inverse, MAP b, MAP x, OUT residual)
-{
-    ITEMS_EXTRA
-    residual_extra(begin, end, node, start, column, weight, divide, anchor, inverse, b, x, residual);
-}
-
-void restrict_extra(const int begin, const int end, TABLE_ARGS, MAP residual, OUT b)
-{
-    EACH_EXTRA {
-        SUM(whole, w * residual[j])
-        b[node[k]] = whole;
-    }
-}
-
-__kernel void multigrid_restrict_extra(const int at, const int count, TABLE_ARGS, MAP residual, OUT b)
-{
-    ITEMS_EXTRA
-    restrict_extra(begin, end, node, start, column, weight, residual, b);
-}
-
-void prolong_extra(const int begin, const int end, TABLE_ARGS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
-{
-    EACH_EXTRA {
-        const int i = node[k];
-        SUM(whole, w * e[j])
-        corrected[i] = keep * x[i] + inverse[i] * whole;
-    }
-}
-
-__kernel void multigrid_prolong_extra(
-    const int at, const int count, TABLE_ARGS, const float keep, MAP inverse, MAP e, MAP x, OUT corrected)
-{
-    ITEMS_EXTRA
-    prolong_extra(begin, end, node, start, column, weight, keep, inverse, e, x, corrected);
-}
-
-__kernel void multigrid_returns_extra(const int at, const int count, TABLE_ARGS, MAP evened, OUT returns)
-{
-    ITEMS_EXTRA
-    EACH_EXTRA {
-        SUM(back, w * w * evened[j])
-        returns[node[k]] = evened[node[k]] * back;
-    }
-}
-
-__kernel void multigrid_local_extra(
-    const int at, const int count, TABLE_ARGS, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
-{
-    ITEMS_EXTRA
-    EACH_EXTRA {
-        const int i = node[k];
-        SUM(beside, w * (evened[j] * (c[3] + c[4] * returns[j]) + c[2] * evened[i] * returns[j]))
-        local_part[i] = evened[i] * (c[0] + c[1] * returns[i] + beside);
-    }
-}
-
-// The coarsest level: the pseudo-inverse of its matrix, times the right side of its nodes.
-void solve_node(const int k, const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
-{
-    float sum = 0;
-    for (int m = 0; m < count; ++m) {
-        sum += matrix[k * count + m] * b[bottom[m]];
-    }
-    x[bottom[k]] = sum;
-}
-
-__kernel void multigrid_solve(const int count, __global const int *restrict bottom, MAP matrix, MAP b, OUT x)
-{
-    const int k = get_global_id(0);
-    if (k < count) solve_node(k, count, bottom, matrix, b, x);
-}
-
-#if WIDTH > 1
-// Half a V-cycle over a large level without extra links, in one go: what passes hand on stays in the cache, in lines of
-// an item's own. An item does a band of coarse rows, and at its borders what its neighbours do as well.
-#define LINES 8
-#define MARGIN 8
-#define LINE(row) (mine + ((row) & 3) * width)
-#define OTHER_LINE(row) (mine + (4 + ((row) & 3)) * width)
-#define BAND                                                                                               \
-    const int first = get_global_id(0) * band, last = LESSER(first + band, coarse_rows);                   \
-    const int top = 2 * first, bottom = 2 * last, width = stride + 2 * MARGIN;                             \
-    __global float *mine = lines + (int)get_global_id(0) * LINES * width + MARGIN;
-#define EACH_OF_ROW(r) for (int c = 0, i = base + stride * ((r) + 1); c < stride; c += WIDTH, i += WIDTH)
-#define IN_PICTURE(r) ((r) >= 0 && (r) < rows)
-#define LINED(p) AT(p)
-
-void clear_line(__global float *line, const int stride)
-{
-    for (int c = 0; c < stride; c += WIDTH) PUT(line + c) = 0;
-}
-
-// Two steps of Jacobi's method from heights of zero, the residual then, which is written if `keep` is 1, and the
-// coarse right side.
-__kernel void multigrid_descend(
-    LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band, const int keep,
-    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, OUT x, OUT residual, OUT lines, OUT coarse_b)
-{
-    BAND
-    if (first >= last) return;
-    for (int r = top - 2; r <= bottom + 1; ++r) {
-        __global float *line = LINE(r);
-        if (!IN_PICTURE(r)) clear_line(line, stride);
-        else EACH_OF_ROW(r) {
-            LINKS
-            const reals height = FIRST(i) + then * AT(inverse + i) * (AT(b + i) + FLOWING(FIRST));
-            PUT(line + c) = height;
-            if (r >= top && r < bottom) PUT(x + i) = height;
-        }
-        const int q = r - 1;
-        if (q < top - 1) continue;
-        __global float *over = OTHER_LINE(q), *middle = LINE(q), *above = LINE(q - 1), *below = LINE(q + 1);
-        if (!IN_PICTURE(q)) clear_line(over, stride);
-        else EACH_OF_ROW(q) {
-            LINKS
-            const reals rest = (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
-            PUT(over + c) = rest;
-            if (keep && q >= top && q < bottom) PUT(residual + i) = rest;
-        }
-        if (q > top && q % 2 == 0) {
-            const int I = base + stride * (q - 1), J = coarse_base + coarse_stride * (q / 2);
-            restrict_row(I, I + stride, J, stride / 2, stride, right, down, OTHER_LINE(q - 3), OTHER_LINE(q - 2),
-                         OTHER_LINE(q - 1), over, coarse_b);
-        }
-    }
-}
-
-// The coarse correction and two steps of Jacobi's method, and parts of the product of heights and right side. The
-// rows of the table for the prolongation to extra nodes that belong to a row of the picture begin at first_extra[row].
-__kernel void multigrid_ascend(
-    LEVEL_ARGS, const int coarse_base, const int coarse_rows, const int coarse_stride, const int band,
-    const float omega, const float then, GRAPH_ARGS, MAP inverse, MAP b, MAP e, MAP x, OUT lines, OUT smoother,
-    OUT parts, const int extras, __global const int *restrict first_extra, TABLE_ARGS)
-{
-    BAND
-    if (first >= last) return;
-    reals sum = 0;
-    for (int row = first - 1; row <= last; ++row) {
-        __global float *upper = LINE(2 * row), *lower = LINE(2 * row + 1);
-        if (row < 0 || row >= coarse_rows) {
-            clear_line(upper, stride);
-            clear_line(lower, stride);
-        } else {
-            prolong_row(row, base, stride, coarse_base, coarse_stride, 1, right, down, inverse, e, x, upper, lower);
-            for (int k = extras ? first_extra[2 * row] : 0; k < (extras ? first_extra[LESSER(2 * row + 2, rows)] : 0); ++k) {
-                SUM(whole, w * e[j])
-                const int i = node[k], r = (i - base) / stride - 1;
-                LINE(r)[i - base - stride * (r + 1)] = x[i] + inverse[i] * whole;
-            }
-        }
-        for (int q = GREATER(2 * row - 1, top - 1); q <= LESSER(2 * row, bottom); ++q) {
-            __global float *line = OTHER_LINE(q), *middle = LINE(q), *above = LINE(q - 1), *below = LINE(q + 1);
-            if (!IN_PICTURE(q)) clear_line(line, stride);
-            else EACH_OF_ROW(q) {
-                LINKS
-                PUT(line + c) = LINED(middle + c)
-                    + then * (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
-            }
-        }
-        for (int q = GREATER(2 * row - 2, top); q < LESSER(2 * row, LESSER(bottom, rows)); ++q) {
-            __global float *middle = OTHER_LINE(q), *above = OTHER_LINE(q - 1), *below = OTHER_LINE(q + 1);
-            EACH_OF_ROW(q) {
-                LINKS
-                const reals height = LINED(middle + c)
-                    + omega * (AT(b + i) + FLOW(LINED, above + c, middle + c, below + c)) * AT(inverse + i);
-                PUT(smoother + i) = height;
-                sum += height * AT(b + i);
-            }
-        }
-    }
-    parts[get_global_id(0)] = WHOLE(sum);
-}
-
-// All passes over the small levels by one item, for each launch would take longer than its pass.
-
-typedef struct {
-    int base, rows, stride, first_extra, extras, graph, graphs, restricting, restricts, prolonging, prolongs;
-} Level;
-
-#define LEVEL(l) levels[l]
-#define TABLE node, start, column, weight
-#define EXTRAS_OF(name, l) LEVEL(l).name##ing, LEVEL(l).name##ing + LEVEL(l).name##s
-#define GRAPH_OF(l) LEVEL(l).graph, LEVEL(l).graph + LEVEL(l).graphs
-#define PICTURE_OF(l) LEVEL(l).base + LEVEL(l).stride, LEVEL(l).base + LEVEL(l).stride * (LEVEL(l).rows + 1)
-#define BEHIND(l) LEVEL(l).first_extra, LEVEL(l).first_extra + LEVEL(l).extras
-#define GRAPH right, down, anchor
-#define ALL_NODES(l) PICTURE_OF(l), LEVEL(l).stride
-#define TAIL                                                                                               \
-    const int first, const int last, __global const Level *restrict levels, GRAPH_ARGS, \
-    MAP inverse, TABLE_ARGS, const int count, __global const int *restrict bottom, MAP matrix, const float omega, \
-    const float then
-
-void tail_restrict(const int l, __global const Level *restrict levels, MAP right, MAP down, TABLE_ARGS, MAP residual, OUT b)
-{
-    const int base = LEVEL(l).base, stride = LEVEL(l).stride;
-    const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
-    for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
-        RESTRICT_ROW
-    }
-    restrict_extra(EXTRAS_OF(restrict, l), TABLE, residual, b);
-}
-
-void tail_prolong(
-    const int l, __global const Level *restrict levels, const float keep, MAP right, MAP down, MAP inverse, TABLE_ARGS,
-    MAP e, MAP x, OUT corrected)
-{
-    const int base = LEVEL(l).base, stride = LEVEL(l).stride;
-    const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
-    for (int row = 0; row < LEVEL(l + 1).rows; ++row) {
-        PROLONG_ROW
-    }
-    prolong_extra(EXTRAS_OF(prolong, l), TABLE, keep, inverse, e, x, corrected);
-}
-
-void tail_smooth(
-    const int l, __global const Level *restrict levels, const float omega, GRAPH_ARGS, MAP inverse, TABLE_ARGS, MAP b,
-    MAP x, OUT smoother)
-{
-    smooth_nodes(ALL_NODES(l), omega, GRAPH, b, x, smoother);
-    smooth_extra(GRAPH_OF(l), TABLE, omega, anchor, inverse, b, x, smoother);
-}
-
-// A cycle from level `first` on: the answer to b goes to x. Levels from `twice` to `once` are gone through a second time
-// for the residual of the first.
-#define CYCLE                                                                                              \
-    const int twice, const int once, __global float *b, __global float *x, __global float *t, __global float *kept
-void tail_cycle(TAIL, CYCLE)
-{
-    int l = first, second = 0;  // a bit for each level
-    do {
-        for (; l < last; ++l) {
-            begin_nodes(ALL_NODES(l), omega, then, GRAPH, inverse, b, t);
-            begin_extra(GRAPH_OF(l), TABLE, omega, then, anchor, inverse, b, t);
-            scaled_residual_nodes(ALL_NODES(l), GRAPH, b, t, x);
-            residual_extra(GRAPH_OF(l), TABLE, 1, anchor, inverse, b, t, x);
-            tail_restrict(l, levels, right, down, TABLE, x, b);
-        }
-        for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, b, x);
-        int again = 0;
-        while (l > first && !again) {
-            --l;
-            tail_prolong(l, levels, 1, right, down, inverse, TABLE, x, t, x);
-            tail_smooth(l, levels, then, GRAPH, inverse, TABLE, b, x, t);
-            tail_smooth(l, levels, omega, GRAPH, inverse, TABLE, b, t, x);
-            if (second >> l & 1) {
-                add_nodes(PICTURE_OF(l), kept, x);
-                add_nodes(BEHIND(l), kept, x);
-            }
-            again = l >= twice && l < once && !(second >> l & 1);
-            second &= ~(1 << l);
-        }
-        if (again) {
-            residual_nodes(ALL_NODES(l), GRAPH, b, x, t);
-            residual_extra(GRAPH_OF(l), TABLE, 0, anchor, inverse, b, x, t);
-            keep_nodes(PICTURE_OF(l), t, x, b, kept);
-            keep_nodes(BEHIND(l), t, x, b, kept);
-            second |= 1 << l;
-        }
-    } while (l > first || second >> l & 1);
-}
-
-__kernel void multigrid_tail_cycle(TAIL, CYCLE)
-{
-    tail_cycle(first, last, levels, GRAPH, inverse, TABLE, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
-}
-
-// Full multigrid from level `first` on.
-__kernel void multigrid_tail_full(TAIL, CYCLE, __global float *full_b, __global float *full_x)
-{
-    for (int l = first; l < last; ++l) {
-        const int base = LEVEL(l).base, stride = LEVEL(l).stride;
-        const int coarse_base = LEVEL(l + 1).base, coarse_stride = LEVEL(l + 1).stride;
-        for (int row = 0; row < LEVEL(l + 1).rows; ++row)
-            gather_row(row, base, stride, coarse_base, coarse_stride, full_b, full_b);
-        if (LEVEL(l).restricts == 0) continue;
-        scale_nodes(PICTURE_OF(l), inverse, full_b, t);
-        scale_nodes(BEHIND(l), inverse, full_b, t);
-        tail_restrict(l, levels, right, down, TABLE, t, full_b);
-    }
-    for (int k = 0; k < count; ++k) solve_node(k, count, bottom, matrix, full_b, x);
-    for (int l = last - 1; l >= first; --l) {
-        tail_prolong(l, levels, 0, right, down, inverse, TABLE, x, full_b, full_x);
-        residual_nodes(ALL_NODES(l), GRAPH, full_b, full_x, b);
-        residual_extra(GRAPH_OF(l), TABLE, 0, anchor, inverse, full_b, full_x, b);
-        tail_cycle(l, last, levels, GRAPH, inverse, TABLE, count, bottom, matrix, omega, then, twice, once, b, x, t, kept);
-        add_nodes(PICTURE_OF(l), full_x, x);
-        add_nodes(BEHIND(l), full_x, x);
-    }
-}
-#endif
-
-// Conjugate gradients. Sums are written in parts, for the host to add up.
 #define EACH_PART                                                                                          \
     const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
     const int end = LESSER(begin + PART, base + stride * (rows + 1));                                      \
@@ -752,8 +542,8 @@ __kernel void multigrid_direct(
     LEVEL_ARGS, const float beta, GRAPH_ARGS, MAP z, MAP before, OUT direction, OUT image, OUT parts)
 {
     EACH_PART {
-        LINKS
-        const reals p = DIRECTION(i), q = -FLOWING(DIRECTION);
+        SIDES
+        const reals p = DIRECTION(i), q = -FLOW(DIRECTION, i, stride);
         PUT(direction + i) = p;
         PUT(image + i) = q;
         sum += p * q;
@@ -783,9 +573,9 @@ __kernel void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const
     const int end = LESSER(begin + PART, base + stride * (rows + 1));
     reals zz = 0, zp = 0, pp = 0, bp = 0;
     EACH_NODE {
-        LINKS
-        const reals along = -FLOWING(STEP);
-        zz -= CORRECTION(i) * FLOWING(CORRECTION);
+        SIDES
+        const reals along = -FLOW(STEP, i, stride);
+        zz -= CORRECTION(i) * FLOW(CORRECTION, i, stride);
         zp += CORRECTION(i) * along;
         pp += STEP(i) * along;
         bp += AT(b + i) * STEP(i);
@@ -836,27 +626,99 @@ __kernel void multigrid_dot(LEVEL_ARGS, MAP one, MAP other, OUT parts)
 __kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, MAP x, OUT parts)
 {
     EACH_PART {
-        sum += AT(anchor + i) * HEIGHT(i) * HEIGHT(i);
+        sum += AT(anchor + i) * AT(x + i) * AT(x + i);
     }
     WRITE_PART
 }
 
-// Maps of pixels without margins, to and from the finest level, row by row.
+// Maps of pixels without margins, to and from the finest level.
+#define PICTURE_ITEMS                                                                                      \
+    const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;                       \
+    const int from = get_global_id(0) % pieces * TILE, upto = LESSER(columns, from + TILE);                \
+    if (row >= rows) return;
 __kernel void multigrid_admit(const int rows, const int columns, const int stride, MAP map, OUT level)
 {
-    const int row = get_global_id(0);
-    if (row >= rows) return;
-    for (int c = 0; c < columns; ++c) {
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
         level[(row + 1) * stride + c] = map[row * columns + c];
     }
 }
 
 __kernel void multigrid_release(const int rows, const int columns, const int stride, MAP level, OUT map)
 {
-    const int row = get_global_id(0);
-    if (row >= rows) return;
-    for (int c = 0; c < columns; ++c) {
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
         map[row * columns + c] = level[(row + 1) * stride + c];
+    }
+}
+
+// --- Variances --------------------------------------------------------------------------------------------------
+
+// What the aggregates have, brought to their nodes; then spread by a step of Jacobi's method, and added to a part.
+__kernel void multigrid_inject(LEVEL_ARGS, COARSE_ARGS, MAP e, const int moved_nodes, BYTES to, OUT t)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
+        PUT(t + i) = injected(i, J, coarse_stride, e, moved_nodes, to);
+    }
+}
+
+__kernel void multigrid_spread(LEVEL_ARGS, GRAPH_ARGS, MAP inverse, MAP t, MAP part, OUT x)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        SIDES
+        PUT(x + i) = AT(part + i) + AT(t + i) + AT(inverse + i) * FLOW(AT, t + i, stride);
+    }
+}
+
+// The links, scaled along both axes so that those along x weigh as much on average as those along y.
+#define MEAN(a, b) (((a) + (b)) * ((((a) > 0) & ((b) > 0)) ? (reals)0.5f : (reals)1))
+#define EVENED_SIDES                                                                                       \
+    AXES                                                                                                  \
+    const reals along_x = MEAN(to_right, to_left), along_y = MEAN(to_below, to_above);                     \
+    const reals both = sqrt(along_x * along_y), one = (reals)1;                                            \
+    const reals by_x = both > 0 ? both / along_x : one, by_y = both > 0 ? both / along_y : one;            \
+    const reals go_right = by_x * to_right, go_left = by_x * to_left;                                      \
+    const reals go_below = by_y * to_below, go_above = by_y * to_above;
+
+// One over the diagonal of these.
+__kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_SIDES
+        const reals diagonal = (go_right + go_left) + (go_below + go_above) WITH_ANCHOR(AT(anchor + i));
+        PUT(evened + i) = INVERSE(diagonal);
+    }
+}
+
+// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps.
+__kernel void multigrid_returns(LEVEL_ARGS, MAP right, MAP down, MAP evened, OUT returns)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_SIDES
+        PUT(returns + i) = AT(evened + i)
+            * ((go_right * go_right * AT(evened + i + 1) + go_left * go_left * AT(evened + i - 1))
+               + (go_below * go_below * AT(evened + i + stride) + go_above * go_above * AT(evened + i - stride)));
+    }
+}
+
+// What a node's variance has that the coarse one does not.
+#define BESIDE(i) (AT(evened + (i)) * (c[3] + c[4] * AT(returns + (i))) + here * AT(returns + (i)))
+__kernel void multigrid_local(
+    LEVEL_ARGS, MAP right, MAP down, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        EVENED_SIDES
+        const reals here = c[2] * AT(evened + i);
+        const reals odd = both > 0 ? 1 - 2 * both / (along_x + along_y) : 1 - one;
+        PUT(local_part + i) = AT(evened + i)
+            * ((c[0] + c[1] * AT(returns + i) + c[5] * odd) + (go_right * BESIDE(i + 1) + go_left * BESIDE(i - 1))
+               + (go_below * BESIDE(i + stride) + go_above * BESIDE(i - stride)));
     }
 }
 
@@ -864,13 +726,12 @@ __kernel void multigrid_release(const int rows, const int columns, const int str
 // where no flag of `wanted` is.
 __kernel void multigrid_deviation(
     const int rows, const int columns, const int stride, const float least, const int wanted,
-    __global const uchar *restrict flags, MAP inverse, MAP variance, OUT map)
+    BYTES flags, MAP inverse, MAP level, OUT map)
 {
-    const int row = get_global_id(0);
-    if (row >= rows) return;
-    for (int c = 0; c < columns; ++c) {
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
         const int i = (row + 1) * stride + c;
-        const float found = GREATER(variance[i], least * inverse[i]);
+        const float found = GREATER(level[i], least * inverse[i]);
         map[row * columns + c] = flags[row * columns + c] & wanted ? sqrt(found) : NAN;
     }
 }

@@ -44,13 +44,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.hierarchy import Hierarchy
-from mirrorskin.engine.integration.split_aggregates import Grid, Ints, Pairs, first_connected
+from mirrorskin.engine.integration.hierarchy import Hierarchy, place_of_coarse
 from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
 
+Ints = NDArray[np.int64]
 Doubles = NDArray[np.float64]
-Rooms = tuple[Array, Array, Array, Array]
+Rooms = tuple[Array, Array, Array, Array, Array]
 
 COARSE = 64
 """Nodes along a side of the level whose variance is found exactly, at most."""
@@ -79,7 +79,26 @@ def find_graph_variance(hierarchy: Hierarchy, answered: NDArray[np.bool_], rooms
         default=0,
     )
     nodes, variance = _find_coarse(hierarchy, number, _masses(hierarchy, number, answered))
-    hierarchy.spread_variance(nodes, variance, [local_part(k == 0) for k in range(number)], rooms)
+    _spread(hierarchy, nodes, variance, number, rooms)
+
+
+def _spread(hierarchy: Hierarchy, nodes: Ints, coarse: Doubles, number: int, rooms: Rooms) -> None:
+    """Bring the variance of a level's nodes to the finest, with what each level adds."""
+    h = hierarchy
+    variance, evened, returns, part, brought = rooms
+    variance.claim()
+    variance.host[...] = 0
+    variance.host[nodes] = coarse
+    variance.upload()
+    links = {name: h.graph[name] for name in ("right", "down")}
+    for fine in reversed(range(number)):
+        level, places = h.levels[fine], place_of_coarse(h.levels[fine + 1])
+        h.over("even", level, **h.graph, evened=evened)
+        h.over("returns", level, **links, evened=evened, returns=returns)
+        numbers = h.device.given("local", local_part(fine == 0))
+        h.over("local", level, **links, evened=evened, returns=returns, c=numbers, local_part=part)
+        h.over("inject", level, **places, e=variance, moved_nodes=h.moves[fine], to=h.to, t=brought)
+        h.over("spread", level, **h.graph, inverse=h.inverse, t=brought, part=part, x=variance)
 
 
 def local_part(finest: bool) -> Floats:
@@ -154,48 +173,39 @@ def expected_misfit(links: int, pixels: int, known: int, free: int, weights: tup
 
 def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> Floats:
     """Return how many pixels each node of a level stands for, by node."""
-    mass = np.zeros(hierarchy.nodes, np.float32)
-    level = hierarchy.levels[0]
+    mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.download()
     picture = answered.view(np.uint8).astype(np.float32)
-    for one, extra in zip(hierarchy.levels[: number + 1], hierarchy.extra, strict=False):
-        if one is not level:
-            padded = np.zeros((2 * one.rows, 2 * one.columns), np.float32)
-            padded[: picture.shape[0], : picture.shape[1]] = picture
-            picture = (padded[::2, ::2] + padded[1::2, ::2]) + (padded[::2, 1::2] + padded[1::2, 1::2])
-        inside = mass[one.first : one.end - one.stride].reshape(one.rows, one.stride)[:, : one.columns]
-        inside[...] = picture
-        if extra.step is not None:
-            nodes, owners = extra.step.members
-            mass[extra.step.blocks] = 0
-            np.add.at(mass, owners, mass[nodes])
-            picture = inside.copy()
+    for fine, coarse in zip(hierarchy.levels[:number], hierarchy.levels[1:], strict=False):
+        padded = np.zeros((2 * coarse.rows, 2 * coarse.columns), np.float32)
+        padded[: fine.rows, : fine.columns] = picture
+        picture = (padded[::2, ::2] + padded[1::2, ::2]) + (padded[::2, 1::2] + padded[1::2, 1::2])
+        to = moved[fine.first : fine.end - fine.stride].reshape(fine.rows, fine.stride)[:, : fine.columns]
+        row, column = np.nonzero(to)
+        if row.size and hierarchy.moves.any():
+            down, right = np.divmod(to[row, column].astype(np.int64) - 1, 3)
+            share = padded[row, column]
+            np.subtract.at(picture, (row // 2, column // 2), share)
+            np.add.at(picture, (row // 2 + down - 1, column // 2 + right - 1), share)
+    hierarchy.to.upload()
+    level = hierarchy.levels[number]
+    inside = mass[level.first : level.end - level.stride].reshape(level.rows, level.stride)
+    inside[:, : level.columns] = picture
     return mass
 
 
 def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints, Doubles]:
     """Return a level's nodes, and the diagonal of the inverse of its matrix."""
-    level, step = hierarchy.levels[number], hierarchy.extra[number].step
-    with hierarchy.on_host() as (right, down, anchor):
-        grid, inside = Grid(level, right, down), np.arange(level.first, level.end - level.stride)
-        links = Pairs.join(grid.rightward(inside), grid.downward(inside))
-        row, column = grid.place(inside)
-        node = inside
-        if step is not None:
-            node = np.concatenate([inside, step.extra.node])
-            links = Pairs.join(links, step.extra.links)
-            row, column = (
-                np.concatenate(pair) for pair in zip((row, column), step.extra.block.T, strict=True)
-            )
-        links = links.where(links.weight > 0)
-        pull = anchor[node].astype(np.float64) if hierarchy.anchored else np.zeros(len(node))
+    level = hierarchy.levels[number]
+    node, a, b, weight, pull = hierarchy.equations(number)
+    row, column = np.divmod(node - level.first, level.stride)
     used = np.zeros(hierarchy.nodes, bool)
-    used[links.a] = used[links.b] = True
+    used[a] = used[b] = True
     chosen = used[node] | (pull > 0)
     node, pull = node[chosen], pull[chosen]
     line = (row if level.rows >= level.columns else column)[chosen]
     index = np.zeros(hierarchy.nodes, np.int64)
     index[node] = np.arange(len(node))
-    a, b, weight = index[links.a], index[links.b], links.weight.astype(np.float64)
+    a, b = index[a], index[b]
     count = len(node)
     parts, label = count, first_connected(count, a, b)
     diagonal = _add_up(a, weight, count) + _add_up(b, weight, count)
@@ -240,3 +250,17 @@ def invert_diagonal(line: Ints, diagonal: Doubles, a: Ints, b: Ints, weight: Dou
         own[k - 1] += moved[k].T @ own[k] @ moved[k]
     found: Doubles = own[line, place, place]
     return found
+
+
+def first_connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return of each node the first that it is connected with; quickly where chains of links are short."""
+    label = np.arange(count)
+    while True:
+        lower = np.minimum(label[a], label[b])
+        found = label.copy()
+        np.minimum.at(found, a, lower)
+        np.minimum.at(found, b, lower)
+        found = found[found]
+        if np.array_equal(found, label):
+            return label
+        label = found

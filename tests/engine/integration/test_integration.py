@@ -515,7 +515,7 @@ def test_noise_spreads_as_in_the_best_linear_estimate(region):
 
 
 def test_levels_halve_and_never_overlap():
-    from mirrorskin.engine.integration.levels import cut_levels
+    from mirrorskin.engine.integration.hierarchy import cut_levels
 
     for shape in [(480, 640), (1, 1), (5, 4), (1, 1000), (33, 17)]:
         levels = cut_levels(shape)
