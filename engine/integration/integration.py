@@ -107,8 +107,8 @@ def integrate(
         Of the residual, which is `Surface.residual`; parts of small weight may be less near. None takes what
         full multigrid and two cycles give.
     budget : float, optional
-        Seconds, in place of the tolerance: after the first, no cycle is begun that would end later. The
-        set-up is not cut.
+        Seconds, in place of the tolerance: after the first, no cycle is begun that would end later. Neither
+        the set-up nor ``sigma`` is cut.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 

@@ -108,6 +108,17 @@ class _Relief:
     edges: Flags | None = None
 
 
+@dataclass(slots=True)
+class _Kept:
+    """What was found of a picture's graph, for the next picture that has the same."""
+
+    numbers: tuple[object, ...] | None  # all that says what links weigh; None where it takes maps
+    flags: Flags
+    built: bool = False  # whether the multigrid is that of this graph
+    components: Components | None = None
+    deviation: Floats | None = None  # of heights, for slopes of variance 1
+
+
 class SurfaceSolver:
     """Solvers for pictures of one shape and pixel size; what they allocated and found is used again."""
 
@@ -117,11 +128,7 @@ class SurfaceSolver:
         self._levelling = Levelling(self._graph)
         self._rectangle: Rectangle | None = None
         self._multigrid: Multigrid | None = None
-        self._flags = np.zeros(shape, np.uint8)
-        self._key: tuple[object, ...] | None = None
-        self._next_key: tuple[object, ...] | None = None
-        self._components: Components | None = None
-        self._deviation: Floats | None = None  # of heights, for slopes of variance 1
+        self._kept = _Kept(None, np.zeros(shape, np.uint8))
         self._plane: Plane | None = None
         self._last: Array | None = None
         self._finishing = 0.0  # seconds that the last picture took after its solution
@@ -137,58 +144,54 @@ class SurfaceSolver:
         flags = self._graph.upload(inputs)
         if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
             raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
-        same = self._is_same(inputs, flags)
-        relief = self._find(inputs, options, start, same)
+        numbers = None
+        if inputs.weight_x is None and inputs.known_height_weights is None:
+            numbers = inputs.weight, inputs.known_height_weight, inputs.known_heights is None
+        if numbers is None or numbers != self._kept.numbers or not np.array_equal(flags, self._kept.flags):
+            self._kept = _Kept(numbers, flags.copy())
+        relief = self._find(inputs, options, start)
         if not relief.converged and options.deadline is None:
             raise NotConverged(explain(relief.iterations, relief.residual, options.tolerance))
         begun = time.perf_counter()
-        surface = self._finish(inputs, options, relief, same)
+        surface = self._finish(inputs, options, relief)
         self._finishing = time.perf_counter() - begun
         return surface
 
-    def _is_same(self, inputs: Inputs, flags: Flags) -> bool:
-        """Tell whether the graph is that of the last multigrid; until there is a new one, it is no one's."""
-        even = inputs.weight_x is None and inputs.known_height_weights is None
-        heights = inputs.known_height_weight, inputs.known_heights is None
-        key = inputs.weight, *heights, inputs.pixel_size
-        same = even and key == self._key and np.array_equal(flags, self._flags)
-        self._key, self._next_key = None, key if even else None
-        if not same:
-            self._flags, self._deviation = flags.copy(), None
-        return same
-
-    def _find(
-        self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None, same: bool
-    ) -> _Relief:
+    def _find(self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None) -> _Relief:
         """Choose a solver and run it."""
         if options.sharpness is None and self._is_full_and_even(inputs):
             height = self._find_rectangle(inputs).solve(self._graph.source(), self._screening(inputs))
             return _Relief(height, LEVEL, "direct", 1, 0.0, True)
         if self._plane is None:
             self._plane = self._graph.mean_plane()
-        first = None if start is None else self._above_plane(start, inputs, self._plane)
-        links = self._graph.links(self._plane)
+        plane, links = self._plane, self._graph.links(self._plane)
+        first = None if start is None else self._above_plane(start, inputs, plane)
         if options.sharpness is not None:
-            return self._solve_robust(inputs, links, options, options.sharpness, first)
+            known = inputs, links, self._kept.flags, plane, options.sharpness
+            goal = options.tolerance or _GOAL
+            one = solve_robust(*known, start=first, tolerance=goal, deadline=options.deadline)
+            numbers = one.iterations, one.residual, one.converged or options.tolerance is None
+            return _Relief(one.relief, plane, "robust", *numbers, one.links, one.flags, one.edges)
         begin = self._last if first is None else self._graph.put("start", first)
         if self._multigrid is None:
             self._multigrid = Multigrid(links)
-        elif not same:
+        elif not self._kept.built:
             self._multigrid.rebuild(links)
-        self._key = self._next_key
-        goal = options.tolerance if options.deadline is None else options.tolerance or _GOAL
-        deadline = None if options.deadline is None else options.deadline - self._finishing
+        self._kept.built = True
+        if options.deadline is None:
+            goal, deadline = options.tolerance, None
+        else:
+            goal, deadline = options.tolerance or _GOAL, options.deadline - self._finishing
         found = self._multigrid.solve(begin, tolerance=goal, deadline=deadline)
         self._last = found.height
-        numbers = found.iterations, found.residual, found.converged
-        return _Relief(found.height, self._plane, "multigrid", *numbers)
+        return _Relief(found.height, plane, "multigrid", found.iterations, found.residual, found.converged)
 
     def _is_full_and_even(self, inputs: Inputs) -> bool:
         """Tell whether all pixels, links and known heights are alike."""
-        if inputs.weight_x is not None or inputs.edges is not None or inputs.known_height_weights is not None:
+        if self._kept.numbers is None or inputs.edges is not None:
             return False
         every = SLOPE if inputs.known_heights is None else SLOPE | KNOWN
-        full = bool(np.bitwise_and.reduce(self._flags, axis=None) & every == every)
+        full = bool(np.bitwise_and.reduce(self._kept.flags, axis=None) & every == every)
         return full and self._screening(inputs) <= _STIFF
 
     def _find_rectangle(self, inputs: Inputs) -> Rectangle:
@@ -211,27 +214,9 @@ class SurfaceSolver:
             datum = float(np.mean(above, where=known)) if known.any() else 0.0
         return np.where(known, above - datum, 0.0).astype(np.float32)
 
-    def _solve_robust(
-        self, inputs: Inputs, links: Links, options: SolverOptions, sharpness: float, start: Floats | None
-    ) -> _Relief:
-        assert self._plane is not None
-        tolerance = options.tolerance or _GOAL
-        found = solve_robust(
-            inputs,
-            links,
-            self._flags,
-            self._plane,
-            sharpness,
-            start=start,
-            tolerance=tolerance,
-            deadline=options.deadline,
-        )
-        numbers = found.iterations, found.residual, found.converged or options.tolerance is None
-        return _Relief(found.relief, self._plane, "robust", *numbers, found.links, found.flags, found.edges)
-
-    def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief, same: bool) -> Surface:
+    def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief) -> Surface:
         """Add plane and offsets to relief, and estimate its standard deviation."""
-        components = self._find_components(inputs, relief, same)
+        components = self._find_components(inputs, relief)
         self._levelling.use(components)
         height = self._levelling.level(relief.height, relief.plane, inputs.datum)
         return Surface(
@@ -245,51 +230,50 @@ class SurfaceSolver:
             residual=relief.residual,
             converged=relief.converged,
             method=relief.method,
-            invalid=int(np.count_nonzero(self._flags & LOST)),
+            invalid=int(np.count_nonzero(self._kept.flags & LOST)),
         )
 
-    def _find_components(self, inputs: Inputs, relief: _Relief, same: bool) -> Components:
+    def _find_components(self, inputs: Inputs, relief: _Relief) -> Components:
         if relief.method == "direct":
             labels, unknown = np.zeros(self._graph.shape, np.int32), np.array([inputs.known_heights is None])
             return Components(labels, unknown)
         if relief.flags is not None:
             return find_components(relief.flags, True)
-        if not same or self._components is None:
-            alone = (self._flags & (SLOPE | KNOWN)) == KNOWN
+        if self._kept.components is None:
+            flags = self._kept.flags
+            alone = (flags & (SLOPE | KNOWN)) == KNOWN
             cut = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
-            self._components = find_components(self._flags, cut)
-        return self._components
+            self._kept.components = find_components(flags, cut)
+        return self._kept.components
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
         factor = self._graph.scale
         if not inputs.weights_given:
             factor *= self._excess(inputs, relief, components)
         if relief.method == "direct":
-            return self._find_rectangle(inputs).deviation(self._screening(inputs)) * np.float32(factor**0.5)
-        deviation = self._deviation if relief.flags is None else None
-        if deviation is None:
-            deviation = self._find_deviation(inputs, relief, components)
-            self._deviation = deviation if self._key else None  # for the next picture of these pixels
+            deviation = self._find_rectangle(inputs).deviation(self._screening(inputs))
+        elif relief.flags is not None:  # links are as sure as their pixels' weights, or broken
+            graph = self._graph
+            graph.put("flags", relief.flags)
+            deviation = self._find_deviation(Multigrid(graph.links()), inputs, components)
+        else:
+            assert self._multigrid is not None
+            if self._kept.deviation is None:
+                self._kept.deviation = self._find_deviation(self._multigrid, inputs, components)
+            deviation = self._kept.deviation
         return deviation * np.float32(factor**0.5)
 
-    def _find_deviation(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
-        solver, graph = self._multigrid, self._graph
-        if relief.flags is not None:  # links are as sure as their pixels' weights, or broken
-            graph.flags.claim()
-            graph.flags.host[...] = relief.flags
-            graph.flags.upload()
-            solver = Multigrid(graph.links())
-        assert solver is not None
+    def _find_deviation(self, solver: Multigrid, inputs: Inputs, components: Components) -> Floats:
         ends = self._link_weights(inputs)
         uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
-        found = solver.deviation(components.labels >= 0, graph.flags, uneven)
-        if uneven and solver is self._multigrid:
-            self._key = None
-        return found
+        if uneven:
+            self._kept.built = False  # its levels are no solver's
+        return solver.deviation(components.labels >= 0, self._graph.flags, uneven)
 
     def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
         """Return how much worse slopes fit than noise of variance 1 would; NaN where nothing tells."""
-        flags, ends = self._flags if relief.flags is None else relief.flags, self._link_weights(inputs)
+        flags = self._kept.flags if relief.flags is None else relief.flags
+        ends = self._link_weights(inputs)
         count = {bit: int(np.count_nonzero(flags & bit)) for bit in (RIGHT, DOWN, KNOWN, SLOPE | KNOWN)}
         links, share = count[RIGHT] + count[DOWN], 1.0
         if relief.links is not None:  # which have that share of their full weight
