@@ -168,8 +168,8 @@ class SurfaceSolver:
         first = None if start is None else self._above_plane(start, inputs, plane)
         if options.sharpness is not None:
             known = inputs, links, self._kept.flags, plane, options.sharpness
-            goal = options.tolerance or _GOAL
-            one = solve_robust(*known, start=first, tolerance=goal, deadline=options.deadline)
+            near = options.tolerance or _GOAL
+            one = solve_robust(*known, start=first, tolerance=near, deadline=options.deadline)
             numbers = one.iterations, one.residual, one.converged or options.tolerance is None
             return _Relief(one.relief, plane, "robust", *numbers, one.links, one.flags, one.edges)
         begin = self._last if first is None else self._graph.put("start", first)
@@ -178,11 +178,10 @@ class SurfaceSolver:
         elif not self._kept.built:
             self._multigrid.rebuild(links)
         self._kept.built = True
-        if options.deadline is None:
-            goal, deadline = options.tolerance, None
-        else:
-            goal, deadline = options.tolerance or _GOAL, options.deadline - self._finishing
-        found = self._multigrid.solve(begin, tolerance=goal, deadline=deadline)
+        goal, late = options.tolerance, options.deadline
+        if late is not None:
+            goal, late = goal or _GOAL, late - self._finishing
+        found = self._multigrid.solve(begin, tolerance=goal, deadline=late)
         self._last = found.height
         return _Relief(found.height, plane, "multigrid", found.iterations, found.residual, found.converged)
 

@@ -91,7 +91,6 @@ def check_inputs(
     heights = None if known_heights is None else check_map("known_heights", known_heights, shape)
     if not weight:
         planes = [np.zeros(shape, np.float32)]
-    typical = _median(planes) if planes else weight
     box, lost = (slice(0, shape[0]), slice(0, shape[1])), 0
     if crop:
         whole, box = box, find_box(shape, lambda part: _may_answer(slopes(part), part, marks, heights))
@@ -101,7 +100,7 @@ def check_inputs(
     x, y, steep = slopes(box)
     if steep is not None and not robust:
         planes = [steep * plane for plane in planes] or [np.float32(weight) * steep]
-        typical = _median(planes)
+    typical = _median(planes) if planes else weight
     known, datum = None, 0.0
     if heights is not None and height_weight:
         exact = np.asarray(heights[box], np.float64)

@@ -268,6 +268,46 @@ def test_any_array_will_do_and_stays_as_it_was():
     np.testing.assert_array_equal(slopes[0], dz_dx.astype(np.float32))
 
 
+INNER = np.s_[9:40, 21:58]  # what is left of the picture below
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("told", ["by a mask", "by slopes", "by known heights"])
+def test_only_the_box_that_has_an_answer_is_integrated(told, robust):
+    asked = problem(WAVES, 0.2, edges=surfaces.random_cuts(SHAPE, 8), slope_weights=uneven())
+    inside = np.zeros(SHAPE, bool)
+    inside[INNER] = surfaces.disc((31, 37), 0.99)
+    maps = {"dz_dx": asked.dz_dx, "dz_dy": asked.dz_dy, **asked.options, "known_heights": some()}
+    lost = 0
+    if told == "by a mask":
+        maps["mask"] = inside.copy()
+        maps["mask"][0, :7] = maps["dz_dx"][0, :7] = True
+        maps["dz_dx"][0, :7], maps["slope_weights"][:, 0, 0] = np.nan, 0  # wanted, but there is none
+        maps["known_heights"][0, :7], lost = np.nan, 6
+    else:
+        maps["dz_dy"] = np.where(inside, maps["dz_dy"], np.nan)
+        maps["known_heights"] = np.where(inside, maps["known_heights"], np.nan)
+        lost = (~inside).sum() - (~inside[INNER]).sum()
+    if told == "by known heights":
+        maps["dz_dy"][9:12] = np.nan
+        maps["known_heights"][9, 40] = 1.0
+    cut = {name: one[(..., *INNER)] for name, one in maps.items() if one is not None}
+    whole = engine.integrate(pixel_size=PIXEL, robust=robust, **maps)
+    part = engine.integrate(pixel_size=PIXEL, robust=robust, **cut)
+    assert part.height.shape == (31, 37)
+    for name, rest in {"height": np.nan, "sigma": np.nan, "component": -1, "filled": 0, "edges": 0}.items():
+        found, expected = getattr(whole, name), getattr(part, name)
+        if expected is None:
+            assert found is None
+            continue
+        np.testing.assert_array_equal(found[INNER], expected)
+        around = found.copy()
+        around[INNER] = rest
+        np.testing.assert_array_equal(around, np.full(SHAPE, rest, found.dtype))
+    np.testing.assert_array_equal(whole.offset_unknown, part.offset_unknown)
+    assert whole.invalid == part.invalid + lost
+
+
 @pytest.mark.parametrize("weight", [1e-30, 1e8, 1e30])
 def test_one_weight_however_odd_changes_little(weight):
     asked = problem(WAVES, mask=DISC)
