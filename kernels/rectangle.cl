@@ -1,9 +1,10 @@
 // Heights of a full rectangle: cosine modes of its rows and then of its columns, each divided by what the links make of it, and
 // back. Specification: rectangle.py.
 //
-// LANES  complex numbers side by side in a vector: 8 where an item is a core's loop, 1 where it is a lane of a group
-// ROOM   complex vectors that a group has room for, `size` or more; 0 where they lie in `scratch`
-// ODD    1 where a step has a radix of 7 or more: these take three times the registers
+// LANES    complex numbers side by side in a vector: 8 where an item is a core's loop, 1 where it is a lane of a group
+// ROOM     complex vectors that a group has room for, `size` or more; 0 where they lie in `scratch`
+// HEIGHTS  1 where known heights are given
+// ODD      1 where a step has a radix of 7 or more: these take three times the registers
 //
 // A group transforms 2 * LANES lines at once, half of them as real parts of complex numbers and half as imaginary parts. With the
 // even points of a line forwards and then the odd ones backwards, its cosine modes are the parts of its Fourier transform, turned
@@ -257,7 +258,7 @@ __kernel void rectangle_modes(
 }
 
 __kernel void rectangle_heights(
-    const int rows, const int padded, LINES, MAP spectrum, const float level, OUT height, __global float *restrict scratch)
+    const int rows, const int padded, LINES, MAP spectrum, OUT height, __global float *restrict scratch)
 {
     const int first = get_group_id(0) * 2 * LANES;
     TAKE_WORK
@@ -279,8 +280,8 @@ __kernel void rectangle_heights(
         F v[2][LANES];
         EACH(i) {
             const C z = work[SPOT(LESSER(n + i, length - 1))];
-            v[0][i] = z.hi + level;
-            v[1][i] = z.lo + level;
+            v[0][i] = z.hi;
+            v[1][i] = z.lo;
         }
         TRANSPOSE(v[0])
         TRANSPOSE(v[1])
@@ -319,4 +320,92 @@ __kernel void rectangle_divide(
         column[2 * PARTS * n] = z.hi;
         column[2 * PARTS * n + PARTS] = z.lo;
     }
+}
+
+// ---- From slopes
+
+#if HEIGHTS
+#define HEIGHT_MAPS , const float weight_z, MAP heights
+#else
+#define HEIGHT_MAPS
+#endif
+
+// An item has a piece of some rows: PoCL makes vector code of loops without branches.
+#define PIECE_ROWS 16
+#define PIECE_COLUMNS (LANES == 8 ? 256 : 1)
+#define PIECE                                                                                              \
+    const int pieces = (columns + PIECE_COLUMNS - 1) / PIECE_COLUMNS, item = get_global_id(0);             \
+    const int top = item / pieces * PIECE_ROWS, bottom = LESSER(rows, top + PIECE_ROWS);                   \
+    const int begin = item % pieces * PIECE_COLUMNS, end = LESSER(columns, begin + PIECE_COLUMNS);
+
+// Does one thing near the border and another where links lead to all sides from all neighbours.
+#define ALL_PIXELS(border, inner)                                                                          \
+    for (int row = top; row < bottom; ++row) {                                                             \
+        const int first = row * columns;                                                                   \
+        int column = begin;                                                                                \
+        for (; column < (row < 2 || row >= rows - 2 ? end : LESSER(end, 2)); ++column) border(first + column) \
+        for (; column < LESSER(end, columns - 2); ++column) inner(first + column)                          \
+        for (; column < end; ++column) border(first + column)                                              \
+    }
+
+// 24 times the slope of the link from pixel p to the next one in line: of four pixels, or at the ends of two.
+#define LINK(slope, p, next)                                                                               \
+    (13.0f * (slope[p] + slope[(p) + (next)]) - (slope[(p) - (next)] + slope[(p) + 2 * (next)]))
+
+float link(MAP slope, const int p, const int next, const int n, const int count)
+{
+    if (n > 0 && n < count - 2) return LINK(slope, p, next);
+    return n >= 0 && n < count - 1 ? 12.0f * (slope[p] + slope[p + next]) : 0.0f;
+}
+
+// The right side: weights of links times their rise, of those that end in a pixel less those that begin there.
+__kernel void rectangle_source(
+    const int rows, const int columns, const float x, const float y, MAP dz_dx, MAP dz_dy HEIGHT_MAPS, OUT source)
+{
+    PIECE
+#define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) + KNOWN(p);
+#define ENDS(slope, p, next, n, count) link(slope, p - next, next, n - 1, count) - link(slope, p, next, n, count)
+#define MIDST(slope, p, next)                                                                              \
+    14.0f * (slope[p - next] - slope[p + next]) - (slope[p - 2 * next] - slope[p + 2 * next])
+#define BORDER(p) PUT_SOURCE(p, ENDS(dz_dx, p, 1, column, columns), ENDS(dz_dy, p, columns, row, rows))
+#define INNER(p) PUT_SOURCE(p, MIDST(dz_dx, p, 1), MIDST(dz_dy, p, columns))
+#if HEIGHTS
+#define KNOWN(p) weight_z * heights[p]
+#else
+#define KNOWN(p) 0.0f
+#endif
+    ALL_PIXELS(BORDER, INNER)
+}
+
+// What is left over of links and known heights: squares, times their weights, summed by item.
+__kernel void rectangle_misfit(
+    const int rows, const int columns, const float weight_x, const float weight_y, const float size_x, const float size_y,
+    MAP dz_dx, MAP dz_dy HEIGHT_MAPS, MAP relief, OUT sums)
+{
+    PIECE
+    float squares[PIECE_COLUMNS];
+    for (int i = 0; i < end - begin; ++i) squares[i] = 0.0f;
+#undef BORDER
+#undef INNER
+#undef KNOWN
+#define X_LEFT(p, link) relief[p + 1] - relief[p] - size_x / 24 * (link)
+#define Y_LEFT(p, link) relief[p + columns] - relief[p] + size_y / 24 * (link)
+#define ADD_SQUARES(p, in_x, x_link, in_y, y_link)                                                         \
+    {                                                                                                      \
+        const float x = in_x ? X_LEFT(p, x_link) : 0.0f, y = in_y ? Y_LEFT(p, y_link) : 0.0f;              \
+        squares[column - begin] += weight_x * x * x + weight_y * y * y + KNOWN(p);                         \
+    }
+#define BORDER(p)                                                                                          \
+    ADD_SQUARES(p, column < columns - 1, link(dz_dx, p, 1, column, columns), row < rows - 1,               \
+        link(dz_dy, p, columns, row, rows))
+#define INNER(p) ADD_SQUARES(p, 1, LINK(dz_dx, p, 1), 1, LINK(dz_dy, p, columns))
+#if HEIGHTS
+#define KNOWN(p) weight_z * (relief[p] - heights[p]) * (relief[p] - heights[p])
+#else
+#define KNOWN(p) 0.0f
+#endif
+    ALL_PIXELS(BORDER, INNER)
+    float sum = 0.0f;
+    for (int i = 0; i < end - begin; ++i) sum += squares[i];
+    if (top < rows) sums[item] = sum;
 }

@@ -10,6 +10,9 @@ The spectrum, (strips, rows, 16), has in the slots of strip s modes k = 8 s ... 
 then length - k. Mode ``length`` is 0; what slots with k beyond half the length hold means nothing. Pictures
 lie one below the other.
 
+Pictures from slopes are links that all have one weight along x and another along y: right sides, and what
+is left over of them.
+
 The kernels take sizes besides, and go about the Fourier transforms by the tables of
 ``mirrorskin.engine.integration.rectangle``.
 """
@@ -60,3 +63,46 @@ def rectangle_heights(spectrum: Floats, level: float, height: Floats) -> None:
     )
     modes = np.concatenate([low[:, : length // 2 + 1], high[:, 1 : (length + 1) // 2][:, ::-1]], axis=1)
     height[...] = level + 2 * length * idct(modes[:rows].astype(np.float64), axis=1)
+
+
+def rectangle_source(
+    x: float,
+    y: float,
+    dz_dx: Floats,
+    dz_dy: Floats,
+    source: Floats,
+    weight_z: float = 0.0,
+    heights: Floats | None = None,
+) -> None:
+    """Write weights of links times their rise, of those that end in a pixel less those that begin there.
+
+    ``x`` and ``y`` are the weight of links times the size of a pixel / 24. Known heights add what they are
+    times ``weight_z``.
+    """
+    source[...] = 0.0 if heights is None else weight_z * heights
+    for factor, slope, part in ((x, dz_dx, source), (y, dz_dy.T, source.T)):
+        part -= np.diff(np.pad(factor * _links(slope), ((0, 0), (1, 1))), axis=1)
+
+
+def rectangle_misfit(
+    weights: tuple[float, float],
+    sizes: tuple[float, float],
+    slopes: tuple[Floats, Floats],
+    relief: Floats,
+    weight_z: float = 0.0,
+    heights: Floats | None = None,
+) -> float:
+    """Return what is left over of links and known heights: the sum of squares, times their weights."""
+    left = 0.0 if heights is None else weight_z * float(((relief - heights.astype(np.float64)) ** 2).sum())
+    ways = (1, slopes[0], relief.astype(np.float64)), (-1, slopes[1].T, relief.T.astype(np.float64))
+    for weight, size, (sign, slope, points) in zip(weights, sizes, ways, strict=True):
+        left += weight * float(((np.diff(points, axis=1) - sign * size / 24 * _links(slope)) ** 2).sum())
+    return left
+
+
+def _links(slope: Floats) -> NDArray[np.float64]:
+    """Return 24 times the slopes of links along rows: of four pixels in line, or at the ends of two."""
+    s = slope.astype(np.float64)
+    found = 12 * (s[:, :-1] + s[:, 1:])
+    found[:, 1:-1] = 13 * (s[:, 1:-2] + s[:, 2:-1]) - (s[:, :-3] + s[:, 3:])
+    return found

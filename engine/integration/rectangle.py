@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.height_variance import find_rectangle_variance
-from mirrorskin.engine.integration.validation import Floats
+from mirrorskin.engine.integration.height_variance import expected_misfit, find_rectangle_variance
+from mirrorskin.engine.integration.validation import Floats, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
@@ -25,6 +25,9 @@ SLOTS = 2 * HALF
 
 _RADICES = 13, 11, 7, 5, 3  # the odd ones; see ``rectangle.cl``
 _RARE = 7  # and more: kernels for others take fewer registers
+_PIECE = 16, 256  # rows and columns of an item that is a core's loop, when it goes over pixels
+_SAMPLED = 64  # rows of which one is looked at, whether a picture is full
+_STIFF = 100.0  # times a link's that known heights weigh, above which float32 has too few digits
 _LANES = 8  # lines side by side in a vector, where an item is a core's loop
 _LEAST_ROOM, _MOST_ROOM = 256, 4096  # complex numbers in a group's own memory; where there are more, none are
 
@@ -110,11 +113,11 @@ class Rectangle:
         self, shape: tuple[int, ...], pixel_size: tuple[float, float], device: Device, scale: float = 1.0
     ) -> None:
         self._device, self._shape = device, shape
-        self._lanes = _LANES if device.layout.tile > 1 else 1
+        self.lanes = _LANES if device.layout.tile > 1 else 1
         self._pictures, (rows, columns) = math.prod(shape[:-2]), shape[-2:]
         self._weights = scale / pixel_size[0] ** 2, scale / pixel_size[1] ** 2
         plans = make_plan(columns), make_plan(rows)
-        strips, at_once = len(plans[0].place) // HALF, 2 * self._lanes
+        strips, at_once = len(plans[0].place) // HALF, 2 * self.lanes
         groups = -(-self._pictures * rows // at_once), strips * self._pictures * SLOTS // at_once
         self._spectrum = device.array("spectrum", (strips, groups[0] * at_once, SLOTS), np.float32)
         self._spectrum.upload()
@@ -131,12 +134,10 @@ class Rectangle:
             self._deviation = screening, np.sqrt(variance)
         return self._deviation[1]
 
-    def solve(
-        self, source: Array, screening: float = 0.0, *, level: float = 0.0, height: Array | None = None
-    ) -> Array:
-        """Return heights of a mean level, in a given array or a new one, for a right side and a screening.
+    def solve(self, source: Array, screening: float = 0.0, height: Array | None = None) -> Array:
+        """Return heights, in a given array or a new one, for a right side and a screening.
 
-        What the right side sums to is left out: nothing but the screening would tell of it.
+        Their mean is 0: what the right side sums to is left out.
         """
         if self._across is None or self._across[0] != screening:
             rows = self._shape[-2]
@@ -151,7 +152,7 @@ class Rectangle:
         self._run("rectangle_modes", lying, moved, source=source, **lines)
         rates = {"along": self._along, "across": self._across[1]}
         self._run("rectangle_divide", standing, moved, pictures=self._pictures, **rates, **spectrum)
-        self._run("rectangle_heights", lying, moved, level=level, height=height, **lines)
+        self._run("rectangle_heights", lying, moved, height=height, **lines)
         return height
 
     def _rates(
@@ -163,7 +164,7 @@ class Rectangle:
 
     def _prepare(self, plan: Plan, groups: int) -> tuple[int, dict[str, int], dict[str, Any]]:
         """Return how many groups go through a plan, the kernels' macros, and the plan on the device."""
-        given, lanes, room = self._device.given, self._lanes, _MOST_ROOM
+        given, lanes, room = self._device.given, self.lanes, _MOST_ROOM
         if lanes == 1:
             room = max(_LEAST_ROOM, 1 << (plan.size - 1).bit_length())
         inside = plan.size <= room <= _MOST_ROOM
@@ -174,7 +175,7 @@ class Rectangle:
         whole = {"plan": given("plan", plan.steps, np.int32), "place": given("place", plan.place, np.int32)}
         sizes = {"length": plan.length, "size": plan.size, "steps": len(plan.steps)}
         odd = int(plan.steps[:, 0].max(initial=0) >= _RARE)
-        macros = {"LANES": lanes, "ROOM": room if inside else 0, "ODD": odd}
+        macros = {"LANES": lanes, "ROOM": room if inside else 0, "ODD": odd, "HEIGHTS": 0}
         padded = self._spectrum.host.shape[1]
         return groups, macros, {"padded": padded, **sizes, **whole, **tables, "scratch": scratch}
 
@@ -184,3 +185,84 @@ class Rectangle:
         groups, macros, plan = run
         kernel = self._device.kernel("rectangle", name, **macros)
         kernel(groups * kernel.group, **plan, **arguments, moved=moved)
+
+
+class SlopeRectangle:
+    """Heights from slopes in full pictures of one shape and pixel size, where all counts alike.
+
+    ``solve`` tells of a picture that is not full. One thread at a time.
+    """
+
+    def __init__(self, shape: tuple[int, int], pixel_size: tuple[float, float], device: Device) -> None:
+        self._device, self._shape, self._size = device, shape, pixel_size
+        self._area = pixel_size[0] * pixel_size[1]
+        self._weights = self._area / pixel_size[0] ** 2, self._area / pixel_size[1] ** 2
+        self._solver = Rectangle(shape, pixel_size, device, self._area)
+        rows, columns = shape
+        width = _PIECE[1] if device.layout.tile > 1 else 1
+        self._items = -(-rows // _PIECE[0]) * -(-columns // width)
+        self._source = device.array("source", shape, np.float32)
+        self._sums = device.array("sums", (self._items,), np.float32)
+        for array in (self._source, self._sums):
+            array.upload()
+
+    def solve(self, inputs: Inputs, sigma: bool) -> tuple[Floats, Floats | None] | None:
+        """Return heights, (H, W), mm, and their standard deviation if wanted; None where one is missing."""
+        if not self._seems_full(inputs):
+            return None
+        (width, height), (along, across) = self._size, self._weights
+        maps: dict[str, Any] = {
+            name: self._device.seen(name, getattr(inputs, name)) for name in ("dz_dx", "dz_dy")
+        }
+        screening = 0.0
+        if inputs.known_heights is not None:
+            screening = self._screening(inputs)
+            maps |= {"heights": self._device.seen("heights", inputs.known_heights), "weight_z": screening}
+        factors = {"x": along * width / 24, "y": -across * height / 24}
+        self._run("rectangle_source", **maps, **factors, source=self._source)
+        relief = self._solver.solve(self._source, screening)
+        if sigma:
+            weights = {"weight_x": along, "weight_y": across, "size_x": width, "size_y": height}
+            self._run("rectangle_misfit", **maps, **weights, relief=relief, sums=self._sums)
+        found: Floats = relief.detach()
+        if not math.isfinite(found[0, 0]):  # what is no number anywhere is so everywhere
+            return None
+        deviation = self._deviation(inputs, screening) if sigma else None
+        if inputs.known_heights is not None:
+            found += np.float32(inputs.datum)
+        return found, deviation
+
+    def _seems_full(self, inputs: Inputs) -> bool:
+        """Tell whether all pixels seem to have slopes and known heights that count alike; soon, of a few."""
+        given = inputs.weight_x, inputs.edges, inputs.known_height_weights
+        if any(one is not None for one in given) or self._screening(inputs) > _STIFF:
+            return False
+        if inputs.mask is not None and not inputs.mask.all():
+            return False
+        some = slice(None, None, _SAMPLED if min(self._shape) > 1 else 1)
+        maps = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
+        return all(bool(np.isfinite(one[some]).all()) for one in maps if one is not None)
+
+    def _screening(self, inputs: Inputs) -> float:
+        if inputs.known_heights is None:
+            return 0.0
+        return self._area / inputs.typical_weight * inputs.known_height_weight
+
+    def _deviation(self, inputs: Inputs, screening: float) -> Floats:
+        """Return the heights' standard deviation; by how well slopes fit, where no weights were given."""
+        (rows, columns), scale = self._shape, self._area / inputs.typical_weight
+        factor = scale
+        if not inputs.weights_given:
+            links, pixels = rows * (columns - 1) + (rows - 1) * columns, rows * columns
+            known, free = (pixels, 0) if inputs.known_heights is not None else (0, 1)
+            unit = expected_misfit(links, pixels, known, free, self._weights)
+            misfit = float(self._sums.download().sum(dtype=np.float64)) / scale
+            factor *= misfit / unit if unit > 0 else math.nan
+        return self._solver.deviation(screening) * np.float32(factor**0.5)
+
+    def _run(self, name: str, **arguments: Any) -> None:
+        rows, columns = self._shape
+        macros = {"HEIGHTS": int("heights" in arguments)}
+        moved = 12 * rows * columns
+        kernel = self._device.kernel("rectangle", name, LANES=self._solver.lanes, ROOM=0, ODD=0, **macros)
+        kernel(self._items, rows=rows, columns=columns, **arguments, moved=moved)

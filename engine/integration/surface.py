@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.graph import (
-    LEVEL,
     Components,
     Levelling,
     Links,
@@ -21,7 +20,7 @@ from mirrorskin.engine.integration.graph import (
     find_components,
 )
 from mirrorskin.engine.integration.height_variance import expected_misfit
-from mirrorskin.engine.integration.rectangle import Rectangle
+from mirrorskin.engine.integration.rectangle import SlopeRectangle
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.integration.vcycle import Multigrid
@@ -32,7 +31,6 @@ from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 IntegrationMethod = Literal["direct", "multigrid", "robust"]
 
-_STIFF = 100.0  # times a link's that known heights weigh, above which the direct solver loses too many digits
 _UNEVEN = 2.0  # weights of links to the right over those down, or back, that the multigrid may split
 _GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
 
@@ -126,7 +124,7 @@ class SurfaceSolver:
         self._device = device
         self._graph = PixelGraph(device, shape)
         self._levelling = Levelling(self._graph)
-        self._rectangle: Rectangle | None = None
+        self._rectangle: SlopeRectangle | None = None
         self._multigrid: Multigrid | None = None
         self._kept = _Kept(None, np.zeros(shape, np.uint8))
         self._plane: Plane | None = None
@@ -141,6 +139,10 @@ class SurfaceSolver:
         self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
     ) -> Surface:
         """Return the surface of a picture, from a start, (H, W), mm, or the last heights on."""
+        if options.sharpness is None:
+            full = self._solve_full(inputs, options)
+            if full is not None:
+                return full
         flags = self._graph.upload(inputs)
         if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
             raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
@@ -157,11 +159,29 @@ class SurfaceSolver:
         self._finishing = time.perf_counter() - begun
         return surface
 
+    def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
+        """Return the surface of a full rectangle with even weights; None of any other."""
+        if self._rectangle is None:
+            self._rectangle = SlopeRectangle(self._graph.shape, inputs.pixel_size, self._device)
+        found = self._rectangle.solve(inputs, options.sigma)
+        if found is None:
+            return None
+        return Surface(
+            height=found[0],
+            sigma=found[1],
+            component=np.zeros(self._graph.shape, np.int32),
+            offset_unknown=np.array([inputs.known_heights is None]),
+            filled=np.zeros(self._graph.shape, np.uint8),
+            edges=None,
+            iterations=1,
+            residual=0.0,
+            converged=True,
+            method="direct",
+            invalid=0,
+        )
+
     def _find(self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None) -> _Relief:
         """Choose a solver and run it."""
-        if options.sharpness is None and self._is_full_and_even(inputs):
-            height = self._find_rectangle(inputs).solve(self._graph.source(), self._screening(inputs))
-            return _Relief(height, LEVEL, "direct", 1, 0.0, True)
         if self._plane is None:
             self._plane = self._graph.mean_plane()
         plane, links = self._plane, self._graph.links(self._plane)
@@ -184,23 +204,6 @@ class SurfaceSolver:
         found = self._multigrid.solve(begin, tolerance=goal, deadline=late)
         self._last = found.height
         return _Relief(found.height, plane, "multigrid", found.iterations, found.residual, found.converged)
-
-    def _is_full_and_even(self, inputs: Inputs) -> bool:
-        """Tell whether all pixels, links and known heights are alike."""
-        if self._kept.numbers is None or inputs.edges is not None:
-            return False
-        every = SLOPE if inputs.known_heights is None else SLOPE | KNOWN
-        full = bool(np.bitwise_and.reduce(self._kept.flags, axis=None) & every == every)
-        return full and self._screening(inputs) <= _STIFF
-
-    def _find_rectangle(self, inputs: Inputs) -> Rectangle:
-        if self._rectangle is None:
-            scale = self._graph.scale * inputs.weight
-            self._rectangle = Rectangle(self._graph.shape, inputs.pixel_size, self._device, scale)
-        return self._rectangle
-
-    def _screening(self, inputs: Inputs) -> float:
-        return 0.0 if inputs.known_heights is None else self._graph.scale * inputs.known_height_weight
 
     def _above_plane(self, start: NDArray[np.floating], inputs: Inputs, plane: Plane) -> Floats:
         """Return heights to begin with above the plane, about 0 where nothing is known of them."""
@@ -233,9 +236,6 @@ class SurfaceSolver:
         )
 
     def _find_components(self, inputs: Inputs, relief: _Relief) -> Components:
-        if relief.method == "direct":
-            labels, unknown = np.zeros(self._graph.shape, np.int32), np.array([inputs.known_heights is None])
-            return Components(labels, unknown)
         if relief.flags is not None:
             return find_components(relief.flags, True)
         if self._kept.components is None:
@@ -249,9 +249,7 @@ class SurfaceSolver:
         factor = self._graph.scale
         if not inputs.weights_given:
             factor *= self._excess(inputs, relief, components)
-        if relief.method == "direct":
-            deviation = self._find_rectangle(inputs).deviation(self._screening(inputs))
-        elif relief.flags is not None:  # links are as sure as their pixels' weights, or broken
+        if relief.flags is not None:  # links are as sure as their pixels' weights, or broken
             graph = self._graph
             graph.put("flags", relief.flags)
             deviation = self._find_deviation(Multigrid(graph.links()), inputs, components)

@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration.rectangle import Rectangle, find_modes
-from mirrorskin.kernels.rectangle import rectangle_divide, rectangle_heights, rectangle_modes
+from mirrorskin.engine.integration.rectangle import Rectangle, SlopeRectangle, find_modes
+from mirrorskin.kernels.rectangle import (
+    rectangle_divide,
+    rectangle_heights,
+    rectangle_misfit,
+    rectangle_modes,
+    rectangle_source,
+)
 
 WEIGHTS = 1.0, 0.6
 
@@ -73,3 +79,26 @@ def test_device_and_reference_find_the_same_heights(device, shape, screening):
         told = refer(source, screening)
         told = told if picture is source else told.T
         np.testing.assert_allclose(height, told, atol=2e-6 * max(1e-3, np.ptp(told)))
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (3, 2), (4, 4), (37, 41), (3, 300)])
+def test_device_and_reference_make_the_same_of_slopes(device, shape, known):
+    dz_dx, dz_dy, relief, heights = np.random.default_rng(1).normal(size=(4, *shape)).astype(np.float32)
+    given = {name: device.given(name, value) for name, value in (("dz_dx", dz_dx), ("dz_dy", dz_dy))}
+    extra, args = {}, ()
+    if known:
+        extra, args = {"weight_z": 0.7, "heights": device.given("heights", heights)}, (0.7, heights)
+    solver = SlopeRectangle(shape, (0.3, 0.4), device)
+    source = device.given("source", relief)
+    solver._run("rectangle_source", **given, **extra, x=0.5, y=-0.6, source=source)
+    told = np.empty(shape)
+    rectangle_source(0.5, -0.6, dz_dx, dz_dy, told, *args)
+    np.testing.assert_allclose(source.download(), told, atol=1e-4)
+    numbers = {"weight_x": 1.5, "weight_y": 0.8, "size_x": 0.3, "size_y": 0.4}
+    solver._run(
+        "rectangle_misfit", **given, **extra, **numbers, relief=device.given("u", relief), sums=solver._sums
+    )
+    found = float(solver._sums.download().sum(dtype=np.float64))
+    told = rectangle_misfit((1.5, 0.8), (0.3, 0.4), (dz_dx, dz_dy), relief, *args)
+    assert found == pytest.approx(told, rel=1e-5)

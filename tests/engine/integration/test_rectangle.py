@@ -8,7 +8,8 @@ import scipy.sparse
 from rectangles import put, scene, solve_by_cosines, source_of
 from scipy.sparse.linalg import spsolve
 
-from mirrorskin.engine.integration.rectangle import Rectangle
+from mirrorskin.engine.integration.rectangle import Rectangle, SlopeRectangle
+from mirrorskin.engine.integration.validation import check_inputs
 
 
 def solve_sparse(source, wx, wy, screening):
@@ -43,12 +44,6 @@ def test_heights_solve_the_links_of_any_shape(device, shape, screening):
 def test_a_picture_without_slopes_is_flat(device, shape):
     height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, np.zeros(shape))).download()
     np.testing.assert_array_equal(height, 0)
-
-
-def test_heights_have_the_mean_that_is_asked_for(device):
-    source = put(device, np.array([[3.0, 1.0]]))
-    height = Rectangle((1, 2), (1.0, 1.0), device).solve(source, 1.5, level=2.0).download()
-    np.testing.assert_allclose(height, 2 + np.array([[1, -1]]) / 3.5, atol=1e-6)
 
 
 def test_what_a_source_sums_to_changes_nothing(device):
@@ -113,3 +108,21 @@ def test_a_long_strip_is_solved_by_a_convolution_or_outside_of_a_group_s_own_mem
     height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
     told = solve_by_cosines(source)
     assert np.abs(height - told).max() < 1e-6 * np.ptp(told)
+
+
+@pytest.mark.parametrize("mask", [None, True])
+@pytest.mark.parametrize(
+    ("shape", "missing"), [((70, 90), (33, 17)), ((1, 9), (0, 4)), ((9, 1), (4, 0)), ((1, 1), (0, 0))]
+)
+def test_one_slope_that_is_missing_is_noticed_anywhere(device, shape, missing, mask):
+    slopes = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
+    solver = SlopeRectangle(shape, (1.0, 1.0), device)
+    mask = None if mask is None else np.ones(shape, bool)
+    assert solver.solve(check_inputs(*slopes, 1.0, mask=mask), False) is not None
+    for slope in slopes:
+        slope[missing], kept = np.inf, slope[missing]
+        assert solver.solve(check_inputs(*slopes, 1.0, mask=mask), False) is None
+        slope[missing] = kept
+    if mask is not None:
+        mask[missing] = False
+        assert solver.solve(check_inputs(*slopes, 1.0, mask=mask), False) is None
