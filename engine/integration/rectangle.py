@@ -187,15 +187,30 @@ class Rectangle:
         kernel(groups * kernel.group, **plan, **arguments, moved=moved)
 
 
-class SlopeRectangle:
-    """Heights from slopes in full pictures of one shape and pixel size, where all counts alike.
+def seems_full(inputs: Inputs) -> bool:
+    """Tell whether all pixels have slopes and known heights that count alike; soon, by some of the rows."""
+    maps = inputs.weight_x, inputs.edges, inputs.known_height_weights
+    if any(one is not None for one in maps) or _screening(inputs) > _STIFF:
+        return False
+    if inputs.mask is not None and not inputs.mask.all():
+        return False
+    some = slice(None, None, _SAMPLED if min(inputs.shape) > 1 else 1)
+    given = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
+    return all(bool(np.isfinite(one[some]).all()) for one in given if one is not None)
 
-    ``solve`` tells of a picture that is not full. One thread at a time.
-    """
+
+def _screening(inputs: Inputs) -> float:
+    if inputs.known_heights is None:
+        return 0.0
+    return math.prod(inputs.pixel_size) / inputs.typical_weight * inputs.known_height_weight
+
+
+class SlopeRectangle:
+    """Heights from slopes in pictures of one shape and pixel size that seem full. One thread at a time."""
 
     def __init__(self, shape: tuple[int, int], pixel_size: tuple[float, float], device: Device) -> None:
         self._device, self._shape, self._size = device, shape, pixel_size
-        self._area = pixel_size[0] * pixel_size[1]
+        self._area = math.prod(pixel_size)
         self._weights = self._area / pixel_size[0] ** 2, self._area / pixel_size[1] ** 2
         self._solver = Rectangle(shape, pixel_size, device, self._area)
         rows, columns = shape
@@ -208,15 +223,12 @@ class SlopeRectangle:
 
     def solve(self, inputs: Inputs, sigma: bool) -> tuple[Floats, Floats | None] | None:
         """Return heights, (H, W), mm, and their standard deviation if wanted; None where one is missing."""
-        if not self._seems_full(inputs):
-            return None
         (width, height), (along, across) = self._size, self._weights
         maps: dict[str, Any] = {
             name: self._device.seen(name, getattr(inputs, name)) for name in ("dz_dx", "dz_dy")
         }
-        screening = 0.0
+        screening = _screening(inputs)
         if inputs.known_heights is not None:
-            screening = self._screening(inputs)
             maps |= {"heights": self._device.seen("heights", inputs.known_heights), "weight_z": screening}
         factors = {"x": along * width / 24, "y": -across * height / 24}
         self._run("rectangle_source", **maps, **factors, source=self._source)
@@ -231,22 +243,6 @@ class SlopeRectangle:
         if inputs.known_heights is not None:
             found += np.float32(inputs.datum)
         return found, deviation
-
-    def _seems_full(self, inputs: Inputs) -> bool:
-        """Tell whether all pixels seem to have slopes and known heights that count alike; soon, of a few."""
-        given = inputs.weight_x, inputs.edges, inputs.known_height_weights
-        if any(one is not None for one in given) or self._screening(inputs) > _STIFF:
-            return False
-        if inputs.mask is not None and not inputs.mask.all():
-            return False
-        some = slice(None, None, _SAMPLED if min(self._shape) > 1 else 1)
-        maps = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
-        return all(bool(np.isfinite(one[some]).all()) for one in maps if one is not None)
-
-    def _screening(self, inputs: Inputs) -> float:
-        if inputs.known_heights is None:
-            return 0.0
-        return self._area / inputs.typical_weight * inputs.known_height_weight
 
     def _deviation(self, inputs: Inputs, screening: float) -> Floats:
         """Return the heights' standard deviation; by how well slopes fit, where no weights were given."""

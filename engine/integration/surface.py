@@ -20,7 +20,7 @@ from mirrorskin.engine.integration.graph import (
     find_components,
 )
 from mirrorskin.engine.integration.height_variance import expected_misfit
-from mirrorskin.engine.integration.rectangle import SlopeRectangle
+from mirrorskin.engine.integration.rectangle import SlopeRectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.integration.vcycle import Multigrid
@@ -139,7 +139,7 @@ class SurfaceSolver:
         self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
     ) -> Surface:
         """Return the surface of a picture, from a start, (H, W), mm, or the last heights on."""
-        if options.sharpness is None:
+        if options.sharpness is None and seems_full(inputs):
             full = self._solve_full(inputs, options)
             if full is not None:
                 return full
@@ -160,7 +160,7 @@ class SurfaceSolver:
         return surface
 
     def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
-        """Return the surface of a full rectangle with even weights; None of any other."""
+        """Return the surface of a full rectangle with even weights; None where a slope is missing."""
         if self._rectangle is None:
             self._rectangle = SlopeRectangle(self._graph.shape, inputs.pixel_size, self._device)
         found = self._rectangle.solve(inputs, options.sigma)
