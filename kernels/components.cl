@@ -98,16 +98,3 @@ __kernel void components_add_offsets(
         height[p] = chosen(ANSWERED(p), RISEN(p, column) + offsets[LABEL(p)], NAN);
     }
 }
-
-// What brings the mean of each component to 0.
-__kernel void components_level(const int strips, const int count, MAP sums, MAP totals, OUT offsets)
-{
-    const int component = get_global_id(0);
-    if (component >= count) return;
-    float sum = 0.0f, total = 0.0f;
-    for (int strip = 0; strip < strips; ++strip) {
-        sum += sums[strip * count + component];
-        total += totals[strip * count + component];
-    }
-    offsets[component] = total > 0.0f ? -sum / total : 0.0f;
-}

@@ -44,13 +44,6 @@ def components_add_offsets(
     return np.where(labels >= 0, height, np.nan)
 
 
-def components_level(sums: Array, totals: Array) -> Doubles:
-    """Return the offset of each component that brings its mean to 0, by sums and totals of strips."""
-    total = np.sum(totals, axis=0, dtype=np.float64)
-    sum_ = np.sum(sums, axis=0, dtype=np.float64)
-    return np.asarray(-np.divide(sum_, total, out=np.zeros(total.shape), where=total > 0))
-
-
 def _level(plane: Triple, shape: tuple[int, ...]) -> Doubles:
     row, column = np.indices(shape)
     return np.asarray(plane[2] + plane[0] * column + plane[1] * row)

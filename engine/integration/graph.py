@@ -236,24 +236,14 @@ class Levelling:
 
     def __init__(self, graph: PixelGraph) -> None:
         self._graph, self._device = graph, graph.device
-        self._labels: Array | None = None
         self._arrays: dict[str, Array] = {}
         self._components: Components | None = None
 
-    def use(self, components: Components) -> None:
-        """Work on these components from now on."""
-        if components is self._components:
-            return
-        self._components = components
-        if components.count > 1:
-            self._labels = self._labels or self._device.array("labels", components.labels.shape, np.int32)
-            self._labels.claim()
-            self._labels.host[...] = components.labels
-            self._labels.upload()
-
-    def level(self, relief: Array, plane: Plane, datum: float) -> Floats:
+    def level(self, components: Components, relief: Array, plane: Plane, datum: float = 0.0) -> Floats:
         """Return heights, (H, W), mm; known heights are above ``datum``."""
-        unknown = self._of.offset_unknown
+        if components is not self._components and components.count > 1:
+            self._graph.put("labels", components.labels)
+        self._components, unknown = components, components.offset_unknown
         offsets = self._array("offsets", unknown.shape)
         offsets.claim()
         known_heights = self._graph.known_heights
@@ -264,65 +254,37 @@ class Levelling:
                 offsets.host[some] = mean - self._means(relief, plane, maps)[some]
         offsets.upload()
         height = self._device.array("levelled", self._graph.shape, np.float32)
-        self._add(relief, plane, offsets, height)
-        levelled: Floats = height.detach()
-        return levelled
-
-    def launch(self, relief: Array, plane: Plane) -> Array:
-        """Put `level` without known heights on the queue; return heights, until the next launch."""
-        count = self._of.count
-        _, strips = self._strips()
-        sizes = {"live sums": strips * count, "live totals": strips * count, "live offsets": count}
-        sums, totals, offsets = (self._array(name, (size,), or_more=True) for name, size in sizes.items())
-        self._sum(relief, plane, {}, sums, totals)
-        kernel, moved = self._device.kernel("components", "components_level", ONE=0), 8 * strips * count
-        kernel(count, strips=strips, count=count, sums=sums, totals=totals, offsets=offsets, moved=moved)
-        height = self._array("live heights", self._graph.shape)
-        self._add(relief, plane, offsets, height)
-        return height
-
-    def _means(self, relief: Array, plane: Plane, maps: dict[str, Array]) -> NDArray[np.float64]:
-        """Return the mean heights of components, or those above their known ones, (components,), mm."""
-        count, (_, strips) = self._of.count, self._strips()
-        sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
-        self._sum(relief, plane, maps, sums, totals)
-        sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
-        return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
-
-    def _sum(self, relief: Array, plane: Plane, maps: dict[str, Array], sums: Array, totals: Array) -> None:
-        strip, strips = self._strips()
-        outputs = {"strip": strip, "components": self._of.count, "sums": sums, "totals": totals}
-        given = {"heights": None, "height_weights": None, **maps}
-        self._run("components_sum", strips, relief, plane, **given, **outputs)
-
-    def _strips(self) -> tuple[int, int]:
-        """Return the rows of a strip of the picture that is summed on its own, and how many there are."""
-        rows = self._graph.shape[0]
-        strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * self._of.count // _MOST_SUMS))
-        return strip, -(-rows // strip)
-
-    def _add(self, relief: Array, plane: Plane, offsets: Array, height: Array) -> None:
         rows, columns = self._graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
         self._run("components_add_offsets", items, relief, plane, offsets=offsets, height=height)
+        levelled: Floats = height.detach()
+        return levelled
+
+    def _means(self, relief: Array, plane: Plane, maps: dict[str, Array]) -> NDArray[np.float64]:
+        """Return the mean heights of components, or those above their known ones, (components,), mm."""
+        rows, count = self._graph.shape[0], self._count
+        strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * count // _MOST_SUMS))
+        strips = -(-rows // strip)
+        sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
+        sizes = {"strip": strip, "components": count}
+        given = {"heights": None, "height_weights": None, **maps}
+        self._run("components_sum", strips, relief, plane, **given, **sizes, sums=sums, totals=totals)
+        sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
+        return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
     @property
-    def _of(self) -> Components:
-        assert self._components is not None  # ``use`` comes first
-        return self._components
+    def _count(self) -> int:
+        return self._components.count if self._components else 0
 
-    def _array(self, name: str, shape: tuple[int, ...], *, or_more: bool = False) -> Array:
-        """Return an array of a shape, or with room to spare: components come and go from frame to frame."""
-        kept = self._arrays.get(name)
-        if kept is not None and (kept.host.size >= shape[0] if or_more else kept.host.shape == shape):
-            return kept
-        self._arrays[name] = self._device.array(name, (2 * shape[0],) if or_more else shape, np.float32)
-        self._arrays[name].upload()
+    def _array(self, name: str, shape: tuple[int, ...]) -> Array:
+        if name not in self._arrays or self._arrays[name].host.shape != shape:
+            self._arrays[name] = self._device.array(name, shape, np.float32)
+            self._arrays[name].upload()
         return self._arrays[name]
 
     def _run(self, name: str, items: int, relief: Array, plane: Plane, **arguments: Any) -> None:
-        one = self._of.count == 1
-        labels = self._graph.flags if one or self._labels is None else self._labels
+        one = self._count == 1
+        labels = self._graph.flags if one else self._graph.array("labels", np.int32)
         (rows, columns), steps = self._graph.shape, self._graph.steps(plane)
         kernel = self._device.kernel("components", name, ONE=int(one))
         arguments |= dict(zip(("plane_x", "plane_y", "plane_z"), steps, strict=True))

@@ -219,8 +219,7 @@ class SurfaceSolver:
     def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief) -> Surface:
         """Add plane and offsets to relief, and estimate its standard deviation."""
         components = self._find_components(inputs, relief)
-        self._levelling.use(components)
-        height = self._levelling.level(relief.height, relief.plane, inputs.datum)
+        height = self._levelling.level(components, relief.height, relief.plane, inputs.datum)
         return Surface(
             height=height,
             sigma=self._find_sigma(inputs, relief, components) if options.sigma else None,

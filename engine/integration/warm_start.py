@@ -72,8 +72,7 @@ class WarmStartIntegrator:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)
         relief = self._from_scratch() if self._relief is None else self._relief
-        self._levelling.use(components)
-        height: Floats = self._levelling.launch(relief, LEVEL).download().copy()
+        height = self._levelling.level(components, relief, LEVEL)
         self._steps += 1
         self._look()
         return height
