@@ -7,10 +7,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.surface import SolverOptions, Surface, SurfaceSolver
@@ -28,8 +28,6 @@ from mirrorskin.kernels.device import Device, open_device
 # The memory of the last call, some 100 bytes a pixel, stays with the device for the next one: making it takes
 # as long as a solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
 _KEPT = 2**23
-
-T = TypeVar("T", bound=np.generic)
 
 
 def integrate(
@@ -163,21 +161,13 @@ def integrate(
 
 def _put_back(surface: Surface, inputs: Inputs) -> Surface:
     """Return the surface of the picture that a box was cut out of."""
-
-    def whole(part: NDArray[T], rest: float) -> NDArray[T]:
-        picture = np.full(inputs.picture, rest, part.dtype)
-        picture[inputs.box] = part
-        return picture
-
-    return replace(
-        surface,
-        height=whole(surface.height, np.nan),
-        sigma=None if surface.sigma is None else whole(surface.sigma, np.nan),
-        component=whole(surface.component, -1),
-        filled=whole(surface.filled, 0),
-        edges=None if surface.edges is None else whole(surface.edges, 0),
-        invalid=surface.invalid + inputs.lost,
-    )
+    maps: dict[str, Any] = {}
+    for name, rest in {"height": np.nan, "sigma": np.nan, "component": -1, "filled": 0, "edges": 0}.items():
+        part = getattr(surface, name)
+        if part is not None:
+            maps[name] = np.full(inputs.picture, rest, part.dtype)
+            maps[name][inputs.box] = part
+    return replace(surface, **maps, invalid=surface.invalid + inputs.lost)
 
 
 @contextmanager

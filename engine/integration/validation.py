@@ -38,8 +38,7 @@ class Inputs:
     # (H, W), float32: ``weight_y`` is None where it is ``weight_x``; both are where all have the same.
     weight_x: Floats | None = None
     weight_y: Floats | None = None
-    weight: float = 1.0  # that same weight, else 1
-    typical_weight: float = 1.0  # the median weight
+    typical_weight: float = 1.0  # that same weight, or the median
     # Whether the weights of the slopes were given, and are to be taken for inverse variances.
     weights_given: bool = True
     # (H, W), float32: heights relative to ``datum``; weights None where all have the same.
@@ -59,6 +58,11 @@ class Inputs:
         """Rows and columns."""
         rows, columns = self.dz_dx.shape
         return rows, columns
+
+    @property
+    def weight(self) -> float:
+        """What the maps of weights are multiplied by; what all weigh without."""
+        return self.typical_weight if self.weight_x is None else 1.0
 
 
 def check_inputs(
@@ -93,7 +97,7 @@ def check_inputs(
         planes = [np.zeros(shape, np.float32)]
     box, lost = (slice(0, shape[0]), slice(0, shape[1])), 0
     if crop:
-        whole, box = box, find_box(shape, lambda part: _may_answer(slopes(part), part, marks, heights))
+        whole, box = box, find_box(shape, lambda part: _may_answer(part, slopes, marks, heights))
         lost = 0 if box == whole else _count(whole, marks, planes) - _count(box, marks, planes)
     marks, cuts = (None if one is None else one[box] for one in (marks, cuts))
     planes, height_planes = ([plane[box] for plane in some] for some in (planes, height_planes))
@@ -105,15 +109,15 @@ def check_inputs(
     if heights is not None and height_weight:
         exact = np.asarray(heights[box], np.float64)
         if camera is not None:
-            squares = np.asarray(exact**2, np.float32)
-            height_planes = [plane * squares for plane in height_planes] or [
-                np.float32(height_weight) * squares
-            ]
+            squares = np.asarray(height_weight * exact**2, np.float32)
+            height_planes = [plane * squares for plane in height_planes] or [squares]
             height_weight, exact = 1.0, logarithm("known_heights", exact)
         counted = np.isfinite(exact) if marks is None else np.isfinite(exact) & (marks != 0)
         for plane in height_planes:
             counted &= plane > 0
-        known, datum = _relative(exact, counted)
+        if counted.any():  # relative to their mean: with it, float32 would lose their digits
+            datum = float(np.mean(exact, where=counted))
+            known = np.where(counted, exact - datum, np.nan).astype(np.float32)
     firmest = _FIRMEST * typical / min(size) ** 2
     planes = [_bounded(plane, typical * LEAST, typical * MOST) for plane in planes]
     height_planes = [_bounded(plane, 0.0, firmest) for plane in height_planes]
@@ -125,7 +129,6 @@ def check_inputs(
         edges=cuts,
         weight_x=planes[0] if planes else None,
         weight_y=planes[1] if len(planes) > 1 else None,
-        weight=1.0 if planes else weight,
         typical_weight=typical,
         weights_given=slope_weights is not None,
         steep=steep,
@@ -163,12 +166,18 @@ def _find_source(
     return shape, lambda box: (np.asarray(x[box], np.float32), np.asarray(y[box], np.float32), None)
 
 
-def _may_answer(slopes: Slopes, box: Box, mask: Flags | None, heights: NDArray[Any] | None) -> Mask:
+def _may_answer(
+    box: Box, slopes: Callable[[Box], Slopes], mask: Flags | None, heights: NDArray[Any] | None
+) -> Mask:
     """Tell which pixels of a box have slopes or a known height."""
-    found = np.isfinite(slopes[0]) & np.isfinite(slopes[1])
+    wanted: Mask | None = None if mask is None else mask[box] != 0
+    if wanted is not None and not wanted.any():
+        return wanted
+    x, y, _ = slopes(box)
+    found: Mask = np.isfinite(x) & np.isfinite(y)
     if heights is not None:
         found |= np.isfinite(heights[box])
-    return np.asarray(found if mask is None else found & (mask[box] != 0))
+    return found if wanted is None else found & wanted
 
 
 def _count(box: Box, mask: Flags | None, weights: list[Floats]) -> int:
@@ -257,14 +266,3 @@ def _bounded(plane: Floats, least: float, most: float) -> Floats:
     if np.min(plane, where=positive, initial=np.inf) >= least and plane.max() <= most:
         return plane
     return np.where(positive, np.clip(plane, least, most), 0).astype(np.float32)
-
-
-def _relative(heights: NDArray[np.float64], counted: Mask) -> tuple[Floats | None, float]:
-    """Return heights less the mean of those that count, which would cost float32 its digits, and that mean.
-
-    Others are NaN; None where none counts.
-    """
-    if not counted.any():
-        return None, 0.0
-    datum = float(np.mean(heights, where=counted))
-    return np.where(counted, heights - datum, np.nan).astype(np.float32), datum
