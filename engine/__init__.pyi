@@ -2,6 +2,7 @@ from .errors import NotConverged
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
+from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
 from .press.changepoint import ChangePointSearch, find_change_point
@@ -37,6 +38,7 @@ __all__ = [
     "free_memory",
     "fuse",
     "integrate",
+    "invert_laplacian",
     "measure",
     "reconstruct",
     "score",
