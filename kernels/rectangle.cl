@@ -4,7 +4,7 @@
 // LANES    complex numbers side by side in a vector: 8 where an item is a core's loop, 1 where it is a lane of a group
 // ROOM     complex vectors that a group has room for, `size` or more; 0 where they lie in `scratch`
 // HEIGHTS  1 where known heights are given
-// ODD      1 where a step has a radix of 7 or more: these take three times the registers
+// ODD      1 where a step has a radix of 7 or more: these take twice the registers
 //
 // A group transforms 2 * LANES lines at once, half of them as real parts of complex numbers and half as imaginary parts. With the
 // even points of a line forwards and then the odd ones backwards, its cosine modes are the parts of its Fourier transform, turned
@@ -61,33 +61,6 @@ C conjugate(const C z) { return (C)(z.lo, -z.hi); }
 C turned_back(const C z) { return (C)(z.hi, -z.lo); }  // by a quarter
 C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, z.lo); }
 
-#define UNROLL _Pragma("unroll")
-#define ADD_2(radix)                                                                                       \
-    const C last = z[0] - z[1];                                                                            \
-    z[0] += z[1]; z[1] = last;
-#define ADD_4(radix)                                                                                       \
-    const C a = z[0] + z[2], b = z[0] - z[2], c = z[1] + z[3], d = turned_back(z[1] - z[3]);               \
-    z[0] = a + c; z[1] = b + d; z[2] = a - c; z[3] = b - d;
-// Numbers n and radix - n go together: cosines meet their sums, sines their differences.
-#define ADD_ODD(radix)                                                                                     \
-    C sum[radix / 2], off[radix / 2];                                                                      \
-    const C first = z[0];                                                                                  \
-    UNROLL for (int n = 0; n < radix / 2; ++n) {                                                           \
-        sum[n] = z[n + 1] + z[radix - 1 - n];                                                              \
-        off[n] = turned_back(z[radix - 1 - n] - z[n + 1]);                                                 \
-        z[0] += sum[n];                                                                                    \
-    }                                                                                                      \
-    UNROLL for (int k = 1; k <= radix / 2; ++k) {                                                          \
-        C a = first, b = 0.0f;                                                                             \
-        UNROLL for (int n = 0; n < radix / 2; ++n) {                                                       \
-            MAP root = roots + 2 * (k * (n + 1) % radix) * (size / radix);                                 \
-            a += root[0] * sum[n];                                                                         \
-            b += root[1] * off[n];                                                                         \
-        }                                                                                                  \
-        z[k] = a + b;                                                                                      \
-        z[radix - k] = a - b;                                                                              \
-    }
-
 // A step adds numbers that are `far` apart, from number j of each block on: to modes (not `up`) they are turned afterwards, to
 // points before.
 #if LANES == 8
@@ -98,8 +71,8 @@ C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, 
 #define ALL_BLOCKS                                                                                         \
     for (int i = ME, block, j; block = (i + 0.5f) / far, j = i - block * far, block * stretch < size; i += OTHERS)
 #endif
-#define TURN_ALL(radix)                                                                                    \
-    UNROLL for (int n = 1; n < radix; ++n) z[n] = turned(z[n], roots + 2 * n * j * apart);
+#define UNROLL _Pragma("unroll")
+#define TURNED(n, value) turned(value, roots + 2 * (n) * j * apart)
 #define STEP(radix, add)                                                                                   \
     void step_##radix(Work work, const int size, const int far, MAP roots, const int up)                   \
     {                                                                                                      \
@@ -108,20 +81,51 @@ C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, 
             Work at = work + block * stretch + j;                                                          \
             C z[radix];                                                                                    \
             UNROLL for (int n = 0; n < radix; ++n) z[n] = at[n * far];                                     \
-            if (up && j) { TURN_ALL(radix) }                                                               \
-            { add(radix) }                                                                                 \
-            if (!up && j) { TURN_ALL(radix) }                                                              \
-            UNROLL for (int n = 0; n < radix; ++n) at[n * far] = z[n];                                     \
+            if (up && j) { UNROLL for (int n = 1; n < radix; ++n) z[n] = TURNED(n, z[n]); }                \
+            add(radix)                                                                                     \
         }                                                                                                  \
     }
+#define PUT_ALL(radix)                                                                                     \
+    if (!up && j) { UNROLL for (int n = 1; n < radix; ++n) z[n] = TURNED(n, z[n]); }                       \
+    UNROLL for (int n = 0; n < radix; ++n) at[n * far] = z[n];
+#define ADD_2(radix)                                                                                       \
+    const C last = z[0] - z[1];                                                                            \
+    z[0] += z[1]; z[1] = last;                                                                             \
+    PUT_ALL(2)
+#define ADD_4(radix)                                                                                       \
+    const C a = z[0] + z[2], b = z[0] - z[2], c = z[1] + z[3], d = turned_back(z[1] - z[3]);               \
+    z[0] = a + c; z[1] = b + d; z[2] = a - c; z[3] = b - d;                                                \
+    PUT_ALL(4)
+// Numbers n and radix - n go together: cosines meet their sums, sines their differences.
+#define ADD_ODD(radix, unroll)                                                                             \
+    C all = z[0];                                                                                          \
+    UNROLL for (int n = 1; n <= radix / 2; ++n) {                                                          \
+        const C off = turned_back(z[radix - n] - z[n]);                                                    \
+        z[n] += z[radix - n];                                                                              \
+        z[radix - n] = off;                                                                                \
+        all += z[n];                                                                                       \
+    }                                                                                                      \
+    at[0] = all;                                                                                           \
+    unroll for (int k = 1; k <= radix / 2; ++k) {                                                          \
+        C a = z[0], b = 0.0f;                                                                              \
+        UNROLL for (int n = 1; n <= radix / 2; ++n) {                                                      \
+            MAP root = roots + 2 * (k * n % radix) * (size / radix);                                       \
+            a += root[0] * z[n];                                                                           \
+            b += root[1] * z[radix - n];                                                                   \
+        }                                                                                                  \
+        at[k * far] = !up && j ? TURNED(k, a + b) : a + b;                                                 \
+        at[(radix - k) * far] = !up && j ? TURNED(radix - k, a - b) : a - b;                               \
+    }
+#define ADD_FEW(radix) ADD_ODD(radix, UNROLL)
+#define ADD_MANY(radix) ADD_ODD(radix, )  // in fewer registers
 STEP(2, ADD_2)
-STEP(3, ADD_ODD)
+STEP(3, ADD_FEW)
 STEP(4, ADD_4)
-STEP(5, ADD_ODD)
+STEP(5, ADD_FEW)
 #if ODD
-STEP(7, ADD_ODD)
-STEP(11, ADD_ODD)
-STEP(13, ADD_ODD)
+STEP(7, ADD_MANY)
+STEP(11, ADD_MANY)
+STEP(13, ADD_MANY)
 #define TAKE_ODD TAKE(7) TAKE(11) TAKE(13)
 #else
 #define TAKE_ODD
