@@ -89,14 +89,15 @@ def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slope
     n_y / (n . v), v = -r. The weight is (n . v)^2 of unit normals: a normal's errors are divided by n . v.
     Where the surface faces away, or the normal is no number, the slopes are NaN.
     """
-    x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
-    facing = z.copy()
-    if camera is not None:
-        across, up = camera.sight((normals.shape[0], normals.shape[1]))
-        facing += x * across[box[1]] + y * up[box[0]]
-    bad = ~(facing > 0)
-    facing[bad] = np.nan
-    over = np.reciprocal(facing if camera is not None else -facing)
-    with np.errstate(invalid="ignore", over="ignore"):
-        weight: NDArray[np.float32] = np.where(bad, np.float32(1), facing * facing / (x * x + y * y + z * z))
+    with np.errstate(all="ignore"):
+        x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
+        facing = z.copy()
+        if camera is not None:
+            across, up = camera.sight((normals.shape[0], normals.shape[1]))
+            facing += x * across[box[1]] + y * up[box[0]]
+        square = x * x + y * y + z * z
+        bad = ~((facing > 0) & (square < np.inf))
+        facing[bad] = np.nan
+        over = np.reciprocal(facing if camera is not None else -facing)
+        weight: NDArray[np.float32] = np.where(bad, np.float32(1), facing * facing / square)
         return x * over, y * over, weight
