@@ -60,8 +60,8 @@ typedef int ints;
 #define WITH_ANCHOR(value)
 #endif
 
-// The links of nodes i, their sum with the anchor, and what flows to nodes along them: -A x. READ gives heights
-// at p, in rows of s.
+// The links of nodes i, their sum with the anchor, what flows to nodes along them, -A x, and what is around nodes, by
+// weight. READ gives heights at p, in rows of s. Flow is found from differences, so that float32 heights are enough.
 #define AXES                                                                                               \
     const reals to_right = AT(right + i), to_left = AT(right + i - 1);                                     \
     const reals to_below = AT(down + i), to_above = AT(down + i - stride);
@@ -73,10 +73,14 @@ typedef int ints;
 #define WITH_DIAGONALS(READ, p, s)                                                                         \
     + ((to_fall * (READ((p) + (s) + 1) - READ(p)) + from_fall * (READ((p) - (s) - 1) - READ(p)))           \
        + (to_rise * (READ((p) + (s) - 1) - READ(p)) + from_rise * (READ((p) - (s) + 1) - READ(p))))
+#define WITH_CORNERS(READ, p, s)                                                                           \
+    + ((to_fall * READ((p) + (s) + 1) + from_fall * READ((p) - (s) - 1))                                   \
+       + (to_rise * READ((p) + (s) - 1) + from_rise * READ((p) - (s) + 1)))
 #define WITH_DIAGONAL_SUMS + ((to_fall + from_fall) + (to_rise + from_rise))
 #else
 #define SIDES AXES
 #define WITH_DIAGONALS(READ, p, s)
+#define WITH_CORNERS(READ, p, s)
 #define WITH_DIAGONAL_SUMS
 #endif
 #define SUM_OF_SIDES ((to_right + to_left) + (to_below + to_above) WITH_DIAGONAL_SUMS WITH_ANCHOR(AT(anchor + i)))
@@ -84,6 +88,9 @@ typedef int ints;
     ((to_right * (READ((p) + 1) - READ(p)) + to_left * (READ((p) - 1) - READ(p)))                          \
      + (to_below * (READ((p) + (s)) - READ(p)) + to_above * (READ((p) - (s)) - READ(p)))                   \
      WITH_DIAGONALS(READ, p, s) WITH_ANCHOR(-AT(anchor + i) * READ(p)))
+#define AROUND_OF(READ, p, s)                                                                              \
+    ((to_right * READ((p) + 1) + to_left * READ((p) - 1)) + (to_below * READ((p) + (s)) + to_above * READ((p) - (s))) \
+     WITH_CORNERS(READ, p, s))
 #define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
 
 // --- Levels -----------------------------------------------------------------------------------------------------
@@ -312,8 +319,11 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
 
 // --- Cycles -----------------------------------------------------------------------------------------------------
 
-#define STEPS_ARGS const float first, const float second, const float third
-#define STEP_BY(omega, READ, p, s) (READ(p) + (omega) * AT(inverse + i) * (AT(b + i) + FLOW(READ, p, s)))
+// Steps of Jacobi's method: Chebyshev's polynomial over the upper half of the spectrum, and one for what sums over blocks leave.
+#define FIRST 1.3896f
+#define SECOND 0.5617f
+#define THIRD 1.0f
+#define STEP_BY(omega, READ, p, s) ((1 - (omega)) * READ(p) + (omega) * AT(inverse + i) * (AT(b + i) + AROUND_OF(READ, p, s)))
 
 // What the aggregates of nodes have, and those of fine nodes i, whose blocks are at J.
 #if WIDTH == 8
@@ -379,17 +389,17 @@ float gathered(
 // Three steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
 // side. The residual itself is written if `keep` is 1.
 __kernel void multigrid_descend(
-    LEVEL_ARGS, COARSE_ARGS, STEPS_ARGS, GRAPH_ARGS, MAP inverse, MAP b, const int again, MAP x_before, OUT t, const int keep,
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, MAP b, const int again, MAP x_before, OUT t, const int keep,
     OUT residual, OUT coarse_b)
 {
     TILE_ITEMS
     if (again) {
-        FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(first, AT, x_before + i, stride);)
+        FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride);)
     } else {
-        FILL(3, one, PUT_NEAR(one + p) = first * AT(inverse + i) * AT(b + i);)
+        FILL(3, one, PUT_NEAR(one + p) = FIRST * AT(inverse + i) * AT(b + i);)
     }
-    FILL(2, other, STEP_NEAR(second, one, other))
-    FILL(1, one, STEP_NEAR(third, other, one) if (MINE) PUT(t + i) = NEAR(one + p);)
+    FILL(2, other, STEP_NEAR(SECOND, one, other))
+    FILL(1, one, STEP_NEAR(THIRD, other, one) if (MINE) PUT(t + i) = NEAR(one + p);)
     FILL(0, other, SIDES
         const reals rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
         PUT_NEAR(other + p) = rest;
@@ -417,18 +427,18 @@ __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed
 // What the aggregates have, added to t, and three steps of Jacobi's method; the sums over tiles of the heights times
 // the right side.
 __kernel void multigrid_ascend(
-    LEVEL_ARGS, COARSE_ARGS, STEPS_ARGS, GRAPH_ARGS, MAP inverse, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
     OUT parts)
 {
     TILE_ITEMS
     FILL(3, one,
         const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
         PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)
-    FILL(2, other, STEP_NEAR(third, one, other))
-    FILL(1, one, STEP_NEAR(second, other, one))
+    FILL(2, other, STEP_NEAR(THIRD, one, other))
+    FILL(1, one, STEP_NEAR(SECOND, other, one))
     reals sum = 0;
     FILL(0, other, SIDES
-        const reals height = STEP_BY(first, NEAR, one + p, ACROSS);
+        const reals height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
         PUT(x_new + i) = height;
         sum += height * AT(b + i);)
     other[get_local_id(0)] = WHOLE(sum);
@@ -459,7 +469,7 @@ typedef struct {
     }                                                                                                      \
     FENCE
 __kernel void multigrid_tail(
-    const int from, const int last, const int twice, __global const Level *restrict levels, STEPS_ARGS, GRAPH_ARGS, MAP inverse,
+    const int from, const int last, const int twice, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
     BYTES to, COUNTS changed, const int again, __global float *b, __global float *x, __global float *t)
 {
     int l = from, start = again, gone = 0;  // a bit for each level
@@ -468,13 +478,13 @@ __kernel void multigrid_tail(
             OF_LEVEL(l)
             OF_COARSE(l + 1)
             if (start) {
-                SMOOTH(first, x, t)
+                SMOOTH(FIRST, x, t)
             } else {
-                EACH_OF_LEVEL PUT(t + i) = first * AT(inverse + i) * AT(b + i);
+                EACH_OF_LEVEL PUT(t + i) = FIRST * AT(inverse + i) * AT(b + i);
                 FENCE
             }
-            SMOOTH(second, t, x)
-            SMOOTH(third, x, t)
+            SMOOTH(SECOND, t, x)
+            SMOOTH(THIRD, x, t)
             EACH_OF_LEVEL {
                 SIDES
                 PUT(x + i) = AT(b + i) + FLOW(AT, t + i, stride);
@@ -506,9 +516,9 @@ __kernel void multigrid_tail(
                 PUT(t + i) = AT(t + i) + injected(i, J, coarse_stride, x, moved, to);
             }
             FENCE
-            SMOOTH(third, t, x)
-            SMOOTH(second, x, t)
-            SMOOTH(first, t, x)
+            SMOOTH(THIRD, t, x)
+            SMOOTH(SECOND, x, t)
+            SMOOTH(FIRST, t, x)
             start = l > from && l <= twice && !(gone >> l & 1);
             gone = start ? gone | 1 << l : gone & ~(1 << l);
         }

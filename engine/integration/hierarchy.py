@@ -18,7 +18,7 @@ Doubles = NDArray[np.float64]
 STRENGTH = 0.25
 """Of links that join nodes in one aggregate; see ``multigrid_parts``."""
 
-TILE_ROWS = 16
+TILE_ROWS = 32
 """Of the tiles that a group takes in half a cycle."""
 
 _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors

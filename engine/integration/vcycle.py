@@ -26,11 +26,8 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Kernel
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
-_STEPS = {"first": 1.3896, "second": 0.5617, "third": 1.0}
-"""Of Jacobi's method: Chebyshev's polynomial over the upper spectrum, and one for what aggregates leave."""
-
 _TWICE, _ONCE = 2, 3  # the finest level that is gone through twice, and how many of the coarsest are not
-_TAIL = 4096  # nodes of a level from which on down one group does all
+_TAIL = 20480  # nodes of a level from which on down one group does all
 _USUAL = 40  # cycles, after which coarse levels are given up
 _CYCLES = 3  # that are enough where no tolerance is given
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must fall by so much: float32 does no more
@@ -339,7 +336,7 @@ class VCycle:
         h = self._h
         last = len(h.levels) - 1
         kernel, moved = self._kernel("tail", self._tail + 1), 200 * h.levels[self._tail].nodes
-        known: dict[str, Any] = {"levels": self._table, **_STEPS, **h.graph, "inverse": h.inverse}
+        known: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
         known |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
         known |= {"from": self._tail, "last": last, "twice": last - _ONCE, "again": again}
         kernel(kernel.group, **known, moved=moved)
@@ -361,6 +358,6 @@ class VCycle:
         fine, coarse = h.levels[number : number + 2]
         kernel = self._kernel(name, number)
         places = {**fine.place, **place_of_coarse(coarse)}
-        known = {**_STEPS, **h.graph, "inverse": h.inverse, "b": self.b}
+        known = {**h.graph, "inverse": h.inverse, "b": self.b}
         items = self._tiles(fine) * kernel.group
         kernel(items, **places, **known, **arguments, moved=21 * fine.nodes)
