@@ -133,7 +133,8 @@ float link_of(const int i, const int stride, const int down_by, const int right_
 
 // Of each block's nodes a, b and below them c, d, by bits: the largest part, and, 4 bits on, those that have links.
 __kernel void multigrid_parts(
-    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts, __global int *restrict touched)
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts, __global int *restrict touched,
+    const int level, __global int *restrict splits)
 {
     COARSE_ITEMS
     EACH_BLOCK {
@@ -163,21 +164,32 @@ __kernel void multigrid_parts(
         LARGER(with_d)
         PUT_BYTES(parts + J, main | live << 4);
     }
-    EACH_COARSE_NODE touched[J] = 0;
+    int some = 0;
+    EACH_COARSE_NODE {
+        touched[J] = 0;
+        some |= (parts[J] >> 4) & ~parts[J];
+    }
+    if (some) atomic_or(splits + level, 1);
 }
 
-// Where nodes go that are beside their block's largest part.
+// Rows and columns from a node's block to the aggregate that it belongs to.
+#define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
+#define WENT_RIGHT(i) (to[i] ? (to[i] - 1) % 3 - 1 : 0)
+
+// To which aggregates parts go that are not their block's largest. In each round, a part without a place takes that next to its
+// block to which its links to nodes with a place lead, unless another of its links would then lead further than to the next
+// aggregate. In the last round, parts of which that has become true stay with their block, and aggregates that are no blocks are
+// marked.
 __kernel void multigrid_move(
-    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, __global uchar *restrict to)
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear, const int first_round, const int last_round,
+    BYTES to, __global uchar *restrict places, __global int *restrict touched, const int level, __global int *restrict moves)
 {
     COARSE_ITEMS
+    for (int x = 2 * from; x < 2 * upto && clear; ++x) places[first + x] = places[first + stride + x] = 0;
     EACH_COARSE_NODE {
-        const int I = first + 2 * C, main = parts[J] & 15, live = parts[J] >> 4;
-        const int at[4] = {I, I + 1, I + stride, I + stride + 1};
-        for (int k = 0; k < 4; ++k) to[at[k]] = 0;
-        for (int rest = live & ~main; rest;) {
-            int part = rest & -rest, before = 0, target = 0;
-            float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
+        const int I = first + 2 * C, at[4] = {I, I + 1, I + stride, I + stride + 1};
+        for (int rest = (parts[J] >> 4) & ~parts[J]; rest;) {
+            int part = rest & -rest, before = 0;
             while (part != before) {  // what hangs together with it
                 before = part;
                 for (int k = 0; k < 16; ++k) {
@@ -191,49 +203,39 @@ __kernel void multigrid_move(
                 }
             }
             rest &= ~part;
+            float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
+            int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;  // where no link would be too long
             for (int k = 0; k < 36; ++k) {
                 const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
-                if (!(part >> m & 1) || (v >> 1 == 0 && u >> 1 == 0)) continue;
-                if (!(parts[J + (v >> 1) * coarse_stride + (u >> 1)] >> (2 * (v & 1) + (u & 1)) & 1)) continue;
-                const int way = 3 * ((v >> 1) + 1) + (u >> 1) + 1;
-                sums[way] += link_of(at[m], stride, y, x, right, down, falling, rising, anchor);
-                if (sums[way] > most) {
-                    most = sums[way];
-                    target = 1 + way;
+                const int inside = v >> 1 == 0 && u >> 1 == 0;
+                if (!(part >> m & 1) || (inside && part >> (2 * v + u) & 1)) continue;
+                if (!first_round) old = to[at[m]];
+                const float w = link_of(at[m], stride, y, x, right, down, falling, rising, anchor);
+                if (w == 0) continue;
+                const int j = at[m] + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
+                const int went = first_round ? 0 : to[j];
+                const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), beside = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
+                top = GREATER(top, below - 1);
+                bottom = LESSER(bottom, below + 1);
+                left = GREATER(left, beside - 1);
+                right_most = LESSER(right_most, beside + 1);
+                const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
+                if (has_place && !inside && below >= -1 && below <= 1 && beside >= -1 && beside <= 1)
+                    sums[3 * (below + 1) + beside + 1] += w;
+            }
+            for (int way = 0; way < 9; ++way) {
+                const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
+                if (sums[way] == 0 || y < top || y > bottom || x < left || x > right_most) continue;
+                if (last_round ? is_old : is_old || sums[way] > most) {
+                    most = is_old ? INFINITY : sums[way];
+                    target = way + 1;
                 }
             }
+            if (last_round && target == 5) target = 0;
             for (int k = 0; k < 4; ++k) {
-                if (part >> k & 1) to[at[k]] = target;
+                if (part >> k & 1) places[at[k]] = target;
             }
-        }
-    }
-}
-
-// Rows and columns from a node's block to the aggregate that it belongs to.
-#define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
-#define WENT_RIGHT(i) (to[i] ? (to[i] - 1) % 3 - 1 : 0)
-
-// Parts whose links would lead further than to the next aggregate stay with their block; the aggregates of the others are marked.
-__kernel void multigrid_settle(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES parts, BYTES to, __global uchar *restrict settled, __global int *restrict touched,
-    const int level, __global int *restrict moves)
-{
-    COARSE_ITEMS
-    EACH_COARSE_NODE {
-        const int I = first + 2 * C, at[4] = {I, I + 1, I + stride, I + stride + 1};
-        const int gone = (parts[J] >> 4) & ~parts[J];
-        int far[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0};  // by where a part goes: all that goes there stays
-        for (int k = 0; k < 36 && gone; ++k) {
-            const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x, i = at[m];
-            if (!to[i] || link_of(i, stride, y, x, right, down, falling, rising, anchor) == 0) continue;
-            const int j = i + y * stride + x, below = (v >> 1) + WENT_DOWN(j) - WENT_DOWN(i);
-            const int beside = (u >> 1) + WENT_RIGHT(j) - WENT_RIGHT(i);
-            if (below < -1 || below > 1 || beside < -1 || beside > 1) far[to[i] - 1] = 1;
-        }
-        for (int k = 0; k < 4; ++k) {
-            const int target = gone && to[at[k]] && !far[to[at[k]] - 1] ? to[at[k]] : 0;
-            settled[at[k]] = target;
-            if (!target) continue;
+            if (!last_round || !target) continue;
             atomic_or(touched + J, 1);
             atomic_or(touched + J + ((target - 1) / 3 - 1) * coarse_stride + (target - 1) % 3 - 1, 1);
             atomic_inc(moves + level);

@@ -175,13 +175,14 @@ def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> F
     """Return how many pixels each node of a level stands for, by node."""
     mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.download()
     picture = answered.view(np.uint8).astype(np.float32)
-    for fine, coarse in zip(hierarchy.levels[:number], hierarchy.levels[1:], strict=False):
+    levels = zip(hierarchy.levels[:number], hierarchy.levels[1:], hierarchy.moves, strict=False)
+    for fine, coarse, moves in levels:
         padded = np.zeros((2 * coarse.rows, 2 * coarse.columns), np.float32)
         padded[: fine.rows, : fine.columns] = picture
         picture = (padded[::2, ::2] + padded[1::2, ::2]) + (padded[::2, 1::2] + padded[1::2, 1::2])
-        to = moved[fine.first : fine.end - fine.stride].reshape(fine.rows, fine.stride)[:, : fine.columns]
-        row, column = np.nonzero(to)
-        if row.size and hierarchy.moves.any():
+        if moves:
+            to = moved[fine.first : fine.end - fine.stride].reshape(fine.rows, fine.stride)
+            row, column = np.nonzero(to)
             down, right = np.divmod(to[row, column].astype(np.int64) - 1, 3)
             share = padded[row, column]
             np.subtract.at(picture, (row // 2, column // 2), share)

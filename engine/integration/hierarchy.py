@@ -21,6 +21,7 @@ STRENGTH = 0.25
 TILE_ROWS = 32
 """Of the tiles that a group takes in half a cycle."""
 
+_ROUNDS = 4  # an even number, in which parts of blocks find another aggregate
 _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
 _BEYOND = 64  # nodes behind the last level, which vectors may read
 
@@ -91,8 +92,8 @@ class Hierarchy:
         )
         self._touched, self.changed = (self.array(name, dtype=np.int32) for name in ("touched", "changed"))
         self.moves = np.zeros(len(self.levels), np.int32)
-        self._counts, self._changes = (
-            self.array(name, len(self.levels), np.int32) for name in ("moves", "changes")
+        self._splits, self._counts, self._changes = (
+            self.array(name, len(self.levels), np.int32) for name in ("splits", "moves", "changes")
         )
 
     def array(self, name: str, size: int | None = None, dtype: DTypeLike = np.float32) -> Array:
@@ -108,17 +109,22 @@ class Hierarchy:
         the geometric mean of their nodes' greatest ones along the same axis.
         """
         self._admit_graph(links)
-        for counts in (self._counts, self._changes):
-            counts.claim()
-            counts.host[...] = 0
-            counts.upload()
+        for numbers in (self._splits, self._counts, self._changes):
+            numbers.claim()
+            numbers.host[...] = 0
+            numbers.upload()
         for number in range(len(self.levels) - 1):
             if not plain:
-                known: dict[str, Any] = {**self.graph, "parts": self._parts}
-                marks: dict[str, Any] = {"touched": self._touched, "level": number, "moves": self._counts}
-                self.between("parts", number, strength=strength, **known, touched=self._touched)
-                self.between("move", number, strength=strength, **known, to=self._wanted)
-                self.between("settle", number, **known, to=self._wanted, settled=self.to, **marks)
+                known: dict[str, Any] = {"strength": strength, **self.graph, "parts": self._parts}
+                known["touched"] = self._touched
+                self.between("parts", number, **known, level=number, splits=self._splits)
+                splits = self._splits.download()[number]
+                self._splits.upload()
+                for turn in range(_ROUNDS if splits else 0):
+                    old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
+                    ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == _ROUNDS - 1}
+                    counts: dict[str, Any] = {"level": number, "moves": self._counts}
+                    self.between("move", number, **known, **ends, to=old, places=new, **counts)
             self._coarsen(number)
         self.moves[...] = self._changes.download()
         self._changes.upload()

@@ -29,10 +29,10 @@ from mirrorskin.kernels.links import KNOWN, SLOPE
 _TWICE, _ONCE = 2, 3  # the finest level that is gone through twice, and how many of the coarsest are not
 _TAIL = 20480  # nodes of a level from which on down one group does all
 _USUAL = 40  # cycles, after which coarse levels are given up
-_CYCLES = 3  # that are enough where no tolerance is given
+_CYCLES = 2  # that are enough where no tolerance is given
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must fall by so much: float32 does no more
 _WORSE = 10  # times the least residual so far, at which rounding has taken over
-_FAILED = 0.3  # residual from which on up three cycles have failed
+_FAILED = 0.3  # residual from which on up two cycles have failed
 _ROUNDING = 1e-6  # of the right side: what is left over of an exact answer
 _LEAST = 1e-12  # of a component's links: anchors that are weaker leave its offset free
 _FIRM = 1e-3  # share of known heights in the energy that errors are measured against
@@ -97,7 +97,7 @@ class Multigrid:
     ) -> Solution:
         """Solve for the heights, from a start, (H, W), or from 0.
 
-        It ends when the residual is within the tolerance (None: after three cycles), after ``limit`` cycles,
+        It ends when the residual is within the tolerance (None: after two cycles), after ``limit`` cycles,
         or when the next one would end after ``deadline``, of ``time.perf_counter``.
         """
         h, cycle = self._hierarchy, self._cycle
