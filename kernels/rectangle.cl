@@ -3,7 +3,7 @@
 //
 // LANES    complex numbers side by side in a vector: 8 where an item is a core's loop, 1 where it is a lane of a group
 // ROOM     complex vectors that a group has room for, `size` or more; 0 where they lie in `scratch`
-// HEIGHTS  1 where known heights are given
+// KNOWN    1 where known heights are given
 // ODD      1 where a step has a radix of 7 or more: these take twice the registers
 //
 // A group transforms 2 * LANES lines at once, half of them as real parts of complex numbers and half as imaginary parts. With the
@@ -230,7 +230,7 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // a row begins any
 #endif
 #define SLOT(k, row) (((long)((k) / HALF) * padded + (row)) * SLOTS + (k) % HALF)
 
-#define ROW(row, n) ((row) < rows ? LOAD(source + (long)(row) * length + n) : (F)0.0f)
+#define POINTS(row, n) ((row) < rows ? LOAD(source + (long)(row) * length + n) : (F)0.0f)
 
 __kernel void rectangle_modes(
     const int rows, const int padded, LINES, MAP source, OUT spectrum, __global float *restrict scratch)
@@ -239,8 +239,8 @@ __kernel void rectangle_modes(
     TAKE_WORK
     BLOCKS(n, length) {
         F a[LANES], b[LANES];
-        EACH(i) a[i] = ROW(first + i, n);
-        EACH(i) b[i] = ROW(first + LANES + i, n);
+        EACH(i) a[i] = POINTS(first + i, n);
+        EACH(i) b[i] = POINTS(first + LANES + i, n);
         TRANSPOSE(a)
         TRANSPOSE(b)
         EACH(i) if (n + i < length) work[SPOT(n + i)] = (C)(a[i], b[i]);
@@ -328,23 +328,23 @@ __kernel void rectangle_divide(
 
 // ---- From slopes
 
-#if HEIGHTS
-#define HEIGHT_MAPS , const float weight_z, MAP heights
+#if KNOWN
+#define IF_KNOWN(words) words
+#define SLOPES                                                                                             \
+    const int rows, const int columns, MAP dz_dx, MAP dz_dy, MAP known_heights, const float weight_z
 #else
-#define HEIGHT_MAPS
+#define IF_KNOWN(words)
+#define SLOPES const int rows, const int columns, MAP dz_dx, MAP dz_dy
 #endif
 
-// An item has a piece of some rows: PoCL makes vector code of loops without branches.
-#define PIECE_ROWS 16
-#define PIECE_COLUMNS (LANES == 8 ? 256 : 1)
-#define PIECE                                                                                              \
-    const int pieces = (columns + PIECE_COLUMNS - 1) / PIECE_COLUMNS, item = get_global_id(0);             \
-    const int top = item / pieces * PIECE_ROWS, bottom = LESSER(rows, top + PIECE_ROWS);                   \
-    const int begin = item % pieces * PIECE_COLUMNS, end = LESSER(columns, begin + PIECE_COLUMNS);
-
-// Does one thing near the border and another where links lead to all sides from all neighbours.
+// An item has a piece of some rows. Near the border it does another thing than where links lead to all sides from all neighbours:
+// PoCL makes vector code of loops without branches.
+#define ROWS 16
+#define COLUMNS (LANES == 8 ? 256 : 1)
 #define ALL_PIXELS(border, inner)                                                                          \
-    for (int row = top; row < bottom; ++row) {                                                             \
+    const int pieces = (columns + COLUMNS - 1) / COLUMNS, item = get_global_id(0);                         \
+    const int begin = item % pieces * COLUMNS, end = LESSER(columns, begin + COLUMNS);                     \
+    for (int row = item / pieces * ROWS; row < LESSER(rows, item / pieces * ROWS + ROWS); ++row) {         \
         const int first = row * columns;                                                                   \
         int column = begin;                                                                                \
         for (; column < (row < 2 || row >= rows - 2 ? end : LESSER(end, 2)); ++column) border(first + column) \
@@ -363,53 +363,36 @@ float link(MAP slope, const int p, const int next, const int n, const int count)
 }
 
 // The right side: weights of links times their rise, of those that end in a pixel less those that begin there.
-__kernel void rectangle_source(
-    const int rows, const int columns, const float x, const float y, MAP dz_dx, MAP dz_dy HEIGHT_MAPS, OUT source)
+__kernel void rectangle_source(SLOPES, const float x, const float y, OUT source)
 {
-    PIECE
-#define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) + KNOWN(p);
+#define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) IF_KNOWN(+ weight_z * known_heights[p]);
 #define ENDS(slope, p, next, n, count) link(slope, p - next, next, n - 1, count) - link(slope, p, next, n, count)
 #define MIDST(slope, p, next)                                                                              \
     14.0f * (slope[p - next] - slope[p + next]) - (slope[p - 2 * next] - slope[p + 2 * next])
-#define BORDER(p) PUT_SOURCE(p, ENDS(dz_dx, p, 1, column, columns), ENDS(dz_dy, p, columns, row, rows))
-#define INNER(p) PUT_SOURCE(p, MIDST(dz_dx, p, 1), MIDST(dz_dy, p, columns))
-#if HEIGHTS
-#define KNOWN(p) weight_z * heights[p]
-#else
-#define KNOWN(p) 0.0f
-#endif
-    ALL_PIXELS(BORDER, INNER)
+#define SOURCE_BORDER(p) PUT_SOURCE(p, ENDS(dz_dx, p, 1, column, columns), ENDS(dz_dy, p, columns, row, rows))
+#define SOURCE_INNER(p) PUT_SOURCE(p, MIDST(dz_dx, p, 1), MIDST(dz_dy, p, columns))
+    ALL_PIXELS(SOURCE_BORDER, SOURCE_INNER)
 }
 
 // What is left over of links and known heights: squares, times their weights, summed by item.
 __kernel void rectangle_misfit(
-    const int rows, const int columns, const float weight_x, const float weight_y, const float size_x, const float size_y,
-    MAP dz_dx, MAP dz_dy HEIGHT_MAPS, MAP relief, OUT sums)
+    SLOPES, const float weight_x, const float weight_y, const float size_x, const float size_y, MAP relief, OUT sums)
 {
-    PIECE
-    float squares[PIECE_COLUMNS];
-    for (int i = 0; i < end - begin; ++i) squares[i] = 0.0f;
-#undef BORDER
-#undef INNER
-#undef KNOWN
-#define X_LEFT(p, link) relief[p + 1] - relief[p] - size_x / 24 * (link)
-#define Y_LEFT(p, link) relief[p + columns] - relief[p] + size_y / 24 * (link)
-#define ADD_SQUARES(p, in_x, x_link, in_y, y_link)                                                         \
+    float squares[COLUMNS];
+    for (int i = 0; i < COLUMNS; ++i) squares[i] = 0.0f;
+#define ADD_SQUARES(p, right, below, x_link, y_link)                                                       \
     {                                                                                                      \
-        const float x = in_x ? X_LEFT(p, x_link) : 0.0f, y = in_y ? Y_LEFT(p, y_link) : 0.0f;              \
-        squares[column - begin] += weight_x * x * x + weight_y * y * y + KNOWN(p);                         \
+        const float x = relief[p + right] - relief[p] - size_x / 24 * (x_link);                            \
+        const float y = relief[p + below] - relief[p] + size_y / 24 * (y_link);                            \
+        IF_KNOWN(const float z = relief[p] - known_heights[p];)                                            \
+        squares[column - begin] += weight_x * x * x + weight_y * y * y IF_KNOWN(+ weight_z * z * z);       \
     }
-#define BORDER(p)                                                                                          \
-    ADD_SQUARES(p, column < columns - 1, link(dz_dx, p, 1, column, columns), row < rows - 1,               \
-        link(dz_dy, p, columns, row, rows))
-#define INNER(p) ADD_SQUARES(p, 1, LINK(dz_dx, p, 1), 1, LINK(dz_dy, p, columns))
-#if HEIGHTS
-#define KNOWN(p) weight_z * (relief[p] - heights[p]) * (relief[p] - heights[p])
-#else
-#define KNOWN(p) 0.0f
-#endif
-    ALL_PIXELS(BORDER, INNER)
+#define MISFIT_BORDER(p)                                                                                   \
+    ADD_SQUARES(p, (column < columns - 1), (row < rows - 1 ? columns : 0),                                 \
+        link(dz_dx, p, 1, column, columns), link(dz_dy, p, columns, row, rows))
+#define MISFIT_INNER(p) ADD_SQUARES(p, 1, columns, LINK(dz_dx, p, 1), LINK(dz_dy, p, columns))
+    ALL_PIXELS(MISFIT_BORDER, MISFIT_INNER)
     float sum = 0.0f;
-    for (int i = 0; i < end - begin; ++i) sum += squares[i];
-    if (top < rows) sums[item] = sum;
+    for (int i = 0; i < COLUMNS; ++i) sum += squares[i];
+    if (item / pieces * ROWS < rows) sums[item] = sum;
 }

@@ -20,7 +20,7 @@ from mirrorskin.engine.integration.graph import (
     find_components,
 )
 from mirrorskin.engine.integration.height_variance import expected_misfit
-from mirrorskin.engine.integration.rectangle import SlopeRectangle, seems_full
+from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.integration.vcycle import Multigrid
@@ -124,7 +124,7 @@ class SurfaceSolver:
         self._device = device
         self._graph = PixelGraph(device, shape)
         self._levelling = Levelling(self._graph)
-        self._rectangle: SlopeRectangle | None = None
+        self._rectangle: Rectangle | None = None
         self._multigrid: Multigrid | None = None
         self._kept = _Kept(None, np.zeros(shape, np.uint8))
         self._plane: Plane | None = None
@@ -162,8 +162,9 @@ class SurfaceSolver:
     def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
         """Return the surface of a full rectangle with even weights; None where a slope is missing."""
         if self._rectangle is None:
-            self._rectangle = SlopeRectangle(self._graph.shape, inputs.pixel_size, self._device)
-        found = self._rectangle.solve(inputs, options.sigma)
+            size, area = inputs.pixel_size, math.prod(inputs.pixel_size)
+            self._rectangle = Rectangle(self._graph.shape, size, self._device, area)
+        found = self._rectangle.integrate(inputs, options.sigma)
         if found is None:
             return None
         return Surface(

@@ -8,7 +8,7 @@ import scipy.sparse
 from rectangles import put, scene, solve_by_cosines, source_of
 from scipy.sparse.linalg import spsolve
 
-from mirrorskin.engine.integration.rectangle import Rectangle, SlopeRectangle, seems_full
+from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.validation import check_inputs
 
 
@@ -116,11 +116,11 @@ def test_a_long_strip_is_solved_by_a_convolution_or_outside_of_a_group_s_own_mem
 )
 def test_one_slope_that_is_missing_is_noticed_anywhere(device, shape, missing, mask):
     slopes = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
-    solver, mask = SlopeRectangle(shape, (1.0, 1.0), device), None if mask is None else np.ones(shape, bool)
+    solver, mask = Rectangle(shape, (1.0, 1.0), device), None if mask is None else np.ones(shape, bool)
 
     def is_full():
         inputs = check_inputs(*slopes, 1.0, mask=mask)
-        return seems_full(inputs) and solver.solve(inputs, False) is not None
+        return seems_full(inputs) and solver.integrate(inputs, False) is not None
 
     assert is_full()
     for slope in slopes:
