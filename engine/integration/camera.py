@@ -14,6 +14,8 @@ from mirrorskin.io import InputError
 Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
 """Slopes along x and y, and their weight, (H, W); no weight where all have the same."""
 
+_EDGE_ON = 1e-4  # squared share of a normal along the line of sight, up to which it tells no slope
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -87,7 +89,7 @@ def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slope
     With one they are those of the logarithm of the depth, by the pixel size at depth 1: a step along x
     changes the point Z r by Z (r d(ln Z) + dr), and n is perpendicular to that; so n_x / (n . v) and
     n_y / (n . v), v = -r. The weight is (n . v)^2 of unit normals: a normal's errors are divided by n . v.
-    Where the surface faces away, or the normal is no number, the slopes are NaN.
+    Where the surface faces away or is seen edge-on, or the normal is no number, the slopes are NaN.
     """
     with np.errstate(all="ignore"):
         x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
@@ -96,8 +98,8 @@ def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slope
             across, up = camera.sight((normals.shape[0], normals.shape[1]))
             facing += x * across[box[1]] + y * up[box[0]]
         square = x * x + y * y + z * z
-        bad = ~((facing > 0) & (square < np.inf))
-        facing[bad] = np.nan
+        weight = np.square(facing) / square
+        bad = ~((facing > 0) & (weight > _EDGE_ON))
+        facing[bad], weight[bad] = np.nan, 1
         over = np.reciprocal(facing if camera is not None else -facing)
-        weight: NDArray[np.float32] = np.where(bad, np.float32(1), facing * facing / square)
         return x * over, y * over, weight

@@ -70,7 +70,8 @@ def integrate(
         Millimetres, one number or (x, y). Left out with a camera.
     normals : array_like, (H, W, 3), optional
         Surface normals in place of slopes: along x, y and z, which runs towards the camera; of any length.
-        Not finite or 0 where there is none; where the surface faces away there is none either.
+        Not finite or 0 where there is none; where the surface faces away, or is seen within 0.6 degrees of
+        edge-on, they count as none.
     camera : mirrorskin.engine.Camera, optional
         What saw the normals; by default one so far away that all lines of sight are along z. With a camera,
         ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical

@@ -95,14 +95,15 @@ def test_without_a_camera_lines_of_sight_are_parallel(device):
     normals = 3 * np.stack([-x, -y, np.ones(SHAPE)], axis=-1)
     normals[:9] *= -1  # faces away
     normals[20, 20], normals[21, 20], normals[22, 20, 1] = 0, np.nan, np.inf  # there is none
-    x[:9] = x[20:23, 20] = np.nan
+    normals[23, 20] = 1, 0, 0.009  # is seen edge-on
+    x[:9] = x[20:24, 20] = np.nan
     found = engine.integrate(normals=normals, pixel_size=(0.3, 0.5), device=device)
     weights = 1 / (1 + np.nan_to_num(x**2 + y**2))  # n_z^2: normals are as noisy, not slopes
     expected = engine.integrate(x, y, (0.3, 0.5), slope_weights=weights, device=device)
     np.testing.assert_allclose(found.height, expected.height, atol=1e-5)
     shares = found.sigma / expected.sigma
     np.testing.assert_allclose(shares[np.isfinite(x)], np.nanmedian(shares), rtol=1e-3)
-    assert found.invalid == expected.invalid == 9 * SHAPE[1] + 3
+    assert found.invalid == expected.invalid == 9 * SHAPE[1] + 4
 
 
 NORMALS, FLAT = np.broadcast_to([0.0, 0, 1], (4, 5, 3)), np.zeros((4, 5))
