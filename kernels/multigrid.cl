@@ -386,15 +386,35 @@ float gathered(
     }                                                                                                      \
     barrier(CLK_LOCAL_MEM_FENCE);
 #define STEP_NEAR(omega, from, to) SIDES PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);
+#define EACH_COARSE_OF_TILE                                                                                \
+    for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + left / 2;            \
+         y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines)                                            \
+        for (int x = lane * WIDTH; x < wide / 2; x += lanes * WIDTH)
 #define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
+
+// Which tiles have nodes with links or anchors: all others are left out.
+__kernel void multigrid_find_live(LEVEL_ARGS, MAP inverse, const int first_tile, __global uchar *restrict live)
+{
+    const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_global_id(0), top = tile / across * ROWS;
+    const int left = tile % across * COLUMNS, bottom = LESSER(top + ROWS, rows), right_end = LESSER(left + COLUMNS, stride);
+    if (top >= rows) return;
+    int any = 0;
+    for (int y = top; y < bottom && !any; ++y)
+        for (int x = left; x < right_end; ++x) any |= inverse[base + stride * (y + 1) + x] > 0;
+    live[first_tile + tile] = any;
+}
 
 // Three steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
 // side. The residual itself is written if `keep` is 1.
 __kernel void multigrid_descend(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, MAP b, const int again, MAP x_before, OUT t, const int keep,
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, MAP b, const int again, MAP x_before, OUT t, const int keep,
     OUT residual, OUT coarse_b)
 {
     TILE_ITEMS
+    if (!live[first_tile + get_group_id(0)]) {
+        EACH_COARSE_OF_TILE PUT(coarse_b + coarse_of_tile + coarse_stride * y + x) = 0;
+        return;
+    }
     if (again) {
         FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride);)
     } else {
@@ -406,12 +426,10 @@ __kernel void multigrid_descend(
         const reals rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
         PUT_NEAR(other + p) = rest;
         if (keep) PUT(residual + i) = rest;)
-    for (int y = line; y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines) {
-        for (int x = lane * WIDTH; x < wide / 2; x += lanes * WIDTH) {
-            __local const float *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
-            PUT(coarse_b + coarse_base + coarse_stride * (top / 2 + y + 1) + left / 2 + x)
-                = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
-        }
+    EACH_COARSE_OF_TILE {
+        __local const float *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
+        PUT(coarse_b + coarse_of_tile + coarse_stride * y + x)
+            = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
     }
 }
 
@@ -429,10 +447,16 @@ __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed
 // What the aggregates have, added to t, and three steps of Jacobi's method; the sums over tiles of the heights times
 // the right side.
 __kernel void multigrid_ascend(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
     OUT parts)
 {
     TILE_ITEMS
+    if (!live[first_tile + get_group_id(0)]) {
+        EACH_LINE(0)
+            EACH_OF_LINE(0) if (top + y < rows) PUT(x_new + i) = 0;
+        if (get_local_id(0) == 0) parts[get_group_id(0)] = 0;
+        return;
+    }
     FILL(3, one,
         const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
         PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)

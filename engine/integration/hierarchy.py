@@ -237,7 +237,7 @@ def place_of_coarse(coarse: Level) -> dict[str, int]:
 
 def tile_columns(device: Device) -> int:
     """Return the columns of the tiles that a group takes in half a cycle."""
-    return 256 if device.layout.tile > 1 else 32
+    return 128 if device.layout.tile > 1 else 32
 
 
 def part_of(device: Device) -> int:

@@ -138,6 +138,7 @@ class Multigrid:
         """
         h, cycle = self._hierarchy, self._cycle
         h.follow(links, deep=deep)
+        cycle.find_tiles()
         h.copy_picture("admit", self._source, links.source)
         self._find_residual()
         cycle.launch()
@@ -250,7 +251,10 @@ class VCycle:
         self._tail = next(
             k for k, one in enumerate(h.levels) if k == len(h.levels) - 1 or (k > 0 and one.nodes <= _TAIL)
         )
+        tiles = [self._tiles(one) for one in h.levels[: self._tail]]
+        self._first_tile = np.cumsum([0, *tiles])
         self.parts = h.array("parts", self._tiles(h.levels[0]))
+        self._live = h.array("live", max(1, int(self._first_tile[-1])), np.uint8)
 
     def prepare(self) -> None:
         """Make ready for what the hierarchy holds now."""
@@ -258,6 +262,18 @@ class VCycle:
         table = [[*one.place.values(), moves] for one, moves in zip(h.levels, h.moves, strict=True)]
         self._table = h.device.given("levels", np.array(table), np.int32)
         self._factors: Callable[[Doubles], Doubles] | None = None
+        self.find_tiles()
+
+    def find_tiles(self) -> None:
+        """Find the tiles that have nodes; no cycle goes over the others."""
+        h = self._h
+        for number, level in enumerate(h.levels[: self._tail]):
+            kernel, items = self._kernel("find_live", number), self._tiles(level)
+            known = {"inverse": h.inverse, **self._live_of(number)}
+            kernel(items, **level.place, **known, moved=4 * level.nodes)
+
+    def _live_of(self, number: int) -> dict[str, Any]:
+        return {"live": self._live, "first_tile": int(self._first_tile[number])}
 
     def factorise(self) -> bool:
         """Solve the second level directly from now on, on the host; tell whether that is something new.
@@ -358,6 +374,6 @@ class VCycle:
         fine, coarse = h.levels[number : number + 2]
         kernel = self._kernel(name, number)
         places = {**fine.place, **place_of_coarse(coarse)}
-        known = {**h.graph, "inverse": h.inverse, "b": self.b}
+        known = {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
         items = self._tiles(fine) * kernel.group
         kernel(items, **places, **known, **arguments, moved=21 * fine.nodes)
