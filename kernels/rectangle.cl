@@ -11,18 +11,17 @@
 // (Makhoul 1980).
 //
 // The Fourier transform stays in its place. `plan` has for each step its radix and how far apart the numbers are that it adds,
-// `roots` are those of 1. Afterwards the modes are out of order: `place` says where modes k and length - k are. Backwards, with real and imaginary
-// parts exchanged, the same steps in reverse lead from there to the points. A length that has a large prime factor is less than
-// `size`: its transform is then a convolution of so many points (Bluestein 1970).
+// `roots` are those of 1. Afterwards the modes are out of order: `place` says where modes k and length - k are. Backwards, with
+// real and imaginary parts exchanged, the same steps in reverse lead from there to the points. A length that has a large prime
+// factor is less than `size`: its transform is then a convolution of so many points (Bluestein 1970).
 //
-// The spectrum lies in strips of 16 slots, for modes k ... k + 7 and length - k ... length - k - 7 of rows; a strip has 16 numbers
-// of each of `padded` rows.
+// The spectrum lies in strips of 2 * LANES slots, for modes k, k + 1 ... of rows and then length - k, length - k - 1 ...: of each of
+// `padded` rows a strip has so many numbers, and its columns are what a group transforms at once. Numbers of one size go together:
+// each rounds the other.
 
 #include "common.clh"
 
-#define HALF 8
-#define SLOTS 16
-#define PARTS (HALF / LANES)  // groups that share a strip's columns
+#define SLOTS (2 * LANES)
 
 #if LANES == 8
 typedef float8 F;
@@ -228,14 +227,13 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // a row begins any
 #ifndef STREAM
 #define STREAM STORE
 #endif
-#define SLOT(k, row) (((long)((k) / HALF) * padded + (row)) * SLOTS + (k) % HALF)
-
+#define SLOT(k, row) (((long)(k) / LANES * padded + (row)) * SLOTS)
 #define POINTS(row, n) ((row) < rows ? LOAD(source + (long)(row) * length + n) : (F)0.0f)
 
 __kernel void rectangle_modes(
     const int rows, const int padded, LINES, MAP source, OUT spectrum, __global float *restrict scratch)
 {
-    const int first = get_group_id(0) * 2 * LANES;
+    const int first = get_group_id(0) * SLOTS;
     TAKE_WORK
     BLOCKS(n, length) {
         F a[LANES], b[LANES];
@@ -255,24 +253,24 @@ __kernel void rectangle_modes(
         }
         TRANSPOSE(low_a) TRANSPOSE(low_b) TRANSPOSE(high_a) TRANSPOSE(high_b)
         __global float *out = spectrum + SLOT(k, first);
-        EACH(i) { STREAM(out + SLOTS * i, low_a[i]); STREAM(out + SLOTS * i + HALF, high_a[i]); }
+        EACH(i) { STREAM(out + SLOTS * i, low_a[i]); STREAM(out + SLOTS * i + LANES, high_a[i]); }
         out += SLOTS * LANES;
-        EACH(i) { STREAM(out + SLOTS * i, low_b[i]); STREAM(out + SLOTS * i + HALF, high_b[i]); }
+        EACH(i) { STREAM(out + SLOTS * i, low_b[i]); STREAM(out + SLOTS * i + LANES, high_b[i]); }
     }
 }
 
 __kernel void rectangle_heights(
     const int rows, const int padded, LINES, MAP spectrum, OUT height, __global float *restrict scratch)
 {
-    const int first = get_group_id(0) * 2 * LANES;
+    const int first = get_group_id(0) * SLOTS;
     TAKE_WORK
     BLOCKS(k, length / 2 + 1) {
         F low_a[LANES], low_b[LANES], high_a[LANES], high_b[LANES];
         __global const float *in = spectrum + SLOT(k, first);
-        for (int i = 0; i < 2 * LANES; ++i) AHEAD(in + ((long)padded + i) * SLOTS)
-        EACH(i) { low_a[i] = LOAD(in + SLOTS * i); high_a[i] = LOAD(in + SLOTS * i + HALF); }
+        for (int i = 0; i < SLOTS; ++i) AHEAD(in + ((long)padded + i) * SLOTS)
+        EACH(i) { low_a[i] = LOAD(in + SLOTS * i); high_a[i] = LOAD(in + SLOTS * i + LANES); }
         in += SLOTS * LANES;
-        EACH(i) { low_b[i] = LOAD(in + SLOTS * i); high_b[i] = LOAD(in + SLOTS * i + HALF); }
+        EACH(i) { low_b[i] = LOAD(in + SLOTS * i); high_b[i] = LOAD(in + SLOTS * i + LANES); }
         TRANSPOSE(low_a) TRANSPOSE(low_b) TRANSPOSE(high_a) TRANSPOSE(high_b)
         EACH(i) {
             const C low = (C)(low_a[i], low_b[i]), high = (C)(high_a[i], high_b[i]);
@@ -303,27 +301,21 @@ __kernel void rectangle_heights(
 __kernel void rectangle_divide(
     const int pictures, const int padded, LINES, MAP along, MAP across, OUT spectrum, __global float *restrict scratch)
 {
-    const int part = get_group_id(0) % PARTS, picture = get_group_id(0) / PARTS % pictures;
-    const int strip = get_group_id(0) / PARTS / pictures;
-    __global F *column = (__global F *)(spectrum + ((long)strip * padded + picture * length) * SLOTS) + part;
-    __global const F *given = (__global const F *)along + 2 * PARTS * strip + part;
-    const C beside = (C)(given[0], given[PARTS]);
+    const int strip = get_group_id(0) / pictures, picture = get_group_id(0) % pictures;
+    __global C *column = (__global C *)spectrum + (long)strip * padded + picture * length;
+    const C beside = ((__global const C *)along)[strip];
     TAKE_WORK
-    ALL(n, length) work[SPOT(n)] = (C)(column[2 * PARTS * n], column[2 * PARTS * n + PARTS]);
+    ALL(n, length) work[SPOT(n)] = column[n];
     TRANSFORM(0)
     ALL(k, length / 2 + 1) {
         GET_MODES(k)
         low /= beside + across[k];
         high /= beside + across[length - k];
-        if (k == 0 && strip == 0 && part == 0) low.s0 = 0.0f * high.s0;
+        if (k == 0 && strip == 0) low.s0 = 0.0f * high.s0;
         PUT_MODES(k)
     }
     TRANSFORM(1)
-    ALL(n, length) {
-        const C z = work[SPOT(n)];
-        column[2 * PARTS * n] = z.hi;
-        column[2 * PARTS * n + PARTS] = z.lo;
-    }
+    ALL(n, length) column[n] = crossed(work[SPOT(n)]);
 }
 
 // ---- From slopes

@@ -6,9 +6,9 @@ cosines ::
 
     modes of b along rows, then down columns  ->  each divided by its eigenvalue  ->  back to points of u
 
-The spectrum, (strips, rows, 16), has in the slots of strip s modes k = 8 s ... 8 s + 7 of rows of a length,
-then length - k. Mode ``length`` is 0; what slots with k beyond half the length hold means nothing. Pictures
-lie one below the other.
+The spectrum, (strips, rows, 2 lanes), has in the slots of a strip some modes k of rows of a length, one after
+the other, then length - k. Mode ``length`` is 0; what slots with k beyond half the length hold means nothing.
+Pictures lie one below the other.
 
 Pictures from slopes are links that all have one weight along x and another along y: right sides, and what
 is left over of them.
@@ -27,14 +27,12 @@ from scipy.fft import dct, idct
 
 Floats = NDArray[np.floating[Any]]
 
-_HALF = 8
-
 
 def rectangle_modes(source: Floats, spectrum: Floats) -> None:
     """Write the cosine modes of rows, twice the sums of their points times cosines."""
     rows, length = source.shape
     found = np.pad(dct(source.astype(np.float64), axis=1), ((0, 0), (0, 1)))
-    low = np.minimum(np.arange(len(spectrum) * _HALF).reshape(-1, _HALF), length)
+    low = np.minimum(np.arange(spectrum[:, 0].size // 2).reshape(len(spectrum), -1), length)
     slots = np.concatenate([low, length - low], axis=1)
     spectrum[:, :rows] = found[:, slots].transpose(1, 0, 2)
 
@@ -42,8 +40,8 @@ def rectangle_modes(source: Floats, spectrum: Floats) -> None:
 def rectangle_divide(pictures: int, along: Floats, across: Floats, spectrum: Floats) -> None:
     """Divide cosine modes of the columns of each picture by ``along`` + ``across``, in place.
 
-    ``along``, (strips, 16), is of a slot, ``across``, (rows of a picture + 1), of a mode of columns. The mode
-    that is the same everywhere becomes 0.
+    ``along``, (strips, 2 lanes), is of a slot, ``across``, (rows of a picture + 1), of a mode of columns. The
+    mode that is the same everywhere becomes 0.
     """
     rows = len(across) - 1
     for picture in range(pictures):

@@ -16,9 +16,6 @@ from mirrorskin.kernels.device import Device, Kernel
 Doubles = NDArray[np.float64]
 Whole = NDArray[np.intp]
 
-HALF, SLOTS = 8, 16
-"""Pairs of modes that go together, and modes of a strip of the spectrum; see ``rectangle.cl``."""
-
 _RADICES = 13, 11, 7, 5, 3  # the odd ones; see ``rectangle.cl``
 _RARE = 7  # and more: kernels for others take fewer registers
 _PIECE = 16, 256  # rows and columns of an item that is a core's loop, when it goes over pixels
@@ -31,7 +28,7 @@ _LEAST_ROOM, _MOST_ROOM = 256, 4096  # complex numbers in a group's own memory; 
 Table = NDArray[np.float64] | NDArray[np.intp]
 
 
-def make_plan(length: int) -> dict[str, Table]:
+def make_plan(length: int, lanes: int) -> dict[str, Table]:
     """Return the tables for transforms of lines of so many points, by the kernels' names of them.
 
     ``plan``, (S, 2), are radices and how far apart the points are that they add, ``roots``, (size, 2), those
@@ -40,7 +37,7 @@ def make_plan(length: int) -> dict[str, Table]:
     ``chirp``, (length, 2), is what points and modes are multiplied by, ``other``, (size, 2), the Fourier
     transform of its other factor, in the order of the modes. All complex numbers are in two parts.
     """
-    size, mode = length, np.arange(find_modes(length).size // 2)
+    size, mode = length, np.arange(find_modes(length, lanes).size // 2)
     place, radices = np.stack([mode % length, -mode % length], axis=1), find_radices(length)
     chirp, other = (np.empty(0, complex),) * 2
     if radices is not None:
@@ -80,9 +77,9 @@ def _order(radices: list[int]) -> NDArray[np.intp]:
     return place
 
 
-def find_modes(length: int) -> Whole:
-    """Return the modes of a row's slots, (strips, 16); those that mean nothing are never 0."""
-    low = np.arange(-(-(length // 2 + 1) // HALF) * HALF).reshape(-1, HALF)
+def find_modes(length: int, lanes: int) -> Whole:
+    """Return the modes of a row's slots, (strips, 2 lanes); those that mean nothing are never 0."""
+    low = np.arange(-(-(length // 2 + 1) // lanes) * lanes).reshape(-1, lanes)
     return np.concatenate([np.minimum(low, length), np.maximum(length - low, 1)], axis=1)
 
 
@@ -124,9 +121,9 @@ class Rectangle:
         self._lanes = _LANES if device.layout.tile > 1 else 1
         self._weights = scale / pixel_size[0] ** 2, scale / pixel_size[1] ** 2
         pictures, (rows, columns), at_once = math.prod(shape[:-2]), shape[-2:], 2 * self._lanes
-        modes = find_modes(columns)
+        modes = find_modes(columns, self._lanes)
         groups = -(-pictures * rows // at_once), pictures * modes.size // at_once
-        self._spectrum = self._array("spectrum", (len(modes), groups[0] * at_once, SLOTS))
+        self._spectrum = self._array("spectrum", (len(modes), groups[0] * at_once, at_once))
         self._runs = [self._prepare(*one) for one in zip((columns, rows), groups, strict=True)]
         self._along = device.given("along", self._rates(modes, columns, self._weights[0]))
         self._across: tuple[float, Array] | None = None
@@ -212,7 +209,7 @@ class Rectangle:
 
     def _prepare(self, length: int, groups: int) -> tuple[int, dict[str, int], dict[str, Any]]:
         """Return how many groups transform lines of a length, the kernels' macros, and their tables."""
-        tables = make_plan(length)
+        tables = make_plan(length, self._lanes)
         steps, size, room = len(tables["plan"]), len(tables["roots"]), _MOST_ROOM
         if self._lanes == 1:
             room = max(_LEAST_ROOM, 1 << (size - 1).bit_length())

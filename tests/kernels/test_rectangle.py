@@ -37,8 +37,8 @@ def laplacian(lines, length, along, across, screening):
 def refer(source, screening, weights=WEIGHTS):
     """The whole way, in the reference."""
     rows, columns = source.shape
-    modes = find_modes(columns), np.arange(rows + 1)
-    spectrum = np.full((len(modes[0]), rows, 16), np.nan)
+    modes = find_modes(columns, 4), np.arange(rows + 1)
+    spectrum = np.full((len(modes[0]), rows, 8), np.nan)
     rectangle_modes(source, spectrum)
     along, across = (
         4 * weight * np.sin(np.pi * mode / (2 * count)) ** 2
