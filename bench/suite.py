@@ -16,6 +16,7 @@ from mirrorskin.bench import (
     normals,
     onset,
     paths,
+    robust,
     sweep,
     twin,
 )
@@ -29,6 +30,7 @@ _RUNS: Cases = {
     **normals.CASES,
     **correlation.CASES,
     **integration.CASES,
+    **robust.CASES,
     **twin.CASES,
     **sweep.CASES,
     **paths.CASES,

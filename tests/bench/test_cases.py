@@ -35,6 +35,7 @@ QUICK = (
     "call-edges",
     "integrate-mask",
     "integrate-live",
+    "integrate-robust",
     "twin",
     "sweep-onset",
     "sweep-changepoint-unknown",
