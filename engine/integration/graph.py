@@ -207,11 +207,12 @@ def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
     """Label what links to the right and down connect: runs of pixels in a row, then runs that touch."""
     starts = answered.copy()
     starts[:, 1:] &= ~right
-    run = np.cumsum(starts, dtype=np.int32).reshape(answered.shape) - 1
+    begin = np.flatnonzero(starts)  # of each run
     changes = down.copy()  # one link of each pair of runs
     changes[:, 1:] &= ~(down[:, :-1] & right[:-1] & right[1:])
-    upper, lower = run[:-1][changes], run[1:][changes]
-    label = np.arange(int(starts.sum()), dtype=np.int32)
+    place = np.flatnonzero(changes)
+    upper, lower = (np.searchsorted(begin, end, "right") - 1 for end in (place, place + answered.shape[1]))
+    label = np.arange(begin.size, dtype=np.int32)
     while upper.size:
         one, other = label[upper], label[lower]
         apart = one != other
@@ -224,7 +225,9 @@ def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
     if count < 2:
         return answered.astype(np.int32) - 1, count
     number = (np.cumsum(first, dtype=np.int32) - 1)[label]
-    return np.where(answered, number[run], np.int32(-1)), count
+    ends = np.append(begin[1:], answered.size)
+    whole = np.concatenate([np.zeros(begin[0], np.int32), np.repeat(number, ends - begin)])
+    return np.where(answered, whole.reshape(answered.shape), np.int32(-1)), count
 
 
 class Levelling:
