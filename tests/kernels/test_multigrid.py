@@ -1,146 +1,219 @@
-"""Each pass against its reference, on levels of odd sizes with nodes that are odd as well."""
+"""Levels, cycles and passes of a device against those of the reference."""
 
+from typing import Any
+
+import graphs
 import numpy as np
 import pytest
-from launches import launch
 
-from mirrorskin.engine.integration.hierarchy import part_of
-from mirrorskin.kernels import multigrid
+from mirrorskin.engine.integration import vcycle
+from mirrorskin.engine.integration.graph import Links
+from mirrorskin.engine.integration.height_variance import local_part
+from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, part_of, place_of_coarse
+from mirrorskin.kernels import multigrid as twin
 
-FINE = (0, 13, 32)  # base, rows, stride; 21 columns
-COARSE = (15 * 32, 7, 16)
-ODD = COARSE[0] + 9 * 16  # the first node without a place in the picture
-NODES = ODD + 16
-ROWS = 9
-PARTS = -(-FINE[1] * FINE[2] // 64)
-STEPS = 1.3896, 0.5617
-PAIR = (FINE[0], FINE[2], *COARSE)
+SHAPE = 90, 300  # several tiles, parts of sums and items, none of them full
+GRAPHS = [("rectangle", False), ("holes", False), ("soft", False), ("cuts", True), ("uneven", True)]
+STRAIGHT, CROSSED = ("rectangle", False), ("cuts", True)
 
 
-class Arrays:
-    """All that passes work on, at random."""
+class Case:
+    """A graph's levels on a device and by the reference, and random pictures of both."""
 
-    def __init__(self, anchored, seed=0):
-        rng = np.random.default_rng(seed)
-        self.right, self.down, self.anchor = (np.zeros(NODES) for _ in range(3))
-        for (base, rows, stride), columns in ((FINE, 21), (COARSE, 11)):
-            node = base + stride * (np.arange(rows)[:, np.newaxis] + 1) + np.arange(columns)
-            for name, inside in (("right", node[:, :-1]), ("down", node[:-1])):
-                weights = rng.uniform(0.1, 3.0, inside.shape) * (rng.random(inside.shape) < 0.8)
-                getattr(self, name)[inside] = weights * rng.choice([1, 1e-3], inside.shape, p=[0.9, 0.1])
+    def __init__(self, device, kind, anchored, *, plain=False):
+        self.device, self.rng = device, np.random.default_rng(0)
+        graph = graphs.pixel_graph(kind, SHAPE, anchored)
+        self.h = Hierarchy(SHAPE, anchored, device)
+        right, down = (self.map(getattr(graph, name)) for name in ("right", "down"))
+        anchor = self.map(graph.anchor) if anchored else None
+        self.h.build(Links(device, SHAPE, right, down, anchor, right), plain=plain)
+        given = [None if one is None else one.host.copy() for one in (right, down, anchor)]
+        self.levels = twin.build(*given, None if plain else STRENGTH)
+
+    def map(self, values, dtype=np.float32):
+        array = self.device.array("map", values.shape, dtype)
+        array.host[...] = values
+        array.upload()
+        return array
+
+    def random(self, number=0):
+        """Return a picture of a level, and an array that holds it."""
+        picture = self.rng.normal(size=self.levels[number].to.shape).astype(np.float32)
+        array = self.h.array("picture")
+        array.claim()
+        self._inside(number, array.host)[...] = picture
+        array.upload()
+        return picture.astype(np.float64), array
+
+    def _inside(self, number, values):
+        level = self.h.levels[number]
+        return values[level.first : level.end - level.stride].reshape(level.rows, level.stride)[
+            :, : level.columns
+        ]
+
+    def get(self, array, number=0):
+        found = self._inside(number, array.download()).copy()
+        array.upload()
+        return found
+
+    def sums(self, name, parts=1, **arguments):
+        """Run a pass that adds up; return its sums."""
+        count = -(-self.h.levels[0].nodes // part_of(self.device))
+        array = self.h.array("parts", parts * count)
+        self.h.over_parts(name, array, **arguments, **({"count": count} if parts > 1 else {}))
+        return array.download().reshape(parts, count).sum(axis=1, dtype=np.float64)
+
+
+def close(found, expected, within=1e-5):
+    np.testing.assert_allclose(found, expected, rtol=within, atol=within * np.abs(expected).max())
+
+
+@pytest.fixture(scope="module")
+def cases(device):
+    made: dict[Any, Case] = {}
+    return lambda kind, anchored: made.setdefault((kind, anchored), Case(device, kind, anchored))
+
+
+@pytest.mark.parametrize(("kind", "anchored"), [*GRAPHS, ("isolated", False)])
+def test_levels_are_those_of_the_reference(device, kind, anchored):
+    for plain in (False, True):
+        case = Case(device, kind, anchored, plain=plain)
+        for number, (level, moves) in enumerate(zip(case.levels, case.h.moves, strict=True)):
+            for name, weights in zip(("right", "down", "falling", "rising"), level.links, strict=True):
+                np.testing.assert_allclose(
+                    case.get(case.h.graph[name], number), weights, rtol=1e-5, atol=1e-5
+                )
             if anchored:
-                self.anchor[node] = rng.uniform(0, 1, node.shape) * (rng.random(node.shape) < 0.3)
-        for name in ("b", "x", "e", "z", "before", "residual", "inverse"):
-            setattr(self, name, rng.normal(size=NODES))
-        self.inverse = np.abs(self.inverse)
-        self.smoother, self.direction, self.image, self.split = (np.zeros(NODES) for _ in range(4))
-        self.weight_at = np.abs(rng.normal(size=NODES))
-        self.parts = np.zeros(PARTS)
-        self.curves = np.zeros(4 * PARTS)
-        ends = np.array([[0.5], [0.1], [0.3], [-0.5]])
-        self.plane = (ends + 0.1 * rng.random((4, PARTS))).ravel()
-        self.same = np.repeat([0.5, 0.5, 0.5, 0.3], PARTS)
-        inside = FINE[2] + rng.choice(FINE[1] * FINE[2], ROWS - 3, replace=False)
-        self.node = np.sort(np.concatenate([inside, ODD + np.arange(3)]))
-        counts = rng.integers(1, 9, ROWS)
-        self.start = np.concatenate([[0], np.cumsum(counts)])
-        self.column = rng.integers(FINE[2], ODD + 3, self.start[-1])
-        self.weight = rng.uniform(0, 2, self.start[-1])
-        self.bottom = COARSE[0] + COARSE[2] + np.arange(30)
-        self.matrix = rng.normal(size=900)
-        self.map_ = rng.normal(size=13 * 21)
-        self.level = np.zeros(NODES)
-        self.returns, self.evened = np.abs(rng.normal(size=NODES)), np.zeros(NODES)
-        self.c = rng.normal(size=6)
-        self.flags = rng.choice([1, 4, 6, 8], 13 * 21)
-
-    def all(self):
-        return vars(self)
+                np.testing.assert_allclose(case.get(case.h.graph["anchor"], number), level.anchor, rtol=1e-5)
+            close(case.get(case.h.inverse, number), twin.inverse_of(level.diagonal))
+            np.testing.assert_array_equal(case.get(case.h.to, number) if moves else 0 * level.to, level.to)
+            assert moves == len(changed(level))
+            if moves:
+                coarse = case.h.levels[number + 1]
+                found = case.h.changed.download()[coarse.base : coarse.base + moves] - coarse.first
+                case.h.changed.upload()
+                assert sorted(np.transpose(np.divmod(found, coarse.stride)).tolist()) == changed(level)
+        assert plain == (not case.h.moves.any()) or kind == "rectangle"
 
 
-TABLE = "node", "start", "column", "weight"
-GRAPH = "right", "down", "anchor"
-PASSES = {
-    "invert": (FINE, *GRAPH, "inverse"),
-    "begin": (FINE, *STEPS, *GRAPH, "inverse", "b", "x"),
-    "smooth": (FINE, 0.5617, *GRAPH, "b", "x", "smoother"),
-    "residual": (FINE, *GRAPH, "b", "x", "residual"),
-    "scaled_residual": (FINE, *GRAPH, "b", "x", "residual"),
-    "keep": (FINE, "residual", "x", "b", "smoother"),
-    "scale": (FINE, "inverse", "b", "residual"),
-    "clear": (FINE, "x"),
-    "add": (FINE, "e", "x"),
-    "restrict": (PAIR, "right", "down", "residual", "b"),
-    "gather": (PAIR, "e", "b"),
-    "prolong": (PAIR, 1.0, "right", "down", "inverse", "e", "x", "smoother"),
-    "coarsen": (PAIR, 0.25, *GRAPH, *GRAPH, "split"),
-    "invert_extra": ((1, 7), *TABLE, "anchor", "inverse"),
-    "begin_extra": ((1, 7), *TABLE, *STEPS, "anchor", "inverse", "b", "x"),
-    "smooth_extra": ((0, ROWS), *TABLE, 0.5617, "anchor", "inverse", "b", "x", "smoother"),
-    "residual_extra": ((2, 7), *TABLE, 1, "anchor", "inverse", "b", "x", "residual"),
-    "restrict_extra": ((0, ROWS), *TABLE, "residual", "b"),
-    "prolong_extra": ((3, 6), *TABLE, 0.0, "inverse", "e", "x", "smoother"),
-    "solve": ((30,), "bottom", "matrix", "b", "x"),
-    "direct": (FINE, 0.7, *GRAPH, "z", "before", "direction", "image", "parts"),
-    "advance": (FINE, 0.3, "e", "before", "b", "x", "parts"),
-    "curve": (FINE, *GRAPH, "b", "z", "before", PARTS, "curves"),
-    "follow": (FINE, 5, "weight_at", PARTS, "plane", "z", "before", "x"),
-    "follow along one": (FINE, 5, "weight_at", PARTS, "same", "z", "before", "x"),
-    "dot": (FINE, "e", "x", "parts"),
-    "weigh": (FINE, "weight_at", "x", "parts"),
-    "even": (FINE, *GRAPH, "evened"),
-    "returns": (FINE, "right", "down", "inverse", "smoother"),
-    "returns_extra": ((1, 7), *TABLE, "inverse", "smoother"),
-    "local": (FINE, "right", "down", "inverse", "returns", "c", "evened"),
-    "local_extra": ((1, 7), *TABLE, "inverse", "returns", "c", "evened"),
-    "deviation": ((13, 21, 32), 0.12, 12, "flags", "inverse", "returns", "map_"),
-    "admit": ((13, 21, 32), "map_", "level"),
-    "release": ((13, 21, 32), "x", "map_"),
-}
-TYPES = dict.fromkeys(("node", "start", "column", "bottom"), np.int32) | {"flags": np.uint8}
-SUMS = "direct", "advance", "curve", "dot", "weigh"  # in parts of 64 nodes here, so that there are several
+def changed(level):
+    """Return the aggregates that are no blocks."""
+    y, x = np.nonzero(level.to)
+    row, column = level.aggregate
+    pairs = {*zip((y // 2).tolist(), (x // 2).tolist(), strict=True)}
+    return sorted(map(list, pairs | {*zip(row[y, x].tolist(), column[y, x].tolist(), strict=True)}))
 
 
-def items_of(name, device):
-    if name in ("restrict", "gather", "prolong", "coarsen"):
-        return COARSE[1]
-    if name in ("admit", "release", "deviation"):
-        return FINE[1]
-    if name == "solve":
-        return 30
-    if name.endswith("extra"):
-        return ROWS
-    nodes = FINE[1] * FINE[2]
-    return -(-nodes // (64 if name in SUMS else device.layout.tile))
+@pytest.mark.parametrize(("kind", "anchored"), GRAPHS)
+def test_a_cycle_answers_as_the_reference_wherever_one_group_takes_over(cases, kind, anchored, monkeypatch):
+    case = cases(kind, anchored)
+    b, given = case.random()
+    expected = twin.cycle(case.levels, b)
+    for first in (1, 3, 6):
+        monkeypatch.setattr(vcycle, "_TAIL", case.h.levels[first].nodes)
+        cycle = vcycle.VCycle(case.h)
+        cycle.prepare()
+        cycle.b = given
+        product = cycle.run()
+        close(case.get(cycle.x), expected)
+        assert product == pytest.approx((b * expected).sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("anchored", [True, False], ids=["anchored", "free"])
-@pytest.mark.parametrize("name", PASSES)
-def test_a_pass_does_what_its_reference_says(device, name, anchored):
-    sizes, *arguments = PASSES[name]
-    name = name.split()[0]
-    arrays = Arrays(anchored).all()
-    arrays = {key: value.astype(TYPES.get(key, np.float32)) for key, value in arrays.items()}
-    on_device = {}
-    for key, value in arrays.items():
-        on_device[key] = device.array(key, value.shape, value.dtype)
-        on_device[key].host[...] = value
-        on_device[key].upload()
-    before = {key: value.copy() for key, value in arrays.items()}
-    getattr(multigrid, f"multigrid_{name}")(
-        *sizes, *(arrays[a] if isinstance(a, str) else a for a in arguments)
-    )
-    width = 8 if device.layout.tile > 1 else 1
-    part = 64 if name in SUMS else part_of(device)  # as the engine has it, so that it is compiled once
-    kernel = device.kernel("multigrid", f"multigrid_{name}", ANCHORED=int(anchored), PART=part, WIDTH=width)
-    given = [on_device[a] if isinstance(a, str) else a for a in arguments]
-    launch(kernel, items_of(name, device), *sizes, *given)
-    changed = [key for key in arrays if not np.array_equal(arrays[key], before[key])]
-    assert changed
-    for key in arrays:
-        found = on_device[key].download()
-        if key in ("parts", "curves"):
-            found, expected = (one.reshape(-1, PARTS).sum(1, np.float64) for one in (found, arrays[key]))
-            np.testing.assert_allclose(found, expected, rtol=1e-5)
-        else:
-            np.testing.assert_allclose(found, arrays[key], rtol=2e-5, atol=2e-5)
+@pytest.mark.parametrize("graph", [STRAIGHT, CROSSED], ids=str)
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_residual_is_that_of_the_reference(cases, graph, number):
+    case = cases(*graph)
+    (b, b_given), (x, x_given), found = case.random(number), case.random(number), case.h.array("found")
+    arrays = {"b": b_given, "x": x_given, "residual": found}
+    case.h.over("residual", case.h.levels[number], **case.h.graph, **arrays)
+    close(case.get(found, number), twin.residual(case.levels[number], b, x))
+
+
+@pytest.mark.parametrize("graph", [STRAIGHT, CROSSED], ids=str)
+def test_steps_of_conjugate_gradients_and_sums(cases, graph):
+    case = cases(*graph)
+    level, zero = case.levels[0], np.zeros(SHAPE)
+    (z, z_given), (before, before_given), (b, b_given), (x, x_given) = (case.random() for _ in range(4))
+    assert case.sums("dot", one=b_given, other=x_given) == pytest.approx((b * x).sum(), rel=1e-3, abs=1e-2)
+    if case.h.anchored:
+        weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
+        assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
+    direction, image = case.h.array("direction"), case.h.array("image")
+    arrays = {"z": z_given, "before": before_given, "direction": direction, "image": image}
+    curvature = case.sums("direct", beta=0.7, **case.h.graph, **arrays)
+    p = z + 0.7 * before
+    close(case.get(direction), p)
+    close(case.get(image), -twin.residual(level, zero, p))
+    assert curvature == pytest.approx(-(p * twin.residual(level, zero, p)).sum(), rel=1e-5)
+    square = case.sums("advance", alpha=0.3, direction=direction, image=image, b=b_given, x=x_given)
+    close(case.get(x_given), x + 0.3 * p)
+    close(case.get(b_given), b + 0.3 * twin.residual(level, zero, p))
+    assert square == pytest.approx((case.get(b_given).astype(float) ** 2).sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("same", [False, True], ids=["plane", "line"])
+@pytest.mark.parametrize("graph", [STRAIGHT, CROSSED], ids=str)
+def test_the_best_step_in_a_plane(cases, graph, same):
+    case = cases(*graph)
+    level, zero = case.levels[0], np.zeros(SHAPE)
+    (z, z_given), (p, p_given), (b, b_given), (x, x_given) = (case.random() for _ in range(4))
+    if same:
+        p, p_given = z, case.h.array("same")
+        p_given.claim()
+        p_given.host[...] = z_given.host
+        p_given.upload()
+    z_image, p_image = (-twin.residual(level, zero, one) for one in (z, p))
+    expected = [(one * other).sum() for one, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))]
+    products = case.sums("curve", 4, **case.h.graph, b=b_given, z=z_given, p=p_given)
+    np.testing.assert_allclose(products, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    halves = np.array([0.25, 0.75]) * (b * z).sum()
+    parts = np.repeat(expected, 2) * np.tile([0.5, 0.5], 4)
+    given = {
+        name: case.device.given(name, values) for name, values in (("product", halves), ("parts", parts))
+    }
+    places = {"products": 2, "count": 2, **given}
+    case.h.over("follow", case.h.levels[0], **places, z=z_given, p=p_given, x=x_given)
+    along, again = twin.best_step((b * z).sum(), *expected)
+    assert (again == 0) == same
+    close(case.get(p_given), along * z + again * p, 1e-4)
+    close(case.get(x_given), x + along * z + again * p, 1e-4)
+
+
+@pytest.mark.parametrize("graph", [STRAIGHT, CROSSED], ids=str)
+@pytest.mark.parametrize("number", [0, 1])
+def test_what_a_level_adds_to_variances(cases, graph, number):
+    case = cases(*graph)
+    h, fine, level = case.h, case.h.levels[number], case.levels[number]
+    coarse, given = case.random(number + 1)
+    evened, returns, part, brought, found = (h.array(name) for name in "abcde")
+    links, c = {name: h.graph[name] for name in ("right", "down")}, local_part(number == 0)
+    h.over("even", fine, **h.graph, evened=evened)
+    h.over("returns", fine, **links, evened=evened, returns=returns)
+    numbers = h.device.given("local", c)
+    h.over("local", fine, **links, evened=evened, returns=returns, c=numbers, local_part=part)
+    arrays = {"e": given, "moved_nodes": h.moves[number], "to": h.to, "t": brought}
+    h.over("inject", fine, **place_of_coarse(h.levels[number + 1]), **arrays)
+    h.over("spread", fine, **h.graph, inverse=h.inverse, t=brought, part=part, x=found)
+    d, r = twin.walk(level)
+    local = twin.local_part(level, c)
+    close(case.get(evened, number), d)
+    close(case.get(returns, number), r)
+    close(case.get(part, number), local)
+    close(case.get(brought, number), twin.injected(level, coarse))
+    close(case.get(found, number), twin.spread(level, coarse, local))
+
+
+def test_pictures_come_to_the_finest_level_and_back(cases):
+    case = cases(*CROSSED)
+    picture = case.rng.normal(size=SHAPE).astype(np.float32)
+    level, back, found = case.h.array("level"), case.map(0 * picture), case.map(0 * picture)
+    case.h.copy_picture("admit", level, case.map(picture))
+    np.testing.assert_array_equal(case.get(level), picture)
+    case.h.copy_picture("release", level, back)
+    np.testing.assert_array_equal(back.download(), picture)
+    flags = case.rng.choice([1, 4, 6, 8], SHAPE)
+    known = {"least": 0.12, "wanted": 12, "flags": case.map(flags, np.uint8), "inverse": case.h.inverse}
+    case.h.copy_picture("deviation", level, found, **known)
+    least = 0.12 * twin.inverse_of(case.levels[0].diagonal)
+    expected = np.where(flags & 12, np.sqrt(np.maximum(picture, least)), np.nan)
+    np.testing.assert_allclose(found.download(), expected, rtol=1e-5)
