@@ -176,6 +176,9 @@ __kernel void multigrid_parts(
 #define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
 #define WENT_RIGHT(i) (to[i] ? (to[i] - 1) % 3 - 1 : 0)
 
+// The nodes of a block whose first is I, from 0 to 3.
+#define NODE(k) (I + (k) / 2 * stride + (k) % 2)
+
 // To which aggregates parts go that are not their block's largest. In each round, a part without a place takes that next to its
 // block to which its links to nodes with a place lead, unless another of its links would then lead further than to the next
 // aggregate. In the last round, parts of which that has become true stay with their block, and aggregates that are no blocks are
@@ -187,13 +190,13 @@ __kernel void multigrid_move(
     COARSE_ITEMS
     for (int x = 2 * from; x < 2 * upto && clear; ++x) places[first + x] = places[first + stride + x] = 0;
     EACH_COARSE_NODE {
-        const int I = first + 2 * C, at[4] = {I, I + 1, I + stride, I + stride + 1};
+        const int I = first + 2 * C;
         for (int rest = (parts[J] >> 4) & ~parts[J]; rest;) {
             int part = rest & -rest, before = 0;
             while (part != before) {  // what hangs together with it
                 before = part;
                 for (int k = 0; k < 16; ++k) {
-                    const int a = at[k / 4], b = at[k % 4], y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
+                    const int a = NODE(k / 4), b = NODE(k % 4), y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
                     if (!(part >> k / 4 & 1) || !(rest >> k % 4 & 1) || k / 4 == k % 4) continue;
                     const float w = link_of(a, stride, y, x, right, down, falling, rising, anchor);
                     const float ax = ALONG_X(*, a), ay = ALONG_Y(*, a), bx = ALONG_X(*, b), by = ALONG_Y(*, b);
@@ -209,10 +212,10 @@ __kernel void multigrid_move(
                 const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
                 const int inside = v >> 1 == 0 && u >> 1 == 0;
                 if (!(part >> m & 1) || (inside && part >> (2 * v + u) & 1)) continue;
-                if (!first_round) old = to[at[m]];
-                const float w = link_of(at[m], stride, y, x, right, down, falling, rising, anchor);
+                if (!first_round) old = to[NODE(m)];
+                const float w = link_of(NODE(m), stride, y, x, right, down, falling, rising, anchor);
                 if (w == 0) continue;
-                const int j = at[m] + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
+                const int j = NODE(m) + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
                 const int went = first_round ? 0 : to[j];
                 const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), beside = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
                 top = GREATER(top, below - 1);
@@ -220,8 +223,8 @@ __kernel void multigrid_move(
                 left = GREATER(left, beside - 1);
                 right_most = LESSER(right_most, beside + 1);
                 const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
-                if (has_place && !inside && below >= -1 && below <= 1 && beside >= -1 && beside <= 1)
-                    sums[3 * (below + 1) + beside + 1] += w;
+                if (!has_place || inside || below < -1 || below > 1 || beside < -1 || beside > 1) continue;
+                for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;  // in registers
             }
             for (int way = 0; way < 9; ++way) {
                 const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
@@ -233,7 +236,7 @@ __kernel void multigrid_move(
             }
             if (last_round && target == 5) target = 0;
             for (int k = 0; k < 4; ++k) {
-                if (part >> k & 1) places[at[k]] = target;
+                if (part >> k & 1) places[NODE(k)] = target;
             }
             if (!last_round || !target) continue;
             atomic_or(touched + J, 1);
@@ -283,7 +286,7 @@ __kernel void multigrid_coarsen(
     EACH_COARSE_NODE {
         if (touched[J]) changed[coarse_base + atomic_inc(changes + level)] = J;
         if (!IS_TOUCHED(J)) continue;
-        float sums[4] = {0, 0, 0, 0}, held = 0;  // of links to the right, and down to the left, below and to the right
+        float to_right = 0, to_below = 0, falls = 0, rises = 0, held = 0;
         EACH_MEMBER {
 #if ANCHORED
             held += anchor[i];
@@ -294,14 +297,16 @@ __kernel void multigrid_coarsen(
                 if (w == 0) continue;
                 const int v = y + way / 3 - 1, u = x + way % 3 - 1, j = i + (way / 3 - 1) * stride + way % 3 - 1;
                 const int below = (v >> 1) + WENT_DOWN(j) - row, beside = (u >> 1) + WENT_RIGHT(j) - C;
-                if (below == 0 && beside == 1) sums[0] += w;
-                if (below == 1 && beside >= -1 && beside <= 1) sums[2 + beside] += w;
+                if (below == 0 && beside == 1) to_right += w;
+                if (below == 1 && beside == -1) rises += w;
+                if (below == 1 && beside == 0) to_below += w;
+                if (below == 1 && beside == 1) falls += w;
             }
         }
-        coarse_right[J] = 0.5f * sums[0];
-        coarse_rising[J] = 0.5f * sums[1];
-        coarse_down[J] = 0.5f * sums[2];
-        coarse_falling[J] = 0.5f * sums[3];
+        coarse_right[J] = 0.5f * to_right;
+        coarse_rising[J] = 0.5f * rises;
+        coarse_down[J] = 0.5f * to_below;
+        coarse_falling[J] = 0.5f * falls;
 #if ANCHORED
         coarse_anchor[J] = held;
 #endif
