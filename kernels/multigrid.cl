@@ -373,8 +373,9 @@ float gathered(
     const int lines = get_local_size(0) / lanes;                                                           \
     const int line = (int)get_local_id(0) < lanes * lines ? (int)get_local_id(0) / lanes : ROWS + AROUND;  \
     const int across = (stride + COLUMNS - 1) / COLUMNS, top = get_group_id(0) / across * ROWS;            \
-    const int left = get_group_id(0) % across * COLUMNS, wide = LESSER(COLUMNS, stride - left);
-#define EACH_LINE(more) for (int y = line - (more); y < ROWS + (more); y += lines)
+    const int left = get_group_id(0) % across * COLUMNS, wide = LESSER(COLUMNS, stride - left);            \
+    const int is_live = live[first_tile + get_group_id(0)];
+#define EACH_LINE(more) for (int y = line - (more); y < ROWS + (more) && is_live; y += lines)
 #define EACH_OF_LINE(more)                                                                                 \
     for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + left + x,         \
              p = (y + AROUND) * ACROSS + SIDE + x;                                                         \
@@ -416,10 +417,6 @@ __kernel void multigrid_descend(
     OUT residual, OUT coarse_b)
 {
     TILE_ITEMS
-    if (!live[first_tile + get_group_id(0)]) {
-        EACH_COARSE_OF_TILE PUT(coarse_b + coarse_of_tile + coarse_stride * y + x) = 0;
-        return;
-    }
     if (again) {
         FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride);)
     } else {
@@ -433,8 +430,8 @@ __kernel void multigrid_descend(
         if (keep) PUT(residual + i) = rest;)
     EACH_COARSE_OF_TILE {
         __local const float *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
-        PUT(coarse_b + coarse_of_tile + coarse_stride * y + x)
-            = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
+        const reals sum = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
+        PUT(coarse_b + coarse_of_tile + coarse_stride * y + x) = is_live ? sum : (reals)0;
     }
 }
 
@@ -456,12 +453,6 @@ __kernel void multigrid_ascend(
     OUT parts)
 {
     TILE_ITEMS
-    if (!live[first_tile + get_group_id(0)]) {
-        EACH_LINE(0)
-            EACH_OF_LINE(0) if (top + y < rows) PUT(x_new + i) = 0;
-        if (get_local_id(0) == 0) parts[get_group_id(0)] = 0;
-        return;
-    }
     FILL(3, one,
         const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
         PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)
@@ -472,6 +463,9 @@ __kernel void multigrid_ascend(
         const reals height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
         PUT(x_new + i) = height;
         sum += height * AT(b + i);)
+    for (int y = line; y < ROWS && top + y < rows && !is_live; y += lines) {
+        EACH_OF_LINE(0) PUT(x_new + i) = 0;
+    }
     other[get_local_id(0)] = WHOLE(sum);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) {
