@@ -262,8 +262,12 @@ def ratio_target(what: str, bound: float, ours: Row, theirs: Row, than: str, *, 
     )
 
 
-def call_targets(rows: Sequence[Row]) -> tuple[Target, ...]:
-    """Return what a whole call aims at: to take little more than its kernels do, and less than each peer."""
+def call_targets(rows: Sequence[Row], faster: Mapping[str, float] | None = None) -> tuple[Target, ...]:
+    """Return what a whole call aims at: to take little more than its kernels do, and less than each peer.
+
+    ``faster`` are peers, or single works of theirs, and how many times as fast as these we want to be.
+    """
+    goals = {**_PEERS, **(faster or {})}
     by_name = {row.name: row for row in rows}
     ours = by_name[OURS]
     targets = []
@@ -274,7 +278,7 @@ def call_targets(rows: Sequence[Row]) -> tuple[Target, ...]:
     for peer in rows:
         name, comma, part = peer.name.partition(", ")
         if name != OURS and "limit" not in name:
-            mine, wanted = by_name[OURS + comma + part], _PEERS.get(name, 1.0)
+            mine, wanted = by_name[OURS + comma + part], goals.get(peer.name, goals.get(name, 1.0))
             targets.append(ratio_target(mine.name, wanted, mine, peer, peer.name, faster=True))
     return tuple(targets)
 
