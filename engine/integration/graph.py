@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
-from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE, Mask
 
@@ -54,15 +55,15 @@ class PixelGraph:
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self.device, self.shape = device, shape
-        self.known_heights: dict[str, Array] = {}
+        self.known_heights: Mapping[str, Operand] = {}
         self._arrays: dict[str, Array] = {}
 
     def upload(self, inputs: Inputs) -> Flags:
         """Bring maps to the device; return what the pixels are, in memory that the next call overwrites."""
-        slopes = self._put_all(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
-        weights = self._put_all(map_x=inputs.weight_x, map_y=inputs.weight_y)
-        heights = self._put_all(heights=inputs.known_heights, height_weights=inputs.known_height_weights)
-        mask, edges = self._put_all(mask=inputs.mask), self._put_all(edges=inputs.edges)
+        slopes = self._see(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
+        weights = self._see(map_x=inputs.weight_x, map_y=inputs.weight_y)
+        heights = self._see(heights=inputs.known_heights, height_weights=inputs.known_height_weights)
+        mask, edges = self._see(mask=inputs.mask), self._see(edges=inputs.edges)
         self._use(inputs, slopes, weights, heights, mask, edges)
         flags: Flags = self.flags.download()
         return flags
@@ -75,11 +76,11 @@ class PixelGraph:
     def _use(
         self,
         inputs: Inputs,
-        slopes: dict[str, Array],
-        weights: dict[str, Array],
-        heights: dict[str, Array] | None = None,
-        mask: dict[str, Array] | None = None,
-        edges: dict[str, Array] | None = None,
+        slopes: Mapping[str, Operand],
+        weights: Mapping[str, Operand],
+        heights: Mapping[str, Operand] | None = None,
+        mask: Mapping[str, Operand] | None = None,
+        edges: Mapping[str, Operand] | None = None,
     ) -> None:
         self._inputs, self._slopes, self._weights = inputs, slopes, weights
         self.known_heights = heights or {}
@@ -147,8 +148,11 @@ class PixelGraph:
         array.upload()
         return array
 
-    def _put_all(self, **maps: NDArray[Any] | None) -> dict[str, Array]:
-        return {name: self.put(name, values) for name, values in maps.items() if values is not None}
+    def _see(self, **maps: NDArray[Any] | None) -> dict[str, Operand]:
+        """Return maps where they lie if the device can read them there, else in the graph's own arrays."""
+        given = {name: values for name, values in maps.items() if values is not None}
+        borrow = self.device.borrow if self.device.info.shares_memory else lambda name, values: None
+        return {name: borrow(name, values) or self.put(name, values) for name, values in given.items()}
 
     def array(self, name: str, dtype: DTypeLike = np.float32, shape: tuple[int, ...] | None = None) -> Array:
         """Return one of the graph's arrays, (H, W) by default."""
@@ -166,7 +170,7 @@ class PixelGraph:
     def _run(self, name: str, macros: dict[str, int], **arguments: Any) -> None:
         counts = {"WEIGHTS": len(self._weights), "HEIGHTS": len(self.known_heights)}
         kernel = self.device.kernel("links", name, **{"MASK": 0, "KEEP": 0, **counts, **macros})
-        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
+        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Operand))
         rows, columns = self.shape
         kernel(self._items(name), rows=rows, columns=columns, **arguments, moved=moved)
 
@@ -250,7 +254,7 @@ class Levelling:
         offsets = self._array("offsets", unknown.shape)
         offsets.claim()
         known_heights = self._graph.known_heights
-        parts: list[tuple[NDArray[np.bool_], dict[str, Array], float]]
+        parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
         parts = [(unknown, {}, 0.0), (~unknown, known_heights, datum)]
         for some, maps, mean in parts:
             if some.any():
@@ -263,7 +267,7 @@ class Levelling:
         levelled: Floats = height.detach()
         return levelled
 
-    def _means(self, relief: Array, plane: Plane, maps: dict[str, Array]) -> NDArray[np.float64]:
+    def _means(self, relief: Array, plane: Plane, maps: Mapping[str, Operand]) -> NDArray[np.float64]:
         """Return the mean heights of components, or those above their known ones, (components,), mm."""
         rows, count = self._graph.shape[0], self._count
         strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * count // _MOST_SUMS))
