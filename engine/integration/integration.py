@@ -95,9 +95,9 @@ def integrate(
         Their inverse variances, 1/mm^2 (1 over the square of the depths' unit); 0 where nothing is known. 1
         by default. What is above 1e4 of a link's weight w counts as that.
     robust : bool
-        Whether to look for discontinuities beyond ``edges``, by bilateral weights.
+        Whether to look for discontinuities beyond ``edges``.
     bilateral_sharpness : float
-        How sharply these choose a side, 1/pixel^2: k of Cao et al., Bilateral normal integration, 2022.
+        How sharply, 1/pixel^2: links that miss their slopes by more than 2.4 over the root of 2 k are cut.
     sigma : bool
         Whether to find the standard deviation of the heights, in about the time of the heights themselves.
     initial_heights : array_like, (H, W), optional

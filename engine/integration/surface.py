@@ -86,7 +86,7 @@ class SolverOptions:
 
     tolerance: float | None = None  # of the residual; None: as near as two cycles get
     deadline: float | None = None  # of ``time.perf_counter``; where there is one, no tolerance must be met
-    # Of the bilateral weights that look for discontinuities; None where none are looked for.
+    # k of the search for discontinuities; None where none are looked for.
     sharpness: float | None = None
     sigma: bool = False  # whether to estimate the heights' standard deviation
 

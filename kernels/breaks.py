@@ -1,0 +1,117 @@
+"""Links that let go where the surface breaks: what ``breaks.cl`` computes, in NumPy with float64 inside.
+
+A link is trusted by how well its two pixels know its slope. With s the slopes, a the cosines of the normals
+to the line of sight, and t what tells of a tear beside it, the slope of the link has about the variance ::
+
+    v = n^2 (1 / a_i^4 + 1 / a_j^4) / 2 + (bend (s_i - s_j))^2 + (tear t)^2
+
+n being the normals' noise: slopes of a surface seen from aside are uncertain; where they differ, a bend or a
+cliff lies between; where four links about a corner do not close, one of them leads across a cliff. Heights u
+are sought that make ::
+
+    sum of (n^2 / v) w f(r),      f' = 2 r / (1 + k m^2)^2,      r = (u_j - u_i) / p - s
+
+small, w being the link's weight without all this, p the pixel size, k the sharpness, and m what |r| is above
+slack |s_i - s_j|, as a bend may lie anywhere between the pixels: without slack f = r^2 / (1 + k r^2). The
+weights (n^2 / v) w / (1 + k m^2)^2, held while heights change, make least squares that bound the sum from
+above and touch it, since f is concave in r^2: their solution lowers it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.uint8]
+
+RIGHT, DOWN = 1, 2
+"""Flags of a pixel: there is a link to the one on the right, to the one below."""
+
+
+def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, height: float) -> Doubles:
+    """Return by how much four links about a corner of pixels fail to close, in slopes.
+
+    It is that of the corner right and below of each pixel; 0 where a link is missing. Slopes are to the right
+    and *down* the picture; width and height are a pixel's, in units of their geometric mean.
+    """
+    curl = np.zeros(flags.shape)
+    across = (slope_x[:, 1:].astype(np.float64) + slope_x[:, :-1]) / 2
+    along = (slope_y[1:].astype(np.float64) + slope_y[:-1]) / 2
+    right, down = flags[:, :-1] & RIGHT != 0, flags[:-1] & DOWN != 0
+    closed = right[:-1] & right[1:] & down[:, 1:] & down[:, :-1]
+    loop = width * (across[:-1] - across[1:]) + height * (along[:, 1:] - along[:, :-1])
+    curl[:-1, :-1] = np.where(closed, loop, 0.0)
+    return curl
+
+
+def breaks_spread(curl: Floats, noise: float, wide: bool) -> Doubles:
+    """Return how much tells of a tear at each corner, above the noise.
+
+    It is the curl's size over the nine corners around, about zero where a slanted crease makes it alternate;
+    or the geometric mean of that and the corner's own, which keeps to the place.
+    """
+    ring = np.pad(curl.astype(np.float64), 1)
+    rows = ring[:-2] + ring[1:-1] + ring[2:]
+    mean = np.abs(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 3
+    tears = np.zeros(curl.shape)
+    tears[:-1, :-1] = np.maximum((mean if wide else np.sqrt(np.abs(curl) * mean)) - noise, 0.0)[:-1, :-1]
+    return tears
+
+
+def breaks_trust(right: Floats, down: Floats, slope_x: Floats, slope_y: Floats, facing: Floats, tears: Floats,
+                 noise: float, bend: float, tear: float, least: float) -> tuple[Doubles, ...]:  # fmt: skip
+    """Return weights of the links to the right and down, and their slopes.
+
+    ``facing`` are the cosines a, ``right`` and ``down`` the weights w, ``noise`` is n^2, and n^2 / v is at
+    least ``least``. A link's slope is that of the sum of both normals: without error on a sphere.
+    """
+    one = _trust(right, slope_x, facing, tears, noise, bend, tear, least)
+    other = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, least)
+    return one[0], other[0].T, one[1], other[1].T
+
+
+def _trust(
+    link: Floats,
+    slope: Floats,
+    facing: Floats,
+    tears: Floats,
+    noise: float,
+    bend: float,
+    tear: float,
+    least: float,
+) -> tuple[Doubles, Doubles]:
+    w, s, a, t = (one.astype(np.float64) for one in (link, slope, facing, tears))
+    s_next, a_next = np.roll(s, -1, 1), np.roll(a, -1, 1)
+    torn = np.maximum(t, np.roll(t, 1, 0))
+    v = noise * (a**-4 + a_next**-4) / 2 + (bend * (s - s_next)) ** 2 + (tear * torn) ** 2
+    return w * np.maximum(noise / v, least), (a * s + a_next * s_next) / (a + a_next)
+
+
+def breaks_links(weight_x: Floats, weight_y: Floats, rise_x: Floats, rise_y: Floats, slope_x: Floats,
+                 slope_y: Floats, held: Floats, heights: Floats, width: float, height: float, slack: float,
+                 sharpness: float, most: float) -> tuple[Doubles, Doubles, Doubles, float]:  # fmt: skip
+    """Return links to the right and down, the right side of their equations, and how many are broken.
+
+    Links whose k m^2 is above ``most`` are cut; ``held`` is the right side of known heights. Those broken
+    count k m^2 / (1 + k m^2) each; the kernel writes a sum for each of its items.
+    """
+    u = heights.astype(np.float64)
+    x = _links(weight_x, rise_x, slope_x, u, width, slack, sharpness, most)
+    y = _links(weight_y.T, rise_y.T, slope_y.T, u.T, height, slack, sharpness, most)
+    return x[0], y[0].T, x[1] + y[1].T + held, x[2] + y[2]
+
+
+def _links(
+    weight: Floats, rise: Floats, slope: Floats, u: Doubles, size: float, slack: float, k: float, most: float
+) -> tuple[Doubles, Doubles, float]:
+    bend = np.abs(np.roll(slope, -1, 1) - slope)
+    miss = np.maximum(np.abs((np.roll(u, -1, 1) - u) / size - rise) - slack * bend, 0.0)
+    square = k * miss**2
+    link = np.where(square > most, 0.0, weight / (1 + square) ** 2)
+    pull = size * link * rise
+    return link, np.roll(pull, 1, 1) - pull, float(np.sum(np.where(weight > 0, square / (1 + square), 0.0)))
