@@ -12,6 +12,9 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
 SHAPES = [(1, 33), (29, 1), (2, 2), (64, 48)]
+# For a residual of 1e-6; at most one and a half times what three draws of each took.
+CYCLES = dict.fromkeys(["rectangle", "disc", "annulus"], 5) | {"holes": 13, "cuts": 15, "soft": 20}
+CYCLES |= {"uneven": 20, "isolated": 16, "comb": 45}
 
 
 def given(device, name, values):
@@ -45,8 +48,77 @@ def test_heights_are_those_of_a_sparse_direct_solver(device, kind, anchored):
     found = Multigrid(links_of(device, graph)).solve(tolerance=1e-6)
     assert found.converged
     assert found.residual <= 1e-6
-    assert error_of(graph, heights_of(found)) < 2e-5  # it is the energy that is within 1e-6
-    assert 2 <= found.iterations <= 16
+    assert error_of(graph, heights_of(found)) < 1e-5  # it is the energy that is within 1e-6
+    assert 2 <= found.iterations <= CYCLES[kind]
+
+
+@pytest.mark.parametrize("anchored", [False, True], ids=["free", "anchored"])
+@pytest.mark.parametrize("kind", ["disc", "cuts", "holes", "soft", "uneven", "isolated"])
+def test_a_cycle_is_symmetric_and_positive_definite(device, kind, anchored):
+    graph = graphs.pixel_graph(kind, (75, 130), anchored)
+    hierarchy = Hierarchy(graph.right.shape, anchored, device)
+    hierarchy.build(links_of(device, graph))
+    cycle = VCycle(hierarchy)
+    cycle.prepare()
+    rng = np.random.default_rng(0)
+    right = [graph.centred(rng.normal(size=graph.right.shape)) for _ in range(4)]
+    # And one whose heights cycles hardly change: what is left of noise after some.
+    slow = rng.normal(size=graph.right.shape)
+    for _ in range(8):
+        slow = graph.centred(slow - answer(cycle, image(graph, slow)))
+        slow /= np.abs(slow).max()
+    right.append(image(graph, slow))
+    answers = [answer(cycle, one) for one in right]
+    products = np.array([[(one * other).sum() for other in answers] for one in right])
+    scale = np.sqrt(np.outer(products.diagonal(), products.diagonal()))
+    assert (products.diagonal() > 0).all()
+    np.testing.assert_allclose(products / scale, products.T / scale, atol=1e-4)
+    assert np.linalg.eigvalsh((products + products.T) / scale).min() > 0
+
+
+def image(graph, heights):
+    return (graph.matrix @ heights.ravel()).reshape(heights.shape)
+
+
+def answer(cycle, values):
+    """Return what a cycle makes of a right side."""
+    hierarchy = cycle._h
+    hierarchy.copy_picture("admit", cycle.b, given(hierarchy.device, "b", values))
+    cycle.run()
+    found = given(hierarchy.device, "found", np.zeros(values.shape))
+    hierarchy.copy_picture("release", cycle.x, found)
+    return found.download().astype(float)
+
+
+@pytest.mark.parametrize("kind", ["comb", "spiral"])
+def test_corridors_as_wide_as_a_pixel_are_solved(device, kind):
+    shape = 120, 160
+    graph = graphs.pixel_graph("comb", shape) if kind == "comb" else spiral(shape)
+    solver = Multigrid(links_of(device, graph))
+    found = solver.solve(tolerance=1e-4)
+    assert found.converged
+    assert error_of(graph, heights_of(found)) < 1e-3
+    if kind == "spiral":
+        assert solver._cycle._factors is not None  # of the second level: cycles alone do not do it
+
+
+def spiral(shape):
+    """Return a graph of a corridor that winds to the middle, walls a pixel wide between its turns."""
+    graph = graphs.pixel_graph("rectangle", shape)
+    valid = np.zeros(shape, bool)
+    (top, left), (bottom, right) = (0, 0), (shape[0] - 1, shape[1] - 1)
+    while bottom - top > 3 and right - left > 3:
+        valid[top, max(left - 2, 0) : right + 1] = valid[top : bottom + 1, right] = True
+        valid[bottom, left : right + 1] = valid[top + 2 : bottom + 1, left] = True
+        top, left, bottom, right = top + 2, left + 2, bottom - 2, right - 2
+    graph.right[:, :-1] *= valid[:, 1:] & valid[:, :-1]
+    graph.down[:-1] *= valid[1:] & valid[:-1]
+    rise = np.random.default_rng(0).normal(size=(2, *shape)) + 0.5
+    along, across = graph.right * rise[0], graph.down * rise[1]
+    graph.source[...] = -along - across
+    graph.source[:, 1:] += along[:, :-1]
+    graph.source[1:] += across[:-1]
+    return graph
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -68,13 +140,11 @@ def test_the_residual_tells_the_error_within_a_factor_of_three(device, kind):
         assert share / 3 <= found.residual <= 3 * share
 
 
-def test_cuts_cost_no_more_than_twice_the_iterations_of_a_mask(device):
-    iterations = {}
-    for kind in ("disc", "cuts", "soft"):
+def test_cuts_cost_few_cycles_more_than_a_mask_does(device):
+    most = {"disc": 4, "cuts": 8, "soft": 15}
+    for kind, cycles in most.items():
         graph = graphs.pixel_graph(kind, (200, 200))
-        iterations[kind] = Multigrid(links_of(device, graph)).solve(tolerance=3e-5).iterations
-    assert iterations["cuts"] <= 2 * iterations["disc"]
-    assert iterations["soft"] <= 2 * iterations["disc"]
+        assert Multigrid(links_of(device, graph)).solve(tolerance=3e-5).iterations <= cycles
 
 
 def test_without_a_tolerance_two_cycles_are_done(device):
@@ -128,26 +198,16 @@ def test_what_float32_cannot_reach_is_reported_and_the_next_graph_is_solved(devi
 
 
 @pytest.mark.parametrize(("kind", "anchored"), [("disc", True), ("cuts", False), ("holes", True)])
-def test_half_cycles_in_one_pass_do_what_single_passes_do(kind, anchored):
+def test_lanes_of_a_gpu_answer_as_vectors_do(kind, anchored):
     graph = graphs.pixel_graph(kind, (150, 270), anchored)
     answers = []
-    for shape in (CPU_LAYOUT, GPU_LAYOUT):
+    for layout in (CPU_LAYOUT, GPU_LAYOUT):
         device = Device(device_layer._find()[0])
         device.info = dataclasses.replace(device.info, shares_memory=False)
-        device.layout = shape
-        links = links_of(device, graph)
-        hierarchy = Hierarchy(graph.right.shape, anchored, device)
-        hierarchy.build(links)
-        cycle = VCycle(hierarchy)
-        cycle.prepare()
-        hierarchy.copy_picture("admit", cycle.full_b, links.source)
-        to = given(device, "to", np.zeros(hierarchy.levels[0].end))
-        cycle.start(to)
-        hierarchy.copy_picture("admit", cycle.b, links.source)
-        product = cycle.run()
-        finest = hierarchy.levels[0].end
-        answers.append((product, to.download().copy(), cycle.x.download()[:finest].copy()))
-    (one, first, other), (two, second, another) = answers
-    np.testing.assert_allclose(one, two, rtol=1e-5)
-    np.testing.assert_allclose(first, second, atol=2e-5 * np.ptp(second))
-    np.testing.assert_allclose(other, another, atol=2e-5 * np.ptp(another))
+        device.layout = layout
+        answers.append(Multigrid(links_of(device, graph)).solve(tolerance=1e-6))
+    one, other = answers
+    assert one.iterations == other.iterations
+    assert one.residual == pytest.approx(other.residual, rel=0.1)
+    heights = [graph.centred(heights_of(one)) for one in answers]
+    np.testing.assert_allclose(*heights, atol=1e-5 * np.ptp(heights[0]))
