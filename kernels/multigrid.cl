@@ -494,7 +494,7 @@ typedef struct {
     }                                                                                                      \
     FENCE
 __kernel void multigrid_tail(
-    const int from, const int last, const int twice, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
+    const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
     BYTES to, COUNTS changed, const int again, __global float *b, __global float *x, __global float *t)
 {
     int l = from, start = again, gone = 0;  // a bit for each level
@@ -544,7 +544,7 @@ __kernel void multigrid_tail(
             SMOOTH(THIRD, t, x)
             SMOOTH(SECOND, x, t)
             SMOOTH(FIRST, t, x)
-            start = l > from && l <= twice && !(gone >> l & 1);
+            start = l > from && !(gone >> l & 1);
             gone = start ? gone | 1 << l : gone & ~(1 << l);
         }
     } while (start);

@@ -10,8 +10,9 @@ anchors a. A cycle solves it nearly, on grids of which each has half the rows an
   follow in reverse, so that a cycle is symmetric.
 - A coarse link has half the weight of those that it stands for, since the way between the middles of
   aggregates is twice as long: I^T A I would let heights follow slopes only half as far.
-- As sums and injection are coarser than A asks for, levels from the third on are gone through twice, but for
-  the coarsest ones.
+- As sums and injection are coarser than A asks for, levels from the third on are gone through twice. The
+  first time they answer up to twice too much where parts hang together by few links; the second time mends
+  that, and a cycle is positive definite. It must be done on all of them, or too much becomes more and more.
 
 *Aggregates* are blocks of two by two, as a rule. Over a cut, that would join what A keeps apart, and the
 coarse answer would be wrong on both sides: so where a block's nodes do not hang together by strong links,
@@ -241,7 +242,7 @@ def cycle(levels: Sequence[Level], b: Doubles, x: Doubles | None = None, number:
         return inverse_of(level.diagonal) * b
     x = smooth(level, b, np.zeros(b.shape) if x is None else x)
     coarse, e = gathered(level, residual(level, b, x)), None
-    for _ in range(2 if 2 <= number + 1 < len(levels) - 3 else 1):
+    for _ in range(2 if number else 1):
         e = cycle(levels, coarse, e, number + 1)
     assert e is not None
     return smooth(level, b, x + injected(level, e), STEPS[::-1])

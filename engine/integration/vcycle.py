@@ -26,7 +26,7 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Kernel
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
-_TWICE, _ONCE = 2, 3  # the finest level that is gone through twice, and how many of the coarsest are not
+_TWICE = 2  # the finest level that is gone through twice: all coarser ones are, or cycles may be indefinite
 _TAIL = 20480  # nodes of a level from which on down one group does all
 _USUAL = 40  # cycles, after which coarse levels are given up
 _CYCLES = 2  # that are enough where no tolerance is given
@@ -354,7 +354,7 @@ class VCycle:
         kernel, moved = self._kernel("tail", self._tail + 1), 200 * h.levels[self._tail].nodes
         known: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
         known |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
-        known |= {"from": self._tail, "last": last, "twice": last - _ONCE, "again": again}
+        known |= {"from": self._tail, "last": last, "again": again}
         kernel(kernel.group, **known, moved=moved)
 
     def product(self) -> float:
