@@ -20,8 +20,9 @@ _BROKEN = 6.0
 """Of k r^2 (see ``mirrorskin.kernels.breaks``) above which a link leads across a discontinuity."""
 
 _SCALES = 32.0, 16.0, 8.0, 4.0, 2.0, 1.0  # over the root of 2 k: by what a link may miss its slope
-_MOST, _REST = 12, 0.02  # steps at a scale, and by what part of the broken links they must lower these
-_LOOSE = 0.003  # residual of a step's equations
+_MOST, _REST = 4, 0.02  # steps at a scale, and by what part of the broken links they must lower these
+_LOOSE = 0.001  # residual of a step's equations
+_AGAIN = 3  # more solutions in the end, at most
 _NOISE = 0.03  # of slopes, at least
 _CLEAR = 3.0  # standard deviations of the curl's noise that do not tell of a tear
 _SLACK = 0.25  # of the difference of slopes, by which a link may miss for nothing: a crease may lie anywhere
@@ -175,6 +176,11 @@ class _Search:
         """Cut what is broken, solve the rest to the tolerance, and return what was found."""
         done = not self.late()
         last = self._solve(heights, tolerance, 1.0, _BROKEN)
+        for _ in range(_AGAIN):  # from new residuals on, where rounding of steps ends the descent of weak links
+            if last.converged or self.late():
+                break
+            assert self._solver is not None
+            last = self._solver.solve(last.height, tolerance=tolerance, deadline=self._deadline)
         flags, edges = flags.copy(), np.zeros_like(flags)
         for bit, axis, link in ((RIGHT, 1, self.last.right), (DOWN, 0, self.last.down)):
             broken = (flags & bit != 0) & (link.download() == 0)
