@@ -49,13 +49,21 @@ __kernel void breaks_curl(
 
 #define SIZE_OF(x) ((x) > 0 ? (x) : -(x))
 
-__kernel void breaks_spread(SIZE, MAP curl, const float noise, const int wide, OUT tears)
+__kernel void breaks_sum(SIZE, MAP values, const int reach, const int downwards, OUT sums)
 {
-#define THREE(p) (curl[(p) > 0 ? (p) - 1 : count - 1] + curl[p] + curl[LESSER((p) + 1, count - 1)])
+#define ONE_SUM(p, before, after, above, below)                                                      \
+    const int place = downwards ? row : p - row * columns, end = downwards ? rows : columns;         \
+    const int from = GREATER(-reach, -place), to = LESSER(reach, end - 1 - place);                   \
+    float sum = 0;                                                                                   \
+    for (int i = from; i <= to; ++i) sum += values[p + (downwards ? i * columns : i)];               \
+    sums[p] = sum;
+    PIECE(ONE_SUM)
+}
+
+__kernel void breaks_spread(SIZE, MAP curl, MAP sums, const int reach, const float noise, const int wide, OUT tears)
+{
 #define ONE_TEAR(p, before, after, above, below)                                                     \
-    const float sum = THREE(p) + (row > 0 ? THREE(above) : 0) + (row + 1 < rows ? THREE(below) : 0); \
-    const float mean = SIZE_OF(sum) * (1.0f / 3), own = SIZE_OF(curl[p]);                            \
-    const float both = own * mean + 1e-30f;                                                          \
+    const float mean = SIZE_OF(sums[p]) / (2 * reach + 1), both = SIZE_OF(curl[p]) * mean + 1e-30f;  \
     const float left = (wide ? mean : root(both)) - noise;                                           \
     tears[p] = left > 0 && row + 1 < rows && p + 1 < (row + 1) * columns ? left : 0;
     PIECE(ONE_TEAR)

@@ -49,15 +49,22 @@ def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, he
     return curl
 
 
-def breaks_spread(curl: Floats, noise: float, wide: bool) -> Doubles:
+def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
+    """Return sums of as many pixels to either side, along rows or downwards."""
+    one = values.astype(np.float64) if downwards else values.T.astype(np.float64)
+    ring = np.pad(one, ((reach, reach), (0, 0)))
+    sums = sum((ring[i : i + len(one)] for i in range(2 * reach + 1)), np.zeros(one.shape))
+    return sums if downwards else sums.T
+
+
+def breaks_spread(curl: Floats, sums: Floats, reach: int, noise: float, wide: bool) -> Doubles:
     """Return how much tells of a tear at each corner, above the noise.
 
-    It is the curl's size over the nine corners around, about zero where a slanted crease makes it alternate;
-    or the geometric mean of that and the corner's own, which keeps to the place.
+    ``sums`` are those of the curl over a square around, 2 reach + 1 along each side, about zero where a
+    slanted crease makes it alternate. It is the size of that over the side; or the geometric mean of that and
+    the corner's own, which keeps to the place.
     """
-    ring = np.pad(curl.astype(np.float64), 1)
-    rows = ring[:-2] + ring[1:-1] + ring[2:]
-    mean = np.abs(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 3
+    mean = np.abs(sums.astype(np.float64)) / (2 * reach + 1)
     tears = np.zeros(curl.shape)
     tears[:-1, :-1] = np.maximum((mean if wide else np.sqrt(np.abs(curl) * mean)) - noise, 0.0)[:-1, :-1]
     return tears

@@ -22,13 +22,17 @@ _BROKEN = 6.0
 _SCALES = 32.0, 16.0, 8.0, 4.0, 2.0, 1.0  # over the root of 2 k: by what a link may miss its slope
 _MOST, _REST = 4, 0.02  # steps at a scale, and by what part of the broken links they must lower these
 _LOOSE = 0.001  # residual of a step's equations
+_CYCLES = 10  # of a step, at most
+_GONE = (
+    1e4  # of k r^2, above which a link is cut for a step: what hangs by links of no weight cannot be solved
+)
 _AGAIN = 3  # more solutions in the end, at most
 _NOISE = 0.03  # of slopes, at least
 _CLEAR = 3.0  # standard deviations of the curl's noise that do not tell of a tear
 _SLACK = 0.25  # of the difference of slopes, by which a link may miss for nothing: a crease may lie anywhere
 _LEAST = 1e-5  # of a link's weight, that trust leaves it
 _SAMPLES = 1 << 16  # of the curl, that tell of its noise
-_LOCAL, _WIDE = (0, 0.5, 2.0), (1, 0.1, 2.0)  # of two searches: whether tears are wide; bend, tear
+_LOCAL, _WIDE = (1, 0.5, 2.0), (5, 0.1, 2.0)  # of two searches: reach of the curl's sums; bend, tear
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +65,8 @@ def solve_robust(
     each other (see ``mirrorskin.kernels.breaks``). Least squares of the links so weighted come first; then
     links that miss their slopes lose weight, step by step by smaller misses. At last those are cut that miss
     theirs by more than 2.4 over the root of 2 k, and the rest is solved to the tolerance. There are two
-    searches, with contradictions counted where they are and over nine corners; the heights that break fewer
-    links are taken.
+    searches, with contradictions counted where they are and over 11 x 11 corners; the heights that
+    break fewer links are taken.
 
     - What is cut off all round keeps its shape, and is a component with an unknown offset unless a height in
       it is known. As long as no slope contradicts, it is not cut off at all: a ball on a plane stays on it.
@@ -85,9 +89,10 @@ def solve_robust(
         best.upload()
         search.trust(*_WIDE)
         best = search.descend()
+        search.trust(*_LOCAL)
+        best = search.descend(best)
         if search.link(best) >= broken:
             best = links.device.given("first", known)
-            search.trust(*_LOCAL)
     return search.conclude(best, flags, tolerance)
 
 
@@ -120,14 +125,19 @@ class _Search:
         """Tell whether the deadline is over."""
         return self._deadline is not None and time.perf_counter() > self._deadline
 
-    def trust(self, wide: int, bend: float, tear: float) -> None:
+    def trust(self, reach: int, bend: float, tear: float) -> None:
         """Weigh links by what is known of them before any heights."""
         room, noise = self._room, max(_NOISE, self._noise / math.sqrt(2))
-        self._run("spread", curl=self._curl, noise=_CLEAR * self._noise, wide=wide, tears=room["tears"])
+        sums = self._curl
+        for downwards, name in enumerate(("rise_x", "rise_y")):
+            self._run("sum", values=sums, reach=reach, downwards=downwards, sums=room[name])
+            sums = room[name]
+        known = {"reach": reach, "noise": _CLEAR * self._noise, "wide": int(reach > 1)}
+        self._run("spread", curl=self._curl, sums=sums, **known, tears=room["tears"])
         found = {name: room[name] for name in ("tears", "weight_x", "weight_y", "rise_x", "rise_y")}
         numbers = {"noise": noise**2, "bend": bend, "tear": tear, "least": _LEAST}
-        known = {"right": self._links.right, "down": self._links.down, **self._slopes}
-        self._run("trust", **known, facing=self._facing, **numbers, **found)
+        links = {"right": self._links.right, "down": self._links.down, **self._slopes}
+        self._run("trust", **links, facing=self._facing, **numbers, **found)
 
     def descend(self, heights: Array | None = None) -> Array:
         """Solve for heights again and again, by the links that the last ones keep at each scale.
@@ -152,7 +162,7 @@ class _Search:
         """Make the links that heights keep; return how many are broken."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
         room = {name: self._room[name] for name in names}
-        numbers = {"sharpness": self._sharpness / scale**2, "most": min(most, 1e30), "slack": _SLACK}
+        numbers = {"sharpness": self._sharpness / scale**2, "most": min(most, _GONE), "slack": _SLACK}
         maps = {**room, **self._slopes, "held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
         broken = float(self._sums.download().sum(dtype=np.float64))
@@ -170,13 +180,16 @@ class _Search:
         self._steps += 1
         self.last = links
         start = None if scale == math.inf else heights
-        return self._solver.solve(start, tolerance=tolerance, deadline=self._deadline)
+        limit = _CYCLES if tolerance == _LOOSE else 100
+        return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
 
     def conclude(self, heights: Array, flags: Flags, tolerance: float) -> Robust:
         """Cut what is broken, solve the rest to the tolerance, and return what was found."""
         done = not self.late()
         last = self._solve(heights, tolerance, 1.0, _BROKEN)
-        for _ in range(_AGAIN):  # from new residuals on, where rounding of steps ends the descent of weak links
+        for _ in range(
+            _AGAIN
+        ):  # from new residuals on, where rounding of steps ends the descent of weak links
             if last.converged or self.late():
                 break
             assert self._solver is not None

@@ -45,9 +45,16 @@ def test_what_tells_of_tears_is_that_of_the_reference(device, shape):
     flags, _, _, slope_x, slope_y, *_ = picture(shape)
     (curl,) = run(device, "curl", shape, [flags, slope_x, slope_y, *SIZE], 1)
     np.testing.assert_allclose(curl, breaks.breaks_curl(flags, slope_x, slope_y, *SIZE), atol=1e-6)
-    for wide in (0, 1):
-        (tears,) = run(device, "spread", shape, [curl, 0.05, wide], 1)
-        np.testing.assert_allclose(tears, breaks.breaks_spread(curl, 0.05, bool(wide)), atol=1e-5)
+    for wide, reach in ((0, 1), (1, 5)):
+        sums, wanted = curl, curl
+        for downwards in (0, 1):
+            (sums,) = run(device, "sum", shape, [sums, reach, downwards], 1)
+            wanted = breaks.breaks_sum(wanted, reach, bool(downwards))
+        np.testing.assert_allclose(sums, wanted, atol=1e-5)
+        (tears,) = run(device, "spread", shape, [curl, sums, reach, 0.05, wide], 1)
+        np.testing.assert_allclose(
+            tears, breaks.breaks_spread(curl, sums, reach, 0.05, bool(wide)), atol=1e-5
+        )
 
 
 @SHAPES
