@@ -80,8 +80,6 @@ class _OneLine:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, KeyboardInterrupt | click.Abort):
-            # All is said and put away: a second Ctrl-C ends the interpreter without a traceback.
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
             sys.exit(_INTERRUPTED)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
         code = getattr(error, "exit_code", None)
@@ -143,5 +141,13 @@ def main() -> None:
         sys.exit(0)
 
 
+def program() -> None:
+    """Run the command line as a program of its own."""
+    try:
+        main()
+    finally:  # all is said and put away: another Ctrl-C ends the interpreter without a traceback
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 if __name__ == "__main__":
-    main()
+    program()
