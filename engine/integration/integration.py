@@ -104,7 +104,7 @@ def integrate(
         Heights to begin with, NaN where there is none.
     tolerance : float or None
         Of the residual, which is `Surface.residual`; parts of small weight may be less near. None takes what
-        full multigrid and two cycles give.
+        two cycles give.
     budget : float, optional
         Seconds, in place of the tolerance: after the first, no cycle is begun that would end later. Neither
         the set-up nor ``sigma`` is cut.
