@@ -12,6 +12,7 @@ from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.validation import check_above_zero
 from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
@@ -26,7 +27,7 @@ def invert_laplacian(
     down: ArrayLike,
     diagonal: ArrayLike | None = None,
     *,
-    tolerance: float = 1e-5,
+    tolerance: float | None = 1e-5,
     device: str | Device | None = None,
 ) -> LinearOperator:
     """Return the inverse of a graph Laplacian of a picture's pixels, as an operator of SciPy.
@@ -47,8 +48,9 @@ def invert_laplacian(
     diagonal : array_like, (H, W), optional
         What is added on the diagonal, a; 0 by default. Where no pixel of a connected component has any, A is
         singular: of b the part with the mean 0 there is taken, and the mean of u is 0.
-    tolerance : float
-        Energy norm of the error over that of u, of a solution.
+    tolerance : float or None
+        Energy norm of the error over that of u, of a solution. None does one multigrid cycle, which is a
+        preconditioner: the same for every b, and positive definite.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -101,7 +103,7 @@ def invert_laplacian(
 class _Solver:
     """What multiplies by the inverse."""
 
-    def __init__(self, device: Device, maps: list[Doubles], tolerance: float) -> None:
+    def __init__(self, device: Device, maps: list[Doubles], tolerance: float | None) -> None:
         self._tolerance = tolerance
         (right, down, diagonal), weights = maps, np.concatenate([one.ravel() for one in maps])
         weights = weights[weights > 0]
@@ -131,13 +133,17 @@ class _Solver:
         known.claim()
         known.host[...] = (exact / size).reshape(known.host.shape)
         known.upload()
-        found = self._multigrid.solve(tolerance=self._tolerance)
+        height = self._multigrid.precondition() if self._tolerance is None else self._solve(self._tolerance)
+        return self._centred(height.download().ravel() * (size / self._unit))
+
+    def _solve(self, tolerance: float) -> Array:
+        found = self._multigrid.solve(tolerance=tolerance)
         if not found.converged:
             raise NotConverged(
                 f"the Laplacian's solution did not converge: {found.iterations} iterations left a residual of"
-                f" {found.residual:.2g}, more than {self._tolerance:.2g}; give a larger tolerance"
+                f" {found.residual:.2g}, more than {tolerance:.2g}; give a larger tolerance"
             )
-        return self._centred(found.height.download().ravel() * (size / self._unit))
+        return found.height
 
     def _centred(self, values: Doubles) -> Doubles:
         """Return values less the mean of each component whose offset is free."""

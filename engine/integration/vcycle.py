@@ -128,6 +128,13 @@ class Multigrid:
         h.copy_picture("release", self._x, self._height)
         return Solution(self._height, done, residual, residual <= enough)
 
+    def precondition(self) -> Array:
+        """Return one cycle's answer to the right side, (H, W): a symmetric positive operator on that."""
+        self._hierarchy.copy_picture("admit", self._cycle.b, self._links.source)
+        self._cycle.launch()
+        self._hierarchy.copy_picture("release", self._cycle.x, self._height)
+        return self._height
+
     def follow(self, links: Links, *, deep: bool) -> Array:
         """Go one step from the last heights towards those of a graph that is nearly the last one.
 

@@ -53,6 +53,22 @@ def test_a_singular_one_is_inverted_where_it_can_be():
     assert np.linalg.norm(a @ found - source) < 1e-3 * np.linalg.norm(source)
 
 
+def test_one_cycle_is_a_preconditioner():
+    held = HELD + 1e-2
+    a, cycle, steps = (
+        matrix(RIGHT, DOWN, held),
+        engine.invert_laplacian(RIGHT, DOWN, held, tolerance=None),
+        [],
+    )
+    u, v = np.random.default_rng(5).normal(size=(2, held.size))
+    assert u @ (cycle @ v) == pytest.approx(v @ (cycle @ u), rel=1e-4)
+    assert u @ (cycle @ u) > 0
+    found, told = algebra.cg(a, SOURCE.ravel(), M=cycle, rtol=1e-10, callback=steps.append)
+    assert told == 0
+    assert len(steps) <= 30  # 19; Jacobi's method takes 347
+    assert np.linalg.norm(a @ found - SOURCE.ravel()) < 1e-9 * np.linalg.norm(SOURCE)
+
+
 def test_a_solver_in_float64_needs_few_steps_with_it():
     a, steps = matrix(RIGHT, DOWN, HELD + 1e-2), []
     inverse = engine.invert_laplacian(RIGHT, DOWN, HELD + 1e-2)
