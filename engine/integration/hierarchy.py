@@ -113,10 +113,10 @@ class Hierarchy:
             numbers.claim()
             numbers.host[...] = 0
             numbers.upload()
+        known: dict[str, Any] = {"strength": strength, **self.graph}
+        known |= {"parts": self._parts, "touched": self._touched}
         for number in range(len(self.levels) - 1):
             if not plain:
-                known: dict[str, Any] = {"strength": strength, **self.graph, "parts": self._parts}
-                known["touched"] = self._touched
                 self.between("parts", number, **known, level=number, splits=self._splits)
                 splits = self._splits.download()[number]
                 self._splits.upload()
@@ -162,12 +162,17 @@ class Hierarchy:
         a, b = np.concatenate(ends, axis=1)
         return node, a, b, np.concatenate(weights), pull
 
-    def kernel(self, name: str, *, links: int = 8, **macros: int) -> Kernel:
+    def kernel(self, name: str, links: int) -> Kernel:
         """Return a pass over nodes with so many links."""
         width = 8 if self.device.layout.tile > 1 else 1
         given = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device), "WIDTH": width}
         given |= {"ROWS": TILE_ROWS, "COLUMNS": tile_columns(self.device)}
         return self.device.kernel("multigrid", f"multigrid_{name}", **given)
+
+    def places(self, number: int) -> dict[str, int]:
+        """Return arguments of the passes between a level and the next."""
+        fine, coarse = self.levels[number : number + 2]
+        return {**fine.place, **place_of_coarse(coarse)}
 
     def links_of(self, level: Level) -> int:
         """Return how many links a level's nodes may have."""
@@ -176,38 +181,29 @@ class Hierarchy:
     def over(self, name: str, level: Level, **arguments: Any) -> None:
         """Run a pass over the nodes of a level."""
         items = -(-level.nodes // self.device.layout.tile)
-        kernel = self.kernel(name, links=self.links_of(level))
+        kernel = self.kernel(name, self.links_of(level))
         kernel(items, **level.place, **arguments, moved=_bytes(level, arguments))
 
     def between(self, name: str, number: int, **arguments: Any) -> None:
         """Run a pass over the aggregates of a level, which are the next one's nodes."""
         fine, coarse = self.levels[number : number + 2]
         items = coarse.rows * -(-fine.stride // 2 // self.device.layout.tile)
-        kernel = self.kernel(name, links=8 if number else 4)
-        places = {**fine.place, **place_of_coarse(coarse)}
-        kernel(items, **places, **arguments, moved=_bytes(fine, arguments))
+        kernel = self.kernel(name, 8 if number else 4)
+        kernel(items, **self.places(number), **arguments, moved=_bytes(fine, arguments))
 
     def gather(self, number: int, residual: Array, b: Array) -> None:
         """Add up the residual over the aggregates of a level that are no blocks."""
         if count := int(self.moves[number]):
-            fine, coarse = self.levels[number : number + 2]
-            kernel = self.kernel("gather", links=4)
-            places = {**fine.place, **place_of_coarse(coarse)}
+            items = -(-count // max(1, self.device.layout.tile // 16))
             known: dict[str, Any] = {"to": self.to, "changed": self.changed, "count": count}
-            kernel(
-                -(-count // max(1, self.device.layout.tile // 16)),
-                **places,
-                **known,
-                residual=residual,
-                coarse_b=b,
-                moved=80 * count,
-            )
+            known |= {"residual": residual, "coarse_b": b}
+            self.kernel("gather", 4)(items, **self.places(number), **known, moved=80 * count)
 
     def over_parts(self, name: str, parts: Array, **arguments: Any) -> None:
         """Run a pass over the finest level that adds up; ``parts`` gets partial sums."""
         level = self.levels[0]
         count = -(-level.nodes // part_of(self.device))
-        kernel = self.kernel(name, links=4)
+        kernel = self.kernel(name, 4)
         kernel(count, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
 
     def copy_picture(self, name: str, level: Array, map_: Array, **arguments: Any) -> None:
@@ -215,7 +211,7 @@ class Hierarchy:
         finest = self.levels[0]
         sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
         items = finest.rows * -(-finest.columns // self.device.layout.tile)
-        kernel = self.kernel(name, links=4)
+        kernel = self.kernel(name, 4)
         kernel(items, **sizes, level=level, map=map_, **arguments, moved=8 * finest.nodes)
 
     def _admit_graph(self, links: Links) -> None:

@@ -1,4 +1,4 @@
-"""Heights on any graph of pixels: conjugate gradients, preconditioned by a multigrid V-cycle."""
+"""Heights on any graph of pixels: conjugate gradients, preconditioned by a multigrid cycle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from mirrorskin.engine.integration.hierarchy import (
     Hierarchy,
     Level,
     part_of,
-    place_of_coarse,
     tile_columns,
 )
 from mirrorskin.kernels.array import Array
@@ -141,7 +140,7 @@ class Multigrid:
         The step is the best one in the plane of the preconditioned residual and the step before: conjugate
         gradients, as far as the graph is the same, and heights cannot become worse in any case. All of it is
         on the device's queue when this returns; heights are valid until the next solution or step. ``deep``:
-        rebuild all levels of the graph but the coarsest, rather than the finest alone.
+        rebuild all levels of the graph, rather than the finest alone.
         """
         h, cycle = self._hierarchy, self._cycle
         h.follow(links, deep=deep)
@@ -167,8 +166,7 @@ class Multigrid:
         """
         if uneven:
             self.rebuild(self._links, strength=JOINED)
-        h = self._hierarchy
-        cycle = self._cycle
+        h, cycle = self._hierarchy, self._cycle
         rooms = cycle.x, cycle.b, cycle.spare, self._before, self._image
         find_graph_variance(h, answered, rooms)
         found = self._device.array("sigma", self._links.shape, np.float32)
@@ -275,7 +273,7 @@ class VCycle:
         """Find the tiles that have nodes; no cycle goes over the others."""
         h = self._h
         for number, level in enumerate(h.levels[: self._tail]):
-            kernel, items = self._kernel("find_live", number), self._tiles(level)
+            kernel, items = self._kernel("find_live", level), self._tiles(level)
             known = {"inverse": h.inverse, **self._live_of(number)}
             kernel(items, **level.place, **known, moved=4 * level.nodes)
 
@@ -359,7 +357,7 @@ class VCycle:
         """Do all small levels."""
         h = self._h
         last = len(h.levels) - 1
-        kernel, moved = self._kernel("tail", self._tail + 1), 200 * h.levels[self._tail].nodes
+        kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
         known: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
         known |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
         known |= {"from": self._tail, "last": last, "again": again}
@@ -372,16 +370,14 @@ class VCycle:
     def _tiles(self, level: Level) -> int:
         return -(-level.rows // TILE_ROWS) * -(-level.stride // tile_columns(self._h.device))
 
-    def _kernel(self, name: str, number: int) -> Kernel:
-        h = self._h
-        return h.kernel(name, links=h.links_of(h.levels[min(number, len(h.levels) - 1)]))
+    def _kernel(self, name: str, level: Level) -> Kernel:
+        return self._h.kernel(name, self._h.links_of(level))
 
     def _half(self, name: str, number: int, **arguments: Any) -> None:
         """Go down or up by one level."""
         h = self._h
-        fine, coarse = h.levels[number : number + 2]
-        kernel = self._kernel(name, number)
-        places = {**fine.place, **place_of_coarse(coarse)}
+        fine = h.levels[number]
+        kernel = self._kernel(name, fine)
         known = {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
         items = self._tiles(fine) * kernel.group
-        kernel(items, **places, **known, **arguments, moved=21 * fine.nodes)
+        kernel(items, **h.places(number), **known, **arguments, moved=21 * fine.nodes)
