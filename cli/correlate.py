@@ -43,7 +43,9 @@ def command(
         frames=frames,
     )
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(stack, dataset=dataset, memory_limit=limit, **known) as source:
+    with io.open_recording(
+        stack, dataset=dataset, memory_limit=limit, override_motion=True, **known
+    ) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
         io.check_output(target, stack, phases)
         with progress("correlating", source.shape[0]) as show:

@@ -98,10 +98,19 @@ class Layout:
         self._count, self._frame = shape[0], shape[1:]
 
     def header(
-        self, motion: Motion | None, tilt: float | None, pixel_size: tuple[float, float] | None
+        self,
+        motion: Motion | None,
+        tilt: float | None,
+        pixel_size: tuple[float, float] | None,
+        override_motion: bool = False,
     ) -> Header:
         """Read what holds for the whole stack; what is given need not be there."""
         own = self._text(f"{STAGE}/motion")
+        if motion and own in MOTIONS and own != motion and not override_motion:
+            raise InputError(
+                f"{self._file.path} says its motion is {own}, --motion says {motion}: leave --motion out,"
+                " or correct the file"
+            )
         motion = motion or cast(Motion, own)
         if motion not in MOTIONS:
             problem = f"says the motion {motion!r}" if motion else "does not say how the sensor moved"

@@ -195,6 +195,7 @@ def open_recording(
     threads: int | None = None,
     memory_limit: int | None = None,
     live: bool = False,
+    override_motion: bool = False,
 ) -> Recording:
     """Open a stack of frames in HDF5.
 
@@ -203,7 +204,9 @@ def open_recording(
     path : str or Path
     dataset : str, optional
         Name of the stack; needed where the file is not a recording of ours and holds several.
-    motion, travel, phase, tilt, pixel_size
+    motion : str, optional
+        What the file does not say; one that contradicts the file is refused.
+    travel, phase, tilt, pixel_size
         What the file does not say, or what to believe instead: positions in mm or radians, one a frame or as
         ``Steps``; half-angle in radians; mm.
     region : Region, optional
@@ -218,6 +221,8 @@ def open_recording(
         Bytes that chunks of frames may take when they are unpacked.
     live : bool, optional
         Only the frames that a live run used, where it thought the body to be then.
+    override_motion : bool, optional
+        Whether the ``motion`` holds even against the file, as for the correlation of any stack with phases.
 
     Returns
     -------
@@ -243,7 +248,7 @@ def open_recording(
         shape = (state.count, *_shape(stack)[1:])
         cut = _cut(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
-        header = layout.header(motion, tilt, pixel_size)
+        header = layout.header(motion, tilt, pixel_size, override_motion)
         state_of_part, truth = state.of(slice(*cut.frames)), layout.truth()
         if live:
             chosen = _used(str(path), state_of_part, travel, phase)

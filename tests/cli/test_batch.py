@@ -91,6 +91,13 @@ def test_remedies_are_those_of_a_batch():
     assert "give motion in [stack] of --settings, one of vertical" in said
 
 
+def test_a_motion_that_contradicts_a_file_fails_it():
+    presses("a.h5")
+    Path("batch.toml").write_text('[stack]\nmotion = "axial"\n')
+    said = run("batch", "a.h5", "-o", "out", "--settings", "batch.toml").out
+    assert "a.h5 says its motion is vertical, motion in [stack] of --settings says axial" in said
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding):
     for name in (b"a\xff.h5", b"a\nb.h5", "é.h5".encode()):

@@ -93,6 +93,7 @@ def test_a_recording_of_a_rotation_knows_its_phases_and_one_of_a_press_is_told_t
     np.testing.assert_array_equal(own, given)
     record(sphere(), Path("press.h5"))
     assert run("correlate", "press.h5", "--phase-step", "45deg").code == 0
+    assert "--phase-step" in run("correlate", "press.h5").said
 
 
 def test_pictures_are_imported_with_their_phases():

@@ -115,7 +115,11 @@ CASES = {
     "travel not given": (lambda path: foreign(path, frames=FRAMES), GIVEN[:2], "--travel-step"),
     "motion not given": (lambda path: foreign(path, frames=FRAMES), GIVEN[2:], "--motion"),
     "motion unknown": (lambda path: ours(path, motion="sideways"), [], "sideways"),
-    "motion without a method": (ours, ["--motion", "twist"], "twist"),
+    "a motion that contradicts the file": (
+        ours,
+        ["--motion", "twist"],
+        "bad.h5 says its motion is vertical, --motion says twist: leave --motion out, or correct the file",
+    ),
     "dark of another shape": (lambda path: ours(path, dark=np.zeros((5, 6))), [], "dark"),
     "bright not above dark": (lambda path: ours(path, bright=np.full((5, 7), 10.0)), [], "not above dark"),
     "swapped on the command line": (ours, ["--dark", "200", "--bright", "20"], "not above dark"),

@@ -86,11 +86,26 @@ def test_what_is_given_overrides_the_file(press):
         np.testing.assert_allclose(recording.travel, 1.0 + 0.5 * np.arange(8))
         assert recording.header.pixel_size == (0.1, 0.2)
         assert recording.header.tilt == 0.3
-    with io.open_recording(press, motion="axial", phase=io.Steps(np.pi / 4)) as recording:
+
+
+@pytest.mark.parametrize("motion", ["axial", "horizontal"])
+def test_a_motion_that_contradicts_the_file_is_refused(press, motion):
+    line = f"press.h5 says its motion is vertical, --motion says {motion}: leave --motion out"
+    with pytest.raises(io.InputError, match=line):
+        io.open_recording(press, motion=motion, phase=io.Steps(np.pi / 4))
+
+
+def test_a_motion_can_be_overridden_on_purpose(press):
+    with io.open_recording(
+        press, motion="axial", phase=io.Steps(np.pi / 4), override_motion=True
+    ) as recording:
         np.testing.assert_allclose(recording.phase, PHASE)
         assert (recording.motion, recording.travel, recording.header.press) == ("axial", None, None)
-    with io.open_recording(press, motion="horizontal") as recording:
-        assert (recording.travel, recording.phase) == (None, None)
+
+
+def test_a_motion_that_agrees_with_the_file_is_taken(press):
+    with io.open_recording(press, motion="vertical") as recording:
+        np.testing.assert_allclose(recording.travel, TRAVEL)
 
 
 def test_another_stack_of_a_recording_can_be_named(press):
