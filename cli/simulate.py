@@ -91,7 +91,7 @@ def command(
             _VERTICAL,
             "compliance",
             "LENGTH/N",
-            "Vertical, elastic: how far the stage gives way (the body has 1 N/mm^2).",
+            "Vertical, elastic: how far the stage gives way.",
         ),
     ] = None,
     press: Annotated[
@@ -119,6 +119,9 @@ def command(
     asymmetry: Annotated[float, Option(help="Of the lamps, as a share of their light.")] = 0.0,
     scatter: Annotated[str, Option(metavar="ANGLE", help="Of the sheet's flakes.")] = "3deg",
     friction: Annotated[float, Option(help="Coefficient, between sheet and object.")] = 0.8,
+    modulus: Annotated[
+        float, Option(metavar="MPA", help="Young's modulus of the body, which scales all forces.")
+    ] = 1.0,
     camera_distance: Annotated[
         str | None,
         Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
@@ -170,6 +173,7 @@ def command(
             asymmetry=asymmetry,
             scatter=angle(scatter, "--scatter"),
             friction=friction,
+            modulus=modulus,
         ),
         camera=Camera(
             np.dtype(dtype.value),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeGuard, cast
 
 import h5py
@@ -19,8 +19,15 @@ from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Tru
 MARK = "mirrorskin_recording"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
-# The maps of a simulation's truth, and their units.
-TRUTH_UNITS = {"height": "mm", "zenith": "rad", "azimuth": "rad", "contact": None, "slip": None}
+# What a simulation's truth holds, and its units.
+TRUTH_UNITS = {
+    "height": "mm",
+    "zenith": "rad",
+    "azimuth": "rad",
+    "contact": None,
+    "slip": None,
+    "force": "N",
+}
 # What is known of each frame: where that is written, and in what unit.
 SERIES = {
     "time": (f"{DETECTOR}/frame_time", "s"),
@@ -167,20 +174,19 @@ class Layout:
         present = {name: node for name, node in found.items() if node is not None}
         if not present:
             return None
-        missing = [name for name in found if name not in present and name != "slip"]
+        missing = [f.name for f in fields(Truth) if f.default is MISSING and f.name not in present]
         if missing:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
-        maps = {
-            name: np.ascontiguousarray(
-                self._file.read(node, self._frame, unit=TRUTH_UNITS[name])[self._part.region.slices]
-            )
-            for name, node in present.items()
-        }
-        height, zenith, azimuth = (
-            maps[name].astype(np.float32, copy=False) for name in ("height", "zenith", "azimuth")
-        )
-        slip = maps["slip"].astype(np.uint8, copy=False) if "slip" in maps else None
-        return Truth(height, zenith, azimuth, maps["contact"].astype(np.uint8, copy=False), slip)
+        return Truth(**{name: self._known(name, node) for name, node in present.items()})
+
+    def _known(self, name: str, node: Node) -> NDArray[Any]:
+        """Read one part of the truth: a series of frames, or a map."""
+        unit = TRUTH_UNITS[name]
+        if name == "force":
+            forces = self._file.read(node, (self._count, 3), unit=unit)
+            return forces[slice(*self._part.frames)].astype(np.float64, copy=False)
+        values = self._file.read(node, self._frame, unit=unit)[self._part.region.slices]
+        return np.ascontiguousarray(values, np.uint8 if name in ("contact", "slip") else np.float32)
 
     def _cut(self, values: Floats | None) -> Floats | None:
         return None if values is None else values[slice(*self._part.frames)]

@@ -213,6 +213,9 @@ class Truth:
         1 where sheet and object touch: of a vertical motion at some time, of the others in every frame.
     slip : ndarray, (H, W), uint8, or None
         1 where the sheet slips on the object at some time; None where no friction was worked out.
+    force : ndarray, (T, 3), float64, or None
+        Newtons in each frame that the object exerts on the sensor: along the body's x and y, by friction, and
+        normal, positive where it presses; None where no contact mechanics was worked out.
     """
 
     height: NDArray[np.float32]
@@ -220,6 +223,7 @@ class Truth:
     azimuth: NDArray[np.float32]
     contact: NDArray[np.uint8]
     slip: NDArray[np.uint8] | None = None
+    force: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -38,6 +38,7 @@ class Friction:
 
     def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
         self.traction = np.zeros((2, *space.shape))
+        self._pixel_area = space.pixel_area
         self._contact = pressure > 0
         if self._contact.any():
             self._window = rectangle(self._contact)
@@ -47,6 +48,12 @@ class Friction:
             self._before = self._shift = np.zeros((2, *self._touches.shape))
             # How far a pixel shifts itself.
             self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
+
+    @property
+    def force(self) -> Floats:
+        """Newtons along x and y that the object exerts on the body, (2,)."""
+        force: Floats = self.traction.sum(axis=(1, 2)) * self._pixel_area
+        return force
 
     def move(self, displacement: Floats) -> NDArray[np.bool_]:
         """Move the object straight on to another place; return where it slips over the sheet in this step.

@@ -63,6 +63,7 @@ class CachedScene:
         self._kept: dict[int, Light] = {}
         self._visited = np.zeros(len(self._places), bool)
         self._touched = np.ones(shape, bool)
+        self._force = np.full(len(self._places), np.nan)
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure."""
@@ -75,6 +76,13 @@ class CachedScene:
             self._lie(int(place))
         return self._touched
 
+    def forces(self) -> Floats:
+        """Return the normal force at the middle of each frame's exposure, (T,), N; NaN if not worked out."""
+        middle = self._number[:, self._number.shape[1] // 2]
+        for place in np.unique(middle[~self._visited[middle]]):
+            self._lie(int(place))
+        return self._force[middle]
+
     def _at(self, place: int) -> Light:
         if place not in self._kept:
             light = self._optics.light(self._lie(place))
@@ -85,7 +93,7 @@ class CachedScene:
 
     def _lie(self, place: int) -> Sheet:
         sheet = self._skin.drape(self._movement.pose(self._places[place]))
-        self._visited[place] = True
+        self._visited[place], self._force[place] = True, sheet.force
         self._touched &= sheet.contact
         return sheet
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,12 +31,15 @@ class Sheet:
         Its slopes along the body's x and y.
     contact : ndarray, (H, W), bool
         Whether sheet and object touch there.
+    force : float
+        That presses the object into the body, N; NaN where no contact mechanics is worked out.
     """
 
     height: Floats
     dz_dx: Floats
     dz_dy: Floats
     contact: NDArray[np.bool_]
+    force: float = math.nan
 
 
 class Conform:
@@ -93,7 +96,8 @@ class Elastic:
 
     def drape(self, pose: Pose) -> Sheet:
         """Press the sheet on the object in a pose."""
-        return self.sheet(self.solve(pose).pressure)
+        contact = self.solve(pose)
+        return replace(self.sheet(contact.pressure), force=contact.force)
 
     def sheet(self, pressure: Floats) -> Sheet:
         """Return the mirror under a pressure, as the camera's pixels see it."""

@@ -27,6 +27,7 @@ def make_truth(
     view: View,
     body: Body,
     touched: NDArray[np.bool_] | None,
+    pressing: Floats | None,
 ) -> Truth:
     """Return what the upright body stands on, and what touches, sticks and slips.
 
@@ -34,7 +35,8 @@ def make_truth(
     those of the point at which its ray meets the rest plane, and those of another of the point that it sees
     of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN where the
     surface is level. Contact is that at the greatest travel of a vertical movement, and what lasts through
-    all frames of another (``touched``). Slip is known of horizontal movements and twists in elastic contact.
+    all frames of another (``touched``). Slip is known of horizontal movements and twists in elastic contact,
+    and of elastic contact the force, whose normal part of each frame is ``pressing``, N.
     """
     vertical = isinstance(movement, Vertical)
     pressed = pose_at_press(movement.deepest)
@@ -45,26 +47,36 @@ def make_truth(
         height, slopes = obstacle.height - movement.deepest, (obstacle.dz_dx, obstacle.dz_dy)
     zenith, azimuth = zenith_azimuth(*slopes)
     contact = skin.drape(pressed).contact if vertical or touched is None else touched
-    slip = None
-    if isinstance(movement, Horizontal | Twist) and isinstance(skin, Elastic):
-        slip = _slipped(movement, skin, body.friction).astype(np.uint8)
+    slip = force = None
+    if pressing is not None:
+        force = np.zeros((len(pressing), 3))
+        force[:, 2] = pressing
+    if force is not None and isinstance(movement, Horizontal | Twist) and isinstance(skin, Elastic):
+        slip, force[:, :2] = _drag(movement, skin, body.friction)
     return Truth(
         height=height.astype(np.float32),
         zenith=zenith.astype(np.float32),
         azimuth=azimuth.astype(np.float32),
         contact=contact.astype(np.uint8),
         slip=slip,
+        force=force,
     )
 
 
-def _slipped(movement: Horizontal | Twist, skin: Elastic, coefficient: float) -> NDArray[np.bool_]:
-    """Tell where the sheet slips at some time, by the pressure of the press before the movement."""
+def _drag(
+    movement: Horizontal | Twist, skin: Elastic, coefficient: float
+) -> tuple[NDArray[np.uint8], Floats]:
+    """Tell where the sheet slips at some time, and what force along it the object exerts, (T, 2), N.
+
+    The pressure is that of the press before the movement.
+    """
     pressure: Floats = skin.solve(pose_at_press(movement.deepest)).pressure
     friction = Friction(skin.space, pressure, coefficient)
-    slipped = np.zeros(pressure.shape, bool)
-    for place in movement.path:
+    slipped, force = np.zeros(pressure.shape, bool), np.zeros((len(movement.path), 2))
+    for place, drag in zip(movement.path, force, strict=True):
         slipped |= friction.move(skin.shift(movement.pose(place)))
-    return skin.crop(slipped)
+        drag[:] = friction.force
+    return skin.crop(slipped).astype(np.uint8), force
 
 
 ReferenceName = Literal["exact", "ball"]

@@ -161,9 +161,10 @@ class Twin(Closing):
 
         Computed at the first access; after the last frame most of it is known.
         """
-        film = self._scene if self.motion != "vertical" and isinstance(self._scene, CachedScene) else None
-        touched = None if film is None else film.touched_throughout()
-        return make_truth(self._thing, self.movement, self._skin, self._view, self._body, touched)
+        film = self._scene if isinstance(self._scene, CachedScene) else None
+        touched = None if film is None or self.motion == "vertical" else film.touched_throughout()
+        pressing = film.forces() if film is not None and isinstance(self._skin, Elastic) else None
+        return make_truth(self._thing, self.movement, self._skin, self._view, self._body, touched, pressing)
 
     def sheet(self, frame: int) -> Sheet:
         """Return how the sheet lies at the middle of a frame's exposure, computed anew."""
