@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.scoring import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import draw_image, extent, filled_colours, new_figure, save_figure
+from mirrorskin.view.canvas import draw_image, exceeded, extent, filled_colours, new_figure, save_figure
 from mirrorskin.view.colours import FILLED, span
 
 if TYPE_CHECKING:
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 _MESH = 120  # samples of a surface along its longer side
-_FILLED = "orange: filled"
+Range = tuple[float, float]
+"""Lowest and highest, mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +50,22 @@ class Relief:
     levelled: bool
 
     def notes(self, missing: str) -> str:
-        """Tell what colours mean, and what a level is worth."""
-        filled = [_FILLED] if self.filled.any() else []
-        return ", ".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
+        """Tell what colours mean, which share of the heights was filled, and what a level is worth."""
+        share = 100 * float(self.filled.sum()) / max(1.0, float(np.isfinite(self.height).sum()))
+        filled = [f"orange: filled, {share:.0f} % of the heights"] if self.filled.any() else []
+        return "; ".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
+
+    @property
+    def measured(self) -> Relief:
+        """The same without what was filled."""
+        height = np.where(self.filled, np.float32(np.nan), self.height)
+        return replace(self, height=height, filled=np.zeros_like(self.filled))
+
+    @property
+    def ends(self) -> Range:
+        """The lowest and the highest height."""
+        known = self.height[np.isfinite(self.height)]
+        return (float(known.min()), float(known.max())) if known.size else (-1.0, 0.0)
 
 
 def relief_of(result: Result, truth: Truth) -> Relief:
@@ -78,44 +92,45 @@ def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float3
     return np.asarray(height - shift, np.float32)
 
 
-def draw_map(axes: Axes, name: str, relief: Relief) -> None:
-    """Draw heights by brightness, filled ones in shades of orange."""
-    lowest, highest = span(relief.height)
+def draw_map(axes: Axes, name: str, relief: Relief, limits: Range | None = None) -> None:
+    """Draw heights between limits by brightness, filled ones in shades of orange."""
+    lowest, highest = limits or span(relief.height)
+    beyond = exceeded(relief.height, lowest, highest)
     shades: list[str | Colormap] = ["gray", filled_colours()]
     for filled in (False, True) if relief.filled.any() else (False,):
         shown, place = np.where(relief.filled == filled, relief.height, np.nan), extent(relief.x, relief.y)
         label = "" if filled else "height (mm)"
-        draw_image(axes, shown, place, label, cmap=shades[filled], vmin=lowest, vmax=highest)
+        draw_image(axes, shown, place, label, beyond, cmap=shades[filled], vmin=lowest, vmax=highest)
     axes.axhline(0, color="tab:red", lw=0.8, ls=":")
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}\n{relief.notes('blue: no answer')}")
 
 
-def draw_surface(axes: Axes3D, name: str, relief: Relief) -> None:
-    """Draw heights as a surface in space; filled ones have a colour of their own."""
+def draw_surface(axes: Axes3D, name: str, relief: Relief, limits: Range | None = None) -> None:
+    """Draw heights as a surface in space, within limits along z; filled ones have a colour of their own."""
     step = max(1, max(relief.height.shape) // _MESH)
-    lowest, highest = span(relief.height)
-    height, filled = relief.height[::step, ::step], relief.filled[::step, ::step]
-    shown = np.where((height >= lowest) & (height <= highest) | filled, height, np.nan)
+    limits = limits or relief.ends
+    shown, filled = relief.height[::step, ::step], relief.filled[::step, ::step]
     across, up = np.meshgrid(relief.x[::step], relief.y[::step])
     # One surface in two colours: Matplotlib does not sort two surfaces by depth.
-    colours = {"facecolors": _colours(shown, filled), "shade": False} if filled.any() else {"cmap": "viridis"}
-    axes.plot_surface(across, up, shown, rstride=1, cstride=1, linewidth=0, antialiased=True, **colours)
+    colours = _colours(shown, filled, limits)
+    style = {"rstride": 1, "cstride": 1, "linewidth": 0, "antialiased": True, "shade": False}
+    axes.plot_surface(across, up, shown, facecolors=colours, **style)
     axes.set_box_aspect((np.ptp(relief.x), np.ptp(relief.y), 0.45 * np.ptp(relief.x)), zoom=1.15)
+    axes.set_zlim(*limits)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name} (mm)\n{relief.notes('holes: no answer')}")
 
 
-def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_]) -> Floats:
+def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_], limits: Range) -> Floats:
     """Return the colours of a surface, (H, W, 4): by height, and of what was filled."""
     from matplotlib import colormaps
     from matplotlib.colors import Normalize, to_rgba
 
-    known = height[np.isfinite(height)]
-    colours = np.array(colormaps["viridis"](Normalize(known.min(), known.max())(np.nan_to_num(height))))
+    colours = np.array(colormaps["viridis"](Normalize(*limits)(np.nan_to_num(height))))
     colours[filled] = to_rgba(FILLED)
     return colours
 
 
-def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth) -> None:
+def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth, limits: Range | None = None) -> None:
     """Draw heights on the middle row against the truth; filled ones are open circles."""
     row = len(truth.height) // 2
     any_relief = next(iter(reliefs.values()))
@@ -124,10 +139,20 @@ def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth) -> None:
     opened = any(relief.filled[row].any() for relief in reliefs.values())
     title = "cut across the middle" + ("; open circles: filled" if opened else "")
     axes.set(xlabel="x (mm)", ylabel="height (mm)", title=title)
-    lowest = min(span(relief.height)[0] for relief in reliefs.values())
-    axes.set_ylim(1.35 * lowest - 0.02, -0.12 * lowest + 0.02)
+    if limits is None:
+        lowest = min(relief.ends[0] for relief in reliefs.values())
+        limits = 1.04 * lowest - 0.02, -0.04 * lowest + 0.02
+    axes.set_ylim(*limits)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower center", ncols=2, markerscale=2)
+    # Beside the curves, where it hides none of them.
+    axes.legend(
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.13),
+        ncols=3,
+        markerscale=2,
+        frameon=False,
+        fontsize="small",
+    )
 
 
 def dots_on_row(axes: Axes, values: Mapping[str, NDArray[np.float32]], reliefs: Mapping[str, Relief]) -> None:
@@ -148,7 +173,13 @@ def check_same_size(shape: tuple[int, ...], truth: NDArray[np.float32]) -> None:
 
 
 def height_figure(
-    results: Mapping[str, Result], truth: Truth, title: str, path: Path, *, surface: bool = False
+    results: Mapping[str, Result],
+    truth: Truth,
+    title: str,
+    path: Path,
+    *,
+    surface: bool = False,
+    detail: Range | None = None,
 ) -> None:
     """Draw heights, and cuts across the middle against the truth, into a PNG.
 
@@ -164,28 +195,52 @@ def height_figure(
     path : Path
         PNG to write.
     surface : bool
-        Draw a surface in space, as Fig. 5 (a) of the paper, instead of height by brightness, as its Fig. 6.
+        Draw surfaces in space, as Fig. 5 (a) of the paper, instead of height by brightness, as its Fig. 6:
+        on one vertical scale, the first also without what was filled.
+    detail : (float, float), optional
+        Heights, mm, between which maps and cuts are drawn a second time, on a scale of their own.
 
     Raises
     ------
     InputError
         Matplotlib is not installed, a result has no heights or axes, or the file cannot be written.
     """
-    save_figure(_draw_heights(results, truth, surface), title, path)
+    save_figure(_draw_heights(results, truth, surface, detail), title, path)
 
 
-def _draw_heights(results: Mapping[str, Result], truth: Truth, surface: bool) -> Figure:
+def _draw_heights(
+    results: Mapping[str, Result], truth: Truth, surface: bool, detail: Range | None = None
+) -> Figure:
     reliefs = {name: relief_of(result, truth) for name, result in results.items()}
     names = list(reliefs)
-    whole = dict.fromkeys([names[0], names[-1]])
-    figure = new_figure(14, 4.6)
-    grid = figure.add_gridspec(1, len(whole) + 1, width_ratios=[1] * len(whole) + [1.2])
-    for place, name in enumerate(whole):
-        if surface:
-            draw_surface(figure.add_subplot(grid[place], projection="3d"), name, reliefs[name])
-        else:
-            draw_map(figure.add_subplot(grid[place]), name, reliefs[name])
-    draw_cuts(figure.add_subplot(grid[-1]), reliefs, truth)
+    whole = {name: reliefs[name] for name in (names[0], names[-1])}
+    if surface:
+        return _draw_in_space(whole, reliefs, truth)
+    scales: list[Range | None] = [None] if detail is None else [None, detail]
+    figure = new_figure(14, 4.8 * len(scales))
+    grid = figure.add_gridspec(len(scales), len(whole) + 1, width_ratios=[1] * len(whole) + [1.2])
+    for row, limits in enumerate(scales):
+        for column, (name, relief) in enumerate(whole.items()):
+            draw_map(figure.add_subplot(grid[row, column]), name, relief, limits)
+        draw_cuts(figure.add_subplot(grid[row, -1]), reliefs, truth, limits)
+    return figure
+
+
+def _draw_in_space(whole: Mapping[str, Relief], reliefs: Mapping[str, Relief], truth: Truth) -> Figure:
+    """Draw surfaces on one scale, the first also as it was measured, and all cuts."""
+    first, relief = next(iter(whole.items()))
+    if relief.filled.any():
+        whole = {f"{first}, measured": relief.measured, **whole}
+    ends = [relief.ends for relief in whole.values()]
+    limits = min(low for low, _ in ends), max(high for _, high in ends)
+    columns = 2 if len(whole) > 2 else len(whole) + 1
+    rows = -(-(len(whole) + 1) // columns)
+    figure = new_figure(14, 4.8 * rows)
+    grid = figure.add_gridspec(rows, columns)
+    for number, (name, relief) in enumerate(whole.items()):
+        place = grid[divmod(number, columns)]
+        draw_surface(figure.add_subplot(place, projection="3d"), name, relief, limits)
+    draw_cuts(figure.add_subplot(grid[-1, -1]), reliefs, truth)
     return figure
 
 
@@ -197,8 +252,9 @@ def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path:
     """Draw normals, a row for each result, into a PNG.
 
     From left to right: the customary colours, red, green and blue for x, y and z from -1 to 1, with edges
-    black; the normals projected on the sheet as needles, as Fig. 10 (a) of the paper; the angle to the
-    true normal where the sheet was in contact in every frame.
+    black and a key of a half-sphere; the normals projected on the sheet as needles, as Fig. 10 (a) of the
+    paper; the angle to the true normal where the sheet was in contact in every frame. The medians told are
+    those of the pixels that all results answer, so that they can be compared.
 
     Parameters
     ----------
@@ -219,14 +275,16 @@ def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path:
     for result in results.values():
         _check(result, truth)
     errors = {name: _errors(result, truth) for name, result in results.items()}
-    known = np.concatenate([error[np.isfinite(error)] for error in errors.values()])
+    shared = np.logical_and.reduce([np.isfinite(error) for error in errors.values()])
+    known = np.concatenate([error[shared] for error in errors.values()])
     worst = float(np.percentile(known, _WORST)) if known.size else 1.0
     figure = new_figure(14, 4.4 * len(results))
     axes = figure.subplots(len(results), 3, squeeze=False)
+    _draw_key(axes[0, 0].inset_axes((1.05, 0.3, 0.4, 0.4)))
     for row, (name, result) in zip(axes, results.items(), strict=True):
         _draw_normals(row[0], name, result)
         _draw_needles(row[1], result)
-        _draw_angles(row[2], result, errors[name], worst)
+        _draw_angles(row[2], result, errors[name], shared, worst)
     save_figure(figure, title, path)
 
 
@@ -267,6 +325,19 @@ def _draw_normals(axes: Axes, name: str, result: Result) -> None:
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}; black: edges, blue: no answer")
 
 
+def _draw_key(axes: Axes) -> None:
+    """Draw the colours of a half-sphere seen from above: each is that of the normal of its place."""
+    across, up = np.meshgrid(*2 * [np.linspace(-1, 1, 101)])
+    height = np.sqrt(np.maximum(0, 1 - across**2 - up**2))
+    colours = (np.stack([across, up, height, np.ones_like(up)], axis=-1) + 1) / 2
+    colours[across**2 + up**2 > 1, 3] = 0
+    axes.imshow(colours, extent=(-1, 1, -1, 1), origin="lower")
+    axes.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="$n_x$", ylabel="$n_y$", title="normal")
+    axes.yaxis.tick_right()
+    axes.yaxis.set_label_position("right")
+    axes.spines[:].set_visible(False)
+
+
 def _draw_needles(axes: Axes, result: Result) -> None:
     normals, x, y = _maps(result)
     step = max(1, max(normals.shape[:2]) // _NEEDLES)
@@ -295,12 +366,16 @@ def _draw_needles(axes: Axes, result: Result) -> None:
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title="normals, projected on x and y")
 
 
-def _draw_angles(axes: Axes, result: Result, error: Floats, worst: float) -> None:
+def _draw_angles(axes: Axes, result: Result, error: Floats, shared: NDArray[np.bool_], worst: float) -> None:
     _, x, y = _maps(result)
-    known = error[np.isfinite(error)]
-    note = f"median {np.median(known):.2f} deg" if known.size else "no pixel in contact"
-    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", cmap="magma", vmin=0, vmax=worst)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{note}; blue: no lasting contact")
+    known, common = error[np.isfinite(error)], error[shared]
+    note = (
+        f"median {np.median(known):.2f} deg of all {known.size} px" if known.size else "no pixel in contact"
+    )
+    if common.size:
+        note = f"median {np.median(common):.2f} deg of the {common.size} px that all answer\n{note}"
+    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", "max", cmap="magma", vmin=0, vmax=worst)
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{note}; blue: no answer")
 
 
 _MICROMETRES = 1e3  # in a millimetre

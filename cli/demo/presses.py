@@ -53,11 +53,22 @@ class Experiment:
     step: float
     sensors: tuple[Sensor, ...] = SENSORS
     surface: bool = False
+    detail: tuple[float, float] | None = None  # heights, mm, that are drawn on a scale of their own
 
 
 EXPERIMENTS = (
     Experiment("fig5", "sphere", "Fig. 5: sphere, 10 mm, 30 x 0.1 mm", 240, 0.05, 30, 0.1, surface=True),
-    Experiment("fig6", "coin", "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm", 640, 0.041, 90, 0.02, SENSORS[:2]),
+    Experiment(
+        "fig6",
+        "coin",
+        "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm",
+        640,
+        0.041,
+        90,
+        0.02,
+        SENSORS[:2],
+        detail=(-0.3, 0.02),
+    ),
     Experiment(
         "fig6-soft",
         "coin",
@@ -130,7 +141,14 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
         results[sensor] = _reconstruct(base, sensor, device)
     best = {sensor.name: by_method["sub-frame"] for sensor, by_method in results.items()}
     path = (folder / experiment.name).with_suffix(".png")
-    view.height_figure(best, truths[PAPERS], experiment.title, path, surface=experiment.surface)
+    view.height_figure(
+        best,
+        truths[PAPERS],
+        experiment.title,
+        path,
+        surface=experiment.surface,
+        detail=experiment.detail,
+    )
     shared = np.logical_and.reduce([np.isfinite(_height(result)) for result in best.values()])
     return {
         sensor.name: {method: _judge(result, truths[sensor], shared) for method, result in by_method.items()}

@@ -35,9 +35,9 @@ def shown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "made"
     figures, draw, turned, shaped = {}, view.height_figure, view.normal_figure, view.surface_figure
 
-    def watch(results, truth, title, path, *, surface):
-        figures[path.name] = (list(results), title, surface)
-        draw(results, truth, title, path, surface=surface)
+    def watch(results, truth, title, path, **style):
+        figures[path.name] = (list(results), title, style)
+        draw(results, truth, title, path, **style)
 
     def watch_normals(results, truth, title, path):
         figures[path.name] = (list(results), title)

@@ -151,11 +151,7 @@ def test_a_surface_stands_in_space_over_the_field(surfaces):
     x, y = io.pixel_axes(height.shape, (0.1, 0.2))
     np.testing.assert_array_equal(across, np.broadcast_to(x, height.shape))
     np.testing.assert_array_equal(up, np.broadcast_to(y[:, np.newaxis], height.shape))
-    # All but the few at the ends of the span are as they are.
-    known = np.isfinite(shown)
-    np.testing.assert_array_equal(shown[known], height[known])
-    assert 0 < np.count_nonzero(np.isfinite(height) & ~known) < 10
-    assert not known[4:9, 10:15].any()
+    np.testing.assert_array_equal(shown, height)
     for (low, high), place in zip((axes.get_xlim(), axes.get_ylim()), (x, y), strict=True):
         assert low <= place.min() < place.max() <= high
     assert axes.get_zlim()[0] <= np.nanmin(shown)
@@ -214,14 +210,36 @@ def test_what_was_filled_is_orange_on_a_map_and_as_bright_as_it_is_high():
     assert np.all(np.diff(colours.sum(axis=1)) > 0)
 
 
-def test_what_was_filled_has_a_colour_of_its_own_in_space(surfaces, styles):
+def test_a_surface_is_shown_as_measured_and_then_filled_in_a_colour_of_its_own(surfaces, styles):
     height = slope()
-    axes, _ = draw({"a": result_of(height, filled=filled_in())}, truth_of(height), surface=True)
-    colours = styles[0]["facecolors"]
-    orange = np.all(colours[..., :3] == to_rgb("tab:orange"), axis=-1)
+    figure = heights._draw_heights({"a": result_of(height, filled=filled_in())}, truth_of(height), True)
+    measured, closed = figure.axes[:2]
+    np.testing.assert_array_equal(np.isnan(surfaces[0][2]), filled_in() == 1)
+    np.testing.assert_array_equal(surfaces[1][2], height)
+    orange = np.all(styles[1]["facecolors"][..., :3] == to_rgb("tab:orange"), axis=-1)
     np.testing.assert_array_equal(orange, filled_in() == 1)
-    assert len(surfaces) == 1
-    assert "orange: filled" in axes.get_title()
+    assert "filled" not in measured.get_title()
+    assert "orange: filled, 4 % of the heights" in closed.get_title()  # 25 of 600
+
+
+def test_surfaces_share_a_vertical_scale_that_holds_all_of_them():
+    deep = slope().copy()
+    deep[3, 4] = -7
+    figure = heights._draw_heights({"a": result_of(slope()), "b": result_of(deep)}, truth_of(slope()), True)
+    one, other = (axes.get_zlim() for axes in figure.axes if isinstance(axes, Axes3D))
+    assert one == other
+    assert one[0] <= -7
+    assert one[1] >= 0
+
+
+def test_a_detail_has_a_scale_of_its_own():
+    height = slope()
+    figure = heights._draw_heights({"a": result_of(height)}, truth_of(height), False, (-0.1, 0.02))
+    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+    whole, _, part, cut = panels
+    assert whole.get_images()[0].norm.vmin < -0.25
+    assert (part.get_images()[0].norm.vmin, part.get_images()[0].norm.vmax) == (-0.1, 0.02)
+    assert cut.get_ylim() == (-0.1, 0.02)
 
 
 @KINDS

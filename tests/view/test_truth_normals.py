@@ -81,6 +81,28 @@ def test_errors_are_angles_where_contact_is_told_and_true(tmp_path, monkeypatch)
     assert "median 2.00 deg" in rows[1][2].get_title()
 
 
+def test_methods_are_compared_on_the_pixels_that_all_answer(tmp_path, monkeypatch):
+    half = np.ones(SHAPE, np.uint8)
+    half[:, :20] = 0
+    result = result_of()
+    result.normals[:, 20:] = result_of(0.5, ZENITH + np.radians(3)).normals[:, 20:]
+    rows = drawn({"all": result, "part": result_of(contact=half)}, truth_of(), tmp_path, monkeypatch)
+    assert "median 3.00 deg of the 200 px that all answer" in rows[0][2].get_title()
+    assert "median 0.00 deg of all 600 px" in rows[0][2].get_title()
+    assert "median 0.00 deg of the 200 px that all answer" in rows[1][2].get_title()
+
+
+def test_the_key_of_the_colours_is_a_half_sphere(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(normals, "save_figure", lambda figure, title, path: kept.append(figure))
+    view.normal_figure({"one": result_of()}, truth_of(), "title", tmp_path / "x.png")
+    (key,) = kept[0].axes[0].child_axes
+    colours = key.images[0].get_array()
+    np.testing.assert_allclose(colours[50, 50], [0.5, 0.5, 1, 1])
+    np.testing.assert_allclose(colours[50, 90], [0.9, 0.5, (1 + 0.6) / 2, 1], atol=1e-6)
+    assert colours[0, 0, 3] == 0
+
+
 @pytest.mark.parametrize("kind", ["heights", "turns", "no axes", "truth"])
 def test_what_cannot_be_drawn_is_said(tmp_path, kind):
     results = {
