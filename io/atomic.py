@@ -95,18 +95,23 @@ class NewHdf5:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[int]:
-    """Make a file under a temporary name beside ``path``, and rename it when all went well."""
+    """Make a file under a temporary name beside ``path``, and rename it when all went well.
+
+    It is on the disk before it has its name. Where ``path`` is a link, what the link leads to is replaced.
+    """
     check_output(path)
+    target = Path(os.path.realpath(path))
     # Its name is known before there is a file: whenever the program is ended, it is removed.
-    part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
+    part, descriptor = target.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
             descriptor = _make(part)
         yield descriptor
         with as_input_error(f"{path} could not be written", MAKE_ROOM):
+            os.fsync(descriptor)
             os.close(os.dup(descriptor))  # some disks tell only then that they did not take all
             part.chmod(0o666 & ~_umask())
-            part.replace(path)
+            part.replace(target)
     finally:
         part.unlink(missing_ok=True)
         if descriptor >= 0:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import struct
 from collections.abc import Iterable
 from contextlib import suppress
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -35,6 +38,7 @@ class Hdf5File(Closing):
             self.root = _open_file(path, real)
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
+        self._sound: set[bytes] = set()  # names of files whose texts of variable length can be read
 
     def close(self) -> None:
         """Close the file and those it refers to."""
@@ -87,7 +91,7 @@ class Hdf5File(Closing):
         with as_input_error(f"{self.path}: {name}"):
             if node is None or not h5py.h5a.exists(node.id, attribute.encode()):
                 return None
-            return _first(_attribute(node.id, attribute.encode()))
+            return _first(self._values(h5py.h5a.open(node.id, attribute.encode())))
 
     def stacks(self) -> dict[str, str]:
         """Return the three-dimensional datasets that the file itself holds: their names, sizes and types."""
@@ -122,9 +126,9 @@ class Hdf5File(Closing):
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
         check_storage(self, node, frames=rows)
         with as_input_error(lambda: self.where(node)):
-            values = _values(node.id) if rows is None else node[:rows]
+            values = self._values(node.id) if rows is None else node[:rows]
             stated = unit is not None and h5py.h5a.exists(node.id, b"units")
-            given = str(_first(_attribute(node.id, b"units")) or unit) if stated else unit
+            given = str(_first(self._values(h5py.h5a.open(node.id, b"units"))) or unit) if stated else unit
         if given is None or unit is None or given == unit:
             return values
         return values * conversion_factor(given, unit, self.where(node))
@@ -136,14 +140,14 @@ class Hdf5File(Closing):
                 raise InputError(
                     f"{self.where(node)} does not hold one value: write one text or number there"
                 )
-            return _first(_values(node.id))
+            return _first(self._values(node.id))
 
     def texts(self, node: Node, remedy: str) -> tuple[str, ...]:
         """Read a list of texts."""
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.ndim != 1 or node.dtype.kind not in "SO":
                 raise InputError(f"{self.where(node)} holds no list of texts: {remedy}")
-            return tuple(str(_first(text)) for text in _values(node.id))
+            return tuple(str(_first(text)) for text in self._values(node.id))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
         """Do what ``find`` does, from any object on and after so many links."""
@@ -176,6 +180,28 @@ class Hdf5File(Closing):
             if not target.is_file():
                 raise InputError(f"{what} leads to {filename}, which does not exist: copy it there")
         return target
+
+    def _values(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID) -> NDArray[Any]:
+        """Read all of a dataset or attribute, in a third of the time of h5py's own way where that is little.
+
+        ValueError if HDF5 would crash, hang, or take memory for more than there is.
+        """
+        opened, kind = h5py.h5i.get_file_id(node), node.dtype
+        name = h5py.h5f.get_name(opened)
+        text = h5py.check_string_dtype(kind)
+        if kind.hasobject and text is None:
+            raise ValueError("neither numbers nor text")
+        if text is not None and text.length is None and name not in self._sound:
+            _check_heaps(h5py.File(opened))
+            self._sound.add(name)
+        if math.prod(node.shape) * kind.itemsize > opened.get_filesize() and text is not None:
+            raise ValueError("a text longer than its file")
+        values: NDArray[Any] = np.empty(node.shape, kind)
+        if isinstance(node, h5py.h5a.AttrID):
+            node.read(values)
+        else:
+            node.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+        return values
 
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
         with as_input_error(lambda: f"{self.where(node)}: {part}"):
@@ -212,20 +238,6 @@ def _open(group: h5py.Group, name: bytes) -> Node:
     return h5py.Dataset(node)
 
 
-def _values(node: h5py.h5d.DatasetID) -> NDArray[Any]:
-    """Read all of a dataset, in a third of the time of h5py's own way where that is little."""
-    values: NDArray[Any] = np.empty(node.shape, node.dtype)
-    node.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values
-
-
-def _attribute(node: Any, name: bytes) -> NDArray[Any]:
-    attribute = h5py.h5a.open(node, name)
-    values: NDArray[Any] = np.empty(attribute.shape, attribute.dtype)
-    attribute.read(values)
-    return values
-
-
 def _first(value: Any) -> Any:
     """Return a text or a number without its array, bytes or NumPy type."""
     if isinstance(value, np.ndarray):
@@ -258,6 +270,51 @@ def _open_file(path: Path, real: str) -> h5py.File:
         raise InputError(
             f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
         ) from None
+
+
+_HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
+_HEAD = 16  # bytes at the begin of a heap, and of each of its objects
+_BULK = 1 << 16  # bytes of a dataset that is not looked through
+
+
+def _check_heaps(file: h5py.File) -> None:
+    """Raise ValueError if a heap of texts of variable length does not end: HDF5 would read it for ever.
+
+    See "Global Heap" in HDF5's file format specification.
+    """
+    with Path(file.filename).open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
+        start = 0
+        for stop, after in (*sorted(_bulk(file)), (len(data), len(data))):
+            for heap in _HEAP.finditer(data, start, stop):
+                _check_heap(data, heap.start())
+            start = after
+
+
+def _check_heap(data: mmap, start: int) -> None:
+    _, size = struct.unpack_from("<8sQ", data, start)
+    at, stop = start + _HEAD, min(start + size, len(data))
+    while at + _HEAD <= stop:
+        index, length = struct.unpack_from("<H6xQ", data, at)
+        step = length if index == 0 else _HEAD + -(-length // 8) * 8
+        if not 0 < step <= stop - at:
+            raise ValueError("a heap of texts that does not end")
+        at += step
+
+
+def _bulk(file: h5py.File) -> list[tuple[int, int]]:
+    """Return where large datasets lie in a file, which are no heaps: from which byte to which."""
+    places: list[tuple[int, int]] = []
+
+    def visit(_: str, node: Node) -> None:
+        if not isinstance(node, h5py.Dataset) or node.nbytes < _BULK or node.is_virtual or node.external:
+            return
+        if node.chunks:
+            node.id.chunk_iter(lambda one: places.append((one.byte_offset, one.byte_offset + one.size)))
+        elif (start := node.id.get_offset()) is not None:
+            places.append((start, start + node.nbytes))
+
+    file.visititems(visit)
+    return places
 
 
 _VIRTUAL_DEEP = 4

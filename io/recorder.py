@@ -17,8 +17,8 @@ from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
-from mirrorskin.io.os_errors import legible
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
+from mirrorskin.io.writing import fixed_text
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
@@ -49,13 +49,14 @@ def write_header(file: h5py.File, header: Header) -> None:
     """Write what holds for all frames, and the groups for what does not."""
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = new_group(file, "entry", "NXentry", default="data", **{MARK: 1})
-    entry["title"] = legible(header.title)
-    entry["start_time"] = header.start_time or datetime.now(UTC).isoformat(timespec="milliseconds")
+    put(entry, "title", None, header.title)
+    started = header.start_time or datetime.now(UTC).isoformat(timespec="milliseconds")
+    put(entry, "start_time", None, started)
     instrument = new_group(entry, "instrument", "NXinstrument")
     detector = new_group(instrument, "detector", "NXdetector")
     stage = new_group(instrument, "stage", "NXpositioner")
-    stage["motion"] = header.motion
-    put(detector, "local_name", None, legible(header.camera) or None)
+    put(stage, "motion", None, header.motion)
+    put(detector, "local_name", None, header.camera or None)
     x, y = header.pixel_size or (None, None)
     put(detector, "x_pixel_size", "mm", x)
     put(detector, "y_pixel_size", "mm", y)
@@ -99,7 +100,7 @@ def new_group(parent: h5py.Group, name: str, nexus: str, **attrs: Any) -> h5py.G
 def put(group: h5py.Group, name: str, unit: str | None, value: Any) -> None:
     """Write a value and its unit, if there is one."""
     if value is not None:
-        group[name] = value
+        group[name] = fixed_text(value) if isinstance(value, str) else value
         if unit is not None:
             group[name].attrs["units"] = unit
 

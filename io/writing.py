@@ -84,10 +84,16 @@ def write_file(path: Path, items: Iterable[Item]) -> None:
         _layouts[likeness] = _Layout.of(descriptor, own, arrays)
 
 
-def fixed_text(text: str) -> NDArray[Any]:
-    """Return a text as UTF-8 of a fixed length, so that it lies in the file in one piece."""
-    encoded = legible(text).encode() or b"\0"
-    return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
+def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
+    """Return a text, or a list of texts, as UTF-8 of a fixed length: texts of variable length lie in heaps.
+
+    HDF5 reads a heap that is damaged for ever.
+    """
+    if isinstance(text, str):
+        encoded = legible(text).encode() or b"\0"
+        return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
+    texts = [legible(one).encode() for one in text]
+    return np.array(texts, h5py.string_dtype("utf-8", max(map(len, texts), default=0) or 1))
 
 
 def process_items(place: str, process: Mapping[str, ProcessValue]) -> Iterator[Item]:

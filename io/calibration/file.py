@@ -196,11 +196,8 @@ def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
 
 
 def _values_of(value: Any, how: Stored) -> NDArray[Any]:
-    if how.kind == "text":
+    if how.kind in ("text", "names"):
         return fixed_text(value)
-    if how.kind == "names":
-        encoded = [fixed_text(one).tobytes() for one in value]
-        return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded), default=1)))
     integer = how.kind in ("integer", "integers")
     return np.ascontiguousarray(value, np.int64 if integer else how.dtype).reshape(np.shape(value))
 

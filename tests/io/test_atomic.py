@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from mirrorskin.io import atomic
-from mirrorskin.io.atomic import new_hdf5, remove_leftovers
+from mirrorskin.io.atomic import new_hdf5, remove_leftovers, write_new
 
 # Begins a file, says so, and waits to be killed.
 BEGIN = """
@@ -78,3 +78,12 @@ def test_a_program_that_is_ended_while_the_file_is_made_leaves_none(tmp_path, mo
     with pytest.raises(SystemExit), new_hdf5(tmp_path / "a.h5"):
         pass
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
+    (tmp_path / "far").mkdir()
+    target, link = tmp_path / "far" / "result.h5", tmp_path / "link.h5"
+    link.symlink_to(target)
+    write_new(link, [b"new"])
+    assert link.is_symlink()
+    assert target.read_bytes() == b"new"

@@ -12,6 +12,7 @@ import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import io
+from mirrorskin.io.hdf5 import Hdf5File
 
 STACK = random_stack()
 GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
@@ -369,3 +370,25 @@ def test_a_file_that_is_being_written_is_refused(path, monkeypatch):
         refused(path, r"theirs\.h5: another program is writing it: wait until it is done")
         writer.stdin.close()
     np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_a_damaged_heap_of_texts_is_refused(path):
+    """HDF5 itself reads such a heap for ever."""
+    with h5py.File(path, "w") as file:
+        file["x"] = STACK
+        file["x"].attrs["units"] = "counts"
+    data = bytearray(path.read_bytes())
+    heap = data.find(b"GCOL")
+    free = heap + 16 + 16 + 8  # behind the heap's head, and the one text with its own
+    assert data[free : free + 2] == b"\0\0"
+    data[free + 8 : free + 16] = bytes(8)
+    path.write_bytes(data)
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="a heap of texts that does not end"):
+        file.attribute("/x", "units")
+
+
+def test_what_is_neither_number_nor_text_is_refused(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", (), h5py.vlen_dtype(np.int32))
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="neither numbers nor text"):
+        file.value(file.find("/x"))
