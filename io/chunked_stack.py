@@ -142,6 +142,7 @@ class ChunkReader:
         self._index, self._codecs, self._threads = index, codecs, threads
         self._close_file = weakref.finalize(self, os.close, file)
         self._pool: ThreadPoolExecutor | None = None
+        self._process = os.getpid()
         self._scratch: deque[_Scratch] = deque()
 
     def fetch(self, part: Selection, out: NDArray[Any]) -> None:
@@ -149,7 +150,8 @@ class ChunkReader:
         ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(part.spans, self.chunk, strict=True)]
         work = deque(itertools.product(*ranges))
         helpers = min(self._threads, len(work)) - 1
-        if helpers and self._pool is None:
+        if helpers and (self._pool is None or self._process != os.getpid()):  # threads stay behind in a fork
+            self._process = os.getpid()
             self._pool = ThreadPoolExecutor(self._threads - 1, "chunks")
         running: list[Future[None]] = []
         try:

@@ -96,8 +96,14 @@ def open_device(choice: str | Device | None = None) -> Device:
     UnknownDeviceError
         No device, or more than one, answers to the name.
     DeviceError
-        There is no OpenCL device at all, or it cannot run a kernel.
+        There is no OpenCL device at all, or it cannot run a kernel; or this process was forked from one that
+        had opened a device, whose driver's threads it lacks.
     """
+    if any(device.process != os.getpid() for device in _opened):
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, whose threads it lacks: start it with "
+            "multiprocessing.get_context('spawn')"
+        )
     if isinstance(choice, Device):
         return choice
     with _opening:
@@ -135,6 +141,8 @@ class Device:
     Attributes
     ----------
     info : DeviceInfo
+    process : int
+        The process that opened it, the only one in which it works.
     context, queue, copies
         The OpenCL objects; frames are brought on a queue of their own, beside the kernels.
     profile : Profile
@@ -148,7 +156,7 @@ class Device:
     """
 
     def __init__(self, device: cl.Device) -> None:
-        self.info = _describe(device)
+        self.info, self.process = _describe(device), os.getpid()
         if _is_pocl(device):
             embedded.verify(device)
         self.profile = Profile()

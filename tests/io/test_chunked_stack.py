@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -240,3 +242,26 @@ def test_damage_is_told_with_the_frames_on_every_way(tmp_path):
     for room, limit in ((24, 60 * FRAME), (3, 60 * FRAME), (3, 8 * FRAME)):
         with pytest.raises(io.InputError, match="frames 8 to 15 of /x cannot be read: it is damaged"):
             ours(path, room, memory_limit=limit)
+
+
+FORKED = """
+import os, signal, sys, numpy as np
+from mirrorskin import io
+with io.open_recording(sys.argv[1], motion="horizontal", threads=2) as recording:
+    room = np.empty(recording.shape, recording.dtype)
+    recording.read(room[:8])
+    if not os.fork():
+        signal.alarm(20)
+        print(recording.read(room[8:]).frames.sum(), flush=True)
+        os._exit(0)
+    os.wait()
+"""
+
+
+def test_a_forked_process_unpacks_with_threads_of_its_own(tmp_path):
+    stack = np.ones((16, 5, 7), np.uint8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", data=stack, chunks=(1, 5, 7), compression="gzip")
+    command = [sys.executable, "-c", FORKED, str(tmp_path / "a.h5")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert said.stdout.split() == [str(stack[8:].sum())]

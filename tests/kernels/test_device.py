@@ -244,3 +244,24 @@ def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
 
 def test_the_example_runs():
     assert doctest.testmod(device_layer).failed == 0
+
+
+FORKED = """
+import os, signal
+from mirrorskin.kernels.device import DeviceError, open_device
+open_device({choice!r})
+if not os.fork():
+    signal.alarm(20)
+    try:
+        open_device({choice!r})
+    except DeviceError as error:
+        print(error, flush=True)
+    os._exit(0)
+os.wait()
+"""
+
+
+def test_a_forked_process_is_refused_instead_of_waiting_for_ever(device):
+    script = FORKED.format(choice=device.info.title)
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "forked from one that had used OpenCL" in said.stdout
