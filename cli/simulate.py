@@ -85,6 +85,12 @@ def command(
     release: Annotated[
         bool, Option("--release", help="Vertical: then lift it by the same steps, frames - 1 more.")
     ] = False,
+    strokes: Annotated[
+        int | None,
+        Option(
+            min=2, metavar="N", help="Vertical: N strokes down and up like a cosine, as deep as those steps."
+        ),
+    ] = None,
     compliance: Annotated[
         str | None,
         _of(
@@ -164,7 +170,7 @@ def command(
         object=thing,
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
-        movement=make_movement(motion, frames, release, given),
+        movement=make_movement(motion, frames, release, given, strokes),
         contact=contact.value,
         optics=optics.value,
         pattern=pattern,
@@ -203,7 +209,11 @@ def command(
 
 
 def make_movement(
-    motion: options.MotionName, frames: int | None, release: bool, given: Mapping[str, str | None]
+    motion: options.MotionName,
+    frames: int | None,
+    release: bool,
+    given: Mapping[str, str | None],
+    strokes: int | None = None,
 ) -> Movement:
     """Return the twin's movement that options describe; those not given have the values of ``DEFAULTS``."""
     import numpy as np
@@ -214,8 +224,9 @@ def make_movement(
 
     own = DEFAULTS[motion]
     foreign = [f"--{name}" for name, value in given.items() if value is not None and name not in own]
-    if release and motion != options.MotionName.vertical:
-        foreign.append("--release")
+    for option, value in (("--release", release), ("--strokes", strokes)):
+        if value and motion != options.MotionName.vertical:
+            foreign.append(option)
     if foreign:
         raise io.InputError(
             f"{foreign[0]} says nothing of a motion that is {motion.value}: leave it out, or choose another"
@@ -225,6 +236,10 @@ def make_movement(
     if motion == options.MotionName.vertical:
         step, start = (length(words[name], f"--{name}") for name in ("travel-step", "travel-start"))
         down = io.Steps(step, start).positions(count)
+        if strokes is not None:
+            if release:
+                raise io.InputError("--strokes go up as well: leave --release out")
+            down = twin.oscillating_travel(down[0], down[-1], strokes, count)
         travel = np.concatenate([down, down[-2::-1]]) if release else down
         return twin.Vertical(travel, compliance=compliance(words["compliance"], "--compliance"))
     press = length(words["press"], "--press")

@@ -8,6 +8,7 @@ from .metrology.measures import Measures, measure
 from .press.changepoint import ChangePointSearch, find_change_point
 from .press.holes import fill_holes
 from .press.onset import Onset, OnsetSearch, find_onset
+from .press.strokes import Strokes, StrokeSearch
 from .reconstruction import reconstruct
 from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
@@ -28,6 +29,8 @@ __all__ = [
     "Onset",
     "OnsetSearch",
     "Score",
+    "StrokeSearch",
+    "Strokes",
     "Surface",
     "correlate",
     "estimate_normals",

@@ -47,10 +47,10 @@ class Noise:
         self._given, self._integer = given, integer
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the frames so far."""
+    def reset(self, known: float | None = None) -> None:
+        """Forget the frames so far, but for what is known from others."""
         self._seen: list[NDArray[np.float64]] = []
-        self.value = self._given
+        self.value = self._given if known is None else known
 
     def look(self, frames: NDArray[Any]) -> None:
         """See the next frames, (n, H, W); only the first two of all are used."""

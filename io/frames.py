@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_stroke
+from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_strokes
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
 
 
@@ -90,7 +90,7 @@ class FrameSequence(Closing, ABC):
         self._lost = lost or [0] * shape[0]
         self._time = time
         travel, phase = self._along(travel), self._along(phase)
-        self.travel = None if travel is None else check_stroke(travel, shape[0], f"{name}: travel")
+        self.travel = None if travel is None else check_strokes(travel, shape[0], f"{name}: travel")
         self._phase = None if phase is None else check_phase(phase, shape[0], f"{name}: phase")
         self._next = 0
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.positions import check_phase, check_stroke
+from mirrorskin.io.positions import check_phase, check_strokes
 from mirrorskin.io.selection import Selection
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
@@ -51,7 +51,7 @@ POSITIONS: dict[Motion, str] = {
 }
 """Which series says where the body was, of each motion."""
 
-_CHECKS = {"travel": check_stroke, "phase": check_phase}
+_CHECKS = {"travel": check_strokes, "phase": check_phase}
 _REMEDIES = {"travel": "give --travel-step", "phase": "give --phase-step or --phases"}
 
 

@@ -67,36 +67,42 @@ def check_travel(
     return values
 
 
-def check_stroke(
+def check_strokes(
     travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
 ) -> NDArray[np.float64]:
-    """Return the travel of a press, of a release, or of one after the other, mm, as float64.
+    """Return the travel of a vertical movement, mm, as float64: strokes down and up, as many as there are.
 
-    It rises to its greatest value, where it may rest, and falls from there on; either way may be missing.
     Only that of the frames from the first to the end of ``within`` is checked and returned, if it is given.
 
     Examples
     --------
-    >>> check_stroke([0, 1, 1, 0], 4, "travel")
-    array([0., 1., 1., 0.])
+    >>> check_strokes([0, 1, 1, 0, 2], 5, "travel")
+    array([0., 1., 1., 0., 2.])
     """
-    values = _known(travel, count, name, within)
-    deepest = np.flatnonzero(values == np.max(values, initial=-np.inf))
-    frame = np.arange(1, len(values))
-    up, down = values[1:] < values[:-1], values[1:] > values[:-1]
-    back = (up & (frame <= deepest[-1:])) | (down & (frame > deepest[:1]))
-    if np.any(back):
-        at = (within or (0,))[0] + int(np.argmax(back)) + 1
-        raise InputError(
-            f"{name} runs back at frame {at}: a press goes down and its release up, once; cut it"
-        )
-    return values
+    return _known(travel, count, name, within)
+
+
+def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np.intp]:
+    """Return the frames from which on travel goes the other way than before: those after the turning points.
+
+    A stroke is a run of frames in which travel does not change its direction; a rest belongs to the stroke
+    before it. ``direction`` is that of the stroke under way in the first frame: 1 down, -1 up, 0 unknown.
+
+    Examples
+    --------
+    >>> stroke_starts(np.array([0.0, 1.0, 1.0, 0.5, 2.0])).tolist()
+    [3, 4]
+    """
+    steps = np.sign(np.diff(travel))
+    moving = np.flatnonzero(steps)
+    turned = np.diff(steps[moving], prepend=direction or (steps[moving[0]] if len(moving) else 0)) != 0
+    return np.asarray(moving[turned] + 1, np.intp)
 
 
 def check_phase(
     phase: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
 ) -> NDArray[np.float64]:
-    """Return the phases of an axial rotation, radians, as float64; ``within`` as for ``check_stroke``.
+    """Return the phases of an axial rotation, radians, as float64; ``within`` as for ``check_strokes``.
 
     Examples
     --------

@@ -18,13 +18,13 @@ from mirrorskin.io.writing import Item, process_items, write_file
 
 MARK = "mirrorskin_result"
 UNITS = (
-    dict.fromkeys(("height", "height_sigma"), "mm")
+    dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
 )
 _DTYPES = (
     dict.fromkeys(("status", "edges", "filled", "contact", "offset_unknown"), np.uint8)
-    | {"component": np.int32}
+    | {"component": np.int32, "strokes": np.uint16}
     | dict.fromkeys(("x", "y"), np.float64)
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]

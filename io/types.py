@@ -240,6 +240,10 @@ class Result:
     status : ndarray, (H, W), uint8
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
         2 dark at start, 3 light to the end.
+    hysteresis, hysteresis_sigma : ndarray, (H, W), float32
+        Millimetres by which the release is higher than the onset, and the standard deviation of that.
+    strokes : ndarray, (H, W), uint16
+        In how many strokes of an oscillating press there was what the height is made of.
     normals : ndarray, (H, W, 3), float32
         Unit vectors along x, y and z in the mean pose; NaN where there is no answer.
     zenith, azimuth : ndarray, (H, W), float32
@@ -270,6 +274,9 @@ class Result:
     height: NDArray[np.float32] | None = None
     height_sigma: NDArray[np.float32] | None = None
     status: NDArray[np.uint8] | None = None
+    hysteresis: NDArray[np.float32] | None = None
+    hysteresis_sigma: NDArray[np.float32] | None = None
+    strokes: NDArray[np.uint16] | None = None
     normals: NDArray[np.float32] | None = None
     zenith: NDArray[np.float32] | None = None
     azimuth: NDArray[np.float32] | None = None

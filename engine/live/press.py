@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.live.status import Maps
-from mirrorskin.engine.press.onset import OnsetSearch
-from mirrorskin.engine.press.press import finish_press
+from mirrorskin.engine.press.press import add_hysteresis, finish_press
+from mirrorskin.engine.press.strokes import StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.io import InputError, LiveSource, Result
@@ -23,7 +23,7 @@ _ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
 
 
 class LivePress:
-    """Heights of a press so far, by `OnsetSearch`; see `mirrorskin.engine.live.LiveEstimator`.
+    """Heights of a press so far, by `StrokeSearch`; see `mirrorskin.engine.live.LiveEstimator`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class LivePress:
             "bright": level_origin(source, "bright"),
         }
         shape = source.shape[1:]
-        self._search = OnsetSearch(
+        self._search = StrokeSearch(
             shape,
             source.dtype,
             dark=source.header.dark,
@@ -84,20 +84,20 @@ class LivePress:
 
     def warm(self) -> None:
         """Push frames of nothing, and forget them."""
-        for step in range(3):
-            self.push(np.zeros((1, *self._source.shape[1:]), self._source.dtype), travel=[float(step)])
+        for step in (0.0, 1.0, 2.0, 1.0, 0.0):
+            self.push(np.zeros((1, *self._source.shape[1:]), self._source.dtype), travel=[step])
             self.maps()
         self.reset()
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
-        """Take in the next frames; see `OnsetSearch.push`."""
+        """Take in the next frames; see `StrokeSearch.push`."""
         self._search.push(frames, travel=travel, lent=lent)
 
     def maps(self, seconds: float = math.inf, /) -> Maps:
         """Return the heights so far; none before the second frame."""
         if len(self._search.travel) < 2:
             return {}
-        onset = self._search.result()
+        onset = self._search.result().onset
         contact = np.asarray((onset.status == _ONSET) | (onset.status == _LIGHT_AT_START), np.uint8)
         return {"height": onset.height, "contact": contact, "contact_area": area_of(contact, self._source)}
 
@@ -111,14 +111,19 @@ class LivePress:
     def result(self) -> Result:
         """Return the heights, with holes filled if ``fill`` says so, and how they were found.
 
+        Of a press that turned back there is the hysteresis as well.
+
         Raises
         ------
         mirrorskin.io.InputError
             There were fewer than two frames.
         """
-        onset, travel = self._search.result(), self._search.travel
+        found, travel = self._search.result(), self._search.travel
+        onset = found.onset
         process = self._process | {"first_frame": 0, "frames": len(travel), "noise": onset.noise}
         result, done = finish_press(onset, self._source, travel, "onset", self._threshold, self._fill)
+        if found.strokes > 1:
+            result, done = add_hysteresis(result, found, "onset"), done | {"strokes": found.strokes}
         signed = attach_provenance(result, self._source, self.device, process | done | {"live": True})
         return undistorted(signed, self._source)
 

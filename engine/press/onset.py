@@ -274,10 +274,13 @@ class OnsetSearch:
             found = [band.picture(plane) for plane in (answers[0], answers[1], status[0], times[0])]
             return found if last else [plane.copy() for plane in found]
 
-    def reset(self) -> None:
-        """Forget the frames so far, and be ready for another press with the same references."""
+    def reset(self, noise: float | None = None) -> None:
+        """Forget the frames so far, and be ready for another press with the same references.
+
+        Its noise, counts, is estimated anew unless it is given.
+        """
         self._travel.clear()
-        self._noise.reset()
+        self._noise.reset(noise)
 
     @property
     def travel(self) -> NDArray[np.float64]:

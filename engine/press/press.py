@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin import io
 from mirrorskin.engine.press.changepoint import ChangePointSearch
-from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch
+from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch, check_event
+from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.positions import stroke_starts
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -44,14 +46,16 @@ def reconstruct_press(
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> Result:
-    """Reconstruct heights from a press or a release.
+    """Reconstruct heights from a press or a release; of one that oscillates also the hysteresis.
+
+    Where travel turns more than once, from a press to its release, all strokes are used: see `StrokeSearch`.
 
     Parameters
     ----------
     source : Source
         Of vertical motion. It is rewound first, if it can be.
     event : {"onset", "release"}
-        Whether to look for the light state's begin or its end.
+        Whether heights are those of the light state's begin or of its end.
     method : {"threshold", "change-point"}
         The first crossing of the threshold, or the most likely change.
     threshold, hold, subframe
@@ -83,12 +87,15 @@ def reconstruct_press(
     if method not in METHODS:
         known = ", ".join(METHODS)
         raise InputError(f"{source.name} is a press, which method {method!r} cannot do: take {known}")
-    frames = _frames_of(source, event)
+    check_event(event)
+    oscillates = _oscillates(source)
+    frames = range(source.shape[0]) if oscillates else _frames_of(source, event)
     size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
     search = _search(
         source,
         method,
         subframe,
+        oscillates,
         dark=source.header.dark if dark is None else dark,
         bright=source.header.bright if bright is None else bright,
         threshold=threshold,
@@ -103,7 +110,8 @@ def reconstruct_press(
     if isinstance(search, ChangePointSearch) and twice:
         search.start_second_pass()
         feed(source, search, frames, progress)
-    onset = search.result()
+    found = search.result()
+    onset = choose_event(found, event) if isinstance(found, Strokes) else found
     process: dict[str, ProcessValue] = {
         "first_frame": frames.start,
         "frames": len(frames),
@@ -117,7 +125,24 @@ def reconstruct_press(
         "bright": "each pixel's own" if twice else level_origin(source, "bright", bright),
     }
     result, done = finish_press(onset, source, search.travel, event, threshold, fill)
+    if isinstance(found, Strokes):
+        result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}
     return attach_provenance(result, source, search.device, process | done)
+
+
+def choose_event(strokes: Strokes, event: Event) -> Onset:
+    """Return the onsets of all strokes, or the releases."""
+    return strokes.onset if event == "onset" else strokes.release
+
+
+def add_hysteresis(result: Result, strokes: Strokes, event: Event) -> Result:
+    """Add to a press's maps what only strokes tell: hysteresis, and in how many there was the event."""
+    return replace(
+        result,
+        hysteresis=strokes.hysteresis,
+        hysteresis_sigma=strokes.hysteresis_sigma,
+        strokes=strokes.onsets if event == "onset" else strokes.releases,
+    )
 
 
 def finish_press(
@@ -156,6 +181,12 @@ def finish_press(
     return result, done
 
 
+def _oscillates(source: Source) -> bool:
+    """Tell whether a source's travel does more than go down, and then up, once; as far as it is known."""
+    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+    return travel is not None and len(stroke_starts(travel, 1)) > 1
+
+
 def _frames_of(source: Source, event: Event) -> range:
     """Return the frames in which a source was pressed, or lifted; all, where it does not know beforehand."""
     travel: NDArray[np.float64] | None = getattr(source, "travel", None)
@@ -173,10 +204,15 @@ def _frames_of(source: Source, event: Event) -> range:
 
 
 def _search(
-    source: Source, method: PressMethod, subframe: bool, **options: Any
-) -> OnsetSearch | ChangePointSearch:
+    source: Source, method: PressMethod, subframe: bool, oscillates: bool, **options: Any
+) -> OnsetSearch | ChangePointSearch | StrokeSearch:
     """Return the estimator of a method, if the source can feed it."""
     shape, dtype = source.shape[1:], source.dtype
+    if oscillates and method != "threshold":
+        raise InputError(f"{source.name}: travel oscillates, for which method 'threshold' is needed")
+    if oscillates:
+        del options["event"]  # it finds both
+        return StrokeSearch(shape, dtype, subframe=subframe, **options)
     if method == "threshold":
         return OnsetSearch(shape, dtype, subframe=subframe, **options)
     if not subframe:

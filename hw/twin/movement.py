@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.io.positions import check_phase, check_stroke
+from mirrorskin.io.positions import check_phase, check_strokes
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion
 
 TILT_MAX = math.radians(30.0)
@@ -103,7 +103,7 @@ def pose_at_lean(
 
 
 class Vertical(Movement):
-    """Press, release, or one after the other.
+    """Press, release, or strokes down and up, one after the other.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ class Vertical(Movement):
     Raises
     ------
     InputError
-        The travel is empty, not finite, or goes down again after it came up; the compliance is negative.
+        The travel is empty or not finite; the compliance is negative.
     """
 
     motion = "vertical"
     _recorded_as = "travel"
 
     def __init__(self, travel: ArrayLike, *, compliance: float = 0.0) -> None:
-        positions = check_stroke(travel, _count(travel), "travel")
+        positions = check_strokes(travel, _count(travel), "travel")
         super().__init__(positions, "travel", positions.max(initial=-math.inf))
         if not (math.isfinite(compliance) and compliance >= 0):
             raise InputError(f"compliance {compliance} mm/N cannot be: give 0 or more")
@@ -135,6 +135,18 @@ class Vertical(Movement):
     def header(self) -> Header:
         """Return the motion: there is no one press."""
         return Header(self.motion)
+
+
+def oscillating_travel(start: float, stop: float, strokes: int, frames: int) -> Floats:
+    """Return the travel of strokes down and up that follow a cosine, (frames,), mm.
+
+    Examples
+    --------
+    >>> oscillating_travel(0.0, 1.0, 2, 5).round(3).tolist()
+    [0.0, 0.5, 1.0, 0.5, 0.0]
+    """
+    swing = np.cos(np.pi * strokes * np.arange(frames) / max(1, frames - 1))
+    return np.asarray(start + (stop - start) * (1 - swing) / 2)
 
 
 class Axial(Movement):

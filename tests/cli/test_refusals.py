@@ -94,10 +94,10 @@ CASES = {
     "strings": (lambda path: foreign(path, frames=TEXT), GIVEN, "uint8, uint16 or float32"),
     "float64": (lambda path: foreign(path, frames=FRAMES.astype("f8")), GIVEN, "uint8, uint16 or float32"),
     "travel with NaN": (lambda path: ours(path, travel=NAN_TRAVEL), [], "nan at frame 3"),
-    "travel that runs back": (
+    "an oscillation for a change-point": (
         lambda path: ours(path, travel=np.abs(TRAVEL - 0.2)),
-        [],
-        "runs back at frame 1",
+        ["--method", "change-point"],
+        "bad.h5: travel oscillates, for which method 'threshold' is needed",
     ),
     "a release for a press": (
         lambda path: ours(path, travel=TRAVEL[::-1].copy()),

@@ -77,7 +77,7 @@ def test_the_object_turns_against_a_twist() -> None:
     ("make", "words"),
     [
         (lambda: Vertical([]), "travel is empty"),
-        (lambda: Vertical([0.3, 0.2, 0.4]), "travel.*frame 1"),
+        (lambda: Vertical([0.3, np.nan, 0.4]), "travel.*frame 1"),
         (lambda: Vertical([0.1], compliance=-1.0), "compliance"),
         (lambda: Axial([], 0.1, 1.0), "phase is empty"),
         (lambda: Axial([0.0, np.nan], 0.1, 1.0), "phase.*frame 1"),

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import check_phase, check_stroke, check_travel
+from mirrorskin.io.positions import check_phase, check_strokes, check_travel, stroke_starts
 
 
 @pytest.mark.parametrize(
-    "values", [[0, 1, 2, 3], [3, 2, 2, -1], [0, 2, 2, 1], [5, 5, 5, 5], np.array([0, 200, 7, 7], np.uint8)]
+    "values", [[0, 1, 2, 3], [3, 2, 2, -1], [0, 2, 2, 1], [5, 5, 5, 5], np.array([0, 200, 7, 90], np.uint8)]
 )
-def test_a_stroke_is_a_press_a_release_or_both(values):
-    found = check_stroke(values, 4, "travel")
+def test_strokes_go_either_way_any_number_of_times(values):
+    found = check_strokes(values, 4, "travel")
     np.testing.assert_array_equal(found, np.asarray(values, float))
     assert found.dtype == np.float64
 
@@ -31,9 +31,7 @@ def test_a_stroke_is_a_press_a_release_or_both(values):
             "travel runs back at frame 2: a press only goes down; cut or reverse it",
         ),
         (check_travel, np.array([3, 2, 1, 0], np.uint8), "travel runs back at frame 1"),
-        (check_stroke, [0, 2, 1, 3], "runs back at frame 2: a press goes down and its release up, once"),
-        (check_stroke, [2, 1, 2, 1], "travel runs back at frame 1"),
-        (check_stroke, np.array([3, 0, 0, 1], np.uint8), "travel runs back at frame 3"),
+        (check_strokes, [0, 2, np.nan, 3], "travel is nan at frame 2"),
         (check_phase, None, "travel is missing: an axial rotation needs the phase of each frame, in radians"),
         (check_phase, [0, np.nan, 1, 2], "travel is nan at frame 1"),
     ],
@@ -48,3 +46,18 @@ def test_a_block_goes_on_where_the_one_before_ended():
     np.testing.assert_array_equal(check_travel([2, 3], 2, "travel", after=[2.0]), [2, 3])
     with pytest.raises(InputError, match="travel runs back at frame 0"):
         check_travel([1.9, 3], 2, "travel", after=[2.0])
+
+
+@pytest.mark.parametrize(
+    ("travel", "direction", "starts"),
+    [
+        ([0.0, 1.0, 2.0], 0, []),
+        ([0.0, 1.0, 1.0, 0.5, 0.5, 2.0], 0, [3, 5]),
+        ([2.0, 1.0, 2.0], 1, [1, 2]),
+        ([2.0, 1.0, 2.0], -1, [2]),
+        ([1.0, 1.0], 1, []),
+        ([1.0], 1, []),
+    ],
+)
+def test_a_stroke_begins_where_travel_turns(travel, direction, starts):
+    assert stroke_starts(np.array(travel), direction).tolist() == starts

@@ -161,7 +161,6 @@ def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
 
 
 BAD = [
-    (f"{STAGE}/travel", np.abs(TRAVEL - 1), None, "travel runs back at frame 1"),
     (f"{STAGE}/travel", np.where(TRAVEL > 1, np.inf, TRAVEL), None, "travel is inf at frame 4"),
     (f"{STAGE}/travel", TRAVEL[:5], None, r"travel has shape \(5,\) where \(8,\) is needed: give --tr"),
     (f"{STAGE}/travel", ["0"] * 8, None, "travel holds no numbers: give --travel-step"),

@@ -83,9 +83,8 @@ def test_only_the_travel_of_the_range_must_be_right(tmp_path):
         np.testing.assert_array_equal(recording.travel, travel[2:5])
     with io.open_recording(path, motion="vertical", travel=io.Steps(0.1), frames=(2, 5)) as recording:
         np.testing.assert_allclose(recording.travel, (0.2, 0.3, 0.4))
-    for frames, line in (((1, 5), "runs back at frame 3"), ((3, 8), "is nan at frame 5")):
-        with pytest.raises(io.InputError, match=line):
-            io.open_recording(path, motion="vertical", travel=travel, frames=frames)
+    with pytest.raises(io.InputError, match="is nan at frame 5"):
+        io.open_recording(path, motion="vertical", travel=travel, frames=(3, 8))
     with pytest.raises(io.InputError, match="is nan at frame 5"):
         io.open_recording(path, motion="axial", phase=travel, frames=(3, 7))
     with pytest.raises(io.InputError, match=re.escape("has shape (3,) for 8 frames")):

@@ -150,7 +150,7 @@ def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, pa
         ("used", {}, r"a\.h5 does not say which frames a live run used: leave --live out"),
         ("live", {}, r"a\.h5 holds no positions of a live run: leave --live out"),
         ("", {"travel": np.arange(9)}, r"a live run has its own positions: leave --live out, or those given"),
-        ("back", {}, r"travel_live of the frames that were used runs back at frame 3"),
+        ("lost", {}, r"travel_live of the frames that were used is nan at frame 3"),
     ],
 )
 def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, line):
@@ -162,9 +162,8 @@ def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, l
             del file[f"{DETECTOR}/used"]
         elif prepare == "live":
             del file[f"{STAGE}/travel_live"]
-        elif prepare == "back":
-            file[f"{STAGE}/travel_live"][3:5] = 0.0
-            file[f"{STAGE}/travel_live"][8] = 0.02
+        elif prepare == "lost":
+            file[f"{STAGE}/travel_live"][3:5] = np.nan
     with pytest.raises(io.InputError, match=line):
         io.open_recording(tmp_path / "a.h5", live=True, **given)
 

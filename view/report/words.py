@@ -43,6 +43,9 @@ MAPS: Mapping[str, tuple[str, str]] = {
         "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
         "2 dark at start, 3 light to the end",
     ),
+    "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
+    "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),
+    "strokes": ("", "in how many strokes there was what the height is made of"),
     "normals": ("", "unit normals of the surface: x, y and z"),
     "zenith": ("rad", "angle between the normal and the direction to the camera"),
     "azimuth": ("rad", "direction in which the normal leans, counter-clockwise from x"),

@@ -1,0 +1,268 @@
+"""Height and hysteresis from a press that oscillates: the onsets and releases of all strokes, together."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy import special
+
+from mirrorskin.engine.press.onset import Onset, OnsetSearch
+from mirrorskin.io.positions import check_strokes, stroke_starts
+from mirrorskin.kernels.device import Device
+
+_FOUND = 1  # of an onset's status
+_ALIKE = 1e-3  # relative difference of numbers that are the same but for rounding
+_CONTRADICT = 0.001  # share of pixels without a place in all their intervals from which travel is not exact
+_UNLIKELY = 1e-3  # chance of a scatter that is taken to be more than what is predicted
+
+
+@dataclass(frozen=True, slots=True)
+class Strokes:
+    """Where a press that oscillates turned the pixels light, and dark again.
+
+    Attributes
+    ----------
+    onset, release : Onset
+        Heights of all strokes down, and of all strokes up, together; ``frame`` is that of the last stroke in
+        which there was one, -1 without one.
+    onsets, releases : ndarray, (H, W), uint16
+        Strokes in which there was one.
+    strokes : int
+        Strokes that there were.
+    """
+
+    onset: Onset
+    release: Onset
+    onsets: NDArray[np.uint16]
+    releases: NDArray[np.uint16]
+    strokes: int
+
+    @property
+    def hysteresis(self) -> NDArray[np.float32]:
+        """Height of the release less that of the onset, (H, W) float32, mm; NaN without both."""
+        return self.release.height - self.onset.height
+
+    @property
+    def hysteresis_sigma(self) -> NDArray[np.float32]:
+        """Standard deviation of the hysteresis, (H, W) float32, mm."""
+        return np.hypot(self.onset.sigma, self.release.sigma)
+
+
+class StrokeSearch:
+    """Find onsets and releases in a press that oscillates; see `mirrorskin.engine.streaming.Estimator`.
+
+    A stroke is a run of frames in which travel does not change its direction; its turning points belong to
+    both strokes. Each is searched by `OnsetSearch`. See docs/method/vibration.md for how strokes are joined.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : dtype
+        uint8, uint16 or float32.
+    **options
+        Those of `OnsetSearch`, but ``event``. An unknown noise is estimated in the first stroke.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Parameters that cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> travel = 0.5 - 0.5 * np.cos(0.8 * np.arange(60))
+    >>> frames = np.where(travel > 0.3, 255, 0).astype(np.uint8)[:, np.newaxis, np.newaxis]
+    >>> search = engine.StrokeSearch((1, 1), "uint8", noise=1.0)
+    >>> search.push(frames, travel=travel)
+    >>> strokes = search.result()
+    >>> int(strokes.onsets[0, 0]), bool(abs(strokes.onset.height[0, 0] + 0.3) < 0.03)
+    (8, True)
+    """
+
+    position = "travel"
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+        *,
+        device: str | Device | None = None,
+        **options: Any,
+    ) -> None:
+        down = OnsetSearch(shape, dtype, device=device, **options)
+        up = OnsetSearch(shape, dtype, device=down.device, **options, event="release")
+        self.device, self._searches = down.device, {1: down, -1: up}
+        self._shape = shape
+        self.reset()
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        return self._searches[1].room
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        for search in self._searches.values():
+            search.reset()
+        self._direction = 1  # a rest at the start is that before a press
+        self._joined = {sign: _JoinedOnsets(self._shape) for sign in self._searches}
+        self._travel: list[float] = []
+        self._last: NDArray[Any] | None = None
+        self._noise: float | None = None
+
+    @property
+    def travel(self) -> NDArray[np.float64]:
+        """The travel of the frames so far, (T,), mm."""
+        return np.array(self._travel, np.float64)
+
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each, mm.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Frames of another shape or type; travel is missing or not finite.
+        """
+        values = check_strokes(travel, len(frames), "travel")
+        before = self._travel[-1:]
+        turns = (stroke_starts(np.concatenate([before, values]), self._direction) - len(before)).tolist()
+        for start, stop in zip([0, *turns], [*turns, len(frames)], strict=True):
+            if start in turns and stop > start:
+                self._turn(frames[start - 1] if start > 0 else self._last)
+            if stop > start:
+                self._searches[self._direction].push(frames[start:stop], travel=values[start:stop], lent=lent)
+                self._travel += values[start:stop].tolist()
+        self._last = frames[-1].copy()
+
+    def result(self) -> Strokes:
+        """Return the maps of all strokes so far, the last of which is taken to end here; more may follow.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            There were fewer than two frames.
+        """
+        found = self._searches[self._direction].result()
+        joined = {sign: self._with_open(sign, found) for sign in self._searches}
+        noise = found.noise if self._noise is None else self._noise
+        down, up = joined[1], joined[-1]
+        return Strokes(down.onset(noise), up.onset(noise), down.count, up.count, down.strokes + up.strokes)
+
+    def _with_open(self, sign: int, found: Onset) -> _JoinedOnsets:
+        """Return the onsets of a direction's strokes, that of the open one included."""
+        if sign != self._direction:
+            return self._joined[sign]
+        joined = self._joined[sign].copy()
+        joined.add(found, self._searches[sign].travel, len(self._travel))
+        return joined
+
+    def _turn(self, turning: NDArray[Any] | None) -> None:
+        """End the open stroke, and begin the next with the frame at the turning point."""
+        assert turning is not None  # a turn needs a frame before
+        search = self._searches[self._direction]
+        if len(search.travel) > 1:
+            found = search.result()
+            self._noise = found.noise if self._noise is None else self._noise
+            self._joined[self._direction].add(found, search.travel, len(self._travel))
+        self._direction = -self._direction
+        search = self._searches[self._direction]
+        search.reset(self._noise)
+        search.push(turning[np.newaxis], travel=self._travel[-1:])
+
+
+class _JoinedOnsets:
+    """The onsets, or releases, of several strokes: sums and bounds of each pixel, (H W,).
+
+    Heights are counted from the pixel's first, mm.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        pixels = shape[0] * shape[1]
+        self._shape, self.strokes = shape, 0
+        self._first: Onset | None = None
+        self._count, self._sudden = np.zeros((2, pixels), np.uint16)
+        self._height = np.full(pixels, np.nan, np.float32)
+        self._weight, self._guessed, self._moment, self._square = np.zeros((4, pixels))
+        self._low, self._high = np.full(pixels, -np.inf), np.full(pixels, np.inf)
+        self._frame = np.full(pixels, -1, np.int32)
+
+    def copy(self) -> _JoinedOnsets:
+        """Return the same, to which more can be added."""
+        other = copy(self)
+        for name, values in vars(self).items():
+            if isinstance(values, np.ndarray):
+                setattr(other, name, values.copy())
+        return other
+
+    @property
+    def count(self) -> NDArray[np.uint16]:
+        """Strokes that had one, (H, W)."""
+        return self._count.reshape(self._shape)
+
+    def add(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
+        """Take in a stroke: its travel, and the number of the frame after it."""
+        self.strokes += int(np.ptp(travel) > 0)
+        self._first = self._first or found
+        at = np.flatnonzero(found.status == _FOUND)
+        frame = found.frame.reshape(-1)[at]
+        height = found.height.reshape(-1)[at].astype(np.float64)
+        sigma = found.sigma.reshape(-1)[at].astype(np.float64)
+        ends = -travel[frame - 1], -travel[frame]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        half = (high - low) / 2
+        guess = half / np.sqrt(3)
+        guessed = sigma >= (1 - _ALIKE) * guess
+        sudden = guessed & (sigma <= (1 + _ALIKE) * guess) & (abs(height - low - half) <= _ALIKE * half)
+
+        begins = self._count[at] == 0
+        self._height[at[begins]] = height[begins]
+        apart = height - self._height[at]
+        weight = 1 / np.maximum(sigma, np.finfo(np.float32).tiny) ** 2
+        self._count[at] += 1
+        self._sudden[at] += sudden
+        self._weight[at] += weight
+        self._guessed[at] += np.where(guessed, weight, 0.0)
+        self._moment[at] += weight * apart
+        self._square[at] += weight * apart**2
+        inside = at[guessed]
+        self._low[inside] = np.maximum(self._low[inside], low[guessed])
+        self._high[inside] = np.minimum(self._high[inside], high[guessed])
+        self._frame[at] = end - len(travel) + frame
+
+    def onset(self, noise: float) -> Onset:
+        """Join what was found in all strokes; noise is that of a sample, counts."""
+        if self._first is None:
+            nothing = np.full(self._shape, np.nan, np.float32)
+            frame = self._frame.reshape(self._shape)
+            return Onset(nothing, nothing.copy(), np.zeros(self._shape, np.uint8), frame, noise)
+        if self.strokes == 1:
+            return replace(self._first, noise=noise)
+        several, freedom = self._count > 1, np.maximum(self._count, 2) - 1.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean, width = self._moment / self._weight, self._high - self._low
+            # Strokes that pass the same places make the same error in guessing between them.
+            guessed = np.maximum(1 / self._guessed, width.clip(0) ** 2 / 12)
+            predicted = 1 / (self._weight - self._guessed + 1 / guessed)
+            square = np.where(several, self._square - mean * self._moment, 0.0)
+            overall = np.sum(square) / max(1.0, np.sum(freedom[several]))
+            limits = special.chdtri(np.arange(1, freedom.max() + 1), _UNLIKELY)
+            more = np.where(square > limits[freedom.astype(np.intp) - 1], square / freedom, overall)
+            variance = np.maximum(predicted, np.where(several, more / self._weight, 0.0))
+            sudden = several & (self._sudden == self._count)
+            shared = sudden & (width > 0)
+            if np.count_nonzero(shared) < (1 - _CONTRADICT) * np.count_nonzero(sudden):
+                shared[:] = False
+            height = np.where(shared, (self._low + self._high) / 2, self._height + np.where(several, mean, 0))
+            sigma = np.sqrt(np.where(shared, width**2 / 12, variance))
+        found = self.count > 0
+        maps = (one.astype(np.float32).reshape(self._shape) for one in (height, sigma))
+        height_map, sigma_map = (np.where(found, one, np.float32(np.nan)) for one in maps)
+        status = np.where(found, np.uint8(_FOUND), self._first.status)
+        return Onset(height_map, sigma_map, status, self._frame.reshape(self._shape), noise)

@@ -1,0 +1,175 @@
+"""Onsets and releases of an oscillating press, against truth that is known and against the single search."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, hw, io
+from mirrorskin.engine.live import LivePress
+from mirrorskin.hw.twin import Camera, Vertical, oscillating_travel
+
+DARK, BRIGHT, NOISE = 20.0, 220.0, 2.0
+
+
+def made_press(travel, depth, hysteresis=0.0, rise=1e-9, jitter=0.0, seed=1):
+    """Frames of pixels that turn light at a travel and dark again at another; each pixel alone, no twin."""
+    random = np.random.default_rng(seed)
+    light, frames = np.zeros(depth.shape), []
+    for place, step in zip(
+        travel + random.normal(0, jitter, len(travel)), np.diff(travel, prepend=travel[0]), strict=True
+    ):
+        at = depth - (hysteresis if step < 0 else 0.0)
+        light = np.clip((place - at) / rise + 0.5, 0, 1)
+        frames.append(DARK + (BRIGHT - DARK) * light + random.normal(0, NOISE, depth.shape))
+    return np.clip(np.rint(frames), 0, 255).astype(np.uint8)
+
+
+def strokes_of(frames, travel, blocks=(), **options):
+    search = engine.StrokeSearch(
+        frames.shape[1:], frames.dtype, **({"dark": DARK, "bright": BRIGHT} | options)
+    )
+    for part in np.split(np.arange(len(frames)), blocks):
+        search.push(frames[part], travel=travel[part])
+    return search.result()
+
+
+def chi_square(onset, truth):
+    return float(np.nanmean(((onset.height - truth) / onset.sigma) ** 2))
+
+
+DEPTH = np.random.default_rng(2).uniform(0.1, 1.1, (50, 60))
+UNEVEN = 0.6 - 0.6 * np.cos(0.388 * np.arange(154))  # no two strokes pass the same places
+EVEN = oscillating_travel(0.0, 1.2, 16, 161)
+
+
+@pytest.mark.parametrize("travel", [UNEVEN, EVEN], ids=["uneven", "even"])
+@pytest.mark.parametrize("hysteresis", [0.0, 0.07])
+def test_onset_release_and_hysteresis_are_unbiased_and_as_sure_as_they_say(travel, hysteresis):
+    found = strokes_of(made_press(travel, DEPTH, hysteresis), travel)
+    lower = DEPTH - hysteresis
+    for onset, truth in ((found.onset, -DEPTH), (found.release, -lower)):
+        known = (onset.status == 1) & (DEPTH > 0.2)
+        error = (onset.height - truth)[known]
+        assert known.sum() > 2500
+        assert abs(error.mean()) < 4 * np.sqrt(np.mean(onset.sigma[known] ** 2) / 50)  # few are independent
+        assert np.mean((error / onset.sigma[known]) ** 2) == pytest.approx(1, abs=0.1)
+
+
+def test_hysteresis_is_the_difference_of_both():
+    found = strokes_of(made_press(UNEVEN, DEPTH, 0.07), UNEVEN)
+    miss = (found.hysteresis - 0.07)[DEPTH > 0.2]
+    assert abs(miss.mean()) < 1e-3
+    assert np.mean((miss / found.hysteresis_sigma[DEPTH > 0.2]) ** 2) == pytest.approx(1, abs=0.25)
+
+
+def test_strokes_that_pass_other_places_tell_more_than_their_mean_would():
+    """Intervals overlap in ever less: of n strokes the error falls as 1 / n, a mean's as 1 / sqrt(n)."""
+    found = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
+    single = engine.find_onset(made_press(UNEVEN, DEPTH)[:9], UNEVEN[:9], dark=DARK, bright=BRIGHT)
+    rms = [np.sqrt(np.nanmean((one.height + DEPTH) ** 2)) for one in (single, found.onset)]
+    assert rms[1] < 0.7 * rms[0] / np.sqrt(np.median(found.onsets))
+
+
+def test_a_scatter_beyond_what_is_predicted_counts():
+    found = strokes_of(made_press(UNEVEN, DEPTH, jitter=0.05), UNEVEN)
+    inner = (DEPTH > 0.3) & (DEPTH < 0.9)
+    exact = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
+    assert np.median(found.onset.sigma[inner]) > 2 * np.median(exact.onset.sigma[inner])
+    assert np.mean(((found.onset.height + DEPTH) / found.onset.sigma)[inner] ** 2) < 1.3
+
+
+def test_samples_on_the_way_are_averaged_by_inverse_variance():
+    found = strokes_of(made_press(UNEVEN, DEPTH, rise=0.5), UNEVEN, noise=NOISE)
+    inner = (DEPTH > 0.35) & (DEPTH < 0.85)
+    error = (found.onset.height + DEPTH)[inner]
+    assert np.sqrt(np.mean(error**2)) < 0.003
+    assert 0.85 < np.mean((error / found.onset.sigma[inner]) ** 2) < 1.1
+
+
+def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
+    travel = UNEVEN[:60]
+    frames = made_press(travel, DEPTH[:9, :13])
+    whole = strokes_of(frames, travel, device=device)
+    for blocks in (range(1, 60), [7, 8, 9, 17, 40]):
+        parts = strokes_of(frames, travel, blocks, device=device)
+        for name in ("onset", "release"):
+            for field in ("height", "sigma", "status", "frame"):
+                ours, theirs = (getattr(getattr(one, name), field) for one in (whole, parts))
+                np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_array_equal(whole.onsets, parts.onsets)
+        assert whole.strokes == parts.strokes
+
+
+def test_one_stroke_is_the_press_bit_by_bit():
+    travel = np.linspace(0, 1.2, 30)
+    frames = made_press(travel, DEPTH)
+    found, press = strokes_of(frames, travel), engine.find_onset(frames, travel, dark=DARK, bright=BRIGHT)
+    for field in ("height", "sigma", "status", "frame"):
+        np.testing.assert_array_equal(getattr(found.onset, field), getattr(press, field))
+    assert found.onset.noise == press.noise
+    assert np.isnan(found.release.height).all()
+
+
+def test_a_first_stroke_up_is_one_of_releases():
+    travel = 1.2 - oscillating_travel(0.0, 1.2, 3, 46)
+    found = strokes_of(made_press(travel, DEPTH), travel)
+    known = DEPTH > 0.2
+    assert found.strokes == 3
+    assert np.all(found.releases[known] == 2)
+    assert np.all(found.onsets[known] == 1)
+    assert chi_square(found.onset, -DEPTH) < 1.5
+
+
+def test_a_search_that_was_reset_remembers_nothing():
+    frames = made_press(UNEVEN, DEPTH)
+    search = engine.StrokeSearch(DEPTH.shape, np.uint8, dark=DARK, bright=BRIGHT)
+    search.push(255 - frames, travel=UNEVEN)
+    search.reset()
+    search.push(frames, travel=UNEVEN)
+    np.testing.assert_array_equal(search.result().onset.height, strokes_of(frames, UNEVEN).onset.height)
+
+
+@pytest.fixture(scope="module")
+def dither():
+    travel = oscillating_travel(0.0, 1.2, 9, 83)
+    return hw.Twin(
+        object="sphere", shape=(48, 48), pixel_size=0.16, movement=Vertical(travel), camera=Camera(seed=4)
+    )
+
+
+def test_a_source_that_oscillates_is_reconstructed_from_all_its_strokes(dither):
+    result = engine.reconstruct(dither, fill=False)
+    error = result.height - dither.truth.height
+    inner = result.strokes > 1
+    assert result.process["strokes"] == 9
+    assert inner.sum() > 900
+    assert np.sqrt(np.mean(error[inner] ** 2)) < 0.02
+    assert 0.75 < np.mean((error[inner] / result.height_sigma[inner]) ** 2) < 1.25
+    up = engine.reconstruct(dither, fill=False, event="release")
+    np.testing.assert_array_equal(up.hysteresis, result.hysteresis)
+    np.testing.assert_allclose((up.height - result.height)[inner], result.hysteresis[inner], atol=1e-6)
+
+
+def test_it_works_live_and_through_a_file(dither, tmp_path):
+    exact = engine.reconstruct(dither, fill=False)
+    live = LivePress(dither, fill=False)
+    live.warm()
+    dither.rewind()
+    while (block := dither.read(live.room[:5])) is not None:
+        live.push(block.frames, travel=block.travel)
+        live.maps()
+    found = live.result()
+    io.save_result(exact, tmp_path / "result.h5")
+    read = io.open_result(tmp_path / "result.h5")
+    for name in ("height", "height_sigma", "status", "hysteresis", "hysteresis_sigma", "strokes"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(exact, name))
+        np.testing.assert_array_equal(getattr(read, name), getattr(exact, name))
+    assert read.strokes.dtype == np.uint16
+
+
+def test_what_needs_one_press_is_refused():
+    with pytest.raises(io.InputError, match="travel is nan at frame 1"):
+        strokes_of(made_press(UNEVEN[:3], DEPTH), np.array([0, np.nan, 1]))
+    with pytest.raises(io.InputError, match="1 frames has no onset"):
+        strokes_of(made_press(UNEVEN[:1], DEPTH), UNEVEN[:1])
