@@ -76,7 +76,9 @@ RECORDED = {
 
 
 def test_strokes_go_up_and_down_as_far_as_the_steps_would():
-    found, _ = simulate("vertical", "--travel-start", "0.5mm", "--travel-step", "0.2mm", "--strokes", "2")
+    found, _ = simulate(
+        "vertical", "--travel-start", "0.5mm", "--travel-step", "0.2mm", "--strokes", "2", "--frames", "5"
+    )
     np.testing.assert_allclose(found.travel, 0.5 + 0.8 * np.array([0, 0.5, 1, 0.5, 0]), atol=1e-12)
     assert_refused(["axial", "--strokes", "3", "-o", "a.h5"], "--strokes says nothing of a motion")
     assert_refused(["vertical", "--strokes", "3", "--release", "-o", "a.h5"], "leave --release out")
