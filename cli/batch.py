@@ -20,6 +20,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.output import printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -201,7 +202,7 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
             click.echo(f"failed: {_problem(outcome)}")
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
-    click.echo(f"{_printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
+    click.echo(f"{printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:
@@ -229,14 +230,7 @@ def _problem(outcome: Outcome) -> str:
     """Tell in a line what is wrong, and with which file."""
     name, message = str(outcome.job.source), " ".join(outcome.message.split())
     message = _OPTIONS.sub(r"\1 in [stack] of --settings", message)
-    return _printable(message if name in message else f"{name}: {message}")
-
-
-def _printable(text: str) -> str:
-    """Return a text of one line that any output takes: a file's name may be any bytes."""
-    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
-    known = text.encode(encoding, "replace").decode(encoding)
-    return "".join(letter if letter.isprintable() else "?" for letter in known)
+    return printable(message if name in message else f"{name}: {message}")
 
 
 class _Show:
@@ -252,7 +246,7 @@ class _Show:
         """Take note of what became of a job."""
         if not self._wanted:
             return
-        line = f"{outcome.state}: {_printable(str(outcome.job.source))}"
+        line = f"{outcome.state}: {printable(str(outcome.job.source))}"
         if outcome.state == "failed":
             line = f"failed: {_problem(outcome)}"
         elif outcome.state == "done":
@@ -303,11 +297,11 @@ class _Table(_Show):
         for one in last:
             state = _problem(one) if one.state == "failed" else one.state
             speed = _speed(one) if one.bytes else ""
-            cells = _printable(str(one.job.source)), one.motion, state, f"{one.seconds:.2f}", speed
+            cells = printable(str(one.job.source)), one.motion, state, f"{one.seconds:.2f}", speed
             table.add_row(*map(Text, cells))
         for job, (start, frames) in running:
             state = f"{frames} frames" if frames else "begun"
-            table.add_row(Text(_printable(str(job.source))), "", state, f"{time.monotonic() - start:.2f}", "")
+            table.add_row(Text(printable(str(job.source))), "", state, f"{time.monotonic() - start:.2f}", "")
         return Group(table, self._bar)
 
 

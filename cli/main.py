@@ -93,7 +93,9 @@ class _OneLine:
         if kind is not None and kind.__name__ == _HELP:
             sys.stderr.write(f"{message}\n")
         else:
-            sys.stderr.write(f"mirrorskin: {' '.join(message.split())}\n")
+            from mirrorskin.cli.output import printable
+
+            sys.stderr.write(f"mirrorskin: {printable(' '.join(message.split()))}\n")
         sys.exit(code)
 
 

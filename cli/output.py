@@ -33,7 +33,7 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
         facts = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
-        click.echo(", ".join([f"{path}: {summary}", *_words(**pieces)]))
+        click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))
 
 
 def _pieces(result: Result) -> dict[str, int]:
@@ -54,6 +54,16 @@ def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
         yield "offset unknown" if offset_unknown == components else f"offset unknown of {offset_unknown}"
 
 
+def printable(text: object) -> str:
+    """Return a text of one line that any output takes.
+
+    What comes from a file, and a file's name, may hold any letters: those that steer terminals, too.
+    """
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    known = str(text).encode(encoding, "replace").decode(encoding)
+    return "".join(letter if letter.isprintable() else "?" for letter in known)
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; dataclasses become objects, and what is no number null."""
     click.echo(json.dumps(_plain(value), indent=2))
@@ -63,14 +73,15 @@ def print_fields(fields: Mapping[str, object]) -> None:
     """Print names and values in two columns."""
     width = max(map(len, fields), default=0)
     for name, value in fields.items():
-        click.echo(f"{name:<{width}}  {value}")
+        click.echo(f"{printable(name):<{width}}  {printable(value)}")
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under their heads, in columns as wide as they need."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
-        click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+        cells = (f"{printable(cell):<{width}}" for cell, width in zip(row, widths, strict=True))
+        click.echo("  ".join(cells).rstrip())
 
 
 def _plain(value: Any) -> Any:
@@ -90,11 +101,12 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
     for what, remedy in remedies.items():
         said = str(process.get(what))
         if said.startswith(_UNTOLD):
-            click.echo(f"{name}: no {what}: {said.removeprefix(_UNTOLD)}; give {remedy}", err=True)
+            said = said.removeprefix(_UNTOLD)
+            click.echo(printable(f"{name}: no {what}: {said}; give {remedy}"), err=True)
     gel = str(process.get("gel", ""))
     if gel and gel != _NO_GEL:
         what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
-        click.echo(f"{name}: heights {what}", err=True)
+        click.echo(printable(f"{name}: heights {what}"), err=True)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mirrorskin.cli.output import report_missing_maps
+from mirrorskin.cli.output import print_fields, report_missing_maps
 
 
 @pytest.mark.parametrize(
@@ -27,3 +27,8 @@ from mirrorskin.cli.output import report_missing_maps
 def test_what_is_missing_and_what_a_gel_did_is_told_in_a_line(process, said, capsys):
     report_missing_maps("a.h5", process, {"height": "it"})
     assert capsys.readouterr() == ("", f"{said}\n" if said else "")
+
+
+def test_no_text_of_a_file_steers_the_terminal_or_forges_a_line(capsys):
+    print_fields({"title": "a\x1b[2J\x07b\nkind  result\u202e"})
+    assert capsys.readouterr().out == "title  a?[2J?b?kind  result?\n"
