@@ -24,6 +24,7 @@ Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
 Shape = tuple[int, ...]
 
 _LINKS_DEEP = 16
+_MOST_STEPS = 100_000  # along links, and to the sources of virtual datasets
 
 
 class Hdf5File(Closing):
@@ -38,6 +39,7 @@ class Hdf5File(Closing):
             self.root = _open_file(path, real)
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
+        self._steps = 0
         self._sound: set[bytes] = set()  # names of files whose texts of variable length can be read
 
     def close(self) -> None:
@@ -203,7 +205,16 @@ class Hdf5File(Closing):
             node.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
         return values
 
+    def count_step(self, node: Node) -> None:
+        """Raise InputError if a file leads from place to place without end."""
+        self._steps += 1
+        if self._steps > _MOST_STEPS:
+            raise InputError(
+                f"{self.where(node)}: its links lead on and on; copy the frames into one dataset"
+            )
+
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
+        self.count_step(node)
         with as_input_error(lambda: f"{self.where(node)}: {part}"):
             name = part.encode(errors="surrogateescape")
             if not isinstance(node, h5py.Group) or not node.id.links.exists(name):
@@ -396,6 +407,7 @@ def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
 def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dataset:
     """Return the dataset that a part of a virtual one comes from; InputError if it is not there."""
     what = f"the virtual dataset {dataset.name}"
+    file.count_step(dataset)
     origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
     source = file.walk(origin, part.dset_name)
     if not isinstance(source, h5py.Dataset):

@@ -211,8 +211,10 @@ class Layout:
         return self._above_zero((x, y))
 
     def _above_zero(self, pixel_size: tuple[float, float]) -> tuple[float, float]:
-        if not all(0 < size < np.inf for size in pixel_size):
-            raise InputError(f"{self._file.path}: pixel size {pixel_size} mm: give --pixel-size, above zero")
+        if not all(1e-9 < size < 1e6 for size in pixel_size):
+            raise InputError(
+                f"{self._file.path}: pixel size {pixel_size} mm: give --pixel-size, above zero: 1e-9 to 1e6"
+            )
         return pixel_size
 
     def _reference(self, name: str) -> NDArray[np.float32] | None:

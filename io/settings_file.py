@@ -39,6 +39,8 @@ def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
     2.0
     """
     path = Path(path)
+    if path.is_fifo():  # which may have no writer
+        raise InputError(f"{path} is no regular file: save what it gives in one first")
     try:
         with path.open("rb") as file:
             tables = tomllib.load(file)

@@ -34,6 +34,7 @@ _NOUN: dict[Kind, str] = {
     "time": "a time",
     "memory": "an amount of memory",
 }
+_LONGEST = 40  # letters of a unit in a file
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given single names only
 
 
@@ -56,13 +57,14 @@ def conversion_factor(unit: str, wanted: str, where: str) -> float:
     over, _, base = wanted.rpartition("/")
     given_over, _, symbol = unit.rpartition("/")
     try:
-        if given_over != over:
+        if given_over != over or len(unit) > _LONGEST:
             raise ValueError(f"{unit} is no {wanted}")
         (kind,) = (kind for kind, name in BASE.items() if name == base)
         factor = in_base(symbol, kind)
     except ValueError as error:
         raise InputError(
-            f"{where} is in {unit!r}, which cannot be turned into {wanted}: correct its attribute units"
+            f"{where} is in {unit[:_LONGEST]!r}, which cannot be turned into {wanted}: "
+            "correct its attribute units"
         ) from error
     return 1 / factor if over else factor
 

@@ -157,6 +157,7 @@ CASES = {
     ),
     "an incomplete truth": (change("truth/zenith"), [], "/entry/truth has no zenith"),
     "a negative pixel": (change(f"{DETECTOR}/x_pixel_size", -1.0), [], "above zero"),
+    "an endless pixel": (change(f"{DETECTOR}/x_pixel_size", 1e308), [], "above zero: 1e-9 to 1e6"),
     "a pixel that is no number": (
         change(f"{DETECTOR}/x_pixel_size", np.nan),
         [],

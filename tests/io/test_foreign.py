@@ -392,3 +392,20 @@ def test_what_is_neither_number_nor_text_is_refused(path):
         file.create_dataset("x", (), h5py.vlen_dtype(np.int32))
     with Hdf5File(path) as file, pytest.raises(io.InputError, match="neither numbers nor text"):
         file.value(file.find("/x"))
+
+
+def test_links_that_branch_without_end_are_refused(path):
+    with h5py.File(path, "w") as file:
+        file["x"], file["link0"] = STACK, h5py.SoftLink("/")
+        for depth in range(1, 16):
+            file[f"link{depth}"] = h5py.SoftLink("/" + "/".join([f"link{depth - 1}"] * 4))
+    refused(path, "its links lead on and on", dataset="link15/x")
+
+
+def test_a_unit_of_many_letters_is_refused_in_a_line(path):
+    with h5py.File(path, "w") as file:
+        file["x"] = np.ones(3)
+        file["x"].attrs["units"] = "m" * 50_000
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="cannot be turned into mm") as caught:
+        file.read(file.find("/x"), (3,), unit="mm")
+    assert len(str(caught.value)) < 450

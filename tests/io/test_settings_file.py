@@ -1,3 +1,4 @@
+import os
 from typing import Annotated, Literal
 
 import msgspec
@@ -90,3 +91,9 @@ def test_a_file_that_is_no_text_or_missing(tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(io.InputError, match="is not text"):
         load_toml(path, Rig, "docs/rig.md")
+
+
+def test_a_pipe_that_nobody_writes_to_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "rig.toml")
+    with pytest.raises(io.InputError, match="is no regular file: save what it gives in one first"):
+        load_toml(tmp_path / "rig.toml", Rig, "docs/rig.md")
