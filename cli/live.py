@@ -35,7 +35,7 @@ _REMEDIES = {
 
 def command(
     context: click.Context,
-    motion: scans.Motion,
+    motion: scans.LiveMotion,
     rig_file: scans.RigFile,
     record: Annotated[
         Path | None, Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
@@ -172,16 +172,16 @@ class _Live:
     def _make_estimator(self, source: LiveSource, rate: float) -> LivePress | LiveRotation:
         """Make what estimates the maps; the source has its references."""
         from mirrorskin.engine.live import LivePress, LiveRotation, choose_window
-        from mirrorskin.hw.rig.plans import VerticalPlan
+        from mirrorskin.hw.rig.plans import AxialPlan
 
         given, plan = self._given, self._plan
         known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
-        if isinstance(plan, VerticalPlan):
-            threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
-            hold = _HOLD if given["hold"] is None else given["hold"]
-            return LivePress(source, threshold=threshold, hold=hold, **known)
-        window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
-        return LiveRotation(source, window=window, every=every, **known)
+        if isinstance(plan, AxialPlan):
+            window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
+            return LiveRotation(source, window=window, every=every, **known)
+        threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
+        hold = _HOLD if given["hold"] is None else given["hold"]
+        return LivePress(source, threshold=threshold, hold=hold, **known)
 
     def _save(self) -> None:
         """Write the result, if that is asked for, and say what it lacks."""

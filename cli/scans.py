@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +13,7 @@ import click
 from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
+    from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, TwistPlan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
     from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
@@ -26,10 +26,21 @@ SETTLE = "100ms"
 _START = "0mm"
 _TILT = "2.5deg"
 _TURNS = 1.0
+_DIRECTION = "0deg"
+_WAIT = "500ms"
 
 
 class ScanName(StrEnum):
     """Motions that a rig can do."""
+
+    vertical = "vertical"
+    axial = "axial"
+    horizontal = "horizontal"
+    twist = "twist"
+
+
+class LiveName(StrEnum):
+    """Motions that are reconstructed while a rig does them."""
 
     vertical = "vertical"
     axial = "axial"
@@ -40,12 +51,25 @@ def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
 
 
 Motion = Annotated[ScanName, Argument(help="How the body moves.")]
+LiveMotion = Annotated[LiveName, Argument(help="How the body moves.")]
 RigFile = Annotated[Path, Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
 Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
 Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
-Step = Annotated[str | None, _option("LENGTH", "Vertical, in steps: from place to place.")]
-Speed = Annotated[str | None, _option("LENGTH/s", "Vertical, without a halt: 0.5mm/s.")]
-Press = Annotated[str | None, _option("LENGTH", "Axial: how far the body is lowered.")]
+Step = Annotated[
+    str | None, _option("LENGTH", "But axial, in steps: from place to place; of a twist an angle, 1deg.")
+]
+Speed = Annotated[
+    str | None, _option("LENGTH/s", "But axial, without a halt: 0.5mm/s; of a twist an angle, 2deg/s.")
+]
+Press = Annotated[str | None, _option("LENGTH", "But vertical: how far the body is lowered.")]
+Distance = Annotated[str | None, _option("LENGTH", "Horizontal: how far the body slides.")]
+Direction = Annotated[str | None, _option("ANGLE", "Horizontal: from x towards y, where to.", _DIRECTION)]
+Angle = Annotated[
+    str | None, _option("ANGLE", "Twist: how far the body turns, counter-clockwise, or back if negative.")
+]
+Wait = Annotated[
+    str | None, _option("TIME", "Horizontal and twist: at rest, pressed, before the body moves.", _WAIT)
+]
 Tilt = Annotated[str | None, _option("ANGLE", "Axial: half-angle of the precession.", _TILT)]
 Turns = Annotated[float | None, _option("N", "Axial: how often it goes round.", 1)]
 PhaseStep = Annotated[str | None, _option("ANGLE", "Axial, in steps: from place to place, 45deg.")]
@@ -54,10 +78,15 @@ Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first
 StepFrames = Annotated[int | None, Option("--frames", min=1, help="In steps: at each place.")]
 
 
-# The options of one motion only; threshold, hold and window are live's.
-_OWN: Mapping[ScanName, tuple[str, ...]] = {
-    ScanName.vertical: ("start", "stop", "step", "speed", "threshold", "hold"),
-    ScanName.axial: ("press", "tilt", "turns", "phase_step", "rate", "window"),
+# The motions of an option that not all have; threshold, hold and window are live's.
+_OF: Mapping[str, str] = {
+    **dict.fromkeys(("start", "stop", "threshold", "hold"), "vertical"),
+    **dict.fromkeys(("step", "speed"), "vertical horizontal twist"),
+    **dict.fromkeys(("tilt", "turns", "phase_step", "rate", "window"), "axial"),
+    "press": "axial horizontal twist",
+    **dict.fromkeys(("distance", "direction"), "horizontal"),
+    "angle": "twist",
+    "wait": "horizontal twist",
 }
 
 
@@ -67,14 +96,16 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
     from mirrorskin.io import InputError
 
     motion = ScanName(words["motion"])
-    others = [name for other in ScanName if other != motion for name in _OWN[other]]
-    foreign = [name for name in others if words.get(name) is not None]
+    foreign = [
+        name for name, of in _OF.items() if words.get(name) is not None and motion.value not in of.split()
+    ]
     if foreign:
         raise InputError(
             f"--{foreign[0].replace('_', '-')} says nothing of a motion that is {motion.value}:"
             " leave it out, or choose the other"
         )
-    plan: Plan = _vertical(words) if motion == ScanName.vertical else _axial(words)
+    makers = {"vertical": _vertical, "axial": _axial, "horizontal": _horizontal, "twist": _twist}
+    plan: Plan = makers[motion.value](words)
     check_steps(plan, words["settle"], words["frames"])
     check_plan(plan, settings.stage, settings.name)
     return plan
@@ -149,12 +180,33 @@ def _vertical(words: Mapping[str, Any]) -> VerticalPlan:
     from mirrorskin.cli.quantity import length
     from mirrorskin.hw.rig.plans import VerticalPlan
 
-    step, speed = words["step"], words["speed"]
-    return VerticalPlan(
-        length(words["start"] or _START, "--start"),
-        length(_needed(words["stop"], "--stop", "2mm"), "--stop"),
-        None if step is None else length(step, "--step"),
-        None if speed is None else _speed(speed),
+    start = length(words["start"] or _START, "--start")
+    stop = length(_needed(words["stop"], "--stop", "2mm"), "--stop")
+    return VerticalPlan(start, stop, **_pace(words, length, "0.5mm/s"))
+
+
+def _horizontal(words: Mapping[str, Any]) -> HorizontalPlan:
+    from mirrorskin.cli.quantity import angle, duration, length
+    from mirrorskin.hw.rig.plans import HorizontalPlan
+
+    return HorizontalPlan(
+        length(_needed(words["press"], "--press", "1mm"), "--press"),
+        length(_needed(words["distance"], "--distance", "0.5mm"), "--distance"),
+        angle(words["direction"] or _DIRECTION, "--direction"),
+        wait=duration(words["wait"] or _WAIT, "--wait"),
+        **_pace(words, length, "0.5mm/s"),
+    )
+
+
+def _twist(words: Mapping[str, Any]) -> TwistPlan:
+    from mirrorskin.cli.quantity import angle, duration, length
+    from mirrorskin.hw.rig.plans import TwistPlan
+
+    return TwistPlan(
+        length(_needed(words["press"], "--press", "1mm"), "--press"),
+        angle(_needed(words["angle"], "--angle", "10deg"), "--angle"),
+        wait=duration(words["wait"] or _WAIT, "--wait"),
+        **_pace(words, angle, "2deg/s"),
     )
 
 
@@ -172,15 +224,20 @@ def _axial(words: Mapping[str, Any]) -> AxialPlan:
     )
 
 
-def _speed(text: str) -> float:
-    """Read a speed, as in ``0.5mm/s``, in mm/s."""
-    from mirrorskin.cli.quantity import length
+def _pace(
+    words: Mapping[str, Any], quantity: Callable[[str, str], float], example: str
+) -> dict[str, float | None]:
+    """Read the step and the speed, as in ``0.5mm/s``, of which one is given, in mm or rad."""
     from mirrorskin.io import InputError
 
-    distance, slash, second = text.strip().rpartition("/")
-    if not slash or second.strip() != "s":
-        raise InputError(f"--speed {text}: a length for each second is needed; write e.g. 0.5mm/s")
-    return length(distance, "--speed")
+    step, speed = words["step"], words["speed"]
+    found = {"step": None if step is None else quantity(step, "--step"), "speed": None}
+    if speed is not None:
+        distance, slash, second = speed.strip().rpartition("/")
+        if not slash or second.strip() != "s":
+            raise InputError(f"--speed {speed}: so much each second is needed; write e.g. {example}")
+        found["speed"] = quantity(distance, "--speed")
+    return found
 
 
 def _needed(value: str | None, option: str, example: str) -> str:

@@ -14,6 +14,10 @@ from mirrorskin.cli.groups import Group, Option
 _LOOK = 0.2  # seconds from one look whether all is well to the next
 _PRESS = "vertical --stop 1.5mm --speed 0.5mm/s"
 _TURN = "axial --press 1mm --rate 0.5"  # which needs the zenith's scale
+_SIDEWAYS = (
+    "horizontal --press 1mm --distance 0.5mm --step 0.1mm",
+    "twist --press 1mm --angle 10deg --step 2deg",
+)
 
 app = Group(help="Emulate a whole rig: its stage and its camera.", no_args_is_help=True)
 
@@ -86,4 +90,6 @@ def _tell(rig: Path, movements: list[str]) -> str:
             f"  mirrorskin reconstruct {name}.h5",
             f"  mirrorskin live {movement} --rig {rig}",
         ]
+    for movement in _SIDEWAYS:
+        said.append(f"  mirrorskin capture {movement} --rig {rig} -o {movement.split()[0]}.h5")
     return "\n".join([*said, "Ctrl-C ends the rig"])

@@ -4,7 +4,7 @@ from .camera_thread import ThreadedCamera
 from .emulator.rig import EmulatedRig
 from .errors import HardwareError
 from .grbl.stage import GrblStage
-from .rig.plans import AxialPlan, VerticalPlan
+from .rig.plans import AxialPlan, HorizontalPlan, TwistPlan, VerticalPlan
 from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
@@ -19,6 +19,7 @@ __all__ = [
     "EmulatedRig",
     "GrblStage",
     "HardwareError",
+    "HorizontalPlan",
     "Limits",
     "Live",
     "Position",
@@ -27,6 +28,7 @@ __all__ = [
     "SweepScan",
     "ThreadedCamera",
     "Twin",
+    "TwistPlan",
     "VerticalPlan",
     "VideoCamera",
     "load_rig",

@@ -10,7 +10,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
@@ -22,6 +22,7 @@ from mirrorskin.io.settings_file import load_toml
 
 _USER = re.compile("//[^/]*@")
 _STEEPEST = 90.0  # degrees
+_ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
@@ -36,7 +37,7 @@ _Reference = Annotated[
 
 
 class Axis(msgspec.Struct, frozen=True, kw_only=True):
-    """An axis of the machine, and the motion that it makes; see `TravelAxis` and `TiltAxis`.
+    """An axis of the machine, and the motion that it makes; see the classes below.
 
     The machine's coordinate is ``zero + direction * value``, with the value in the axis's own unit.
     """
@@ -97,9 +98,57 @@ class TravelAxis(Axis, frozen=True, kw_only=True):
     speed: Annotated[float, Meta(gt=0, description="a speed above 0, in mm a second,", examples=[5.0])]
 
 
-class TiltAxis(Axis, frozen=True, kw_only=True):
+class CentredAxis(Axis, frozen=True, kw_only=True):
+    """An axis that must be able to go to 0, where the body is before and after all else."""
+
+    _ZERO: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        Axis.__post_init__(self)
+        low, high = self.limits
+        if not low < 0 < high:
+            raise ValueError(
+                f"limits [{low:g}, {high:g}] do not have 0 ({self._ZERO}) within; "
+                "set zero to the machine's coordinate there, and limits on both sides of it"
+            )
+
+
+class ShiftAxis(CentredAxis, frozen=True, kw_only=True):
+    """An axis along the sheet, x or y; 0 is where the body is lowered."""
+
+    _ZERO = "where the body is lowered"
+    zero: Annotated[float, Meta(description="a finite number of mm", examples=[0.0])] = 0.0
+    unit: Literal["mm"] = "mm"
+    limits: Annotated[
+        tuple[float, float],
+        Meta(description="a list of the least and the greatest value, in mm,", examples=[[-2.0, 2.0]]),
+    ]
+    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in mm a second,", examples=[1.0])]
+
+
+class TwistAxis(CentredAxis, frozen=True, kw_only=True):
+    """The axis that turns the body about its own axis; 0 is where the body is lowered."""
+
+    _ZERO = "where the body is lowered"
+    zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
+    unit: Literal["deg"] = "deg"
+    limits: Annotated[
+        tuple[
+            Annotated[float, Meta(ge=-_ROUND, le=_ROUND)],
+            Annotated[float, Meta(ge=-_ROUND, le=_ROUND)],
+        ],
+        Meta(
+            description="a list of the least and the greatest angle, from -360 to 360 degrees,",
+            examples=[[-45.0, 45.0]],
+        ),
+    ]
+    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
+
+
+class TiltAxis(CentredAxis, frozen=True, kw_only=True):
     """An axis of the lean, pitch or roll; 0 is upright."""
 
+    _ZERO = "upright"
     zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
     unit: Literal["deg"] = "deg"
     limits: Annotated[
@@ -113,15 +162,6 @@ class TiltAxis(Axis, frozen=True, kw_only=True):
         ),
     ]
     speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
-
-    def __post_init__(self) -> None:
-        Axis.__post_init__(self)
-        low, high = self.limits
-        if not low < 0 < high:
-            raise ValueError(
-                f"limits [{low:g}, {high:g}] do not have 0 (upright) within; "
-                "set zero to the machine's coordinate there, and limits on both sides of it"
-            )
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,6 +192,9 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     travel: TravelAxis
     pitch: TiltAxis | None = None
     roll: TiltAxis | None = None
+    x: ShiftAxis | None = None
+    y: ShiftAxis | None = None
+    twist: TwistAxis | None = None
 
     def __post_init__(self) -> None:
         if (self.pitch is None) != (self.roll is None):
@@ -176,16 +219,20 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """The axes that the stage has, by the motion they make: travel, pitch, roll."""
-        named = {"travel": self.travel, "pitch": self.pitch, "roll": self.roll}
+        """The axes that the stage has, by the motion they make: travel, pitch, roll, x, y, twist."""
+        named = {name: getattr(self, name) for name in ("travel", "pitch", "roll", "x", "y", "twist")}
         return {name: axis for name, axis in named.items() if axis is not None}
 
     @property
     def limits(self) -> Limits:
-        """What the stage may do: its travel, its greatest half-angle all the way round, its press."""
+        """What the stage may do: its axes, the greatest half-angle all the way round, and its press."""
         reaches = [reach for axis in (self.pitch, self.roll) if axis for reach in (-axis.low, axis.high)]
         travel = (self.travel.low, self.travel.high)
-        return Limits(travel, max(0.0, min(reaches, default=0.0)), min(self.press, self.travel.high))
+        sideways = {
+            name: (axis.low, axis.high) for name, axis in self.axes.items() if name in ("x", "y", "twist")
+        }
+        press = min(self.press, self.travel.high)
+        return Limits(travel, max(0.0, min(reaches, default=0.0)), press, **sideways)
 
 
 class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -364,6 +411,30 @@ zero = 0.0
 # unit = "deg"
 limits = [-5.0, 5.0]
 speed = 20.0
+
+# [stage.x]                     # mm to the right in the picture, 0 where the body is lowered
+# letter = "A"
+# direction = 1
+# zero = 0.0
+# unit = "mm"
+# limits = [-2.0, 2.0]
+# speed = 1.0                   # mm/s
+
+# [stage.y]                     # mm up the picture
+# letter = "B"
+# direction = 1
+# zero = 0.0
+# unit = "mm"
+# limits = [-2.0, 2.0]
+# speed = 1.0
+
+# [stage.twist]                 # degrees about the body's axis, counter-clockwise in the picture
+# letter = "C"
+# direction = 1
+# zero = 0.0
+# unit = "deg"
+# limits = [-45.0, 45.0]
+# speed = 20.0                  # degrees/s
 
 [camera]
 source = 0                      # a camera's number, or a file or URL in quotes

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from mirrorskin.io import InputError
 
 _ROUNDING = 1e-9  # by which a place may lie beyond a limit, mm and rad
+# Motions that need the body upright: their units in messages, and how many there are in one mm or rad.
+_SIDEWAYS = (("x", "mm", 1.0), ("y", "mm", 1.0), ("twist", "degrees", math.degrees(1.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +18,7 @@ class Position:
 
     It leans by the half-angle ``hypot(pitch, roll)`` at the phase ``atan2(roll, pitch)``: it is turned about
     the pivot by Rz(phase) Ry(half-angle) Rz(-phase). A precession is a circle in the plane of pitch and roll.
+    Before that it was moved along x and y, and turned about its own axis by the twist.
 
     Attributes
     ----------
@@ -23,6 +26,10 @@ class Position:
         How far the body is lowered, mm, positive down.
     pitch, roll : float
         Radians: half-angle times the cosine and the sine of the phase.
+    x, y : float
+        How far the body was moved sideways, mm.
+    twist : float
+        Radians that it was turned about its axis, counter-clockwise as its camera sees it.
 
     Examples
     --------
@@ -33,6 +40,9 @@ class Position:
     travel: float = 0.0
     pitch: float = 0.0
     roll: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    twist: float = 0.0
 
     @property
     def tilt(self) -> float:
@@ -66,11 +76,16 @@ class Limits:
         Greatest half-angle of the lean, radians; 0 of a stage that cannot lean.
     press : float
         Greatest travel that the sensor's skin bears, mm.
+    x, y, twist : (float, float)
+        Least and greatest of each, mm and radians; only 0 of a stage without that axis.
     """
 
     travel: tuple[float, float]
     tilt: float
     press: float
+    x: tuple[float, float] = (0.0, 0.0)
+    y: tuple[float, float] = (0.0, 0.0)
+    twist: tuple[float, float] = (0.0, 0.0)
 
     def check(self, position: Position, name: str) -> None:
         """Refuse a place beyond the limits: an InputError names the limit, and the stage by `name`."""
@@ -96,9 +111,41 @@ class Limits:
                 f"{name}: a tilt of {math.degrees(tilt):.9g} degrees is beyond the greatest, "
                 f"{math.degrees(self.tilt):.9g}; tilt less, or correct the rig file's pitch and roll"
             )
+        for motion, unit, scale in _SIDEWAYS:
+            self._check_sideways(getattr(position, motion) * scale, motion, unit, scale, name)
 
     def excess(self, position: Position) -> float:
         """Return how far a place lies beyond the limits: mm or degrees, whichever are more; 0 within."""
         low, high = self.travel
         lean = math.degrees(position.tilt - self.tilt)
-        return max(0.0, low - position.travel, position.travel - min(high, self.press), lean)
+        beyond = [low - position.travel, position.travel - min(high, self.press), lean]
+        for motion, _, scale in _SIDEWAYS:
+            (least, greatest), value = getattr(self, motion), getattr(position, motion)
+            beyond += [(least - value) * scale, (value - greatest) * scale]
+        return max(0.0, *beyond)
+
+    def nearest(self, position: Position) -> Position:
+        """Return the upright place within the limits that is nearest to another."""
+        low, high = self.travel
+        bounds = {"travel": (low, min(high, self.press)), "x": self.x, "y": self.y, "twist": self.twist}
+        return Position(
+            **{
+                motion: min(max(getattr(position, motion), least), greatest)
+                for motion, (least, greatest) in bounds.items()
+            }
+        )
+
+    def _check_sideways(self, value: float, motion: str, unit: str, scale: float, name: str) -> None:
+        """Refuse a move along x or y, mm, or a twist, degrees, beyond its limits."""
+        low, high = (limit * scale for limit in getattr(self, motion))
+        if low - _ROUNDING <= value <= high + _ROUNDING:
+            return
+        if low == high:
+            raise InputError(
+                f"{name}: it has no axis of {motion}, which was to go to {value:.9g} {unit}; "
+                f"add [stage.{motion}] to the rig file"
+            )
+        raise InputError(
+            f"{name}: {value:.9g} {unit} of {motion} are beyond the axis, which goes from {low:.9g} to "
+            f"{high:.9g} {unit}; stay within, or correct the rig file's limits"
+        )

@@ -15,8 +15,18 @@ from numpy.typing import NDArray
 from mirrorskin.hw.camera_thread import ThreadedCamera
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Twin
-from mirrorskin.hw.twin.movement import Pose, pose_at_lean, pose_at_press
+from mirrorskin.hw.twin.movement import Pose, Twist, pose_at_lean, pose_at_press
 from mirrorskin.io.types import InputError
+
+
+def pose_at(place: Position, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
+    """Return where the object is, seen from the body at a place: first it moves sideways and twists."""
+    lean = pose_at_lean(place.travel, place.tilt, place.phase, pivot)
+    if not (place.x or place.y or place.twist):
+        return lean
+    back = Twist([0.0], 0.0).pose(np.asarray(place.twist)).rotation
+    shift = back @ np.array([-place.x, -place.y, 0.0])
+    return Pose(lean.rotation @ back, lean.rotation @ shift + lean.shift)
 
 
 class _Frame(NamedTuple):
@@ -120,11 +130,10 @@ class TwinCamera(ThreadedCamera):
     def _render(self, middle: float, number: int) -> NDArray[Any]:
         pixels = np.empty(self.shape, self.dtype)
 
-        def pose_at(late: float) -> Pose:
-            place = self._where(middle + late)
-            return pose_at_lean(place.travel, place.tilt, place.phase, self._pivot)
+        def pose(late: float) -> Pose:
+            return pose_at(self._where(middle + late), self._pivot)
 
-        self._twin.look(pose_at, number, pixels)
+        self._twin.look(pose, number, pixels)
         return pixels
 
     def _deliver(self) -> None:

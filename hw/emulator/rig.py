@@ -16,14 +16,23 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.emulator.camera import TwinCamera
+from mirrorskin.hw.emulator.camera import TwinCamera, pose_at
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
-from mirrorskin.hw.rig_file import CameraSettings, RigFile, RigSettings, StageSettings, TiltAxis, TravelAxis
+from mirrorskin.hw.rig_file import (
+    CameraSettings,
+    RigFile,
+    RigSettings,
+    ShiftAxis,
+    StageSettings,
+    TiltAxis,
+    TravelAxis,
+    TwistAxis,
+)
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Object, Twin, Vertical
-from mirrorskin.hw.twin.movement import Movement
-from mirrorskin.io.types import InputError
+from mirrorskin.hw.twin.movement import Movement, Pose
+from mirrorskin.io.types import Floats, InputError
 
 PRESS = 3.0
 """Greatest travel that the emulated stage allows, mm."""
@@ -31,12 +40,18 @@ PRESS = 3.0
 TILT = 9.0
 """Greatest pitch and roll, degrees."""
 
+SHIFT, TURN = 2.0, 45.0
+"""Greatest displacement along x and y, mm, and greatest twist, degrees, either way."""
+
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
-# GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, which are pitch, roll
-# (these count degrees) and travel: greatest speeds in units a minute, accelerations, lengths.
+# GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are
+# pitch, roll, travel, x, y and twist: greatest speeds in mm or degrees a minute, accelerations, lengths.
+_AXES = "XYZABC"
 _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
-_SPEED, _ACCELERATION, _LENGTH = (1200.0, 1200.0, 600.0), (800.0, 800.0, 400.0), (20.0, 20.0, 10.0)
+_SPEED = 1200.0, 1200.0, 600.0, 300.0, 300.0, 2400.0
+_ACCELERATION = 800.0, 800.0, 400.0, 200.0, 200.0, 1600.0
+_LENGTH = 20.0, 20.0, 10.0, 5.0, 5.0, 100.0
 _MACHINE = (
     _HOMING
     | dict(enumerate(_SPEED, 110))
@@ -99,12 +114,11 @@ class EmulatedRig:
         of_twin: dict[str, Any] = {"shape": (240, 320), "pixel_size": 0.05, **scene}
         self._make = functools.partial(Twin, object=object, camera=self._levels, **of_twin)
         self._pivot, self._home = pivot, home
-        farthest = Axial(np.arange(8) * np.pi / 4, math.radians(math.hypot(TILT, TILT)), PRESS, pivot)
-        self._seen = self._make(movement=farthest)
+        self._seen = self._make(movement=_Anywhere(pivot))
         self._axes = _axes(home)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
         start[self._axes["travel"].letter] += _LIFT
-        self.machine = GrblMachine({**_MACHINE, 20: home, 22: home}, start=start)
+        self.machine = GrblMachine({**_MACHINE, 20: home, 22: home}, axes=_AXES, start=start)
         self._make_camera = functools.partial(
             TwinCamera, self._seen, self.where, delay=delay, jitter=jitter, seed=seed, pivot=pivot
         )
@@ -192,14 +206,36 @@ class EmulatedRig:
         )
 
 
+class _Anywhere(Axial):
+    """Bounds how far the body goes: it leans all the way round, and is moved and turned as far as can be."""
+
+    def __init__(self, pivot: tuple[float, float, float]) -> None:
+        super().__init__(np.arange(8) * np.pi / 4, math.radians(math.hypot(TILT, TILT)), PRESS, pivot)
+
+    def pose(self, place: Floats, /) -> Pose:
+        """Lean at a phase, moved that way and twisted."""
+        phase, turn = float(place), math.radians(TURN)
+        lean = self.tilt * math.cos(phase), self.tilt * math.sin(phase)
+        x, y = np.sign(np.round([math.cos(phase), math.sin(phase)], 9)) * SHIFT
+        return pose_at(Position(PRESS, *lean, x, y, turn * math.cos(4 * phase)), self.pivot)
+
+
 def _axes(home: bool) -> dict[str, Any]:
     """Describe the axes: one that has homed counts from its upper end, another from where it began."""
-    middle, upper = (-10.0, -_HIGHEST - 0.5) if home else (0.0, -_LIFT)
+
+    def zero(middle: float) -> float:
+        return middle if home else 0.0
+
+    upper = -_HIGHEST - 0.5 if home else -_LIFT
     pitch, roll = (
-        TiltAxis(letter=letter, zero=middle, limits=(-TILT, TILT), speed=20.0) for letter in ("X", "Y")
+        TiltAxis(letter=letter, zero=zero(-10.0), limits=(-TILT, TILT), speed=20.0) for letter in ("X", "Y")
     )
+    x, y = (
+        ShiftAxis(letter=letter, zero=zero(-2.5), limits=(-SHIFT, SHIFT), speed=5.0) for letter in ("A", "B")
+    )
+    twist = TwistAxis(letter="C", zero=zero(-50.0), limits=(-TURN, TURN), speed=40.0)
     travel = TravelAxis(letter="Z", direction=-1, zero=upper, limits=(-_HIGHEST, PRESS), speed=10.0)
-    return {"travel": travel, "pitch": pitch, "roll": roll}
+    return {"travel": travel, "pitch": pitch, "roll": roll, "x": x, "y": y, "twist": twist}
 
 
 def _toml(table: Mapping[str, Any], name: str = "") -> Iterator[str]:

@@ -16,7 +16,7 @@ SLOWEST = 1.0
 _STRAIGHT = "G53G1"  # in the machine's coordinates
 _PLANES = {("X", "Y"): "G17", ("Z", "X"): "G18", ("Y", "Z"): "G19"}
 _CENTRES = {"X": "I", "Y": "J", "Z": "K"}
-_NO_TRAVEL = 1e-3  # mm that count as none where the body leans as well
+_NO_TRAVEL = 1e-3  # mm that count as none where the body turns as well
 _SHORT_ARC = math.radians(1)  # of an arc that is as good as straight
 _ROUNDING = 1e-9  # of a half turn
 _TURNS_MAX = 10_000  # turns at a time, since all their lines are made beforehand
@@ -65,7 +65,7 @@ class Axes:
     def straight(self, start: Position, place: Position, speed: float | None) -> Command | None:
         """Return the straight move from one place to another, None if it is none.
 
-        The speed is in mm/s, or rad/s if only the lean changes; None for the greatest. The line names the
+        The speed is in mm/s, or rad/s if the body only turns; None for the greatest. The line names the
         machine's coordinates, whatever the work coordinates are.
         """
         before, after = self.machine(start), self.machine(place)
@@ -155,10 +155,13 @@ class Axes:
             return times[slowest]
         if not (math.isfinite(speed) and speed > 0):
             raise InputError(f"{self._name}: a speed of {speed:g} is none; give a positive one")
-        lean = math.hypot(changes.get("pitch", 0.0), changes.get("roll", 0.0))
-        path = lean if lean > 0 and changes["travel"] < _NO_TRAVEL else changes["travel"]
+        turn, shift = (
+            math.hypot(*(changes.get(motion, 0.0) for motion in motions))
+            for motions in (("pitch", "roll", "twist"), ("travel", "x", "y"))
+        )
+        path = turn if turn > 0 and shift < _NO_TRAVEL else shift
         if path / speed < times[slowest] * (1 - _ROUNDING):
-            unit = "mm/s" if path != lean else "rad/s"
+            unit = "mm/s" if path != turn else "rad/s"
             raise InputError(
                 f"{self._name}: at {speed:.4g} {unit} the axis of {slowest} is too fast; at most "
                 f"{path / times[slowest]:.4g} {unit}"

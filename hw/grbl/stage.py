@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -151,12 +152,18 @@ class GrblStage(Closing):
             Millimetres a second; radians a second if only the lean changes. If not given, as fast as the
             axes go.
         """
-        self.limits.check(place, self.name)
-        command = self._axes.straight(self._destination(), place, speed)
-        if command is None:
-            self._target = place
+        self.follow([place], speed)
+
+    def follow(self, places: Sequence[Position], speed: float | None = None) -> None:
+        """Begin to go to some places, one after the other, each in a straight line; see ``move``."""
+        for place in places:
+            self.limits.check(place, self.name)
+        ways = itertools.pairwise([self._destination(), *places])
+        commands = [line for way in ways if (line := self._axes.straight(*way, speed)) is not None]
+        if commands:
+            self._send(commands, places[-1], ramps=len(commands))
         else:
-            self._send([command], place)
+            self._target = places[-1]
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
         """Begin to go round at half-angle `tilt`, from phase `start`, where the body must stand.
@@ -315,9 +322,9 @@ class GrblStage(Closing):
             raise HardwareError(f"{self.name}: it is locked until it is homed; home it first")
         return self.report().position if self._target is None else self._target
 
-    def _send(self, commands: list[Command], target: Position) -> None:
+    def _send(self, commands: list[Command], target: Position, ramps: int = 1) -> None:
         """Send lines that end at a target, and wait until the controller took the first that moves."""
-        duration = sum(command.duration for command in commands) + self._ramp
+        duration = sum(command.duration for command in commands) + ramps * self._ramp
         with self._guarded():
             with self._link.lock:
                 number = self._link.enqueue(*(command.line for command in commands)) + int(len(commands) > 1)

@@ -120,10 +120,10 @@ def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict 
 
 
 def _in_words(position: Position, settings: StageSettings) -> str:
-    places = [f"travel {position.travel:.3f} mm"]
-    if settings.pitch:
-        places += [f"{name} {math.degrees(getattr(position, name)):.3f} deg" for name in ("pitch", "roll")]
-    return ", ".join(places)
+    return ", ".join(
+        f"{name} {getattr(position, name) * axis.scale:.3f} {axis.unit}"
+        for name, axis in settings.axes.items()
+    )
 
 
 def _state(report: Report, settings: StageSettings) -> Finding:
@@ -291,8 +291,7 @@ def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     if settings.home:
         stage.home()
         yield Finding("move", "homing", f"done; now {_in_words(stage.report().position, settings)}")
-    travel = stage.report().position.travel
-    home = Position(min(max(travel, stage.limits.travel[0]), stage.limits.press))
+    home = Position(stage.limits.nearest(stage.report().position).travel)
     stage.move(home)
     stage.wait()
     for name in settings.axes:
@@ -302,7 +301,8 @@ def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
 def _step(limits: Limits, name: str, unit: str, value: float) -> float:
     """Return how far an axis is moved: travel goes up if it can, so that nothing is pressed."""
     if name != "travel":
-        return min(_MOVE_MAX[unit], _MOVE_SHARE * limits.tilt)
+        farthest = limits.tilt if name in ("pitch", "roll") else getattr(limits, name)[1]
+        return min(_MOVE_MAX[unit], _MOVE_SHARE * farthest)
     low = limits.travel[0]
     step = min(_MOVE_MAX[unit], _MOVE_SHARE * (limits.press - low))
     return step if value - step < low else -step

@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.moves import SLOWEST
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid, VerticalPlan
 from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.track import Track, even_times
 from mirrorskin.hw.rig_file import Axis
 from mirrorskin.hw.stage import Position
-from mirrorskin.io.types import Floats
+from mirrorskin.io.types import Floats, InputError
 
 # The move
 _SECONDS = 1.5  # one way, or more
@@ -64,7 +64,8 @@ class _Stroke:
 def measure_delay(rig: Rig, plan: Plan) -> Delay:
     """Move there and back in contact, and find out how late the camera's frames come.
 
-    A press goes over the deeper half of its way; a rotation leans from phase 0 to the opposite one. Each way
+    A press goes over the deeper half of its way, and so does that of a slide or a twist, whose friction would
+    make the ways there and back look different; a rotation leans from phase 0 to the opposite one. Each way
     takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
     against the stage's reports: what these are late by themselves is part of it, as it should be.
     """
@@ -102,8 +103,11 @@ def _stroke(rig: Rig, plan: Plan) -> _Stroke:
         return _Stroke(
             begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch)
         )
-    length = (1 - _PRESSED) * (plan.stop - plan.start)
-    first, end = plan.stop - length, Position(plan.stop)
+    start, stop = (plan.start, plan.stop) if isinstance(plan, VerticalPlan) else (0.0, plan.first.travel)
+    length = (1 - _PRESSED) * (stop - start)
+    if length <= 0:
+        raise InputError(f"the camera's delay cannot be measured by a press of {stop:g} mm: {_REMEDY}")
+    first, end = stop - length, Position(stop)
     return _Stroke(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
 
 

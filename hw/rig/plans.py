@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,10 @@ from numpy.typing import ArrayLike
 from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Floats
+from mirrorskin.io.types import Floats, Motion
+
+if TYPE_CHECKING:
+    from mirrorskin.hw.grbl.stage import GrblStage
 
 _RAMP = 0.1  # seconds in which a stage is taken to reach its speed, as long as nothing else is known
 _STEPS_MAX = 10**6
@@ -22,48 +25,173 @@ _ROUNDING = 1e-9  # of a step
 
 @dataclass(frozen=True, slots=True)
 class Trapezoid:
-    """A way that begins and ends at rest: the speed rises evenly, stays, and falls as it rose."""
+    """A way that begins and ends at rest: the speed rises evenly, stays, and falls as it rose.
 
-    length: float  # mm or radians, above 0
-    speed: float  # in the middle, mm/s or rad/s; not reached on a short way
+    It may consist of several equal legs, each of which begins and ends at rest.
+    """
+
+    length: float  # of all legs, mm or radians, above 0
+    speed: float  # in the middle of a leg, mm/s or rad/s; not reached on a short one
     acceleration: float
+    legs: int = 1
 
     @classmethod
-    def planned(cls, length: float, speed: float) -> Trapezoid:
+    def planned(cls, length: float, speed: float, legs: int = 1) -> Trapezoid:
         """Guess the acceleration, of which a plan says nothing."""
-        return cls(length, speed, speed / _RAMP)
+        return cls(length, speed, speed / _RAMP, legs)
+
+    @property
+    def leg(self) -> float:
+        """Length of a leg."""
+        return self.length / self.legs
 
     @property
     def ramp(self) -> float:
         """Seconds that speeding up takes."""
-        return min(self.speed, math.sqrt(self.length * self.acceleration)) / self.acceleration
+        return min(self.speed, math.sqrt(self.leg * self.acceleration)) / self.acceleration
 
     @property
     def duration(self) -> float:
         """Seconds for the whole way."""
-        return self.length / (self.acceleration * self.ramp) + self.ramp
+        return self.legs * self._leg_duration
+
+    @property
+    def _leg_duration(self) -> float:
+        return self.leg / (self.acceleration * self.ramp) + self.ramp
 
     def place(self, time: ArrayLike) -> Floats:
         """Return where it is so many seconds after the beginning; before that and at the end, it rests."""
         t = np.clip(np.asarray(time, np.float64), 0, self.duration)
-        left = self.duration - t
+        number = np.clip(t // self._leg_duration, 0, self.legs - 1)
+        t = t - number * self._leg_duration
+        left = self._leg_duration - t
         up, down = np.minimum(t, self.ramp), np.minimum(left, self.ramp)
         cruise = self.acceleration * self.ramp * (t - self.ramp / 2)
-        early, late = self.acceleration / 2 * up**2, self.length - self.acceleration / 2 * down**2
-        return np.where(t < self.ramp, early, np.where(left < self.ramp, late, cruise))
+        early, late = self.acceleration / 2 * up**2, self.leg - self.acceleration / 2 * down**2
+        return number * self.leg + np.where(t < self.ramp, early, np.where(left < self.ramp, late, cruise))
 
     def time(self, place: ArrayLike) -> Floats:
         """Return when it is at a place, seconds after the beginning; the inverse of ``place``."""
         s = np.clip(np.asarray(place, np.float64), 0, self.length)
+        number = np.clip(s // self.leg, 0, self.legs - 1)
+        s = s - number * self.leg
+        left = np.maximum(self.leg - s, 0)
         ramp_end = self.acceleration / 2 * self.ramp**2
         early = np.sqrt(2 * s / self.acceleration)
-        late = self.duration - np.sqrt(2 * (self.length - s) / self.acceleration)
+        late = self._leg_duration - np.sqrt(2 * left / self.acceleration)
         cruise = s / (self.acceleration * self.ramp) + self.ramp / 2
-        return np.where(s < ramp_end, early, np.where(self.length - s < ramp_end, late, cruise))
+        within = np.where(s < ramp_end, early, np.where(left < ramp_end, late, cruise))
+        return number * self._leg_duration + within
+
+
+class Plan:
+    """What a scan does; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan` and `TwistPlan`.
+
+    Places are told by how far the body has come along its way: mm, or radians.
+    """
+
+    __slots__ = ()
+    motion: ClassVar[Motion]
+    series: ClassVar[str]  # what a recording says of each frame: travel, phase, displacement or twist
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether the body halts for each frame."""
+        raise NotImplementedError
+
+    @property
+    def ways(self) -> Floats:
+        """How far along it is at each step, (n,)."""
+        raise NotImplementedError
+
+    @property
+    def path(self) -> Trapezoid:
+        """The way without a halt."""
+        raise NotImplementedError
+
+    def place(self, way: float) -> Position:
+        """Return where the body stands so far along its way."""
+        raise NotImplementedError
+
+    def recorded(self, ways: Floats) -> Floats:
+        """Return what a recording says of some places, (n,) or (n, 2), mm or radians."""
+        raise NotImplementedError
+
+    def way(self, position: Position, expected: float) -> float:
+        """Return how far along a place is; of those that look alike, the one next to what is expected."""
+        raise NotImplementedError
+
+    def begin(self, stage: GrblStage) -> None:
+        """Tell a stage that stands at the first place to go the way without a halt."""
+        raise NotImplementedError
+
+    @property
+    def period(self) -> float:
+        """How far it is to the next place that looks alike."""
+        return math.inf
+
+    @property
+    def first(self) -> Position:
+        """Where the scan begins."""
+        return self.place(0.0)
+
+    @property
+    def values(self) -> Floats:
+        """What a recording says of each step, (n,) or (n, 2)."""
+        return self.recorded(self.ways)
+
+    @property
+    def places(self) -> list[Position]:
+        """Where the body stands at each step."""
+        return [self.place(float(way)) for way in self.ways]
+
+
+class _Straight(Plan):
+    """A plan whose way is straight; it has a step or a speed."""
+
+    __slots__ = ()
+    step: float | None
+    speed: float | None
+
+    @property
+    def length(self) -> float:
+        """How long the way is, mm or radians."""
+        raise NotImplementedError
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether the body halts for each frame."""
+        return self.step is not None
+
+    @property
+    def ways(self) -> Floats:
+        """How far along it is at each step, (n,)."""
+        assert self.step is not None
+        return np.asarray(self.step * np.arange(_whole(self.length / self.step) + 1), np.float64)
+
+    @property
+    def path(self) -> Trapezoid:
+        """The way without a halt."""
+        assert self.speed is not None
+        return Trapezoid.planned(self.length, self.speed)
+
+    @property
+    def ends(self) -> list[Position]:
+        """Where the body goes straight to, one after the other, where it does not halt."""
+        return [self.place(self.length)]
+
+    def begin(self, stage: GrblStage) -> None:
+        """Tell a stage that stands at the first place to go straight to the ends."""
+        stage.follow(self.ends, self.speed)
+
+    def _check(self, unit: str) -> None:
+        _check_one_of(("step", self.step, unit), ("speed", self.speed, f"{unit}/s"))
+        if self.step is not None:
+            _check_steps(self.length / self.step, 1)
 
 
 @dataclass(frozen=True, slots=True)
-class VerticalPlan:
+class VerticalPlan(_Straight):
     """Lower the body from one travel to another; values that cannot be are an `InputError`.
 
     Attributes
@@ -85,7 +213,8 @@ class VerticalPlan:
     stop: float
     step: float | None = None
     speed: float | None = None
-    motion: ClassVar[Literal["vertical"]] = "vertical"
+    motion: ClassVar[Motion] = "vertical"
+    series: ClassVar[str] = "travel"
 
     def __post_init__(self) -> None:
         _check_number(self.start, "start", "mm")
@@ -94,41 +223,151 @@ class VerticalPlan:
             raise InputError(
                 f"a press from {self.start:g} to {self.stop:g} mm does not go down: give a deeper stop"
             )
-        _check_one_of(("step", self.step, "mm"), ("speed", self.speed, "mm/s"))
-        if self.step is not None:
-            _check_steps((self.stop - self.start) / self.step, 1)
+        self._check("mm")
 
     @property
-    def in_steps(self) -> bool:
-        """Whether the body halts for each frame."""
-        return self.step is not None
+    def length(self) -> float:
+        """How far it goes down, mm."""
+        return self.stop - self.start
 
-    @property
-    def first(self) -> Position:
-        """Where the scan begins."""
-        return Position(travel=self.start)
+    def place(self, way: float) -> Position:
+        """Return where the body stands so far down."""
+        return Position(travel=self.start + way)
 
-    @property
-    def values(self) -> Floats:
-        """Travel of each step, (n,), mm."""
-        assert self.step is not None
-        count = _whole((self.stop - self.start) / self.step) + 1
-        return np.asarray(self.start + self.step * np.arange(count), np.float64)
+    def recorded(self, ways: Floats) -> Floats:
+        """Return the travel, (n,), mm."""
+        return self.start + ways
 
-    @property
-    def places(self) -> list[Position]:
-        """Where the body stands at each step."""
-        return [Position(travel=float(travel)) for travel in self.values]
-
-    @property
-    def path(self) -> Trapezoid:
-        """The way without a halt, from 0 at the start, mm."""
-        assert self.speed is not None
-        return Trapezoid.planned(self.stop - self.start, self.speed)
+    def way(self, position: Position, expected: float) -> float:
+        """Return how far down it has come, mm."""
+        return min(max(position.travel - self.start, 0.0), self.length)
 
 
 @dataclass(frozen=True, slots=True)
-class AxialPlan:
+class HorizontalPlan(_Straight):
+    """Press, wait, and slide: along a straight line from where it was pressed.
+
+    Values that cannot be are an `InputError`.
+
+    Attributes
+    ----------
+    press : float
+        Travel at which the body slides, mm.
+    distance : float
+        How far it slides, mm, above 0.
+    direction : float
+        Radians from x, counter-clockwise: y is at pi/2.
+    step : float or None
+        From place to place, mm, where it goes in steps.
+    speed : float or None
+        Where it goes without a halt, mm/s. Either `step` or `speed` is given.
+    wait : float
+        Seconds at rest, pressed, before it slides.
+
+    Examples
+    --------
+    >>> HorizontalPlan(1.0, 0.5, step=0.25).values.tolist()
+    [[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]]
+    """
+
+    press: float
+    distance: float
+    direction: float = 0.0
+    step: float | None = None
+    speed: float | None = None
+    wait: float = 0.0
+    motion: ClassVar[Motion] = "horizontal"
+    series: ClassVar[str] = "displacement"
+
+    def __post_init__(self) -> None:
+        _check_number(self.press, "press", "mm")
+        _check_number(self.direction, "direction", "radians")
+        _check_above_zero(self.distance, "distance", "mm")
+        _check_wait(self.wait)
+        self._check("mm")
+
+    @property
+    def length(self) -> float:
+        """How far it slides, mm."""
+        return self.distance
+
+    def place(self, way: float) -> Position:
+        """Return where the body stands so far along."""
+        x, y = way * self._along
+        return Position(self.press, x=float(x), y=float(y))
+
+    def recorded(self, ways: Floats) -> Floats:
+        """Return the displacement, (n, 2), mm."""
+        return ways[:, np.newaxis] * self._along
+
+    def way(self, position: Position, expected: float) -> float:
+        """Return how far it has slid, mm."""
+        return min(max(float(np.dot((position.x, position.y), self._along)), 0.0), self.length)
+
+    @property
+    def _along(self) -> Floats:
+        """Unit vector of the direction, whose rounding at right angles moves no other axis."""
+        return np.round([math.cos(self.direction), math.sin(self.direction)], 15) + 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TwistPlan(_Straight):
+    """Press, wait, and turn the body about its own axis; values that cannot be are an `InputError`.
+
+    Attributes
+    ----------
+    press : float
+        Travel at which the body turns, mm.
+    angle : float
+        How far it turns, radians, counter-clockwise if positive; not 0.
+    step : float or None
+        From place to place, radians, above 0, where it goes in steps.
+    speed : float or None
+        Where it goes without a halt, rad/s. Either `step` or `speed` is given.
+    wait : float
+        Seconds at rest, pressed, before it turns.
+
+    Examples
+    --------
+    >>> TwistPlan(1.0, -0.5, step=0.25).values.tolist()
+    [-0.0, -0.25, -0.5]
+    """
+
+    press: float
+    angle: float
+    step: float | None = None
+    speed: float | None = None
+    wait: float = 0.0
+    motion: ClassVar[Motion] = "twist"
+    series: ClassVar[str] = "twist"
+
+    def __post_init__(self) -> None:
+        _check_number(self.press, "press", "mm")
+        if not (math.isfinite(self.angle) and self.angle):
+            raise InputError(f"angle {self.angle:g} radians cannot be: give one that is not 0")
+        _check_wait(self.wait)
+        self._check("radians")
+
+    @property
+    def length(self) -> float:
+        """How far it turns, radians, either way."""
+        return abs(self.angle)
+
+    def place(self, way: float) -> Position:
+        """Return where the body stands so far along."""
+        return Position(self.press, twist=math.copysign(way, self.angle))
+
+    def recorded(self, ways: Floats) -> Floats:
+        """Return the twist, (n,), radians."""
+        return np.copysign(ways, self.angle)
+
+    def way(self, position: Position, expected: float) -> float:
+        """Return how far it has turned, radians."""
+        return min(max(math.copysign(1.0, self.angle) * position.twist, 0.0), self.length)
+
+
+@dataclass(frozen=True, slots=True)
+class AxialPlan(Plan):
     """Press, lean, and go round: the body's axis precesses, from phase 0 on, counter-clockwise.
 
     Values that cannot be are an `InputError`.
@@ -157,7 +396,8 @@ class AxialPlan:
     turns: float = 1.0
     phase_step: float | None = None
     rate: float | None = None
-    motion: ClassVar[Literal["axial"]] = "axial"
+    motion: ClassVar[Motion] = "axial"
+    series: ClassVar[str] = "phase"
 
     def __post_init__(self) -> None:
         _check_number(self.press, "press", "mm")
@@ -175,12 +415,12 @@ class AxialPlan:
         return self.phase_step is not None
 
     @property
-    def first(self) -> Position:
-        """Where the scan begins: pressed, and leaning at phase 0."""
-        return self.place(0.0)
+    def period(self) -> float:
+        """A whole turn."""
+        return math.tau
 
     @property
-    def values(self) -> Floats:
+    def ways(self) -> Floats:
         """Phase of each step, (n,), radians."""
         assert self.phase_step is not None
         # The end of whole turns is their beginning; a step that ends short of it is taken.
@@ -188,15 +428,14 @@ class AxialPlan:
         return np.asarray(self.phase_step * np.arange(count), np.float64)
 
     @property
-    def places(self) -> list[Position]:
-        """Where the body stands at each step."""
-        return [self.place(float(phase)) for phase in self.values]
-
-    @property
     def path(self) -> Trapezoid:
         """The way without a halt, from phase 0, radians."""
         assert self.rate is not None
         return Trapezoid.planned(math.tau * self.turns, math.tau * self.rate)
+
+    def begin(self, stage: GrblStage) -> None:
+        """Tell a stage that leans at phase 0 to go round."""
+        stage.precess(self.tilt, self.turns, self.rate or 0.0)
 
     def frames_a_turn(self, frame_rate: float, each: int = 1) -> float:
         """Return how many frames a turn has, or what there is of the only one.
@@ -213,12 +452,17 @@ class AxialPlan:
                 )
         return turn * min(1.0, self.turns)
 
-    def place(self, phase: float) -> Position:
+    def place(self, way: float) -> Position:
         """Return where the body stands at a phase, radians."""
-        return Position(self.press, self.tilt * math.cos(phase), self.tilt * math.sin(phase))
+        return Position(self.press, self.tilt * math.cos(way), self.tilt * math.sin(way))
 
+    def recorded(self, ways: Floats) -> Floats:
+        """Return the phase, (n,), radians."""
+        return ways
 
-Plan = VerticalPlan | AxialPlan
+    def way(self, position: Position, expected: float) -> float:
+        """Return the phase without jumps, radians."""
+        return position.phase + math.tau * round((expected - position.phase) / math.tau)
 
 
 def _whole(steps: float) -> int:
@@ -234,6 +478,11 @@ def _check_number(value: float, name: str, unit: str) -> None:
 def _check_above_zero(value: float, name: str, unit: str) -> None:
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} {value:g} {unit}".rstrip() + " cannot be: give more than 0")
+
+
+def _check_wait(seconds: float) -> None:
+    if not 0 <= seconds < math.inf:
+        raise InputError(f"a wait of {seconds:g} s cannot be: give 0 or more")
 
 
 def _check_one_of(*both: tuple[str, float | None, str]) -> None:
@@ -253,10 +502,15 @@ def _check_steps(count: float, least: int) -> None:
 
 
 def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
-    """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs."""
+    """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs.
+
+    The body is lowered where x, y and twist are 0, and lifted straight up from where the scan ended: what
+    holds at both ends of the scan holds there, too.
+    """
     from mirrorskin.hw.grbl.moves import Axes
 
-    for place in (plan.first,) if isinstance(plan, AxialPlan) else (plan.first, Position(plan.stop)):
+    ends = plan.ends if isinstance(plan, _Straight) else []
+    for place in (plan.first, *ends):
         stage.limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
@@ -264,5 +518,5 @@ def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
     if isinstance(plan, AxialPlan):
         # One turn is as possible as many, wherever the work coordinates begin.
         axes.arcs(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0, 0.0, axes.machine(Position()))
-    else:
-        axes.straight(plan.first, Position(plan.stop), plan.speed)
+    elif isinstance(plan, _Straight):
+        axes.straight(plan.first, ends[0], plan.speed)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, check_plan
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, TwistPlan, check_plan
 from mirrorskin.hw.rig.references import read_reference
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.stage import Position, Report
@@ -82,7 +82,7 @@ class Scan(Closing):
 
     def positions(self) -> Mapping[str, Floats]:
         """Return the positions of all frames so far; see ``LiveSource``."""
-        return {self._coordinate: np.concatenate([np.empty(0), *self._live])}
+        return {self.plan.series: np.concatenate([self.plan.recorded(np.empty(0)), *self._live])}
 
     def rewind(self) -> None:
         """Refuse: time does not run back."""
@@ -101,17 +101,15 @@ class Scan(Closing):
             return None
         self.count += len(block.frames)
         self.dropped += block.dropped
-        self._live.append(getattr(block, self._coordinate))
+        self._live.append(getattr(block, self.plan.series))
         return block
 
     def lift(self) -> Report:
-        """Bring the body upright, and lift it to the upper end of its travel."""
-        limits = self.rig.stage.limits
-        here = self.rig.stage.report().position
-        if math.hypot(here.pitch, here.roll) > _UPRIGHT:
-            low, high = limits.travel[0], min(limits.travel[1], limits.press)
-            self.rig.go(Position(min(max(here.travel, low), high)))
-        return self.rig.go(Position(limits.travel[0]))
+        """Bring the body upright, lift it straight up to the end of its travel, and go to the middle."""
+        here, limits = self.rig.stage.report().position, self.rig.stage.limits
+        upright, high = limits.nearest(here), limits.travel[0]
+        ways = [upright] if here.tilt > _UPRIGHT else []
+        return self._visit(*ways, replace(upright, travel=high), Position(high))
 
     def close(self) -> None:
         """Lift the body; stop the stage, if it is under way."""
@@ -132,9 +130,9 @@ class Scan(Closing):
         else:
             self.rig.stage.stop()
 
-    @property
-    def _coordinate(self) -> str:
-        return "phase" if isinstance(self.plan, AxialPlan) else "travel"
+    def _visit(self, *places: Position) -> Report:
+        """Go to some places, to each once, and return where the body rests at last."""
+        return [self.rig.go(place) for place in dict.fromkeys(places)][-1]
 
     def _next(self, most: int, origin: float) -> Block | None:
         """Return the next frames, of which the first may have to be waited for."""
@@ -143,18 +141,17 @@ class Scan(Closing):
     def _block(
         self, frames: NDArray[Any], arrival: Floats, place: Floats, dropped: int, origin: float
     ) -> Block:
-        block = Block(
-            frames, index=self.count, time=arrival - origin, dropped=dropped, lent=frames.flags.c_contiguous
-        )
-        if self._coordinate == "phase":
-            return replace(block, phase=place)
-        return replace(block, travel=place)
+        known: dict[str, Any] = {self.plan.series: place}
+        lent = frames.flags.c_contiguous
+        return Block(frames, self.count, arrival - origin, dropped=dropped, lent=lent, **known)
 
     def _prepare(self) -> None:
-        """Go to where the scan begins; the body leans only when it is pressed."""
-        if isinstance(self.plan, AxialPlan):
-            self.rig.go(Position(self.plan.press))
-        self.rig.go(self.plan.first)
+        """Go to where the scan begins, and wait there; the body leans only when it is pressed."""
+        first = self.plan.first
+        rests = self._visit(Position(first.travel), first).time
+        if isinstance(self.plan, HorizontalPlan | TwistPlan):
+            while self.rig.take(1).time[-1] < rests + self.plan.wait:
+                pass
 
     def _known(self) -> Header:
         """Return what is known before anything moves."""
@@ -170,6 +167,8 @@ class Scan(Closing):
         )
         if isinstance(self.plan, AxialPlan):
             return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)
+        if isinstance(self.plan, HorizontalPlan | TwistPlan):
+            return replace(header, press=self.plan.press)
         return header
 
 
@@ -189,7 +188,7 @@ class StepScan(Scan):
     Parameters
     ----------
     rig : Rig
-    plan : VerticalPlan or AxialPlan
+    plan : Plan
         With steps.
     settle : float
         Seconds from rest to the first exposure.
@@ -228,7 +227,7 @@ class StepScan(Scan):
             self._go_on()
         frames, arrival, dropped = self._take(min(most, self._left))
         self._left -= len(frames)
-        place = np.full(len(frames), self._values[self._step])
+        place = np.repeat(self._values[self._step : self._step + 1], len(frames), axis=0)
         return self._block(frames, arrival, place, dropped, origin)
 
     def _go_on(self) -> None:
@@ -256,12 +255,13 @@ class StepScan(Scan):
 
 def _check_there(rest: Report, place: Position, name: str) -> None:
     """Refuse a stage that rests elsewhere than it was sent."""
-    travel, lean = _OFF_TARGET
-    off = abs(rest.position.travel - place.travel)
-    leans = max(abs(rest.position.pitch - place.pitch), abs(rest.position.roll - place.roll))
-    if off > travel or leans > lean:
+    off, turned = (
+        max(abs(getattr(rest.position, motion) - getattr(place, motion)) for motion in motions)
+        for motions in (("travel", "x", "y"), ("pitch", "roll", "twist"))
+    )
+    if off > _OFF_TARGET[0] or turned > _OFF_TARGET[1]:
         raise HardwareError(
-            f"{name} rests {off:.3f} mm and {np.degrees(leans):.3f} degrees from where it was sent:"
+            f"{name} rests {off:.3f} mm and {math.degrees(turned):.3f} degrees from where it was sent:"
             " look at its steps per mm and for what holds it"
         )
 

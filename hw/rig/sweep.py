@@ -15,7 +15,6 @@ from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.scan import Scan
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
-from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Block, Floats
 
 _SLOWER = 1.01  # than planned a turn may be, and still not have too many frames
@@ -33,7 +32,7 @@ class SweepScan(Scan):
     Parameters
     ----------
     rig : Rig
-    plan : VerticalPlan or AxialPlan
+    plan : Plan
         With a speed or a rate.
     turn_frames : int, optional
         Frames that a turn has at most: only every second, third, ... frame is given, as it takes.
@@ -92,9 +91,10 @@ class SweepScan(Scan):
         if not self._complete:
             return super().positions()
         number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
-        times, ways = zip(*self._reports, strict=True)
-        track = Track(times, ways, self._path)
-        return {self._coordinate: self._place(track.at(even_times(number, arrival) - self.delay.seconds))}
+        times, reported = zip(*self._reports, strict=True)
+        track = Track(times, reported, self._path)
+        ways = track.at(even_times(number, arrival) - self.delay.seconds)
+        return {self.plan.series: self.plan.recorded(ways)}
 
     def _prepare(self) -> None:
         super()._prepare()
@@ -124,7 +124,7 @@ class SweepScan(Scan):
         """Make a block of a part of the frames, and remember when they came."""
         time = taken.time[part]
         self._frames.append((taken.number[part], time))
-        return self._block(taken.pixels[part], time, self._place(way), taken.dropped, origin)
+        return self._block(taken.pixels[part], time, self.plan.recorded(way), taken.dropped, origin)
 
     def _begin(self, most: int) -> tuple[Frames, slice]:
         """Wait until frames show the body at rest, and begin to move; return these frames."""
@@ -134,12 +134,7 @@ class SweepScan(Scan):
         rests = stage.report().time + self.delay.seconds
         while (taken := self.rig.take(most)).time[-1] <= rests:
             pass
-        if isinstance(plan, AxialPlan):
-            tilt, turns, rate = plan.tilt, plan.turns, plan.rate or 0.0
-            self._move = self.rig.begin(lambda: stage.precess(tilt, turns, rate))
-        else:
-            stop, speed = Position(plan.stop), plan.speed
-            self._move = self.rig.begin(lambda: stage.move(stop, speed))
+        self._move = self.rig.begin(lambda: plan.begin(stage))
         self._live_track = LiveTrack(self._path, self._move.began)
         self._reports = [(self._move.began, 0.0)]
         return taken, slice(int(np.searchsorted(taken.time, rests, side="right")), len(taken.time))
@@ -154,7 +149,8 @@ class SweepScan(Scan):
     def _part(self, move: Move, exposed: Floats, way: Floats) -> slice:
         """Return which of some frames belong to the scan.
 
-        A press has frames at rest on either side. A rotation has none: they would count one phase too often.
+        A straight way has frames at rest on either side. A rotation has none: they would count one phase too
+        often.
         """
         end = int(np.searchsorted(exposed, move.ended, side="right"))
         if not isinstance(self.plan, AxialPlan):
@@ -168,7 +164,3 @@ class SweepScan(Scan):
             return part
         skipped = -int(taken.number[part.start]) % self._every
         return slice(min(part.start + skipped, part.stop), part.stop, self._every)
-
-    def _place(self, way: Floats) -> Floats:
-        """Return travel or phase so far along the way."""
-        return way if isinstance(self.plan, AxialPlan) else self.plan.start + way

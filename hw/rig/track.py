@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.hw.rig.plans import Plan, Trapezoid, VerticalPlan
+from mirrorskin.hw.rig.plans import Plan, Trapezoid
 from mirrorskin.hw.stage import Report
 from mirrorskin.io.types import Floats
 
@@ -32,15 +33,12 @@ class Progress:
 
     def __call__(self, report: Report) -> float:
         """Return the way so far; reports come in the order of their times."""
-        if isinstance(self._plan, VerticalPlan):
-            return min(
-                max(report.position.travel - self._plan.start, 0.0), self._plan.stop - self._plan.start
-            )
-        expected, phase = 0.0, report.position.phase
+        expected = 0.0
         if self._last is not None:  # as planned, but half as far: the body may have rested meanwhile
             before, way = self._last
-            expected = way + min(self._plan.path.speed * (report.time - before) / 2, math.pi)
-        now = phase + math.tau * round((expected - phase) / math.tau)
+            speed = self._plan.path.speed
+            expected = way + min(speed * (report.time - before) / 2, self._plan.period / 2)
+        now = self._plan.way(report.position, expected)
         self._last = report.time, now
         return now
 
@@ -139,7 +137,7 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
     def trajectory(values: Floats) -> tuple[float, Trapezoid]:
         shift, speed, ramp = values
         faster = path.speed * math.exp(speed)
-        return began + shift, Trapezoid(path.length, faster, faster / math.exp(ramp))
+        return began + shift, replace(path, speed=faster, acceleration=faster / math.exp(ramp))
 
     def residuals(values: Floats) -> Floats:
         start, trial = trajectory(values)

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from commands import run
 from served_rig import served_rig
@@ -36,6 +37,31 @@ def test_a_press_in_steps_becomes_a_recording(emulated, tmp_path):
         assert list(recording.travel) == [0, 0, 0.5, 0.5, 1, 1]
         assert recording.header.dark is not None
         assert recording.header.bright is not None
+
+
+def test_a_slide_in_steps_becomes_a_recording(emulated, tmp_path):
+    path = tmp_path / "slide.h5"
+    words = ("--press", "0.5mm", "--distance", "0.4mm", "--direction", "90deg", "--step", "0.2mm")
+    ended = capture(emulated, "horizontal", "-o", path, *words, "--wait", "0s", "--settle", "0s")
+    assert ended.code == 0, ended.said
+    with io.open_recording(path) as recording:
+        assert recording.motion == "horizontal"
+        assert recording.state == "complete"
+        np.testing.assert_allclose(recording.displacement, [[0, 0], [0, 0.2], [0, 0.4]])
+        assert recording.header.press == 0.5
+        assert recording.read(np.empty((3, *SHAPE), np.uint8)).frames.max() > 100
+
+
+def test_a_twist_without_a_halt_becomes_a_recording(emulated, tmp_path):
+    path = tmp_path / "twist.h5"
+    words = ("--press", "0.5mm", "--angle", "-10deg", "--speed", "20deg/s", "--wait", "0s")
+    ended = capture(emulated, "twist", "-o", path, *words)
+    assert ended.code == 0, ended.said
+    with io.open_recording(path) as recording:
+        assert recording.motion == "twist"
+        assert recording.twist[0] == 0
+        assert recording.twist[-1] == pytest.approx(np.radians(-10), abs=0.01)
+        assert np.all(np.diff(recording.twist) <= 0)
 
 
 def test_a_rotation_without_a_halt_becomes_a_recording(emulated, tmp_path):
@@ -89,7 +115,16 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         (["vertical", "--stop", "1mm", "--step", "1mm", "--settle", "-1s"], "0 or more"),
         (["vertical", "--stop", "1mm", "--step", "1mm", "--press", "1mm"], "--press says nothing"),
         (["axial", "--press", "1mm", "--phase-step", "45deg", "--stop", "1mm"], "--stop says nothing"),
-        (["horizontal", "--stop", "1mm"], "horizontal"),
+        (["horizontal", "--stop", "1mm"], "--stop says nothing of a motion that is horizontal"),
+        (["horizontal", "--press", "1mm", "--step", "1mm"], "--distance is missing"),
+        (["horizontal", "--press", "1mm", "--distance", "5mm", "--step", "1mm"], "5 mm of x are beyond"),
+        (["horizontal", "--press", "1mm", "--distance", "1mm", "--speed", "9mm/s"], "too fast"),
+        (["twist", "--press", "1mm", "--step", "1deg"], "--angle is missing"),
+        (["twist", "--press", "1mm", "--angle", "60deg", "--step", "1deg"], "60 degrees of twist are beyond"),
+        (["twist", "--press", "1mm", "--angle", "9deg", "--speed", "1deg"], "write e.g. 2deg/s"),
+        (["twist", "--press", "1mm", "--angle", "9deg", "--step", "1mm"], "--step 1mm"),
+        (["twist", "--press", "1mm", "--angle", "9deg", "--step", "1deg", "--wait", "-1s"], "a wait of -1 s"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--wait", "1s"], "--wait says nothing"),
     ],
 )
 def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, words, said):

@@ -10,6 +10,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.rig_file import load_rig
 from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import Axial, Camera, Twin, Vertical
+from mirrorskin.hw.twin import Axial, Camera, Horizontal, Twin, Twist, Vertical
 from mirrorskin.io import InputError
 
 PATIENCE = 20.0  # seconds, for a busy machine
@@ -99,13 +100,28 @@ def test_pitch_and_roll_are_the_lean_of_a_precession() -> None:
         assert np.mean(seen != direct(rig.twin(there), number)) < 0.001  # the angles are rounded
 
 
+def test_x_y_and_twist_are_those_of_the_twins_movements() -> None:
+    with EmulatedRig("coin", pattern="linear", **SMALL) as rig, say(rig) as command:
+        command("G21 G90 G1 Z-5 A0.6 B-0.3 F2000")
+        rest(rig)
+        number, seen = newest(rig)
+        slide = Horizontal(np.tile((0.6, -0.3), (number + 1, 1)), 1.0)
+        np.testing.assert_array_equal(seen, direct(rig.twin(slide), number))
+        command("A0 B0 C30 F2000")
+        rest(rig)
+        number, turned = newest(rig)
+        twist = Twist(np.full(number + 1, math.radians(30)), 1.0)
+        assert np.mean(turned != direct(rig.twin(twist), number)) < 0.001  # the angle is rounded
+        assert np.any(turned != seen)
+
+
 def test_an_arc_goes_round_at_the_tilt() -> None:
     with EmulatedRig(**SMALL) as rig, say(rig) as command:
+        begun = time.monotonic()
         command("G21 G90 G17 G1 X2 F2400")
         command("G3 X-2 Y0 I-2 J0 F2400")
         rest(rig)
-        end = time.monotonic()
-        places = [rig.where(float(at)) for at in np.linspace(end - 0.15, end, 30)]
+        places = [rig.where(float(at)) for at in np.linspace(begun, time.monotonic(), 300)]
         assert places[-1].phase == pytest.approx(math.pi)
         round_it = [place for place in places if place.phase > 0.1]
         assert len(round_it) > 5
@@ -120,10 +136,10 @@ def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then() -> N
         assert rig.where(time.monotonic()) == Position(-4.0, 0.0, 0.0)
         assert "error" in command("G1 X1 F100")
         assert "ok" in command("$H")
-        assert "ok" in command("G21 G90 G53 G1 X-10 Y-10 Z-6 F2000")
+        assert "ok" in command("G21 G90 G53 G1 X-10 Y-10 Z-6 A-2.5 B-2.5 C-50 F2000")
         rest(rig)
         place = rig.where(time.monotonic())
-        assert (place.travel, place.tilt) == pytest.approx((1.0, 0.0), abs=1e-9)
+        assert astuple(place) == pytest.approx((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("home", [False, True])
@@ -133,7 +149,7 @@ def test_all_places_that_the_settings_allow_lie_on_the_axes(home: bool) -> None:
     assert stage.port == rig.port.url
     for axis in stage.axes.values():
         ends = [axis.zero + axis.direction * value for value in axis.limits]
-        length = {"X": 20.0, "Y": 20.0, "Z": 10.0}[axis.letter]
+        length = {"X": 20.0, "Y": 20.0, "Z": 10.0, "A": 5.0, "B": 5.0, "C": 100.0}[axis.letter]
         assert abs(ends[0] - ends[1]) < length
         if home:
             assert -length < min(ends)

@@ -17,9 +17,11 @@ from mirrorskin.hw.rig_file import (
     TEMPLATE,
     CameraSettings,
     RigFile,
+    ShiftAxis,
     StageSettings,
     TiltAxis,
     TravelAxis,
+    TwistAxis,
     load_rig,
 )
 from mirrorskin.hw.stage import Limits
@@ -62,6 +64,30 @@ zero = 0.25
 unit = "deg"
 limits = [-5.0, 5.0]
 speed = 45
+
+[stage.x]
+letter = "X"
+direction = -1
+zero = 0.5
+unit = "mm"
+limits = [-1.5, 2.5]
+speed = 0.75
+
+[stage.y]
+letter = "Y"
+direction = 1
+zero = 0.0
+unit = "mm"
+limits = [-3.5, 3.5]
+speed = 1.25
+
+[stage.twist]
+letter = "B"
+direction = 1
+zero = 180.0
+unit = "deg"
+limits = [-30.0, 60.0]
+speed = 12.5
 
 [camera]
 source = "http://localhost:8000/video"
@@ -171,7 +197,15 @@ def test_a_source_beside_the_rig_file_is_found_from_anywhere(tmp_path, monkeypat
 
 def test_the_half_angle_is_the_largest_whole_circle_within_the_limits(rig):
     # The half-plane that is nearest to upright: pitch up to 4 degrees.
-    assert rig(EVERYTHING).stage.limits == Limits((-5.0, 3.0), pytest.approx(math.radians(4)), 2.0)
+    limits = rig(EVERYTHING).stage.limits
+    assert (limits.travel, limits.tilt, limits.press) == ((-5.0, 3.0), pytest.approx(math.radians(4)), 2.0)
+
+
+def test_x_y_and_twist_are_limited_as_the_file_says_and_missing_ones_do_not_move(rig):
+    limits = rig(EVERYTHING).stage.limits
+    assert (limits.x, limits.y) == ((-1.5, 2.5), (-3.5, 3.5))
+    assert limits.twist == pytest.approx((math.radians(-30), math.radians(60)))
+    assert rig(LEAST).stage.limits.x == rig(LEAST).stage.limits.twist == (0.0, 0.0)
 
 
 def test_a_stage_without_tilts_cannot_lean(rig):
@@ -221,6 +255,14 @@ WRONG = [
     ("limits = [-5, 3]", "limits = [3, 3]", "[stage.travel] limits are out of order, 3 not below 3: write ["),
     ("limits = [-5, 3]", "limits = [-5, true]", "stage.travel.limits is [-5, True]: a list of the least and"),
     ("limits = [-6.0, 4.0]", "limits = [0, 4]", "[stage.pitch] limits [0, 4] do not have 0 (upright) within"),
+    (
+        "limits = [-1.5, 2.5]",
+        "limits = [1, 2]",
+        "[stage.x] limits [1, 2] do not have 0 (where the body is",
+    ),
+    ("limits = [-30.0, 60.0]", "limits = [-400, 4]", "stage.twist.limits is [-400, 4]: a list of the least"),
+    ("speed = 0.75", "speed = 0", "stage.x.speed is 0: a speed above 0, in mm a second, is needed"),
+    ('letter = "B"', 'letter = "Y"', '[stage] twist.letter is "Y", and so is y.letter: each motion'),
     ("limits = [-6.0, 4.0]", "limits = [-90, 4]", "stage.pitch.limits is [-90, 4]: a list of the least and"),
     ("speed = 45", "speed = 0", "stage.roll.speed is 0: a speed above 0, in degrees a second, is needed"),
     (
@@ -385,6 +427,9 @@ TABLES = {
     "stage.travel": TravelAxis,
     "stage.pitch": TiltAxis,
     "stage.roll": TiltAxis,
+    "stage.x": ShiftAxis,
+    "stage.y": ShiftAxis,
+    "stage.twist": TwistAxis,
     "camera": CameraSettings,
 }
 
@@ -410,10 +455,11 @@ def test_the_example_of_the_documentation_is_the_template():
 def test_the_template_loads_with_all_its_keys_and_says_their_defaults(rig, tmp_path):
     plain = rig(TEMPLATE)
     save(tmp_path / "bright.tif", np.full((480, 640), 200, np.uint8))
-    whole = re.sub(r"^# (?=\w+ = )", "", TEMPLATE, flags=re.MULTILINE)
+    whole = re.sub(r"^# (?=\w+ = |\[)", "", TEMPLATE, flags=re.MULTILINE)
     said = tomllib.loads(whole)
     tables = {"": said} | {name: said[name] for name in ("stage", "camera")}
-    tables |= {f"stage.{name}": said["stage"][name] for name in ("travel", "pitch", "roll")}
+    tables |= {f"stage.{name}": said["stage"][name] for name in said["stage"] if f"stage.{name}" in TABLES}
     for table, model in TABLES.items():
         assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
-    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0))
+    sideways = {name: getattr(rig(whole).stage, name) for name in ("x", "y", "twist")}
+    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), **sideways)

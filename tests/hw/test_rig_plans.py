@@ -5,11 +5,19 @@ import pytest
 from msgspec import structs
 from rig_fakes import settings
 
-from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan, check_plan
+from mirrorskin.hw.rig.plans import (
+    AxialPlan,
+    HorizontalPlan,
+    Trapezoid,
+    TwistPlan,
+    VerticalPlan,
+    check_plan,
+)
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
-STAGE = settings().stage  # -5 to 3 mm, press 2 mm, 0.1 rad; 20 mm/s, 20 rad/s, pitch and roll on X and Y
+# -5 to 3 mm, press 2 mm, 0.1 rad; x and y to 1 mm, twist to 0.5 rad; 20 mm/s, 20 rad/s
+STAGE = settings().stage
 NAN, INF = math.nan, math.inf
 
 ways = pytest.mark.parametrize(
@@ -50,9 +58,40 @@ def test_a_rotation_leans_by_its_tilt_towards_each_phase():
         assert math.cos(place.phase - phase) == pytest.approx(1)
 
 
+def test_a_slide_goes_straight_where_it_is_directed_and_says_its_displacement():
+    plan = HorizontalPlan(1.5, 0.5, math.radians(30), step=0.25)
+    along = [math.cos(math.radians(30)), math.sin(math.radians(30))]
+    np.testing.assert_allclose(plan.values, np.outer([0, 0.25, 0.5], along), atol=1e-12)
+    assert [(place.x, place.y) for place in plan.places] == [tuple(row) for row in plan.values]
+    assert {place.travel for place in plan.places} == {1.5}
+    assert plan.first == Position(1.5)
+
+
+def test_a_slide_along_an_axis_needs_no_other():
+    stage = structs.replace(STAGE, x=None, twist=None)
+    check_plan(HorizontalPlan(1.0, 0.5, math.pi / 2, step=0.5), stage, "stage")
+    with pytest.raises(InputError, match=r"no axis of x.* add \[stage.x\]"):
+        check_plan(HorizontalPlan(1.0, 0.5, math.pi / 4, step=0.5), stage, "stage")
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_twist_turns_the_way_of_its_sign(sense):
+    plan = TwistPlan(1.0, sense * 0.4, step=0.1)
+    np.testing.assert_allclose(plan.values, sense * np.array([0, 0.1, 0.2, 0.3, 0.4]))
+    assert [place.twist for place in plan.places] == list(plan.values)
+    assert plan.way(Position(1.0, twist=sense * 0.3), 0.0) == pytest.approx(0.3)
+    assert plan.way(Position(1.0, twist=-sense * 1e-4), 0.0) == 0
+
+
 @pytest.mark.parametrize(
     ("plan", "limit"),
     [
+        (HorizontalPlan(2.5, 0.5, step=0.1), "2 mm"),
+        (HorizontalPlan(1.0, 1.2, step=0.1), "1.2 mm of x are beyond"),
+        (HorizontalPlan(1.0, 1.2, -math.pi / 2, speed=0.1), "-1.2 mm of y are beyond"),
+        (TwistPlan(1.0, -0.6, step=0.1), "degrees of twist are beyond"),
+        (HorizontalPlan(1.0, 0.5, speed=21.0), "too fast"),
+        (TwistPlan(1.0, 0.4, speed=21.0), "axis of twist is too fast; at most 10.47 rad/s"),
         (VerticalPlan(-6.0, 1.0, speed=1), "-5"),
         (VerticalPlan(0.0, 2.5, speed=1), "2 mm"),
         (VerticalPlan(0.0, 3.5, step=1), "3 mm"),
@@ -111,6 +150,26 @@ def test_a_rotation_that_cannot_be_is_refused(values):
 
 
 @pytest.mark.parametrize(
+    ("make", "wrong"),
+    [
+        (HorizontalPlan, {"distance": 0}),
+        (HorizontalPlan, {"distance": 1, "direction": NAN}),
+        (HorizontalPlan, {"distance": 1, "press": INF}),
+        (HorizontalPlan, {"distance": 1, "wait": -1}),
+        (HorizontalPlan, {"distance": 1, "step": 2}),
+        (HorizontalPlan, {"distance": 1, "speed": 1}),
+        (TwistPlan, {"angle": 0}),
+        (TwistPlan, {"angle": NAN}),
+        (TwistPlan, {"angle": 1, "wait": INF}),
+        (TwistPlan, {"angle": 1, "step": -0.1}),
+    ],
+)
+def test_a_slide_or_a_twist_that_cannot_be_is_refused(make, wrong):
+    with pytest.raises(InputError):
+        make(**{"press": 1.0, "step": 0.5, **wrong})
+
+
+@pytest.mark.parametrize(
     ("plan", "said"),
     [
         (VerticalPlan(0.0, 1.0, speed=20.1), "axis of travel is too fast"),
@@ -128,7 +187,7 @@ def test_what_the_stage_cannot_do_is_refused(plan, said):
 
 
 def test_arcs_that_grbl_does_not_have_are_refused_and_steps_are_not():
-    stage = structs.replace(STAGE, pitch=structs.replace(STAGE.pitch, letter="A"))
+    stage = structs.replace(STAGE, pitch=structs.replace(STAGE.pitch, letter="A"), x=None)
     with pytest.raises(InputError, match="no arcs in the axes A and Y"):
         check_plan(AxialPlan(1.0, 0.04, rate=1.0), stage, "stage")
     check_plan(AxialPlan(1.0, 0.04, phase_step=1.0), stage, "stage")

@@ -1,6 +1,7 @@
 """Scans of a stage and a camera that are made up, so that every frame tells where it was exposed."""
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from rig_fakes import FakeCamera, FakeStage, settings, spreading
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import delay as delays
-from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, TwistPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
@@ -90,6 +91,57 @@ def test_each_frame_of_a_stepwise_turn_shows_its_phase():
     assert scan.header.press == 0.5
     assert scan.header.tilt == TILT
     assert scan.header.pivot == (0, 0, 0)
+
+
+def slid(place):
+    """A picture that tells travel, x, y and twist: 100 counts a mm or radian from 100 at 0."""
+    values = place.travel, place.x, place.y, place.twist
+    return np.clip(100 + 100 * np.array([values, values]), 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("plan", "columns"),
+    [
+        (HorizontalPlan(0.5, 0.8, math.radians(210), step=0.4), [1, 2]),
+        (TwistPlan(0.5, -0.4, step=0.2), [3]),
+    ],
+)
+def test_each_frame_of_a_stepwise_slide_or_twist_shows_where_it_tells(plan, columns):
+    with make_rig(slid) as rig:
+        with StepScan(rig, plan, settle=0.0, frames=2) as scan:
+            blocks = drain(scan, np.empty((8, 2, 4), np.uint8))
+        places = rig.stage.moves
+    told_values, frames = joined(blocks, plan.series), joined(blocks, "frames")
+    np.testing.assert_allclose(told_values, np.repeat(plan.values, 2, axis=0))
+    np.testing.assert_allclose(frames[:, 0, columns], 100 + 100 * told_values.reshape(6, -1), atol=1)
+    np.testing.assert_array_equal(frames[:, 0, 0], 150)
+    np.testing.assert_array_equal(scan.positions()[plan.series], told_values)
+    assert scan.header.press == 0.5
+    end = plan.places[-1]
+    assert places[:3] == [Position(-5.0), Position(0.5), Position(0.5)]
+    assert places[-2:] == [replace(end, travel=-5.0), Position(-5.0)], "up first, and back above the object"
+
+
+def test_a_slide_without_a_halt_waits_pressed_and_then_knows_where_it_is():
+    plan = HorizontalPlan(0.5, 0.8, math.radians(30), speed=1.5, wait=0.2)
+    with make_rig(slid, rate=100.0) as rig:
+        scan = SweepScan(rig, plan)
+        began = time.monotonic()
+        with scan:
+            assert time.monotonic() > began + plan.wait
+            blocks = drain(scan, np.empty((8, 2, 4), np.uint8))
+    places = _exposed(scan)[0]
+    true = np.array([(place.x, place.y) for place in places])
+    np.testing.assert_allclose(joined(blocks, "displacement"), true, atol=0.1)
+    np.testing.assert_allclose(scan.positions()["displacement"], true, atol=0.02)
+    assert true[0].tolist() == [0, 0]
+
+
+def test_a_body_that_was_left_displaced_is_lifted_before_it_goes_back():
+    with make_rig() as rig:
+        rig.go(Position(0.5, x=0.4, twist=0.1))
+        StepScan(rig, HorizontalPlan(0.5, 0.5, step=0.5)).lift()
+        assert rig.stage.moves[-2:] == [Position(-5.0, x=0.4, twist=0.1), Position(-5.0)]
 
 
 def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):

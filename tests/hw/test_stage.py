@@ -8,6 +8,7 @@ from mirrorskin.hw.stage import Limits, Position
 from mirrorskin.io import InputError
 
 LIMITS = Limits(travel=(-2.0, 10.0), tilt=math.radians(3), press=4.0)
+SIDEWAYS = Limits((-2.0, 10.0), 0.0, 4.0, x=(-1.0, 2.0), twist=(math.radians(-10), math.radians(20)))
 
 
 def test_a_lean_has_a_half_angle_and_a_phase():
@@ -63,3 +64,29 @@ def test_what_lies_beyond_a_limit_is_refused_by_its_name(place, limit):
 )
 def test_how_far_a_place_is_beyond_the_limits_is_known(place, excess):
     assert LIMITS.excess(place) == pytest.approx(excess)
+
+
+@pytest.mark.parametrize(
+    ("place", "limit"),
+    [
+        (Position(x=2.01), "2.01 mm of x are beyond the axis, which goes from -1 to 2 mm"),
+        (Position(x=math.nan), "beyond the axis"),
+        (Position(twist=math.radians(-10.5)), "-10.5 degrees of twist are beyond"),
+        (Position(y=0.1), r"no axis of y, which was to go to 0.1 mm; add \[stage.y\]"),
+    ],
+)
+def test_a_move_sideways_beyond_its_limit_is_refused(place, limit):
+    with pytest.raises(InputError, match=f"^rig: .*{limit}"):
+        SIDEWAYS.check(place, "rig")
+
+
+def test_moves_sideways_count_in_how_far_a_place_is_beyond_the_limits():
+    assert SIDEWAYS.excess(Position(x=-1.0, twist=math.radians(20))) == pytest.approx(0)
+    assert SIDEWAYS.excess(Position(x=-1.5)) == pytest.approx(0.5)
+    assert SIDEWAYS.excess(Position(twist=math.radians(22))) == pytest.approx(2)
+
+
+def test_the_nearest_place_within_the_limits_is_upright():
+    assert SIDEWAYS.nearest(Position(5.0, 0.01, 0.0, 3.0, 0.1, -1.0)) == Position(
+        4.0, x=2.0, twist=math.radians(-10)
+    )

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,18 @@ import numpy as np
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.plans import Trapezoid
-from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings, TiltAxis, TravelAxis
+from mirrorskin.hw.rig_file import (
+    CameraSettings,
+    RigSettings,
+    ShiftAxis,
+    StageSettings,
+    TiltAxis,
+    TravelAxis,
+    TwistAxis,
+)
 from mirrorskin.hw.stage import Limits, Position, Report
 
-LIMITS = Limits((-5.0, 3.0), 0.1, 2.0)
+LIMITS = Limits((-5.0, 3.0), 0.1, 2.0, (-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5))
 PERIOD = 0.05  # seconds between reports
 
 
@@ -32,6 +41,9 @@ def settings(shape=(8, 8), **camera):
         travel=TravelAxis(letter="Z", limits=(-5.0, 3.0), speed=20.0),
         pitch=pitch,
         roll=roll,
+        x=ShiftAxis(letter="A", limits=(-1.0, 1.0), speed=20.0),
+        y=ShiftAxis(letter="B", limits=(-1.0, 1.0), speed=20.0),
+        twist=TwistAxis(letter="C", limits=(-math.degrees(0.5), math.degrees(0.5)), speed=600.0),
     )
     eye = CameraSettings(source=0, size=shape[::-1], **camera)
     return RigSettings(Path("rig.toml"), "fake", stage, eye)
@@ -66,14 +78,21 @@ class FakeStage:
         return not self.stops and path is not None and time.monotonic() < began + path.duration
 
     def move(self, place, speed=None):
-        self.limits.check(place, self.name)
-        self.moves.append(place)
-        here = self.position(math.inf)
-        gap = np.array([place.travel - here.travel, place.pitch - here.pitch, place.roll - here.roll])
-        length = abs(gap[0]) if gap[0] else float(np.hypot(gap[1], gap[2]))
+        self.follow([place], speed)
+
+    def follow(self, places, speed=None):
+        for place in places:
+            self.limits.check(place, self.name)
+            self.moves.append(place)
+            self._straight(place, speed)
+
+    def _straight(self, place, speed):
+        start = np.array(astuple(self.position(math.inf)))
+        gap = np.array(astuple(place)) - start
+        shift = np.linalg.norm(gap[[0, 3, 4]])
+        length = float(shift if shift else np.linalg.norm(gap))
         if length == 0:
             return
-        start = np.array([here.travel, here.pitch, here.roll])
         self._add(length, speed or 100.0, lambda way: Position(*(start + gap * way / length)))
 
     def precess(self, tilt, turns, rate, start=0.0):
@@ -106,8 +125,8 @@ class FakeStage:
                 told = due + float(
                     np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3)
                 )
-                rounded = Position(round(place.travel, 3), round(place.pitch, 6), round(place.roll, 6))
-                self._reports.append(Report(told, rounded, "run"))
+                rounded = np.round(astuple(place), 6)
+                self._reports.append(Report(told, Position(*map(float, rounded)), "run"))
             return [report for report in self._reports if since < report.time]
 
     def stop(self):
@@ -118,7 +137,9 @@ class FakeStage:
 
     def _add(self, length, speed, place):
         path = Trapezoid(length, speed, self._acceleration * speed)
-        self._legs = [*self._legs, (time.monotonic() + 0.01, path, place)]
+        began, last, _ = self._legs[-1]
+        begins = max(time.monotonic() + 0.01, began + (0.0 if last is None else last.duration))
+        self._legs = [*self._legs, (begins, path, place)]
 
 
 class FakeCamera:
