@@ -6,19 +6,41 @@ from pathlib import Path
 from typing import Annotated
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument
+from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.output import print_fields, print_json
 
 
 def command(
     file: Annotated[Path, Argument(metavar="FILE", help="Recording, result, or any HDF5 file.")],
+    verify: Annotated[
+        bool, Option("--verify", help="Read all frames, and compare them with their checksums.")
+    ] = False,
     as_json: options.Json = False,
 ) -> None:
     """Tell what a file holds."""
     from mirrorskin import io
 
     facts = io.describe(file)
+    if verify:
+        facts["checksums"] = _verify(file)
     if as_json:
         print_json(facts)
     else:
         print_fields(facts)
+
+
+def _verify(file: Path) -> str:
+    """Tell that all frames are as they were recorded; InputError if they are not, or if nothing can tell."""
+    from mirrorskin import io
+
+    with io.open_recording(file) as recording:
+        damaged, count = recording.find_damage(), recording.shape[0]
+    if damaged is None:
+        raise io.InputError(f"{file} has no checksums of its frames: only recordings of this program have")
+    if damaged.size:
+        numbers = ", ".join(map(str, damaged[:5])) + (", ..." if damaged.size > 5 else "")
+        raise io.InputError(
+            f"{file}: {damaged.size} of {count} frames differ from what was recorded ({numbers}): "
+            "copy it again"
+        )
+    return f"all {count} frames are as they were recorded"

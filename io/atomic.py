@@ -22,6 +22,10 @@ MAKE_ROOM = "make room, or choose another place with -o"
 
 _PREFIX, _SUFFIX = ".mirrorskin-", ".part"
 
+# Files for HDF5 1.10 and later: the first whose own structures have checksums, and that could read what is
+# being written.
+VERSIONS = ("v110", "v110")
+
 # Frames begin with a page, so that they can be worked on where they lie.
 _ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
@@ -79,7 +83,7 @@ class NewHdf5:
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
         self._disk = _Disk(descriptor, "w+b", closefd=False)
-        self.root = h5py.File(self._disk, "w", **_ALIGNED)
+        self.root = h5py.File(self._disk, "w", libver=VERSIONS, **_ALIGNED)
 
     def check(self) -> None:
         """Raise InputError if the disk did not take all that was written so far."""

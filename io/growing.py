@@ -16,15 +16,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import MAKE_ROOM
+from mirrorskin.io.atomic import MAKE_ROOM, VERSIONS
 from mirrorskin.io.calibration.file import CARRIED, size_of, write_calibration
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.layout import DROPPED, LIVE, POSITIONS, SERIES, STATE, UNDER_WAY, USED
-from mirrorskin.io.recorder import Compression, new_stack, packing, write_header, write_plot
+from mirrorskin.io.layout import CHECKSUM, DROPPED, LIVE, POSITIONS, SERIES, STATE, UNDER_WAY, USED
+from mirrorskin.io.recorder import Compression, checksums, new_stack, packing, write_header, write_plot
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
-# Files for HDF5 1.10 and later, the first that could read what is being written.
-_VERSIONS = ("v110", "v110")
 _STATE_LENGTH = 240  # bytes; their place is made before the first frame
 _ROWS = 1 << 14  # of each column, for which there is room at once
 _PAGE, _STEP, _SPARE, _MOST_META = 4 << 10, 64 << 20, 2 << 20, 4 << 20  # bytes
@@ -136,6 +134,7 @@ class GrowingRecording(Closing):
             for column in columns if rows is not None else ():
                 column.set(self.count, rows)
         self._dropped.set(self.count, np.array([block.dropped]))
+        self._checksums.set(self.count, checksums(frames))
         self.count += n
 
     def mark(self, index: int, used: NDArray[np.bool_]) -> None:
@@ -190,12 +189,13 @@ class GrowingRecording(Closing):
         if position in LIVE:
             self._series[position].append(Column(file, *LIVE[position], np.nan, expected))
         self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
+        self._checksums = Column(file, CHECKSUM, None, np.uint32(0), expected)
         self._used = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
         """Do so; the room that was reserved last is enough for it."""
         self._frames.flush()  # the frames are there before anything says so
-        for column in (*itertools.chain(*self._series.values()), self._dropped, self._used):
+        for column in (*itertools.chain(*self._series.values()), self._dropped, self._checksums, self._used):
             column.flush(self.count)
         self._file.flush()
 
@@ -212,7 +212,7 @@ def _new_hdf5(descriptor: int, meta: int, frame: int) -> h5py.File:
     return h5py.File(
         f"/proc/self/fd/{descriptor}",
         "w",
-        libver=_VERSIONS,
+        libver=VERSIONS,
         locking=False,  # HDF5 lets go of its lock when others may read; ours stays
         meta_block_size=meta,
         alignment_threshold=frame,

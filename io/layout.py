@@ -40,6 +40,8 @@ SERIES = {
 # was used, how many were lost before it, and whether all is well.
 LIVE = {"travel": (f"{STAGE}/travel_live", "mm"), "phase": (f"{STAGE}/phase_live", "rad")}
 USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
+# The CRC-32 of each frame's bytes, as it was recorded.
+CHECKSUM = f"{DETECTOR}/frame_checksum"
 UNDER_WAY, COMPLETE, CUT_SHORT = "under way", "complete", "cut short: "
 
 

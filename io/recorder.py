@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.layout import MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
+from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 from mirrorskin.io.writing import fixed_text
 
@@ -75,6 +76,11 @@ def new_stack(file: h5py.File, shape: tuple[int, int, int], dtype: Any, **storag
     stack = file.create_dataset(STACK, shape, dtype, **storage)
     stack.attrs.update(interpretation="image", units="counts")
     return stack
+
+
+def checksums(frames: NDArray[Any]) -> NDArray[np.uint32]:
+    """Return the CRC-32 of each frame's bytes."""
+    return np.array([zlib.crc32(np.ascontiguousarray(frame).data) for frame in frames], np.uint32)
 
 
 def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:
@@ -178,6 +184,7 @@ class Recorder(TeeSource[Source]):
         self._truth = truth
         self._count = 0
         self._series: dict[str, Floats] = {}
+        self._checksums = np.zeros(self.shape[0], np.uint32)
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
@@ -201,6 +208,7 @@ class Recorder(TeeSource[Source]):
             self._count = part.stop
             self._check_count(self._count <= self.shape[0])
             self._frames[part] = block.frames
+            self._checksums[part] = checksums(block.frames)
             for name in SERIES:
                 values = getattr(block, name)
                 if values is not None:
@@ -224,6 +232,7 @@ class Recorder(TeeSource[Source]):
             self._check_count(self._count == self.shape[0])
             for name, values in self._series.items():
                 put(self._new.root, *SERIES[name], values)
+            put(self._new.root, CHECKSUM, None, self._checksums)
             if self._truth is not None:
                 truth = self._truth() if callable(self._truth) else self._truth
                 _write_truth(self._new.root, truth)

@@ -16,9 +16,10 @@ from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
-from mirrorskin.io.layout import MARK, STACK, Layout, RecordingState, read_state
+from mirrorskin.io.layout import CHECKSUM, MARK, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
+from mirrorskin.io.recorder import checksums
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.result import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
@@ -159,6 +160,23 @@ class Recording(Closing):
     @functools.cached_property
     def _fingerprint(self) -> str:
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
+
+    def find_damage(self) -> NDArray[np.intp] | None:
+        """Return which frames are not as they were recorded, by their checksums; None where it has none.
+
+        Only of a recording that was opened as a whole, which is rewound.
+        """
+        if self.shape != self.full_shape:
+            raise InputError(f"{self.name}: frames are verified whole: open it without frames and region")
+        node = self._file.find(CHECKSUM)
+        if node is None:
+            return None
+        expected = self._file.read(node, (self.full_shape[0],), rows=self.full_shape[0])
+        room = np.empty((1, *self.shape[1:]), self.dtype)
+        self.rewind()
+        found = [checksums(block.frames) for block in iter(lambda: self.read(room), None)]
+        self.rewind()
+        return np.flatnonzero(np.concatenate(found) != expected)
 
     @functools.cached_property
     def carried(self) -> Calibration | None:

@@ -2,12 +2,14 @@
 
 import contextlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from commands import run
@@ -115,6 +117,19 @@ def test_a_memory_limit_changes_nothing(folder):
 def test_info_tells_what_a_file_holds(folder):
     assert "30 of 70 x 60, uint8" in mirrorskin("info", "sphere.h5", cwd=folder)
     assert json.loads(mirrorskin("info", "sphere-result.h5", "--json", cwd=folder))["kind"] == "result"
+
+
+def test_a_damaged_frame_is_found(folder, tmp_path):
+    assert "all 30 frames are as they were recorded" in mirrorskin(
+        "info", "--verify", "sphere.h5", cwd=folder
+    )
+    copy = tmp_path / "copy.h5"
+    shutil.copy(folder / "sphere.h5", copy)
+    with h5py.File(copy, "r+") as file:
+        file["/entry/instrument/detector/data"][7, 3, 2] ^= 1
+    ended = run("info", "--verify", copy)
+    assert ended.code == 2
+    assert "1 of 30 frames differ from what was recorded (7): copy it again" in ended.said
 
 
 def test_devices_lists_what_there_is():

@@ -77,6 +77,7 @@ def test_a_vertical_recording_has_the_layout_of_the_design(tmp_path):
         f"{instrument}/detector/y_pixel_size": ((), "f8", mm),
         f"{instrument}/detector/frame_time": ((8,), "f8", {"units": "s"}),
         f"{instrument}/detector/dark": ((5, 7), "f4", {"units": "counts"}),
+        f"{instrument}/detector/frame_checksum": ((8,), "u4", {}),
         f"{instrument}/detector/bright": ((5, 7), "f4", {"units": "counts"}),
         f"{instrument}/stage": {"NX_class": "NXpositioner"},
         f"{instrument}/stage/motion": ((), "text", {}),
