@@ -23,6 +23,8 @@ def command(
     output: options.NewRecording,
     start: scans.Start = None,
     stop: scans.Stop = None,
+    strokes: scans.Strokes = None,
+    stroke_depth: scans.StrokeDepth = None,
     step: scans.Step = None,
     speed: scans.Speed = None,
     press: scans.Press = None,

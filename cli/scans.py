@@ -55,6 +55,12 @@ LiveMotion = Annotated[LiveName, Argument(help="How the body moves.")]
 RigFile = Annotated[Path, Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
 Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
 Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
+Strokes = Annotated[
+    int | None, Option(min=2, metavar="N", help="Vertical: go down and up, so many ways together.")
+]
+StrokeDepth = Annotated[
+    str | None, _option("LENGTH", "Vertical, with --strokes: their depth, in place of --start.")
+]
 Step = Annotated[
     str | None, _option("LENGTH", "But axial, in steps: from place to place; of a twist an angle, 1deg.")
 ]
@@ -80,7 +86,7 @@ StepFrames = Annotated[int | None, Option("--frames", min=1, help="In steps: at 
 
 # The motions of an option that not all have; threshold, hold and window are live's.
 _OF: Mapping[str, str] = {
-    **dict.fromkeys(("start", "stop", "threshold", "hold"), "vertical"),
+    **dict.fromkeys(("start", "stop", "strokes", "stroke_depth", "threshold", "hold"), "vertical"),
     **dict.fromkeys(("step", "speed"), "vertical horizontal twist"),
     **dict.fromkeys(("tilt", "turns", "phase_step", "rate", "window"), "axial"),
     "press": "axial horizontal twist",
@@ -179,10 +185,17 @@ def _remains(recorder: StreamRecorder) -> str:
 def _vertical(words: Mapping[str, Any]) -> VerticalPlan:
     from mirrorskin.cli.quantity import length
     from mirrorskin.hw.rig.plans import VerticalPlan
+    from mirrorskin.io import InputError
 
-    start = length(words["start"] or _START, "--start")
     stop = length(_needed(words["stop"], "--stop", "2mm"), "--stop")
-    return VerticalPlan(start, stop, **_pace(words, length, "0.5mm/s"))
+    strokes, depth = words["strokes"], words["stroke_depth"]
+    if depth is None:
+        start = length(words["start"] or _START, "--start")
+    elif strokes is None or words["start"] is not None:
+        raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
+    else:
+        start = stop - length(depth, "--stroke-depth")
+    return VerticalPlan(start, stop, strokes=strokes or 1, **_pace(words, length, "0.5mm/s"))
 
 
 def _horizontal(words: Mapping[str, Any]) -> HorizontalPlan:
@@ -224,9 +237,7 @@ def _axial(words: Mapping[str, Any]) -> AxialPlan:
     )
 
 
-def _pace(
-    words: Mapping[str, Any], quantity: Callable[[str, str], float], example: str
-) -> dict[str, float | None]:
+def _pace(words: Mapping[str, Any], quantity: Callable[[str, str], float], example: str) -> dict[str, Any]:
     """Read the step and the speed, as in ``0.5mm/s``, of which one is given, in mm or rad."""
     from mirrorskin.io import InputError
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _RAMP = 0.1  # seconds in which a stage is taken to reach its speed, as long as nothing else is known
 _STEPS_MAX = 10**6
 _TURNS_MAX = 10_000
+_STROKES_MAX = 10_000
 _ROUNDING = 1e-9  # of a step
 
 
@@ -192,27 +193,35 @@ class _Straight(Plan):
 
 @dataclass(frozen=True, slots=True)
 class VerticalPlan(_Straight):
-    """Lower the body from one travel to another; values that cannot be are an `InputError`.
+    """Lower the body from one travel to another, and then up and down between them, if it is to oscillate.
+
+    Values that cannot be are an `InputError`.
 
     Attributes
     ----------
     start, stop : float
-        First and last travel, mm; the second lies deeper.
+        First travel, and that of the first stroke's end, mm; the second lies deeper.
     step : float or None
-        From place to place, mm, where it goes in steps; the last place is the last that is not beyond `stop`.
+        From place to place, mm, where it goes in steps; the last place of a stroke is the last that is not
+        beyond `stop`.
     speed : float or None
         Where it goes without a halt, mm/s. Either `step` or `speed` is given.
+    strokes : int
+        How often it goes down or up, at most 10 000 times; the first stroke goes down.
 
     Examples
     --------
     >>> VerticalPlan(0.0, 1.0, step=0.5).values
     array([0. , 0.5, 1. ])
+    >>> VerticalPlan(0.0, 1.0, step=0.5, strokes=3).values.tolist()
+    [0.0, 0.5, 1.0, 0.5, 0.0, 0.5, 1.0]
     """
 
     start: float
     stop: float
     step: float | None = None
     speed: float | None = None
+    strokes: int = 1
     motion: ClassVar[Motion] = "vertical"
     series: ClassVar[str] = "travel"
 
@@ -223,24 +232,53 @@ class VerticalPlan(_Straight):
             raise InputError(
                 f"a press from {self.start:g} to {self.stop:g} mm does not go down: give a deeper stop"
             )
+        if not 1 <= self.strokes <= _STROKES_MAX:
+            raise InputError(f"{self.strokes} strokes cannot be: 1 to {_STROKES_MAX} are possible")
         self._check("mm")
 
     @property
     def length(self) -> float:
-        """How far it goes down, mm."""
-        return self.stop - self.start
+        """How far it goes in all strokes, mm."""
+        return self.strokes * self._depth
+
+    @property
+    def path(self) -> Trapezoid:
+        """The way without a halt: a leg for each stroke."""
+        assert self.speed is not None
+        return Trapezoid.planned(self.length, self.speed, self.strokes)
+
+    @property
+    def period(self) -> float:
+        """Down and up."""
+        return math.inf if self.strokes == 1 else 2 * self._depth
+
+    @property
+    def ends(self) -> list[Position]:
+        """Where the body turns, and where it ends."""
+        return [Position(self.start if number % 2 else self.stop) for number in range(self.strokes)]
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far down."""
-        return Position(travel=self.start + way)
+        """Return where the body stands so far on its way."""
+        return Position(travel=float(self.recorded(np.asarray(way))))
 
     def recorded(self, ways: Floats) -> Floats:
         """Return the travel, (n,), mm."""
-        return self.start + ways
+        number = np.clip(ways // self._depth, 0, self.strokes - 1)
+        along = ways - number * self._depth
+        return np.asarray(self.start + np.where(number % 2, self._depth - along, along))
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far down it has come, mm."""
-        return min(max(position.travel - self.start, 0.0), self.length)
+        """Return how far on its way it has come, mm: in the stroke that is next to what is expected."""
+        depth = min(max(position.travel - self.start, 0.0), self._depth)
+        number = np.arange(self.strokes)
+        ways = np.where(number % 2, (number + 1) * self._depth - depth, number * self._depth + depth)
+        return float(ways[np.argmin(abs(ways - expected))])
+
+    @property
+    def _depth(self) -> float:
+        """How far a stroke goes, mm."""
+        depth = self.stop - self.start
+        return depth if self.step is None else self.step * _whole(depth / self.step)
 
 
 @dataclass(frozen=True, slots=True)

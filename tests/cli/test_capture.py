@@ -39,6 +39,31 @@ def test_a_press_in_steps_becomes_a_recording(emulated, tmp_path):
         assert recording.header.bright is not None
 
 
+def test_strokes_become_a_recording_of_which_heights_and_hysteresis_are_made(emulated, tmp_path):
+    path = tmp_path / "strokes.h5"
+    words = (
+        "--stop",
+        "1mm",
+        "--strokes",
+        "4",
+        "--stroke-depth",
+        "0.8mm",
+        "--step",
+        "0.4mm",
+        "--settle",
+        "0s",
+    )
+    ended = capture(emulated, "vertical", "-o", path, *words)
+    assert ended.code == 0, ended.said
+    with io.open_recording(path) as recording:
+        travel = [0.2, 0.6, 1.0, 0.6, 0.2, 0.6, 1.0, 0.6, 0.2]
+        np.testing.assert_allclose(recording.travel, travel)
+    assert run("reconstruct", path, "-o", tmp_path / "heights.h5").code == 0
+    result = io.open_result(tmp_path / "heights.h5")
+    assert np.nanmax(result.strokes) >= 2
+    np.testing.assert_allclose(result.hysteresis[np.isfinite(result.hysteresis)], 0, atol=0.05)
+
+
 def test_a_slide_in_steps_becomes_a_recording(emulated, tmp_path):
     path = tmp_path / "slide.h5"
     words = ("--press", "0.5mm", "--distance", "0.4mm", "--direction", "90deg", "--step", "0.2mm")
@@ -115,6 +140,12 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         (["vertical", "--stop", "1mm", "--step", "1mm", "--settle", "-1s"], "0 or more"),
         (["vertical", "--stop", "1mm", "--step", "1mm", "--press", "1mm"], "--press says nothing"),
         (["axial", "--press", "1mm", "--phase-step", "45deg", "--stop", "1mm"], "--stop says nothing"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--stroke-depth", "1mm"], "needs --strokes"),
+        (
+            ["vertical", "--stop", "1mm", "--step", "1mm", "--strokes", "2", "--stroke-depth", "9mm"],
+            "beyond the axis",
+        ),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--strokes", "99999"], "strokes cannot be"),
         (["horizontal", "--stop", "1mm"], "--stop says nothing of a motion that is horizontal"),
         (["horizontal", "--press", "1mm", "--step", "1mm"], "--distance is missing"),
         (["horizontal", "--press", "1mm", "--distance", "5mm", "--step", "1mm"], "5 mm of x are beyond"),

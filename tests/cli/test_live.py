@@ -89,6 +89,17 @@ def test_a_press_is_told_recorded_and_kept(fake, tmp_path):
     assert fake.camera.closed
 
 
+def test_strokes_are_joined_and_their_hysteresis_is_told(fake, tmp_path):
+    output = tmp_path / "res.h5"
+    words = ["--stop", "1mm", "--stroke-depth", "0.8mm", "--strokes", "4", "--speed", "2.5mm/s"]
+    done = fake.run("vertical", *words, "-o", str(output))
+    assert done.exit_code == 0, done.output
+    result = io.open_result(output)
+    assert result.process["strokes"] == 4
+    assert np.isfinite(result.hysteresis).sum() > 20
+    assert abs(np.nanmedian(result.hysteresis)) < 0.15, "a light that spreads with travel alone has none"
+
+
 def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
     from mirrorskin.engine import OnsetSearch
 

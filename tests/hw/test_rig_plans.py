@@ -43,6 +43,34 @@ def test_a_press_in_steps_takes_every_place_to_its_end():
     assert plan.first == Position(0.1)
 
 
+@ways
+def test_legs_are_one_way_after_the_other(length, speed, acceleration):
+    one, three = Trapezoid(length, speed, acceleration), Trapezoid(3 * length, speed, acceleration, 3)
+    assert three.duration == pytest.approx(3 * one.duration)
+    time = np.linspace(0, one.duration, 101)
+    for number in range(3):
+        later = number * one.duration + time[1:-1]
+        np.testing.assert_allclose(
+            three.place(later), number * length + one.place(time[1:-1]), atol=1e-9 * length
+        )
+        np.testing.assert_allclose(three.time(three.place(later)), later, atol=1e-6 * one.duration)
+
+
+def test_strokes_go_down_and_up_between_two_depths():
+    plan = VerticalPlan(0.5, 1.2, step=0.3, strokes=3)
+    np.testing.assert_allclose(plan.values, [0.5, 0.8, 1.1, 0.8, 0.5, 0.8, 1.1])
+    np.testing.assert_allclose([place.travel for place in plan.places], plan.values)
+    swept = VerticalPlan(0.5, 1.2, speed=0.5, strokes=3)
+    assert [place.travel for place in swept.ends] == pytest.approx([1.2, 0.5, 1.2])
+    assert swept.path.length == pytest.approx(2.1)
+
+
+@pytest.mark.parametrize("strokes", [0, 10_001])
+def test_strokes_that_cannot_be_are_refused(strokes):
+    with pytest.raises(InputError, match="strokes cannot be"):
+        VerticalPlan(0.0, 1.0, step=0.5, strokes=strokes)
+
+
 def test_a_turn_in_steps_does_not_take_its_beginning_twice():
     np.testing.assert_allclose(
         np.degrees(AxialPlan(1.0, 0.04, phase_step=math.radians(45)).values), np.arange(0, 360, 45)

@@ -157,6 +157,17 @@ def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):
     assert true[-1] == pytest.approx(1)
 
 
+def test_strokes_without_a_halt_are_told_as_they_are():
+    plan = VerticalPlan(0.2, 0.7, speed=1.5, strokes=3)
+    with make_rig(rate=100.0, late=0.002) as rig, SweepScan(rig, plan) as scan:
+        blocks = drain(scan)
+        assert [place.travel for place in rig.stage.moves[-3:]] == pytest.approx([0.7, 0.2, 0.7])
+    true = np.array([place.travel for place in _exposed(scan)[0]])
+    np.testing.assert_allclose(joined(blocks, "travel"), true, atol=0.2)
+    np.testing.assert_allclose(scan.positions()["travel"], true, atol=0.03)
+    assert np.count_nonzero(np.diff(np.sign(np.diff(true[np.diff(true, prepend=-1) != 0])))) == 2
+
+
 def test_a_rotation_without_a_halt_has_no_frames_at_rest():
     plan = AxialPlan(0.5, TILT, turns=1.5, rate=3.0)
     with make_rig(rate=200.0) as rig, SweepScan(rig, plan) as scan:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,21 @@ def test_the_progress_of_a_rotation_counts_whole_turns():
     way = plan.path.place(time - 0.15)  # begins late
     found = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, way, strict=True)]
     np.testing.assert_allclose(found, way, atol=1e-9)
+
+
+@pytest.mark.parametrize("acceleration", [2.0, 500.0])
+def test_the_progress_of_strokes_counts_them_and_their_track_is_found(acceleration):
+    plan = VerticalPlan(0.2, 0.7, speed=0.6, strokes=6)
+    true = replace(plan.path, speed=0.57, acceleration=acceleration)
+    progress = Progress(plan)
+    time = np.arange(0, true.duration + 0.4, 0.04) + 0.004 * np.random.default_rng(3).uniform(-1, 1)
+    way = true.place(time - 0.15)
+    found = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, way, strict=True)]
+    assert abs(found - way).max() < 0.57 * 0.04, "a turn between two reports may be told late"
+    frames = np.arange(0, true.duration + 0.2, 0.01)
+    travel = plan.recorded(Track(time, found, plan.path).at(frames))
+    error = travel - plan.recorded(true.place(frames - 0.15))
+    assert np.sqrt(np.mean(error**2)) < 0.004
 
 
 @pytest.mark.parametrize("window", [5, 25])
