@@ -128,6 +128,9 @@ def command(
     modulus: Annotated[
         float, Option(metavar="MPA", help="Young's modulus of the body, which scales all forces.")
     ] = 1.0,
+    texture: sensor.Texture = sensor.TextureName.none,
+    texture_size: sensor.TextureSize = "0.1mm",
+    texture_contrast: sensor.TextureContrast = 0.5,
     camera_distance: Annotated[
         str | None,
         Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
@@ -196,6 +199,7 @@ def command(
             else length(camera_distance, "--camera-distance"),
             seed=seed,
         ),
+        texture=sensor.sheet_texture(texture, texture_size, texture_contrast),
         references=references.value,
         device=device,
     )

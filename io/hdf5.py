@@ -114,8 +114,9 @@ class Hdf5File(Closing):
         unit: str | None = None,
         remedy: str = "",
         rows: int | None = None,
+        mapped: bool = False,
     ) -> NDArray[Any]:
-        """Read numbers, once it is sure that they are there."""
+        """Read numbers, once it is sure that they are there; ``mapped``: when they are used."""
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
@@ -128,7 +129,11 @@ class Hdf5File(Closing):
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
         check_storage(self, node, frames=rows)
         with as_input_error(lambda: self.where(node)):
-            values = self._values(node.id) if rows is None else node[:rows]
+            values: NDArray[Any]
+            if mapped and node.id.get_offset() is not None and node.dtype.isnative and node.size:
+                values = np.memmap(node.file.filename, node.dtype, "r", node.id.get_offset(), node.shape)
+            else:
+                values = self._values(node.id) if rows is None else node[:rows]
             stated = unit is not None and h5py.h5a.exists(node.id, b"units")
             given = str(_first(self._values(h5py.h5a.open(node.id, b"units"))) or unit) if stated else unit
         if given is None or unit is None or given == unit:

@@ -27,6 +27,8 @@ TRUTH_UNITS = {
     "contact": None,
     "slip": None,
     "force": "N",
+    "displacement": "mm",
+    "slip_onset": None,
 }
 # What is known of each frame: where that is written, and in what unit.
 SERIES = {
@@ -187,6 +189,10 @@ class Layout:
         if name == "force":
             forces = self._file.read(node, (self._count, 3), unit=unit)
             return forces[slice(*self._part.frames)].astype(np.float64, copy=False)
+        if name == "displacement":
+            shape = (self._count, *self._frame, 2)
+            maps = self._file.read(node, shape, unit=unit, mapped=True)
+            return maps[slice(*self._part.frames), *self._part.region.slices].astype(np.float32, copy=False)
         values = self._file.read(node, self._frame, unit=unit)[self._part.region.slices]
         return np.ascontiguousarray(values, np.uint8 if name in ("contact", "slip") else np.float32)
 

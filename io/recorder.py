@@ -235,7 +235,7 @@ class Recorder(TeeSource[Source]):
             put(self._new.root, CHECKSUM, None, self._checksums)
             if self._truth is not None:
                 truth = self._truth() if callable(self._truth) else self._truth
-                _write_truth(self._new.root, truth)
+                _write_truth(self._new.root, truth, self.motion)
             write_plot(self._new.root, self.motion, set(self._series))
 
     def _check_count(self, fits: bool) -> None:
@@ -245,7 +245,8 @@ class Recorder(TeeSource[Source]):
             )
 
 
-def _write_truth(file: h5py.File, truth: Truth) -> None:
+def _write_truth(file: h5py.File, truth: Truth, motion: Motion) -> None:
     group = new_group(file["entry"], TRUTH, "NXdata", signal="height")
-    for name, unit in TRUTH_UNITS.items():
+    _, travelled = SERIES[POSITIONS[motion]]
+    for name, unit in (TRUTH_UNITS | {"slip_onset": travelled}).items():
         put(group, name, unit, getattr(truth, name))

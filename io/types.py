@@ -216,6 +216,12 @@ class Truth:
     force : ndarray, (T, 3), float64, or None
         Newtons in each frame that the object exerts on the sensor: along the body's x and y, by friction, and
         normal, positive where it presses; None where no contact mechanics was worked out.
+    displacement : ndarray, (T, H, W, 2), float32, or None
+        Millimetres along the body's x and y by which the skin has moved in each frame since the press: that
+        of the point of the skin that lay at the pixel then.
+    slip_onset : ndarray, (H, W), float32, or None
+        The way of the body since the press, mm or radians along its path, after which the point of the skin
+        that lay at the pixel broke loose from the object; NaN where it stuck to the end or was not touched.
     """
 
     height: NDArray[np.float32]
@@ -224,6 +230,8 @@ class Truth:
     contact: NDArray[np.uint8]
     slip: NDArray[np.uint8] | None = None
     force: Floats | None = None
+    displacement: NDArray[np.float32] | None = None
+    slip_onset: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -10,6 +10,7 @@ from mirrorskin.hw.twin.object_files import HeightMap, load_height_map, load_mes
 from mirrorskin.hw.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture
 from mirrorskin.hw.twin.optics import design_range, visible_zenith
 from mirrorskin.hw.twin.skin import Sheet
+from mirrorskin.hw.twin.texture import SheetTexture, TextureName
 from mirrorskin.hw.twin.twin import ContactName, OpticsName, Twin
 
 __all__ = [
@@ -29,9 +30,11 @@ __all__ = [
     "OpticsName",
     "Plane",
     "Sheet",
+    "SheetTexture",
     "Sphere",
     "Step",
     "Texture",
+    "TextureName",
     "Twin",
     "Twist",
     "Vertical",

@@ -13,6 +13,7 @@ from mirrorskin.hw.twin.skin import Sheet
 from mirrorskin.io.types import Floats
 
 Light = NDArray[np.float32]
+Shade = Callable[[Light, Floats, float], Light]
 
 _BLUR_POSES = 5  # poses that stand for the exposure of a moving body
 _BLUR = (np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5  # when, as shares of the exposure
@@ -43,7 +44,8 @@ class CachedScene:
     """Any movement: sheet and optics are found for each place where the body is.
 
     Places that come back, as those of a rotation do, are kept as long as there is memory for their light.
-    ``share`` is the part of the time between frames that an exposure takes.
+    ``share`` is the part of the time between frames that an exposure takes. ``shade`` turns that light into
+    what is seen of it, by the sheet's height and the time, in frames, where that depends on what was before.
     """
 
     def __init__(
@@ -54,20 +56,27 @@ class CachedScene:
         share: float,
         shape: tuple[int, int],
         memory_limit: int,
+        shade: Shade | None = None,
     ) -> None:
         self._skin = skin
         self._optics = optics
         self._movement = movement
-        self._places, self._number = _distinct_places(movement, share)
-        self._room = memory_limit // (np.dtype(np.float32).itemsize * shape[0] * shape[1])
-        self._kept: dict[int, Light] = {}
+        self._moments = share * _BLUR if share > 0 else np.zeros(1)
+        self._places, self._number = _distinct_places(movement, self._moments)
+        each = np.dtype(np.float32).itemsize + (np.dtype(np.float64).itemsize if shade else 0)
+        self._room = memory_limit // (each * shape[0] * shape[1])
+        self._shade = shade
+        self._kept: dict[int, tuple[Light, Floats | None]] = {}
         self._visited = np.zeros(len(self._places), bool)
         self._touched = np.ones(shape, bool)
         self._force = np.full(len(self._places), np.nan)
 
     def light(self, frame: int, /) -> Light:
         """Return the mean light over a frame's exposure."""
-        lights = [self._at(place) for place in self._number[frame]]
+        lights = [
+            self._at(place, frame + moment)
+            for place, moment in zip(self._number[frame], self._moments, strict=True)
+        ]
         return lights[0] if len(lights) == 1 else np.mean(lights, axis=0, dtype=np.float32)
 
     def touched_throughout(self) -> NDArray[np.bool_]:
@@ -83,13 +92,15 @@ class CachedScene:
             self._lie(int(place))
         return self._force[middle]
 
-    def _at(self, place: int) -> Light:
+    def _at(self, place: int, moment: float) -> Light:
         if place not in self._kept:
-            light = self._optics.light(self._lie(place))
+            sheet = self._lie(place)
+            light = self._optics.light(sheet)
             if len(self._kept) >= max(1, self._room):
                 self._kept.pop(next(iter(self._kept)))  # the oldest
-            self._kept[place] = light
-        return self._kept[place]
+            self._kept[place] = light, sheet.height if self._shade else None
+        light, height = self._kept[place]
+        return light if self._shade is None or height is None else self._shade(light, height, moment)
 
     def _lie(self, place: int) -> Sheet:
         sheet = self._skin.drape(self._movement.pose(self._places[place]))
@@ -187,9 +198,8 @@ class Press:
         return self._imprint.light(*map(float, self._passed[frame]))
 
 
-def _distinct_places(movement: Movement, share: float) -> tuple[Floats, NDArray[np.intp]]:
+def _distinct_places(movement: Movement, offsets: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return the places where the body is in some exposure, each once, and their numbers of each frame."""
-    offsets = share * _BLUR if share > 0 else np.zeros(1)
     passed = movement.reduced(_passed(movement.path, offsets))
     count, each, *place = passed.shape
     distinct, number = np.unique(passed.reshape(count * each, -1), axis=0, return_inverse=True)

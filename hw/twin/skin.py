@@ -118,10 +118,15 @@ class Elastic:
 
         return Sheet(seen(height), seen(dz_dx), seen(dz_dy), seen(pressure > 0, order=0))
 
-    def shift(self, pose: Pose) -> Floats:
-        """Return how far an upright pose moves the object along x and y, (2, H, W), mm, on the grown grid."""
-        at = np.stack([self._grid.x, self._grid.y])
-        return np.tensordot(pose.rotation[:2, :2], at, 1) + pose.shift[:2, np.newaxis, np.newaxis] - at
+    @property
+    def places(self) -> Floats:
+        """Where the pixels meet the rest plane, x and y, (2, H, W), mm."""
+        return np.stack([self._view.x, self._view.y])
+
+    @property
+    def grid_places(self) -> Floats:
+        """The same of the grown grid."""
+        return np.stack([self._grid.x, self._grid.y])
 
     def crop(self, values: NDArray[Any]) -> NDArray[Any]:
         """Cut the field of view out of a map on the grown grid, (..., H, W)."""

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from tempfile import TemporaryFile
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Sensor
-from mirrorskin.hw.twin.friction import Friction
-from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
+from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object, Sphere, zenith_azimuth
 from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.skin import Conform, Elastic
+from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.texture import Coat
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, Truth
 
@@ -25,7 +26,7 @@ def make_truth(
     movement: Movement,
     skin: Conform | Elastic,
     view: View,
-    body: Body,
+    history: SkinHistory | None,
     touched: NDArray[np.bool_] | None,
     pressing: Floats | None,
 ) -> Truth:
@@ -35,8 +36,9 @@ def make_truth(
     those of the point at which its ray meets the rest plane, and those of another of the point that it sees
     of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN where the
     surface is level. Contact is that at the greatest travel of a vertical movement, and what lasts through
-    all frames of another (``touched``). Slip is known of horizontal movements and twists in elastic contact,
-    and of elastic contact the force, whose normal part of each frame is ``pressing``, N.
+    all frames of another (``touched``). Slip and displacement are known where there is a history: of
+    horizontal movements and twists in elastic contact. Of elastic contact the force is known, whose normal
+    part of each frame is ``pressing``, N.
     """
     vertical = isinstance(movement, Vertical)
     pressed = pose_at_press(movement.deepest)
@@ -47,12 +49,12 @@ def make_truth(
         height, slopes = obstacle.height - movement.deepest, (obstacle.dz_dx, obstacle.dz_dy)
     zenith, azimuth = zenith_azimuth(*slopes)
     contact = skin.drape(pressed).contact if vertical or touched is None else touched
-    slip = force = None
-    if pressing is not None:
-        force = np.zeros((len(pressing), 3))
-        force[:, 2] = pressing
-    if force is not None and isinstance(movement, Horizontal | Twist) and isinstance(skin, Elastic):
-        slip, force[:, :2] = _drag(movement, skin, body.friction)
+    force = None if pressing is None else np.stack([0 * pressing, 0 * pressing, pressing], axis=1)
+    slip = onset = displacement = None
+    if history is not None and force is not None:
+        force[:, :2], onset = history.force, history.slip_onset.astype(np.float32)
+        slip = np.isfinite(onset).astype(np.uint8)
+        displacement = _displacements(history, len(force), view.shape)
     return Truth(
         height=height.astype(np.float32),
         zenith=zenith.astype(np.float32),
@@ -60,23 +62,20 @@ def make_truth(
         contact=contact.astype(np.uint8),
         slip=slip,
         force=force,
+        displacement=displacement,
+        slip_onset=onset,
     )
 
 
-def _drag(
-    movement: Horizontal | Twist, skin: Elastic, coefficient: float
-) -> tuple[NDArray[np.uint8], Floats]:
-    """Tell where the sheet slips at some time, and what force along it the object exerts, (T, 2), N.
-
-    The pressure is that of the press before the movement.
-    """
-    pressure: Floats = skin.solve(pose_at_press(movement.deepest)).pressure
-    friction = Friction(skin.space, pressure, coefficient)
-    slipped, force = np.zeros(pressure.shape, bool), np.zeros((len(movement.path), 2))
-    for place, drag in zip(movement.path, force, strict=True):
-        slipped |= friction.move(skin.shift(movement.pose(place)))
-        drag[:] = friction.force
-    return skin.crop(slipped).astype(np.uint8), force
+def _displacements(history: SkinHistory, frames: int, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; it lies on the disk."""
+    with TemporaryFile() as file:
+        maps = np.memmap(file, np.float32, "w+", shape=(frames, *shape, 2))
+    moved: Floats = np.zeros((2, *shape))
+    for frame, kept in enumerate(maps):
+        moved = history.displacement(frame, moved)
+        kept[...] = np.moveaxis(moved, 0, -1)
+    return maps
 
 
 ReferenceName = Literal["exact", "ball"]
@@ -91,16 +90,19 @@ _STEP = 0.4  # from place to place of the ball, as a share of its radius
 _STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact: all that a wall can show
 
 
-def exact_references(sensor: Sensor) -> tuple[_Counts, _Counts]:
+def exact_references(sensor: Sensor, optics: Ideal | Wall | Coat) -> tuple[_Counts, _Counts]:
     """Return what no lab knows: each pixel's own counts without light and in full light, (H, W), float32.
 
     They are free of noise, and within what a sample can hold.
     """
     low = -np.inf if sensor.camera.bits is None else 0.0
-    return np.clip(sensor.offset, low, sensor.camera.top), np.clip(sensor.full, low, sensor.camera.top)
+    dark, bright = sensor.offset, sensor.full
+    if isinstance(optics, Coat):
+        dark, bright = (levels.astype(np.float32) for levels in optics.levels(dark, bright))
+    return np.clip(dark, low, sensor.camera.top), np.clip(bright, low, sensor.camera.top)
 
 
-def ball_references(optics: Ideal | Wall, sensor: Sensor, view: View) -> tuple[_Counts, _Counts]:
+def ball_references(optics: Ideal | Wall | Coat, sensor: Sensor, view: View) -> tuple[_Counts, _Counts]:
     """Return each pixel's counts without light and in full light as a lab takes them; NaN where none are.
 
     A sheet at rest shows no light, so the dark reference is the mean of 16 frames before the touch. It shows

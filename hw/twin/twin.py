@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.hw.twin.catalogue import check_fits, make_object
-from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
+from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
 from mirrorskin.hw.twin.objects import Object
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
 from mirrorskin.hw.twin.scene import CachedScene, Imprint, PoseScene, Press, Scene
 from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
+from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.texture import Coat, SheetTexture
 from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, make_truth
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
@@ -62,6 +64,9 @@ class Twin(Closing):
         Of the wall: "uniform", "linear" in the zenith, or a picture, unrolled.
     body : Body
     camera : Camera
+    texture : SheetTexture, optional
+        What can be seen of the sheet itself, which moves with the skin; the skin moves along itself in
+        horizontal movements and twists in elastic contact. References show the texture of the sheet at rest.
     references : {"exact", "ball"}
         Where the header's dark and bright come from: the camera's exact levels, or frames as a lab takes
         them; see `ball_references`.
@@ -100,6 +105,7 @@ class Twin(Closing):
         pattern: str | Path = "uniform",
         body: Body | None = None,
         camera: Camera | None = None,
+        texture: SheetTexture | None = None,
         references: ReferenceName = "exact",
         device: str | Device | None = None,
     ) -> None:
@@ -110,7 +116,7 @@ class Twin(Closing):
         _check_choice(references, REFERENCES, "references")
         self._body = body or Body()
         self._camera = camera or Camera()
-        self._names, self._references = (contact, optics), references
+        self._names, self._references, self._texture = (contact, optics), references, texture
         self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
 
         self.name = f"twin: {self._thing.name}"
@@ -131,6 +137,7 @@ class Twin(Closing):
         self._pattern = make_pattern(pattern, self._body)
         self._sensor = Sensor(self._camera, field, open_device(device))
         self._skin = self._make_skin()
+        self._history = self._make_history()
         self._optics = self._make_optics(self._pattern)
         self._scene = self._make_scene()
         self._next = 0
@@ -139,7 +146,7 @@ class Twin(Closing):
     def header(self) -> Header:
         """What holds for all frames; the references are taken at the first access."""
         if self._references == "exact":
-            dark, bright = exact_references(self._sensor)
+            dark, bright = exact_references(self._sensor, self._optics)
         else:
             dark, bright = ball_references(self._make_optics(Uniform()), self._sensor, self._view)
         gain, offset = self._zenith_scale() or (None, None)
@@ -164,7 +171,9 @@ class Twin(Closing):
         film = self._scene if isinstance(self._scene, CachedScene) else None
         touched = None if film is None or self.motion == "vertical" else film.touched_throughout()
         pressing = film.forces() if film is not None and isinstance(self._skin, Elastic) else None
-        return make_truth(self._thing, self.movement, self._skin, self._view, self._body, touched, pressing)
+        return make_truth(
+            self._thing, self.movement, self._skin, self._view, self._history, touched, pressing
+        )
 
     def sheet(self, frame: int) -> Sheet:
         """Return how the sheet lies at the middle of a frame's exposure, computed anew."""
@@ -240,7 +249,7 @@ class Twin(Closing):
     def _imprint(self) -> Imprint | None:
         """What a press leaves, where no frame needs more than its travel."""
         skin, optics, view = self._skin, self._optics, self._view
-        if not (isinstance(skin, Conform) and isinstance(optics, Ideal) and view.orthographic):
+        if self._names != ("conform", "ideal") or not view.orthographic:
             return None
         touched, untouched = (skin.drape(pose_at_press(depth)) for depth in (_ALL, -_ALL))
         height = np.where(touched.contact, self._thing.height(view.x, view.y), np.nan)
@@ -270,16 +279,28 @@ class Twin(Closing):
         poses.append(pose_at_press(movement.deepest))
         return Elastic(self._thing, poses, self._view, self._body, self._compliance)
 
-    def _make_optics(self, pattern: Pattern) -> Ideal | Wall:
+    def _make_history(self) -> SkinHistory | None:
+        skin, movement = self._skin, self.movement
+        if isinstance(skin, Elastic) and isinstance(movement, Horizontal | Twist):
+            return SkinHistory(skin, movement, self._body.friction)
+        return None
+
+    def _make_optics(self, pattern: Pattern) -> Ideal | Wall | Coat:
+        optics: Ideal | Wall
         if self._names[1] == "ideal":
-            return Ideal(self._body, pattern)
-        return Wall(self._body, pattern, self._view, self._sensor.device)
+            optics = Ideal(self._body, pattern)
+        else:
+            optics = Wall(self._body, pattern, self._view, self._sensor.device)
+        return optics if self._texture is None else Coat(self._texture, optics, self._view)
 
     def _make_scene(self) -> Scene:
         share = self._camera.exposure * self._camera.frame_rate
         if isinstance(self.movement, Vertical) and self._imprint is not None:
             return Press(self._imprint, self.movement.positions, share)
-        return CachedScene(self._skin, self._optics, self.movement, share, self._view.shape, _MEMORY)
+        coat, optics, shade = self._optics, self._optics, None
+        if isinstance(coat, Coat) and self._history is not None:
+            optics, shade = coat.optics, functools.partial(coat.shade, history=self._history)
+        return CachedScene(self._skin, optics, self.movement, share, self._view.shape, _MEMORY, shade)
 
     def _zenith_scale(self) -> tuple[Floats, Floats] | None:
         """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""
@@ -289,6 +310,8 @@ class Twin(Closing):
         dark, bright = np.asarray(self._camera.dark), np.asarray(self._camera.bright)
         if self._references == "exact":
             dark, bright = (levels.astype(np.float64) for levels in (self._sensor.offset, self._sensor.full))
+        if isinstance(self._optics, Coat):
+            dark, bright = self._optics.levels(dark, bright)
         return (bright - dark) * pattern.gain, dark + (bright - dark) * pattern.offset
 
 

@@ -15,7 +15,7 @@ from commands import run
 from stacks import read_all
 
 from mirrorskin import hw, io
-from mirrorskin.hw.twin import OBJECT_NAMES, Body, Camera
+from mirrorskin.hw.twin import OBJECT_NAMES, Body, Camera, SheetTexture
 from mirrorskin.io.types import MOTIONS
 
 SMALL = ["--size", "24x18", "--pixel-size", "0.4mm"]
@@ -198,6 +198,9 @@ def test_without_options_body_and_camera_are_the_twin_s_own(asked):
     chosen = {name: given[name] for name in ("object", "contact", "optics", "pattern", "references")}
     assert chosen == {name: told[f"--{name}"] for name in chosen}
     assert chosen["references"] == "ball"
+    assert given["texture"] is None
+    size, contrast = SheetTexture().size, SheetTexture().contrast
+    assert (told["--texture-size"], told["--texture-contrast"]) == (f"{size:g}mm", str(contrast))
     for option, value in (("--friction", Body().friction), ("--noise", Camera().noise)):
         assert float(told[option]) == value
     assert told["--scatter"] == f"{math.degrees(Body().scatter):g}deg"
@@ -220,6 +223,13 @@ WALL = ["--optics", "cylinder"]
         (["--scatter", "5deg"], "body", Body(scatter=math.radians(5))),
         (["--friction", "0.3"], "body", Body(friction=0.3)),
         (["--modulus", "0.4"], "body", Body(modulus=0.4)),
+        (["--texture", "none"], "texture", None),
+        (["--texture", "flakes", "--texture-size", "0.9mm"], "texture", SheetTexture("flakes", 0.9)),
+        (
+            ["--texture", "random-dots", "--texture-size", "1mm", "--texture-contrast", "0.3"],
+            "texture",
+            SheetTexture("random-dots", 1.0, 0.3),
+        ),
         (["--camera-distance", "20cm"], "camera", Camera(distance=200)),
         (["--point-spread", "0.7"], "camera", Camera(point_spread=0.7)),
         (["--dtype", "uint16"], "camera", Camera(np.dtype(np.uint16), bits=12)),
@@ -330,6 +340,14 @@ BAD = {
     "a gap below zero": (["vertical", *WALL, "--air-gap=-1mm"], "air gap -1.0"),
     "scatter below zero": (["vertical", "--scatter=-1deg"], "scatter"),
     "friction below zero": (["twist", "--friction=-0.1"], "friction -0.1"),
+    "a fine texture": (
+        ["vertical", "--texture", "dots"],
+        "a texture of 0.1 mm is too fine for pixels of 0.4 mm: make it 2 pixels or more",
+    ),
+    "a texture without a contrast": (
+        ["vertical", "--texture", "dots", "--texture-contrast", "0"],
+        "contrast 0.0 of the texture",
+    ),
     "no modulus": (["vertical", "--modulus", "0"], "modulus 0.0"),
     "9 bits": (["vertical", "--bits", "9"], "frames of uint8 cannot have 9 bits: take 8"),
     "9 bits of 16": (["vertical", "--dtype", "uint16", "--bits", "9"], "cannot have 9 bits: take 10, 12, 16"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contact_theory
 import numpy as np
-import poses
 import pytest
 import rays
 from geometry import pixel_centres
@@ -191,16 +190,11 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
     assert (seen.contact != whole.contact).sum() > 10
 
 
-def test_the_object_shifts_on_the_grown_grid_as_its_points_do() -> None:
+def test_the_field_lies_in_the_middle_of_the_grown_grid() -> None:
     shape, pixel = (12, 20), 0.3
     contact = elastic(Coin(), pose_at_press(1.7), shape, pixel)
-    x, y = pixel_centres(contact.space.shape, pixel)
     assert contact.space.shape != shape
-    for pose in (poses.moved_aside((0.4, -0.1), 1.7), poses.twisted(0.3, 1.7)):
-        points = np.stack([x, y, np.full_like(x, -1.7)], axis=-1)
-        moved = pose.to_body(points) - points
-        shift = contact.shift(Pose(pose.turn, pose.shift))
-        np.testing.assert_allclose(shift, np.moveaxis(moved[..., :2], -1, 0), atol=1e-12)
-    here_x, here_y = contact.crop(np.stack([x, y]))
-    np.testing.assert_allclose(here_x, pixel_centres(shape, pixel)[0], atol=1e-12)
-    np.testing.assert_allclose(here_y, pixel_centres(shape, pixel)[1], atol=1e-12)
+    expected = pixel_centres(contact.space.shape, pixel)
+    np.testing.assert_allclose(contact.grid_places, expected, atol=1e-12)
+    np.testing.assert_allclose(contact.crop(contact.grid_places), pixel_centres(shape, pixel), atol=1e-12)
+    np.testing.assert_allclose(contact.places, pixel_centres(shape, pixel), atol=1e-12)

@@ -109,6 +109,27 @@ def test_slip_may_be_known(tmp_path, slip, known):
         assert set(file[TRUTH]) == set(known.split(", "))
 
 
+@pytest.mark.parametrize(("motion", "unit"), [("horizontal", "mm"), ("twist", "rad")])
+def test_what_is_known_of_the_skin_comes_back_of_the_part_that_is_read(tmp_path, motion, unit):
+    count, rows, columns = SHAPE
+    displacement = np.random.default_rng(5).normal(size=(*SHAPE, 2)).astype(np.float32)
+    onset = np.where(np.eye(rows, columns) > 0, np.nan, 0.25).astype(np.float32)
+    force = np.arange(3.0 * count).reshape(count, 3)
+    truth = replace(some_truth(), force=force, displacement=displacement, slip_onset=onset)
+    path = make(tmp_path, motion, truth)
+    with h5py.File(path) as file:
+        units = {name: file[TRUTH][name].attrs["units"] for name in ("force", "displacement", "slip_onset")}
+    assert units == {"force": "N", "displacement": "mm", "slip_onset": unit}
+    with io.open_recording(path) as recording:
+        whole = recording.truth
+    assert_same(whole, truth)
+    with io.open_recording(path, frames=(1, 3), region=io.Region((1, 4), (2, 6))) as recording:
+        part = recording.truth
+    np.testing.assert_array_equal(part.force, force[1:3])
+    np.testing.assert_array_equal(part.displacement, displacement[1:3, 1:4, 2:6])
+    np.testing.assert_array_equal(part.slip_onset, onset[1:4, 2:6])
+
+
 MOVEMENTS = {
     "vertical": hw.twin.Vertical(TRAVEL),
     "axial": hw.twin.Axial(PHASE, 0.04, 0.8, (0.0, 0.5, 10.0)),

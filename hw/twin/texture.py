@@ -1,0 +1,161 @@
+"""What can be seen of the sheet itself: the flakes of its mirror coat, or printed dots."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mirrorskin.hw.twin.optics import Ideal, Wall
+from mirrorskin.hw.twin.scene import Light
+from mirrorskin.hw.twin.skin import Sheet
+from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io.types import Floats, InputError
+
+TextureName = Literal["flakes", "dots", "random-dots"]
+TEXTURES: tuple[TextureName, ...] = get_args(TextureName)
+
+_TILE = 512  # random numbers along each axis, after which a texture repeats itself
+_PIXELS_MIN = 2.0  # of a flake or a dot
+_PITCH = 2.0  # from dot to dot, in diameters
+_RIM = 0.3  # width of a dot's soft rim, in diameters
+_JITTER = (_PITCH - 1 - _RIM) / 2  # by which a dot may lie off its place along x and y, in diameters
+
+
+@dataclass(frozen=True, slots=True)
+class SheetTexture:
+    """How much light the sheet reflects from point to point, fixed in the sheet, without an end.
+
+    A point of the sheet reflects the share r = 1 - contrast t of the light, t being from 0 to 1. Of what it
+    reflects the part ``diffuse`` comes from all of the wall alike, as flakes lie every way, and the rest from
+    where the mirror points to: a pixel that gets the light m from the mirror shows
+    r ((1 - diffuse) m + diffuse), so that the texture is seen in the dark, too.
+
+    Attributes
+    ----------
+    kind : {"flakes", "dots", "random-dots"}
+        Of "flakes", t is a cubic B-spline whose coefficients are 0 or 1 at random, spaced by half the size.
+        Of "dots", t is 1 inside of dots in a square grid of twice their diameter, and falls to 0 over a soft
+        rim; "random-dots" lie up to a third of their diameter off their places.
+    size : float
+        Diameter of a dot, or width of the speckle's autocorrelation at half of its height, mm.
+    contrast : float
+        Above 0 and at most 1.
+    diffuse : float
+        0 to 1.
+    seed : int
+        Of the sheet: the same seed, the same texture.
+
+    Raises
+    ------
+    InputError
+        A value cannot be.
+
+    Examples
+    --------
+    >>> dots = SheetTexture("dots", size=0.5, contrast=0.4)
+    >>> dots.reflectance(np.array([[0.5, 1.0], [0.5, 1.0]])).round(3).tolist()
+    [0.6, 1.0]
+    """
+
+    kind: TextureName = "flakes"
+    size: float = 0.1
+    contrast: float = 0.5
+    diffuse: float = 0.25
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in TEXTURES:
+            raise InputError(f"texture {self.kind!r} is unknown: take {', '.join(TEXTURES)}")
+        rules = {
+            "size": (0 < self.size < math.inf, "mm, more than 0"),
+            "contrast": (0 < self.contrast <= 1, "a share, more than 0 and at most 1"),
+            "diffuse": (0 <= self.diffuse <= 1, "a share, 0 to 1"),
+            "seed": (isinstance(self.seed, int | np.integer) and self.seed >= 0, "a whole number, 0 or more"),
+        }
+        for name, (holds, range_) in rules.items():
+            if not holds:
+                raise InputError(f"{name} {getattr(self, name)} of the texture cannot be: give {range_}")
+
+    def reflectance(self, places: Floats) -> Floats:
+        """Return the share of the light that the sheet's points reflect, by their x and y, (2, ...), mm."""
+        share = self._flakes(places) if self.kind == "flakes" else self._dots(places)
+        return 1 - self.contrast * share
+
+    def shown(self, reflectance: Floats, light: Light) -> Light:
+        """Return the share of full light of pixels that get a light from the mirror."""
+        return np.asarray(reflectance * ((1 - self.diffuse) * light + self.diffuse), np.float32)
+
+    def _flakes(self, places: Floats) -> Floats:
+        from scipy.ndimage import map_coordinates
+
+        flakes = _random(self.seed, 1)[0] < 0.5
+        index = places * (2 / self.size)
+        spline: Floats = map_coordinates(
+            flakes.astype(np.float64), index, order=3, mode="grid-wrap", prefilter=False
+        )
+        return spline
+
+    def _dots(self, places: Floats) -> Floats:
+        index = places / (_PITCH * self.size)
+        cell = np.floor(index)
+        off = (index - cell - 0.5) * _PITCH
+        if self.kind == "random-dots":
+            row, column = cell.astype(np.intp) % _TILE
+            off -= (2 * _JITTER) * (_random(self.seed, 2)[:, row, column] - 0.5)
+        inwards = np.clip((0.5 - np.hypot(*off)) / _RIM + 0.5, 0, 1)
+        return np.asarray(inwards**2 * (3 - 2 * inwards))
+
+
+@functools.lru_cache(maxsize=2)
+def _random(seed: int, count: int) -> Floats:
+    return np.random.default_rng(seed).random((count, _TILE, _TILE))
+
+
+class Coat:
+    """Optics of a sheet with a texture, which moves with the skin.
+
+    Without a history the skin moves along its normal alone, as pressure shifts an incompressible body's
+    surface, or as one that conforms.
+
+    Attributes
+    ----------
+    rest : ndarray, (H, W), float64
+        The reflectance that pixels see of the sheet at rest.
+    """
+
+    def __init__(self, texture: SheetTexture, optics: Ideal | Wall, view: View) -> None:
+        if texture.size < _PIXELS_MIN * max(view.pixel_size):
+            raise InputError(
+                f"a texture of {texture.size:g} mm is too fine for pixels of {max(view.pixel_size):g} mm:"
+                f" make it {_PIXELS_MIN:g} pixels or more"
+            )
+        self.texture, self.optics, self._view = texture, optics, view
+        self.rest = texture.reflectance(np.stack([view.x, view.y]))
+
+    def levels(self, dark: ArrayLike, bright: ArrayLike) -> tuple[Floats, Floats]:
+        """Return what pixels count with no light from the mirror and with all, by the camera's own levels."""
+        dark, bright = np.asarray(dark, np.float64), np.asarray(bright, np.float64)
+        span = (bright - dark) * self.rest
+        return dark + span * self.texture.diffuse, dark + span
+
+    def light(self, sheet: Sheet) -> Light:
+        """Return the share of full light of each pixel, (H, W), float32, of skin that has not moved along."""
+        return self.shade(self.optics.light(sheet), sheet.height)
+
+    def shade(
+        self, light: Light, height: Floats, frame: float = 0.0, history: SkinHistory | None = None
+    ) -> Light:
+        """Return what pixels show that get a light from the mirror, of a sheet as high as this at a frame."""
+        view = self._view
+        if view.orthographic and history is None:
+            return self.texture.shown(self.rest, light)
+        seen = np.stack([view.x + height * view.slope_x, view.y + height * view.slope_y])
+        if history is not None:
+            seen = history.material(frame, seen)
+        return self.texture.shown(self.texture.reflectance(seen), light)

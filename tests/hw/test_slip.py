@@ -1,0 +1,166 @@
+"""The skin's history against the books: where it sticks, when it breaks loose, and where it goes."""
+
+from __future__ import annotations
+
+import functools
+
+import contact_theory
+import numpy as np
+import pytest
+
+from mirrorskin.hw.twin import Body, Horizontal, Sphere, Twist
+from mirrorskin.hw.twin.movement import pose_at_press
+from mirrorskin.hw.twin.skin import Elastic
+from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.view import View
+from mirrorskin.io import InputError
+from mirrorskin.io.types import Floats
+
+BALL, SIDE, FRAMES = Sphere(20.0), 91, 13
+SHARES = np.linspace(0, 0.9, FRAMES)
+ALONG = np.array([0.6, -0.8])
+
+
+def history(movement: Horizontal | Twist, friction: float, pixel: float, side: int = SIDE) -> SkinHistory:
+    body = Body(friction=friction, sheet=0.0)
+    view = View((side, side), (pixel, pixel), body)
+    skin = Elastic(BALL, [pose_at_press(movement.deepest)], view, body)
+    return SkinHistory(skin, movement, friction)
+
+
+class Pushed:
+    """A ball that is pushed to 0.9 of full sliding."""
+
+    def __init__(self, friction: float, radius: float) -> None:
+        self.friction, self.radius, self.pixel = friction, radius, 2.2 * radius / SIDE
+        self.press = contact_theory.sphere(10.0, radius, 1.0)
+        self.far = contact_theory.sliding_distance(self.press, friction, 1.0)
+        self.movement = Horizontal(self.far * np.outer(SHARES, ALONG), self.press.depth)
+        self.found = history(self.movement, friction, self.pixel)
+        x = (np.arange(SIDE) - (SIDE - 1) / 2) * self.pixel
+        self.r = np.hypot(x, x[:, np.newaxis])
+
+    def stick_radius(self, frame: int) -> float:
+        """Return the radius by the force along the sheet: Cattaneo and Mindlin."""
+        share = np.hypot(*self.found.force[frame]) / (self.friction * self.press.force)
+        return float(self.radius * np.cbrt(1 - share))
+
+
+pushed = functools.cache(Pushed)
+CASES = pytest.mark.parametrize(
+    ("friction", "radius"), [(mu, a) for mu in (0.2, 0.5, 0.9) for a in (0.8, 1.2, 1.6)]
+)
+
+
+@CASES
+def test_a_pushed_ball_sticks_within_the_radius_of_cattaneo_and_mindlin(
+    friction: float, radius: float
+) -> None:
+    case = pushed(friction, radius)
+    for frame in range(1, FRAMES):
+        stuck = (case.r < radius) & ~(case.found.slip_onset <= case.found.travel[frame])
+        found = np.sqrt(stuck.sum() / np.pi) * case.pixel
+        assert found == pytest.approx(case.stick_radius(frame), rel=0.02)
+
+
+@CASES
+def test_what_has_slipped_is_known_but_for_a_pixel_at_the_border(friction: float, radius: float) -> None:
+    case = pushed(friction, radius)
+    for frame in range(1, FRAMES):
+        border = case.stick_radius(frame)
+        clear = (np.abs(case.r - border) > case.pixel) & (case.r < radius - case.pixel)
+        found = (case.found.slip_onset <= case.found.travel[frame])[clear]
+        expected = (case.r > border)[clear]
+        both = (found & expected).sum()
+        assert both >= 0.98 * found.sum()
+        assert both >= 0.98 * expected.sum()
+
+
+@CASES
+def test_a_point_breaks_loose_when_the_border_comes_by(friction: float, radius: float) -> None:
+    case = pushed(friction, radius)
+    expected = case.far * (1 - (case.r / radius) ** 2)
+    inside = (case.r < radius - 1.5 * case.pixel) & (expected < 0.95 * case.far * SHARES[-1])
+    late = (case.found.slip_onset - expected)[inside] / (case.far * SHARES[1])
+    assert np.abs(late).max() < 0.25
+    assert np.sqrt(np.mean(late**2)) < 0.1
+    assert np.isnan(case.found.slip_onset[case.r > radius + 1.5 * case.pixel]).all()
+
+
+def test_few_frames_give_the_onsets_of_many() -> None:
+    many = pushed(0.5, 1.2)
+    few = history(Horizontal(many.movement.path[[0, -1]], many.press.depth), 0.5, many.pixel)
+    late = (few.slip_onset - many.found.slip_onset) / (many.far * SHARES[1])
+    assert np.nanmax(np.abs(late[many.r < 1.1])) < 0.25
+    np.testing.assert_allclose(few.force[-1], many.found.force[-1], rtol=2e-3)
+
+
+def test_a_twisted_ball_sticks_within_the_radius_of_lubkin() -> None:
+    radius, friction, pixel = 1.2, 0.5, 2.6 / SIDE
+    press = contact_theory.sphere(10.0, radius, 1.0)
+    inner = np.array([0.95, 0.8, 0.6, 0.4]) * radius
+    angles = [contact_theory.twisted(press, friction, 1.0, rest).angle for rest in inner]
+    found = history(Twist(-np.array(angles), press.depth), friction, pixel)
+    np.testing.assert_allclose(found.travel, angles)
+    pressed = np.hypot(*found._skin.places) < radius
+    for angle, rest in zip(angles, inner, strict=True):
+        stuck = (pressed & ~(found.slip_onset <= angle)).sum()
+        assert np.sqrt(stuck / np.pi) * pixel == pytest.approx(rest, rel=0.02)
+
+
+def test_stuck_skin_goes_with_the_object_and_far_skin_stays() -> None:
+    case = pushed(0.5, 1.2)
+    last = FRAMES - 1
+    moved = case.found.displacement(last, np.zeros((2, SIDE, SIDE)))
+    stuck = case.r < 0.95 * case.stick_radius(last)
+    object_s = -case.movement.path[last][:, np.newaxis]
+    np.testing.assert_allclose(moved[:, stuck] - object_s, 0, atol=2e-3 * case.far)
+    lag = np.sum((moved - object_s[:, np.newaxis]) * ALONG[:, np.newaxis, np.newaxis], axis=0)
+    assert lag[case.r > 1.1].min() > 0.02 * case.far  # what slips stays behind
+
+    twisted = history(Twist([0.0, 0.6], 0.05), 1e3, 0.05)
+    x, y = twisted._skin.places
+    near = np.hypot(x, y) < 0.55  # of a contact of 0.7 mm
+    turned = (x + 1j * y) * np.exp(-0.6j)
+    found = twisted.displacement(1, np.zeros((2, SIDE, SIDE)))
+    np.testing.assert_allclose((x + found[0] - turned.real)[near], 0, atol=2e-3)
+    np.testing.assert_allclose((y + found[1] - turned.imag)[near], 0, atol=2e-3)
+    assert np.abs(found[:, 0, 0]).max() < 0.02
+
+
+def test_displacement_and_material_are_each_other_s_inverse() -> None:
+    case = pushed(0.9, 1.6)
+    there = case.found._skin.places + case.found.displacement(7, np.zeros((2, SIDE, SIDE)))
+    np.testing.assert_allclose(case.found.material(7, there), case.found._skin.places, atol=1e-4 * case.pixel)
+
+
+def test_a_long_slide_drags_the_skin_along_beneath_the_object_alone() -> None:
+    # The object goes 3 mm to the left over a field of 6 mm: the dragged skin goes with it and springs back.
+    far, press = 3.0, 0.1
+    path = np.stack([np.linspace(0, far, 7), np.zeros(7)], axis=1)
+    found = history(Horizontal(path, press), 0.3, 0.1, side=61)
+    first = np.zeros((2, 61, 61))
+    half, last = found.displacement(3, first), found.displacement(6, first)
+    assert np.isfinite(last).all()
+    assert np.unravel_index(half[0].argmin(), (61, 61)) == pytest.approx((30, 15), abs=2)
+    assert np.unravel_index(last[0].argmin(), (61, 61)) == pytest.approx((30, 1), abs=2)
+    assert abs(last[0, 30, 30]) < 0.5 * abs(last[0, 30, 1])
+
+
+def test_between_frames_the_skin_is_between() -> None:
+    case = pushed(0.5, 1.2)
+    points: Floats = case.found._skin.places
+    before, middle, after = (case.found.material(frame, points) for frame in (5, 5.5, 6))
+    np.testing.assert_allclose(middle, (before + after) / 2, atol=0.02 * case.far * SHARES[1])
+
+
+def test_a_body_that_does_not_press_moves_no_skin() -> None:
+    free = history(Horizontal([[0.0, 0.0], [0.5, 0.0]], -0.1), 0.5, 0.1)
+    assert not free.force.any()
+    assert np.isnan(free.slip_onset).all()
+    np.testing.assert_allclose(free.displacement(1, np.zeros((2, SIDE, SIDE))), 0, atol=1e-12)
+
+
+def test_too_long_a_way_is_refused() -> None:
+    with pytest.raises(InputError, match=r"a way of 50 mm .* points, .*: take larger pixels"):
+        history(Horizontal([[0.0, 0.0], [50.0, 0.0]], 0.1), 0.5, 0.005)
