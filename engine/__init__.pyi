@@ -14,6 +14,7 @@ from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
 from .scoring import Score, score
+from .slip.displacement import Displacement, find_displacement
 from .tiling import free_memory
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "ChangePointSearch",
     "Correlation",
     "Correlator",
+    "Displacement",
     "Integrator",
     "Measures",
     "NormalEstimator",
@@ -36,6 +38,7 @@ __all__ = [
     "estimate_normals",
     "fill_holes",
     "find_change_point",
+    "find_displacement",
     "find_edges",
     "find_onset",
     "free_memory",

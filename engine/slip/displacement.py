@@ -1,0 +1,207 @@
+"""Displacement of the skin from frames: dense, to a hundredth of a pixel, with standard errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.frames import check_dtype, check_frames
+from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import Device, open_device
+
+Doubles = NDArray[np.float64]
+
+WINDOW, STEP = 12, 4
+INVALID, FOUND, NOT_FOUND, NO_TEXTURE = range(4)
+"""What the status says of a pixel's displacement."""
+
+_RANK = np.array([1, 0, 2, 3], np.uint8)  # of a status among those of the nodes around a pixel
+_CODES = np.argsort(_RANK).astype(np.uint8)
+_MOST_STEP = 64  # pixels from node to node
+_LEAST_TEXTURED = 0.1  # of the windows; there are as many on a clear sheet where light and dark meet
+
+
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """How far each point of a reference has moved in each frame.
+
+    Attributes
+    ----------
+    displacement, sigma : ndarray, (T, H, W, 2), float32
+        Millimetres along x and along y (up), and their standard deviations; NaN unless status is 1.
+    status : ndarray, (T, H, W), uint8
+        0 the window leaves the picture or holds no usable sample, 1 displacement, 2 the texture was not
+        found again, 3 no texture beyond the noise.
+    noise : float
+        Standard deviation of a sample, counts, given or estimated.
+    """
+
+    displacement: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    status: NDArray[np.uint8]
+    noise: float
+
+
+def find_displacement(
+    reference: NDArray[Any],
+    frames: NDArray[Any],
+    pixel_size: ArrayLike,
+    *,
+    window: int = WINDOW,
+    step: int = STEP,
+    noise: float | None = None,
+    device: str | Device | None = None,
+) -> Displacement:
+    """Find how far the texture of a reference has moved in frames.
+
+    Least squares in square windows, of which each may move, strain and turn (an affine field), and whose
+    brightness may change by a gain and a plane; see ``docs/method/slip.md``. What is seen at the pixel x of
+    the reference is seen at x + displacement in the frame. Each frame begins where those before it lead to,
+    so that steps may be as long as half of the texture's grain; after a longer one, coarser resolutions and
+    the correlation of the whole picture are tried.
+
+    Parameters
+    ----------
+    reference : ndarray, (H, W), uint8, uint16 or float32
+    frames : ndarray, (T, H, W), of the same type
+        In the order in which they were taken.
+    pixel_size : float or (float, float)
+        Millimetres, along x and y.
+    window, step : int
+        Pixels of a window's side, and from one window's centre to the next. Twice the window halves the
+        standard deviation, and smooths over twice as far.
+    noise : float, optional
+        Standard deviation of a sample in counts; by default estimated from what the fit leaves, window by
+        window.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Frames or parameters that cannot be used; hardly any window has texture beyond the noise.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one without room.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
+    >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
+    >>> moved = np.roll(texture, 3, axis=1)[None]
+    >>> found = find_displacement(texture, moved, 0.1, noise=0.1)
+    >>> np.round(found.displacement[0, 30, 40], 3).tolist()
+    [0.3, 0.0]
+    """
+    frames = np.asarray(frames)
+    if frames.ndim != 3 or np.ndim(reference) != 2:
+        shapes = f"reference has shape {np.shape(reference)}, frames {frames.shape}"
+        raise InputError(f"{shapes}: (H, W) and (T, H, W) are needed")
+    dtype = check_dtype(np.asarray(reference).dtype)
+    check_frames(frames, dtype, np.shape(reference))
+    size = check_pixel_size(pixel_size)
+    check_windows(np.shape(reference), window, step)
+    check_noise(noise)
+    tracker = Tracker(reference, window, step, open_device(device))
+    fields = [tracker.follow(frame) for frame in frames]
+    texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
+    texture.refuse_clear("the frames")
+    sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
+    maps = [_maps(tracker, field, texture, sigma, size) for field in fields]
+    displacement, sigmas, status = (np.stack(part) for part in zip(*maps, strict=True))
+    return Displacement(displacement, sigmas, status, texture.noise)
+
+
+@dataclass(frozen=True, slots=True)
+class Texture:
+    """What the windows of a reference can tell.
+
+    Attributes
+    ----------
+    covariance : ndarray, (rows, columns, 2, 2), float64
+        Of a displacement, pixels^2, to the right and down.
+    there : ndarray, (rows, columns), bool
+        Whether the texture's derivatives have at least the variance of those of noise, in every direction.
+    usable : ndarray, (rows, columns), bool
+        Whether the window has enough samples.
+    noise : float
+        Of a sample, counts: the median.
+    """
+
+    covariance: Doubles
+    there: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
+    noise: float
+
+    @classmethod
+    def of(cls, tracker: Tracker, variance: Doubles, noise: float | None) -> Texture:
+        """Judge a tracker's reference; ``variance``, (rows, columns), is that of a sample as frames have it.
+
+        Both the reference and a frame have noise, so that the covariance is 2 variance / information.
+        """
+        level = tracker.finest
+        known = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
+        usual = float(np.median(known)) if known.size else np.nan
+        variance = np.where(np.isfinite(variance) & (noise is None), variance, usual)
+        alone = (GRADIENT_NOISE * variance * level.measured)[..., None, None] * np.eye(2)
+        own = level.information - alone
+        usable = np.isfinite(own[..., 0, 0])
+        least = np.full(level.grid, np.nan)
+        least[usable] = np.linalg.eigvalsh(own[usable])[:, 0]
+        there = least >= np.maximum(alone[..., 0, 0], np.finfo(float).tiny)
+        covariance = np.full(own.shape, np.nan)
+        covariance[there] = 2 * variance[there][:, None, None] * np.linalg.inv(level.information[there])
+        return cls(covariance, there, level.usable, float(np.sqrt(usual)))
+
+    def refuse_clear(self, name: str) -> None:
+        """Raise InputError if hardly any window has texture."""
+        share = float(np.mean(self.there))
+        if share < _LEAST_TEXTURED:
+            raise InputError(
+                f"{name}: {100 * (1 - share):.0f} % of the windows show no texture beyond the noise of"
+                f" {self.noise:.2g} counts: displacement needs a speckled or printed sheet"
+            )
+
+
+def _maps(
+    tracker: Tracker, field: NodeField, texture: Texture, sigma: Doubles, size: tuple[float, float]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return a frame's displacement, sigma, mm, and status, of all pixels."""
+    status = node_status(field, texture)
+    known = (status == FOUND)[..., None]
+    displacement = np.where(known, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
+    return (
+        tracker.to_pixels(displacement),
+        tracker.to_pixels(np.where(known, sigma, np.nan)),
+        _CODES[tracker.worst_at_pixels(_RANK[status])],
+    )
+
+
+def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:
+    """Return the status of a frame's nodes, (rows, columns)."""
+    status = np.where(field.found, FOUND, NOT_FOUND)
+    status = np.where(np.isfinite(field.moved[0]), status, INVALID)
+    status = np.where(texture.there, status, NO_TEXTURE)
+    return np.where(texture.usable, status, INVALID).astype(np.uint8)
+
+
+def check_windows(shape: tuple[int, ...], window: int, step: int) -> None:
+    """Raise InputError unless windows fit into a picture, and nodes are close enough."""
+    most = min(shape)
+    if not 6 <= window <= most:
+        raise InputError(f"window {window}: 6 to {most} pixels are possible, the frames being {shape}")
+    if not 1 <= step <= min(_MOST_STEP, most):
+        raise InputError(
+            f"step {step}: 1 to {min(_MOST_STEP, most)} pixels from window to window are possible"
+        )
+
+
+def check_noise(noise: float | None) -> None:
+    """Raise InputError unless noise is a standard deviation, or not given."""
+    if noise is not None and not 0 < noise < np.inf:
+        raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")

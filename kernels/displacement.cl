@@ -1,0 +1,185 @@
+// How far a texture has moved: a frame's spline, the frame fetched back, and least squares in windows.
+// Specification: displacement.py.
+//
+// FRAME   type of a sample
+// TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// WINDOW  pixels of a window's side
+//
+// A window's sums are kept for each of its columns, and put together at the end: on cores the columns of a chunk
+// lie side by side in vectors, and no sum changes its order.
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#include "common.clh"
+
+#define TAPS 8
+#define MARGIN (TAPS + 4)
+#define PARAMETERS 10
+#define AFFINE 6  // of them
+
+__kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
+{
+    const int width = columns + 2 * MARGIN, pixels = width * (rows + 2 * MARGIN);
+    const int first = get_global_id(0) * TILE, end = min(first + TILE, pixels);
+    for (int p = first; p < end; ++p) {
+        int row = abs(p / width - MARGIN), column = abs(p % width - MARGIN);
+        row = row < rows ? row : 2 * (rows - 1) - row;
+        column = column < columns ? column : 2 * (columns - 1) - column;
+        padded[p] = frame[row * columns + column];
+    }
+}
+
+// sqrt(3) times the powers of the spline's pole, sqrt(3) - 2.
+#define BESIDE(k, weight) (weight) * (source[p - (k) * step] + source[p + (k) * step])
+
+__kernel void displacement_filter(const int pixels, const int step, MAP source, OUT filtered)
+{
+    const int first = get_global_id(0) * TILE, reach = TAPS * step;
+    const int begin = max(first, reach), end = min(first + TILE, pixels - reach);
+    for (int p = begin; p < end; ++p) {
+        filtered[p] = 1.7320508f * source[p] + BESIDE(1, -0.46410162f) + BESIDE(2, 0.12435565f)
+            + BESIDE(3, -0.033320997f) + BESIDE(4, 0.0089283345f) + BESIDE(5, -0.0023923402f)
+            + BESIDE(6, 6.4102660e-4f) + BESIDE(7, -1.7176256e-4f) + BESIDE(8, 4.6023640e-5f);
+    }
+}
+
+// Weights of the coefficients at -1, 0, 1 and 2, for a place from 0 to 1.
+#define CUBIC(w, part) { \
+    const float rest = 1 - (part); \
+    w##0 = rest * rest * rest * (1.0f / 6); \
+    w##1 = 2.0f / 3 - 0.5f * (part) * (part) * (2 - (part)); \
+    w##2 = 2.0f / 3 - 0.5f * rest * rest * (2 - rest); \
+    w##3 = (part) * (part) * (part) * (1.0f / 6); \
+}
+
+// Variance of what they make of samples with noise of variance 1; the constants are CORRELATION.
+#define NOISE_GAIN(w) (CORRELATION0 * (w##0 * w##0 + w##1 * w##1 + w##2 * w##2 + w##3 * w##3) \
+    + 2 * CORRELATION1 * (w##0 * w##1 + w##1 * w##2 + w##2 * w##3) \
+    + 2 * CORRELATION2 * (w##0 * w##2 + w##1 * w##3) + 2 * CORRELATION3 * (w##0 * w##3))
+
+#define CORRELATION0 3.46410162f
+#define CORRELATION1 -1.73205081f
+#define CORRELATION2 0.679491924f
+#define CORRELATION3 -0.239782972f
+
+#define LINE(at, w) (w##0 * (at)[0] + w##1 * (at)[1] + w##2 * (at)[2] + w##3 * (at)[3])
+
+// Where a pixel lies among nodes: the one before, and how far it is from there to the next.
+#define SPLIT(pixel, nodes, node, part) \
+    float part = ((pixel) - start) / step; \
+    part = part > 0 ? part : 0; \
+    part = part < (nodes) - 1 ? part : (nodes) - 1; \
+    int node = (int)part; \
+    node = node < (nodes) - 2 ? node : (nodes) - 2; \
+    node = node > 0 ? node : 0; \
+    part -= node;
+
+__kernel void displacement_warp(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
+    const int halo, MAP coefficients, MAP planes, MAP field, OUT difference)
+{
+    const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
+    if (row >= rows) return;
+    const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, columns);
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), stride = columns + 2 * MARGIN;
+    const int nodes = node_rows * node_columns;
+    SPLIT(row, node_rows, node_row, part_row)
+    MAP upper = field + node_row * node_columns;
+    MAP lower = upper + (node_rows > 1 ? node_columns : 0);
+    for (int column = first; column < end; ++column) {
+        SPLIT(column, node_columns, node, part)
+        const int next = node + (node_columns > 1);
+        const float right = (1 - part) * ((1 - part_row) * upper[node] + part_row * lower[node])
+            + part * ((1 - part_row) * upper[next] + part_row * lower[next]);
+        const float down = (1 - part) * ((1 - part_row) * upper[nodes + node] + part_row * lower[nodes + node])
+            + part * ((1 - part_row) * upper[nodes + next] + part_row * lower[nodes + next]);
+        float x = column + right, y = row + down;
+        const int inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
+        x = inside ? x : 0;
+        y = inside ? y : 0;
+        const int west = (int)x, north = (int)y;
+        x -= west;
+        y -= north;
+        float x0, x1, x2, x3, y0, y1, y2, y3;
+        CUBIC(x, x)
+        CUBIC(y, y)
+        MAP at = coefficients + (north - 1 + MARGIN) * stride + west - 1 + MARGIN;
+        const float value = y0 * LINE(at, x) + y1 * LINE(at + stride, x) + y2 * LINE(at + 2 * stride, x)
+            + y3 * LINE(at + 3 * stride, x);
+        const int p = (row + halo) * width + column + halo;
+        const float counts = planes[p];
+        const int measured = counts - counts == 0;
+        const float found = counts - value + planes[plane + p] * right + planes[2 * plane + p] * down;
+        difference[p] = measured ? (inside ? found : NAN) : 0;
+        difference[plane + p] = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
+    }
+}
+
+#define LANES (TILE > 1 ? 8 : 1)  // columns of a window that are worked on side by side
+
+#define PLACE(i) ((2 * (i) - (WINDOW - 1)) * (1.0f / WINDOW))
+
+#define CLEAR(sum) for (int i = 0; i < LANES; ++i) sum[i] = 0;
+
+__kernel void displacement_solve(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const int first,
+    const int halo, MAP planes, MAP difference, MAP field, MAP inverse, OUT answer)
+{
+    const int nodes = node_rows * node_columns, node = get_global_id(0);
+    if (node >= nodes) return;
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo);
+    const int corner = (first + node / node_columns * step) * width + first + node % node_columns * step;
+    const float right = field[node], down = field[nodes + node];
+
+    float sums[PARAMETERS] = {0}, squares = 0, variances = 0;
+    for (int chunk = 0; chunk < WINDOW; chunk += LANES) {
+        float x[LANES], y[LANES], x_down[LANES], y_down[LANES], level[LANES], level_down[LANES], gain[LANES];
+        float square[LANES], variance[LANES];
+        CLEAR(x) CLEAR(y) CLEAR(x_down) CLEAR(y_down) CLEAR(level) CLEAR(level_down) CLEAR(gain) CLEAR(square)
+        CLEAR(variance)
+        for (int j = 0; j < WINDOW; ++j) {
+            MAP at = planes + corner + j * width + chunk;
+            MAP differs = difference + corner + j * width + chunk;
+            const float below = PLACE(j);
+            for (int i = 0; i < LANES; ++i) {
+                const float along_x = at[plane + i], along_y = at[2 * plane + i];
+                const float left = differs[i] - along_x * right - along_y * down;
+                x[i] += along_x * left;
+                y[i] += along_y * left;
+                x_down[i] += along_x * left * below;
+                y_down[i] += along_y * left * below;
+                level[i] += left;
+                level_down[i] += left * below;
+                gain[i] += at[3 * plane + i] * left;
+                square[i] += left * left;
+                variance[i] += differs[plane + i];
+            }
+        }
+        const int count = WINDOW - chunk < LANES ? WINDOW - chunk : LANES;
+        for (int i = 0; i < count; ++i) {
+            const float beside = PLACE(chunk + i);
+            sums[0] += x[i];
+            sums[1] += y[i];
+            sums[2] += x[i] * beside;
+            sums[3] += x_down[i];
+            sums[4] += y[i] * beside;
+            sums[5] += y_down[i];
+            sums[6] += level[i];
+            sums[7] += level[i] * beside;
+            sums[8] += level_down[i];
+            sums[9] += gain[i];
+            squares += square[i];
+            variances += variance[i];
+        }
+    }
+
+    for (int k = 0; k < PARAMETERS; ++k) {
+        float found = 0;
+        for (int l = 0; l < PARAMETERS; ++l) found += inverse[(k * PARAMETERS + l) * nodes + node] * sums[l];
+        squares -= found * sums[k];
+        if (k < AFFINE) answer[k * nodes + node] = found + (k == 0 ? right : k == 1 ? down : 0);
+        if (k == PARAMETERS - 1) answer[AFFINE * nodes + node] = 1 - found;
+    }
+    answer[(AFFINE + 1) * nodes + node] = squares;
+    answer[(AFFINE + 2) * nodes + node] = variances;
+}

@@ -1,0 +1,180 @@
+"""How far a texture has moved: what ``displacement.cl`` computes, in plain NumPy with float64 inside.
+
+A frame between its samples is the cubic spline through them (Unser, Aldroubi and Eden, IEEE Trans. Signal
+Processing 41, 1993): its coefficients are a filter of the frame, of which 17 samples are taken along each
+axis. What is left out is less than 3e-5 of a sample.
+
+A reference has four planes: its counts, NaN where they are no measurement; their derivatives along columns
+and rows; and their difference from the mean around. They are padded by ``halo`` pixels of zeros (of NaN in
+the first), so that a window may reach beyond the picture.
+
+In a window, the frame is taken for the reference, moved by an affine field, times a gain and plus a plane of
+brightness. That has ten parameters: displacement to the right and down at the window's centre, four
+derivatives of these, brightness and its two slopes, gain. Their columns are those of `basis`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+POLE = np.sqrt(3.0) - 2
+TAPS = 8
+"""Samples on either side that a coefficient is made of."""
+MARGIN = TAPS + 4
+"""Mirrored samples round a padded frame, of which the outer ones have no coefficient."""
+PARAMETERS, AFFINE = 10, 6
+"""Of a window, and those of them that tell how it moves."""
+
+_ROOT = (4 + 2 * np.cos(_ANGLES := np.linspace(0, 2 * np.pi, 256, endpoint=False))) / 6
+CORRELATION = tuple(float(np.mean(np.cos(k * _ANGLES) / _ROOT**2)) for k in range(4))
+"""Covariance of coefficients 0 to 3 samples apart, of frames whose samples have noise of variance 1."""
+
+
+def displacement_pad(frame: Array, padded: Array) -> None:
+    """Write a frame, and its mirror image round it, into a map that is larger by a margin on each side."""
+    padded[:] = np.pad(frame.astype(np.float64), MARGIN, mode="reflect")
+
+
+def displacement_filter(step: int, source: Array, filtered: Array) -> None:
+    """Write the spline's coefficients along one axis: ``step`` is 1 along rows, else the length of a row.
+
+    Values so near the begin or end of the whole map that samples are missing stay as they are.
+    """
+    flat, out, reach = source.reshape(-1).astype(np.float64), filtered.reshape(-1), TAPS * step
+    middle = flat[reach:-reach].copy()
+    for k in range(1, TAPS + 1):
+        beside = (
+            flat[reach - k * step : flat.size - reach - k * step] + flat[reach + k * step :][: middle.size]
+        )
+        middle += POLE**k * beside
+    out[reach:-reach] = np.sqrt(3.0) * middle
+
+
+def cubic(part: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights, (4, ...), of the coefficients at -1, 0, 1 and 2 for a place from 0 to 1."""
+    rest = 1 - part
+    near, far = (2 / 3 - 0.5 * x**2 * (2 - x) for x in (part, rest))
+    return np.stack([rest**3 / 6, near, far, part**3 / 6])
+
+
+def noise_gain(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the variance of an interpolated value, of samples with noise of variance 1, along one axis."""
+    lags = [CORRELATION[k] * np.sum(weights[: 4 - k] * weights[k:], axis=0) for k in range(4)]
+    return np.asarray(lags[0] + 2 * (lags[1] + lags[2] + lags[3]))
+
+
+def interpolate_nodes(field: Array, start: float, step: int, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return a field of nodes, (n, rows, columns), at each pixel: bilinear, and constant beyond the nodes."""
+    values = field.astype(np.float64)
+    for axis, length in ((1, size[0]), (2, size[1])):
+        last = values.shape[axis] - 1
+        place = np.clip((np.arange(length) - start) / step, 0, last)
+        before = np.minimum(place.astype(int), max(last - 1, 0))
+        part = (place - before).reshape((-1, 1) if axis == 1 else (-1,))
+        values = (1 - part) * values.take(before, axis) + part * values.take(
+            np.minimum(before + 1, last), axis
+        )
+    return values
+
+
+def displacement_warp(
+    step: int, start: float, halo: int, coefficients: Array, planes: Array, field: Array, difference: Array
+) -> None:
+    """Write by how much the reference differs from a frame that is fetched back.
+
+    Parameters
+    ----------
+    step, start : pixels from node to node, and the place of the first node's centre on either axis
+    halo : pixels round the reference's planes
+    coefficients : of the frame's spline, padded
+    planes : (4, H + 2 halo, W + 2 halo), of the reference
+    field : (2, rows, columns) of nodes, pixels to the right and down, by which the frame is fetched back
+    difference : (2, H + 2 halo, W + 2 halo), the reference minus the frame, plus the derivatives times the
+        field, so that it is the derivatives times the displacement; and the variance of that, of samples with
+        noise of variance 1; 0 where the reference has no measurement, NaN where the frame ends
+    """
+    rows, columns = (length - 2 * halo for length in planes.shape[1:])
+    right, down = interpolate_nodes(field, start, step, (rows, columns))
+    x, y = np.arange(columns) + right, np.arange(rows)[:, None] + down
+    inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    west, north = np.floor(x).astype(int), np.floor(y).astype(int)
+    weights_x, weights_y = cubic(x - west), cubic(y - north)
+    value = np.zeros((rows, columns))
+    for j in range(4):
+        for i in range(4):
+            found = coefficients[north + j - 1 + MARGIN, west + i - 1 + MARGIN].astype(np.float64)
+            value += weights_y[j] * weights_x[i] * found
+    core = np.s_[halo : halo + rows, halo : halo + columns]
+    counts, along_x, along_y = planes[:3, *core].astype(np.float64)
+    measured = np.isfinite(counts)
+    found = np.where(inside, counts - value + along_x * right + along_y * down, np.nan)
+    variance = 1 + noise_gain(weights_x) * noise_gain(weights_y)
+    difference[0][core] = np.where(measured, found, 0)
+    difference[1][core] = np.where(measured, variance, 0)
+
+
+def windows(maps: Array, row: int, step: int, first: int, window: int, nodes: int) -> NDArray[np.float64]:
+    """Return the windows of a row of nodes, (n, nodes, window^2), of maps (n, H, W).
+
+    ``first`` is where the window of the first node begins, on either axis.
+    """
+    strip = maps[:, first + row * step : first + row * step + window].astype(np.float64)
+    strip = np.lib.stride_tricks.sliding_window_view(strip, window, axis=2)
+    strip = strip[:, :, first : first + nodes * step : step][:, :, :nodes]
+    return strip.transpose(0, 2, 1, 3).reshape(len(maps), nodes, -1)
+
+
+def basis(planes: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Return the columns of the parameters, (nodes, window^2, 10), of windows (4, nodes, window^2).
+
+    Distances from the centre are in halves of the window.
+    """
+    counts, along_x, along_y, texture = planes
+    place = (2 * np.arange(window) - (window - 1)) / window
+    y, x = (part.reshape(-1) for part in np.meshgrid(place, place, indexing="ij"))
+    known = np.isfinite(counts).astype(np.float64)
+    columns = [along_x, along_y, along_x * x, along_x * y, along_y * x, along_y * y]
+    return np.stack([*columns, known, known * x, known * y, texture], axis=-1)
+
+
+def displacement_solve(
+    step: int,
+    first: int,
+    window: int,
+    planes: Array,
+    difference: Array,
+    field: Array,
+    inverse: Array,
+    answer: Array,
+) -> None:
+    """Write each node's displacement: least squares in its window.
+
+    Parameters
+    ----------
+    step, first, window : pixels: from node to node, to where the first window begins, of a window's side
+    planes, difference, field : as of ``displacement_warp``
+    inverse : (10, 10, nodes), of the normal matrix of the window's columns; NaN where there is none
+    answer : (9, nodes): displacement, pixels to the right and down; the derivatives of the first and of the
+        second to the right and down, for each half of the window; gain; sum of the squares that are left; and
+        sum of the variances of the differences, of samples with noise of variance 1
+    """
+    node_rows, node_columns = field.shape[1:]
+    for row in range(node_rows):
+        here = np.s_[row * node_columns : (row + 1) * node_columns]
+        columns = basis(windows(planes, row, step, first, window, node_columns), window)
+        left, variance = windows(difference, row, step, first, window, node_columns)
+        centre = field[:, row].astype(np.float64)
+        left = left - columns[..., 0] * centre[0][:, None] - columns[..., 1] * centre[1][:, None]
+        sums = np.einsum("npk,np->kn", columns, left)
+        found = np.einsum("kln,ln->kn", inverse[..., here].astype(np.float64), sums)
+        answer[:AFFINE, here] = found[:AFFINE]
+        answer[:2, here] += centre
+        answer[AFFINE, here] = 1 - found[-1]
+        answer[AFFINE + 1, here] = np.sum(left**2, axis=1) - np.sum(found * sums, axis=0)
+        answer[AFFINE + 2, here] = np.sum(variance, axis=1)

@@ -1,0 +1,143 @@
+"""Displacement from frames: exact textures, the Cramer-Rao bound, and sheets that tell nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from speckle import Speckle
+
+from mirrorskin.engine import find_displacement
+from mirrorskin.io import InputError
+
+SHAPE, NOISE, PIXEL = (96, 128), 2.0, (0.1, 0.05)
+SPECKLE = Speckle()
+REFERENCE = SPECKLE.frame(SHAPE, 0, 0, NOISE, 99)
+INSIDE = np.s_[..., 16:-16, 16:-16, :]
+
+
+def turned(angle, centre=(64, 48)):
+    """Displacements, pixels to the right and down, of points that are turned clockwise."""
+    c, s = math.cos(angle) - 1, math.sin(angle)
+    x0, y0 = centre
+    return lambda x, y: c * (x - x0) - s * (y - y0), lambda x, y: s * (x - x0) + c * (y - y0)
+
+
+def in_mm(right, down):
+    return np.stack([right * PIXEL[0], -down * PIXEL[1]], axis=-1)
+
+
+def grid(right, down, shape=SHAPE):
+    row, column = np.mgrid[: shape[0], : shape[1]].astype(float)
+    return in_mm(right(column, row), down(column, row))
+
+
+@pytest.mark.parametrize("window", [9, 15])
+def test_errors_are_at_the_bound_and_sigma_is_honest(device, window):
+    shifts = [(0.3 * k, -0.17 * k) for k in range(1, 5)]
+    squares, bound = [], []
+    for seed, (right, down) in enumerate(shifts):
+        reference = SPECKLE.frame(SHAPE, 0, 0, NOISE, 50 + seed)
+        frames = SPECKLE.frame(SHAPE, right, down, NOISE, seed)[None]
+        found = find_displacement(reference, frames, PIXEL, window=window, step=1, noise=NOISE, device=device)
+        error = (found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE]
+        squares.append(error**2)
+        bound.append(found.sigma[INSIDE].astype(float) ** 2)
+    assert np.sqrt(np.mean(squares) / np.mean(bound)) == pytest.approx(1, abs=0.07)
+    assert np.mean(np.array(squares) / np.array(bound)) == pytest.approx(1, abs=0.12)
+
+
+def test_the_noise_is_estimated_from_what_the_fit_leaves():
+    found = find_displacement(REFERENCE, SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None], PIXEL)
+    assert found.noise == pytest.approx(NOISE, rel=0.03)
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.2])
+def test_a_turn_is_followed_frame_by_frame(angle):
+    steps = [turned(angle * k / 5) for k in range(1, 6)]
+    frames = np.stack([SPECKLE.frame(SHAPE, *step, NOISE, k) for k, step in enumerate(steps)])
+    found = find_displacement(REFERENCE, frames, PIXEL)
+    part = np.s_[24:-24, 24:-24]
+    error = (found.displacement[-1] - grid(*steps[-1]))[part]
+    assert (found.status[-1][part] == 1).all()
+    assert np.mean((error / found.sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("far", [6.0, 40.0])
+def test_a_long_way_in_one_step_is_found(far):
+    frame = SPECKLE.frame(SHAPE, far, 0, NOISE, 1)[None]
+    found = find_displacement(REFERENCE, frame, PIXEL, window=16)
+    there = found.displacement[0, 16:-16, 16 : -16 - int(far), 0]
+    assert np.nanmedian(there) == pytest.approx(far * PIXEL[0], abs=1e-3)
+    assert np.mean(np.abs(there - far * PIXEL[0]) < 0.01) > 0.95
+    assert np.isnan(found.displacement[0, :, -int(far) :]).all()
+    assert (found.status[0, :, -int(far) :] == 0).all()
+
+
+def test_another_gain_and_offset_of_brightness_change_nothing():
+    frame = SPECKLE.frame(SHAPE, 1.2, 0.4, NOISE, 1)
+    row = np.arange(SHAPE[0])[:, None]
+    plain, other = (
+        find_displacement(REFERENCE, counts.astype(np.float32)[None], PIXEL, noise=NOISE)
+        for counts in (frame, 1.3 * frame - 40 + 0.5 * row)
+    )
+    error = (other.displacement - plain.displacement)[INSIDE] / plain.sigma[INSIDE]
+    assert np.sqrt(np.mean(error**2)) < 0.4
+
+
+def test_the_frames_own_types_give_the_same():
+    frames = [SPECKLE.frame(SHAPE, 0.3 * k, 0.2 * k, NOISE, k).round() for k in range(3)]
+    by_type = [
+        find_displacement(
+            frames[0].astype(dtype), np.stack(frames[1:]).astype(dtype), PIXEL, noise=NOISE
+        ).displacement
+        for dtype in (np.uint8, np.uint16, np.float32)
+    ]
+    np.testing.assert_array_equal(by_type[0], by_type[1])
+    np.testing.assert_array_equal(by_type[0], by_type[2])
+
+
+def test_where_the_sheet_is_clear_there_is_no_answer():
+    clear = np.random.default_rng(1).normal(100, NOISE, (2, *SHAPE)).astype(np.float32)
+    half = np.s_[:, 64:]
+    reference, frame = REFERENCE.copy(), SPECKLE.frame(SHAPE, 0.5, 0, NOISE, 3)
+    reference[half], frame[half] = clear[0][half], clear[1][half]
+    found = find_displacement(reference, frame[None], PIXEL)
+    assert (found.status[0, :, 76:] == 3).mean() > 0.99
+    assert np.isnan(found.displacement[0, :, 76:]).mean() > 0.99
+    assert (found.status[0, 16:-16, 16:56] == 1).all()
+
+
+def test_a_clear_sheet_is_refused():
+    clear = np.random.default_rng(2).normal(100, NOISE, (3, *SHAPE)).astype(np.float32)
+    with pytest.raises(
+        InputError, match=r"no texture beyond the noise of 2(\.0)? counts: displacement needs"
+    ):
+        find_displacement(clear[0], clear[1:], PIXEL)
+
+
+def test_a_texture_that_is_not_found_again_has_no_answer():
+    other = Speckle(7).frame(SHAPE, 0, 0, NOISE, 1)
+    found = find_displacement(REFERENCE, other[None], PIXEL, noise=NOISE)
+    assert np.isin(found.status, [0, 2]).mean() > 0.9
+    assert np.isnan(found.displacement).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"window": 5}, "window 5: 6 to 96 pixels"),
+        ({"window": 97}, "window 97: 6 to 96 pixels"),
+        ({"step": 0}, "step 0: 1 to 64 pixels"),
+        ({"noise": 0.0}, "noise 0.0: a standard deviation"),
+        ({"pixel_size": -1}, "pixel size -1: one length"),
+        ({"frames": REFERENCE}, r"frames \(96, 128\): \(H, W\) and \(T, H, W\) are needed"),
+        ({"frames": REFERENCE[None, :-1]}, "expected float32"),
+        ({"reference": REFERENCE.astype(float)}, "frames of type float64"),
+    ],
+)
+def test_bad_input_is_one_line(change, message):
+    given = {"reference": REFERENCE, "frames": REFERENCE[None], "pixel_size": PIXEL} | change
+    with pytest.raises(InputError, match=message):
+        find_displacement(**given)

@@ -1,0 +1,147 @@
+"""Displacement of a texture: the reference against closed forms, and the kernels against it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from launches import launch
+from scipy.ndimage import spline_filter
+from speckle import Speckle
+
+from mirrorskin.kernels.device import C_TYPES
+from mirrorskin.kernels.displacement import (
+    MARGIN,
+    PARAMETERS,
+    TAPS,
+    basis,
+    cubic,
+    displacement_filter,
+    displacement_pad,
+    displacement_solve,
+    displacement_warp,
+    interpolate_nodes,
+    noise_gain,
+    windows,
+)
+
+SHAPE, STEP, WINDOW = (34, 45), 4, 11
+FIRST = (STEP - WINDOW) // 2
+START = FIRST + (WINDOW - 1) / 2
+HALO = 2 * WINDOW + 8
+GRID = (9, 12)
+CORE = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
+SPECKLE = Speckle(3)
+
+
+def spline(frame):
+    """Coefficients of a frame, as the reference makes them."""
+    padded = np.empty((frame.shape[0] + 2 * MARGIN, frame.shape[1] + 2 * MARGIN), np.float32)
+    displacement_pad(frame, padded)
+    half, found = padded.copy(), padded.copy()
+    displacement_filter(1, padded, half)
+    displacement_filter(padded.shape[1], half, found)
+    return padded, half, found
+
+
+def planes_of(reference):
+    """Counts, derivatives and texture of a reference in the middle of which a pixel is no measurement."""
+    down, right = np.gradient(reference.astype(float))
+    counts = reference.astype(float)
+    counts[20, 20] = np.nan
+    rest = [np.where(np.isnan(counts), 0, part) for part in (right, down, reference - reference.mean())]
+    rest = [np.pad(part, HALO) for part in rest]
+    return np.stack([np.pad(counts, HALO, constant_values=np.nan), *rest]).astype(np.float32)
+
+
+def case(dtype):
+    reference = SPECKLE.frame(SHAPE, 0, 0).astype(dtype)
+    frame = SPECKLE.frame(SHAPE, 2.3, -1.4, noise=1).astype(dtype)
+    field = np.stack([np.full(GRID, 2.0), np.full(GRID, -1.0)])
+    field += np.random.default_rng(1).normal(0, 0.4, field.shape)
+    inverse = np.random.default_rng(2).normal(0, 1e-4, (PARAMETERS, PARAMETERS, math.prod(GRID)))
+    return frame, planes_of(reference), field.astype(np.float32), inverse.astype(np.float32)
+
+
+def test_coefficients_are_those_of_a_cubic_spline():
+    frame = SPECKLE.frame(SHAPE, 0, 0)
+    expected = spline_filter(frame.astype(float), 3, mode="mirror")
+    np.testing.assert_allclose(spline(frame)[-1][CORE], expected, atol=0.02)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.5])
+def test_a_sample_keeps_its_noise_and_one_between_two_has_less(part):
+    noise = np.random.default_rng(1).normal(0, 1, (1, 40000))
+    c = spline_filter(np.repeat(noise, 1, axis=0)[0], 3)
+    between = np.tensordot(cubic(np.array(part)), np.stack([c[k : k - 4] for k in range(4)]), 1)
+    assert float(noise_gain(cubic(np.array(part)))) == pytest.approx(between.var(), rel=0.03)
+
+
+def test_nodes_are_joined_by_straight_lines():
+    y, x = np.mgrid[: GRID[0], : GRID[1]] * STEP + START
+    inside = np.s_[:, 2:33, 2:44]
+    found = interpolate_nodes(np.stack([x + 2 * y, y]), START, STEP, SHAPE)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    np.testing.assert_allclose(found[inside], np.stack([column + 2 * row, row])[inside])
+
+
+def test_a_displacement_is_found_from_the_columns_of_its_window():
+    planes = planes_of(SPECKLE.frame(SHAPE, 0, 0))
+    columns = basis(windows(planes, 4, STEP, FIRST + HALO, WINDOW, GRID[1]), WINDOW)
+    inverse = np.full((PARAMETERS, PARAMETERS, math.prod(GRID)), np.nan)
+    inverse[:, :, 4 * GRID[1] : 5 * GRID[1]] = np.linalg.inv(columns.transpose(0, 2, 1) @ columns).transpose(
+        1, 2, 0
+    )
+    difference, answer = np.zeros((2, *planes.shape[1:])), np.empty((9, math.prod(GRID)))
+    difference[0] = 0.7 * planes[1] - 0.2 * planes[2] + np.where(np.isnan(planes[0]), 0, 3) + 0.1 * planes[3]
+    field = np.zeros((2, *GRID))
+    displacement_solve(STEP, FIRST + HALO, WINDOW, planes, difference, field, inverse, answer)
+    found = answer.reshape(9, *GRID)[:, 4, 2:-2]
+    np.testing.assert_allclose(found[0], 0.7, atol=1e-5)
+    np.testing.assert_allclose(found[1], -0.2, atol=1e-5)
+    np.testing.assert_allclose(found[2:6], 0, atol=1e-5)
+    np.testing.assert_allclose(found[6], 0.9, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_the_kernels_do_as_the_reference(device, dtype):
+    frame, planes, field, inverse = case(dtype)
+    expected = dict(zip(("padded", "half", "coefficients"), spline(frame), strict=True))
+    difference = np.zeros((2, *planes.shape[1:]), np.float32)
+    displacement_warp(STEP, START, HALO, expected["coefficients"], planes, field, difference)
+    answer = np.empty((9, math.prod(GRID)), np.float32)
+    displacement_solve(STEP, FIRST + HALO, WINDOW, planes, difference, field, inverse, answer)
+    expected |= {"difference": difference, "answer": answer}
+
+    tile = device.layout.tile
+    macros = {"FRAME": C_TYPES[dtype], "WINDOW": WINDOW, "TILE": tile}
+    kernels = {
+        name: device.kernel("displacement", f"displacement_{name}", **macros)
+        for name in ("pad", "filter", "warp", "solve")
+    }
+    given = {"planes": planes, "field": field, "inverse": inverse}
+    maps = {name: device.given(name, values) for name, values in given.items()}
+    maps["frame"] = device.given("frame", frame, frame.dtype)
+    maps |= {name: device.given(name, np.zeros_like(values)) for name, values in expected.items()}
+    (rows, columns), width = SHAPE, SHAPE[1] + 2 * MARGIN
+    pixels = expected["padded"].size
+    launch(kernels["pad"], -(-pixels // tile), rows, columns, maps["frame"], maps["padded"])
+    launch(kernels["filter"], -(-pixels // tile), pixels, 1, maps["padded"], maps["half"])
+    launch(kernels["filter"], -(-pixels // tile), pixels, width, maps["half"], maps["coefficients"])
+    sizes = (rows, columns, *GRID, STEP)
+    launch(
+        kernels["warp"], rows * -(-columns // tile), *sizes, START, HALO,
+        *(maps[name] for name in ("coefficients", "planes", "field", "difference")),
+    )  # fmt: skip
+    launch(
+        kernels["solve"], math.prod(GRID), *sizes, FIRST + HALO, HALO,
+        *(maps[name] for name in ("planes", "difference", "field", "inverse", "answer")),
+    )  # fmt: skip
+    near = np.s_[TAPS:-TAPS, TAPS:-TAPS]  # of a padded map, what is a coefficient
+    for name, values in expected.items():
+        part = near if name in ("half", "coefficients") else ...
+        scale = np.nanmax(np.abs(values[part]))
+        np.testing.assert_allclose(
+            maps[name].download()[part], values[part], rtol=1e-4, atol=3e-6 * scale, err_msg=name
+        )
