@@ -33,6 +33,8 @@ def command(
     angle: scans.Angle = None,
     wait: scans.Wait = None,
     tilt: scans.Tilt = None,
+    rock: scans.Rock = False,
+    phase: scans.Phase = None,
     turns: scans.Turns = None,
     phase_step: scans.PhaseStep = None,
     rate: scans.Rate = None,

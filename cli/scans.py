@@ -13,7 +13,7 @@ import click
 from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, TwistPlan, VerticalPlan
+    from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, VerticalPlan
     from mirrorskin.hw.rig.rig import Rig
     from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
@@ -26,7 +26,7 @@ SETTLE = "100ms"
 _START = "0mm"
 _TILT = "2.5deg"
 _TURNS = 1.0
-_DIRECTION = "0deg"
+_DIRECTION = _PHASE = "0deg"
 _WAIT = "500ms"
 
 
@@ -77,6 +77,10 @@ Wait = Annotated[
     str | None, _option("TIME", "Horizontal and twist: at rest, pressed, before the body moves.", _WAIT)
 ]
 Tilt = Annotated[str | None, _option("ANGLE", "Axial: half-angle of the precession.", _TILT)]
+Rock = Annotated[
+    bool, Option("--rock", help="Axial: from one side to the other, with --step or --speed as of a twist.")
+]
+Phase = Annotated[str | None, _option("ANGLE", "Axial, with --rock: where it leans to.", _PHASE)]
 Turns = Annotated[float | None, _option("N", "Axial: how often it goes round.", 1)]
 PhaseStep = Annotated[str | None, _option("ANGLE", "Axial, in steps: from place to place, 45deg.")]
 Rate = Annotated[float | None, _option("HZ", "Axial, without a halt: turns a second.")]
@@ -87,9 +91,11 @@ StepFrames = Annotated[int | None, Option("--frames", min=1, help="In steps: at 
 # The motions of an option that not all have; threshold, hold and window are live's.
 _OF: Mapping[str, str] = {
     **dict.fromkeys(("start", "stop", "strokes", "stroke_depth", "threshold", "hold"), "vertical"),
-    **dict.fromkeys(("step", "speed"), "vertical horizontal twist"),
-    **dict.fromkeys(("tilt", "turns", "phase_step", "rate", "window"), "axial"),
-    "press": "axial horizontal twist",
+    **dict.fromkeys(("step", "speed"), "vertical horizontal twist rock"),
+    **dict.fromkeys(("turns", "phase_step", "rate", "window"), "axial"),
+    "tilt": "axial rock",
+    "phase": "rock",
+    "press": "axial rock horizontal twist",
     **dict.fromkeys(("distance", "direction"), "horizontal"),
     "angle": "twist",
     "wait": "horizontal twist",
@@ -101,17 +107,24 @@ def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.io import InputError
 
-    motion = ScanName(words["motion"])
-    foreign = [
-        name for name, of in _OF.items() if words.get(name) is not None and motion.value not in of.split()
-    ]
+    motion, rock = str(words["motion"]), words.get("rock")
+    if rock and motion != "axial":
+        raise InputError(f"--rock says nothing of a motion that is {motion}: leave it out, or choose axial")
+    kind = "rock" if rock else motion
+    foreign = [name for name, of in _OF.items() if words.get(name) is not None and kind not in of.split()]
     if foreign:
         raise InputError(
-            f"--{foreign[0].replace('_', '-')} says nothing of a motion that is {motion.value}:"
+            f"--{foreign[0].replace('_', '-')} says nothing of a motion that is {kind}:"
             " leave it out, or choose the other"
         )
-    makers = {"vertical": _vertical, "axial": _axial, "horizontal": _horizontal, "twist": _twist}
-    plan: Plan = makers[motion.value](words)
+    makers = {
+        "vertical": _vertical,
+        "axial": _axial,
+        "rock": _rock,
+        "horizontal": _horizontal,
+        "twist": _twist,
+    }
+    plan: Plan = makers[kind](words)
     check_steps(plan, words["settle"], words["frames"])
     check_plan(plan, settings.stage, settings.name)
     return plan
@@ -196,6 +209,18 @@ def _vertical(words: Mapping[str, Any]) -> VerticalPlan:
     else:
         start = stop - length(depth, "--stroke-depth")
     return VerticalPlan(start, stop, strokes=strokes or 1, **_pace(words, length, "0.5mm/s"))
+
+
+def _rock(words: Mapping[str, Any]) -> RockPlan:
+    from mirrorskin.cli.quantity import angle, length
+    from mirrorskin.hw.rig.plans import RockPlan
+
+    return RockPlan(
+        length(_needed(words["press"], "--press", "1mm"), "--press"),
+        angle(words["tilt"] or _TILT, "--tilt"),
+        angle(words["phase"] or _PHASE, "--phase"),
+        **_pace(words, angle, "2deg/s"),
+    )
 
 
 def _horizontal(words: Mapping[str, Any]) -> HorizontalPlan:

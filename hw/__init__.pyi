@@ -4,7 +4,7 @@ from .camera_thread import ThreadedCamera
 from .emulator.rig import EmulatedRig
 from .errors import HardwareError
 from .grbl.stage import GrblStage
-from .rig.plans import AxialPlan, HorizontalPlan, TwistPlan, VerticalPlan
+from .rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
 from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
@@ -24,6 +24,7 @@ __all__ = [
     "Live",
     "Position",
     "Rig",
+    "RockPlan",
     "StepScan",
     "SweepScan",
     "ThreadedCamera",

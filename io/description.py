@@ -79,6 +79,7 @@ def _recording(recording: Recording) -> dict[str, str]:
         facts["press"] = f"{header.press:g} mm"
     if header.tilt is not None:
         facts["tilt"] = f"{np.degrees(header.tilt):g} deg"
+    facts |= _range("tilt", None if recording.tilt is None else np.degrees(recording.tilt), "deg")
     if recording.motion == "axial":
         facts["zenith gain"] = _counts(header.zenith_gain, "counts/rad")
         facts["zenith offset"] = _counts(header.zenith_offset, "counts")

@@ -7,7 +7,7 @@ import fcntl
 import itertools
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,7 @@ class GrowingRecording(Closing):
         dtype: np.dtype[Any],
         compression: Compression,
         calibration: Calibration | None = None,
+        series: Collection[str] = (),
     ) -> None:
         self.count = 0
         self._raw = compression == "raw"
@@ -114,8 +115,9 @@ class GrowingRecording(Closing):
             write_header(self._file, header)
             if calibration is not None:
                 write_calibration(self._file, calibration, CARRIED)
-            self._make(shape, dtype, compression, POSITIONS[header.motion])
-            write_plot(self._file, header.motion, {"time", POSITIONS[header.motion]})
+            known = {"time", POSITIONS[header.motion], *series}
+            self._make(shape, dtype, compression, known)
+            write_plot(self._file, header.motion, known)
             self._file.flush()  # all but the frames has its place now
             self._exit = opening.pop_all()
 
@@ -171,7 +173,7 @@ class GrowingRecording(Closing):
         self._exit.close()
 
     def _make(
-        self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, position: str
+        self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, known: set[str]
     ) -> None:
         """Make what grows: afterwards nothing new can be made."""
         file, (expected, rows, columns) = self._file, shape
@@ -181,13 +183,15 @@ class GrowingRecording(Closing):
         self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
         self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
         self._write_state(UNDER_WAY)
-        width = (2,) if position == "displacement" else ()
         self._series = {
-            "time": [Column(file, *SERIES["time"], np.nan, expected)],
-            position: [Column(file, *SERIES[position], np.nan, expected, width)],
+            name: [
+                Column(file, *place, np.nan, expected, (2,) if name == "displacement" else ())
+                for place in (SERIES[name], LIVE.get(name))
+                if place is not None
+            ]
+            for name in SERIES
+            if name in known
         }
-        if position in LIVE:
-            self._series[position].append(Column(file, *LIVE[position], np.nan, expected))
         self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
         self._checksums = Column(file, CHECKSUM, None, np.uint32(0), expected)
         self._used = Column(file, USED, None, np.uint8(1), expected)

@@ -37,6 +37,7 @@ SERIES = {
     "phase": (f"{STAGE}/phase", "rad"),
     "displacement": (f"{STAGE}/displacement", "mm"),
     "twist": (f"{STAGE}/twist", "rad"),
+    "tilt": (f"{STAGE}/tilt", "rad"),
 }
 # Of recordings that are written while frames come: the positions as they were known then, whether a frame
 # was used, how many were lost before it, and whether all is well.
@@ -137,7 +138,7 @@ class Layout:
             dark=self._reference("dark"),
             bright=self._reference("bright"),
             press=self._scalar(f"{STAGE}/travel", "mm", "correct it") if pressed else None,
-            tilt=self._scalar(f"{STAGE}/tilt", "rad", "give --tilt") if tilt is None else tilt,
+            tilt=self._tilt() if tilt is None else tilt,
             pivot=self._pivot(pixel_size),
             zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
@@ -158,7 +159,8 @@ class Layout:
         if given is None:
             remedy = _REMEDIES[name]
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
-        return {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
+        found = {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
+        return found | {"tilt": self._cut(self._tilts())} if motion == "axial" else found
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
         """Read when some frames of the part were taken, and where a live run thought the body to be then."""
@@ -236,6 +238,26 @@ class Layout:
         if values is None or not values.ndim:
             return values
         return np.ascontiguousarray(values[self._part.region.slices])
+
+    def _tilt(self) -> float | None:
+        """Read the half-angle of all frames; None if there is one of each."""
+        if self._has_tilts():
+            return None
+        return self._scalar(SERIES["tilt"][0], "rad", "give --tilt")
+
+    def _tilts(self) -> Floats | None:
+        """Read the half-angle of each frame, if that is what there is."""
+        tilts = self._series("tilt", (self._count,)) if self._has_tilts() else None
+        if tilts is not None and not np.isfinite(tilts).all():
+            frame = int(np.argmin(np.isfinite(tilts)))
+            raise InputError(
+                f"{self._file.path}: {SERIES['tilt'][0]} is not finite at frame {frame}: correct it"
+            )
+        return tilts
+
+    def _has_tilts(self) -> bool:
+        node = self._find(SERIES["tilt"][0])
+        return isinstance(node, h5py.Dataset) and (_grows(node) or (node.size or 0) > 1)
 
     def _pivot(self, pixel_size: tuple[float, float] | None) -> tuple[float, float, float] | None:
         """Read the pivot, and place it from the centre of the region."""

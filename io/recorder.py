@@ -88,7 +88,7 @@ def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:
     data = new_group(file["entry"], "data", "NXdata", signal="frames")
     data["frames"] = h5py.SoftLink(STACK)
     axes = known - {"displacement"}  # which is two numbers a frame
-    along = next((name for name in (POSITIONS[motion], "time") if name in axes), None)
+    along = next((name for name in ("tilt", POSITIONS[motion], "time") if name in axes), None)
     if along is not None:
         target = SERIES[along][0]
         name = target.rsplit("/", 1)[-1]

@@ -49,7 +49,7 @@ class Recording(Closing):
         Name of the stack in the file.
     name, header, shape, dtype, motion, rewindable
         As for every ``Source``.
-    time, travel, phase, twist : ndarray, (T,), float64, or None
+    time, travel, phase, twist, tilt : ndarray, (T,), float64, or None
         Seconds, millimetres and radians.
     displacement : ndarray, (T, 2), float64, or None
         Millimetres.
@@ -98,6 +98,7 @@ class Recording(Closing):
         self.state, self.used, self.dropped = state.state, state.used, state.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
+        self.tilt = positions.get("tilt")
         self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
         self.truth = truth
         self.storage = describe_storage(dataset)
@@ -143,6 +144,7 @@ class Recording(Closing):
             phase=here(self.phase),
             displacement=here(self.displacement),
             twist=here(self.twist),
+            tilt=here(self.tilt),
             origin=self.origin,
             lent=lent,
         )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import MAKE_ROOM, check_output, new_file
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.growing import GrowingRecording
-from mirrorskin.io.layout import COMPLETE, CUT_SHORT
+from mirrorskin.io.layout import COMPLETE, CUT_SHORT, SERIES
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recorder import Compression, TeeSource
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource
@@ -202,7 +202,8 @@ class StreamRecorder(TeeSource[LiveSource]):
         with ExitStack() as opening:
             with new_file(self.path) as descriptor:
                 known = self.header, self.shape, self.dtype, self._compression, self._calibration
-                file = opening.enter_context(GrowingRecording(self.path, descriptor, *known))
+                series = [name for name in SERIES if getattr(block, name) is not None]
+                file = opening.enter_context(GrowingRecording(self.path, descriptor, *known, series))
                 self._append(file, block)
                 file.publish()
             opening.pop_all()  # from here on it is the caller's to close

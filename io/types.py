@@ -49,6 +49,8 @@ class Block:
         Millimetres that the body has been moved along x and y (horizontal motion).
     twist : ndarray, (n,), float64, or None
         Radians that the body has been turned about its axis, counter-clockwise (twist).
+    tilt : ndarray, (n,), float64, or None
+        Half-angle of the lean, radians, where it differs from frame to frame (axial motion).
     origin : (int, int)
         Row and column of the first pixel in the full picture.
     dropped : int
@@ -65,6 +67,7 @@ class Block:
     phase: Floats | None = None
     displacement: Floats | None = None
     twist: Floats | None = None
+    tilt: Floats | None = None
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
     lent: bool = False
@@ -86,7 +89,7 @@ class Header:
     press : float or None
         Millimetres of travel at which the other motions happen.
     tilt : float or None
-        Half-angle of the precession, radians.
+        Half-angle of the precession, radians, if it is that of all frames.
     pivot : (float, float, float) or None
         Point that the body turns about, mm, from the rest sheet's centre, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
@@ -195,7 +198,8 @@ class LiveSource(Source, Protocol):
         Returns
         -------
         mapping
-            ``travel``, mm, or ``phase``, radians; one value a frame.
+            ``travel``, mm, ``phase``, ``tilt`` or ``twist``, radians; one value a frame; or ``displacement``,
+            mm, two a frame.
         """
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.moves import SLOWEST
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid, VerticalPlan
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, RockPlan, Trapezoid, VerticalPlan
 from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.track import Track, even_times
 from mirrorskin.hw.rig_file import Axis
@@ -103,6 +104,9 @@ def _stroke(rig: Rig, plan: Plan) -> _Stroke:
         return _Stroke(
             begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch)
         )
+    if isinstance(plan, RockPlan):
+        along = partial(plan.way, expected=0.0)
+        return _Stroke(plan.first, plan.ends[0], plan.length, along, *_speeds(stage.pitch))
     start, stop = (plan.start, plan.stop) if isinstance(plan, VerticalPlan) else (0.0, plan.first.travel)
     length = (1 - _PRESSED) * (stop - start)
     if length <= 0:

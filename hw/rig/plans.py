@@ -86,14 +86,14 @@ class Trapezoid:
 
 
 class Plan:
-    """What a scan does; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan` and `TwistPlan`.
+    """What a scan does; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan`, `TwistPlan` and `RockPlan`.
 
     Places are told by how far the body has come along its way: mm, or radians.
     """
 
     __slots__ = ()
     motion: ClassVar[Motion]
-    series: ClassVar[str]  # what a recording says of each frame: travel, phase, displacement or twist
+    series: ClassVar[str]  # what a recording says of each frame: travel, phase, displacement, twist or tilt
 
     @property
     def in_steps(self) -> bool:
@@ -130,6 +130,11 @@ class Plan:
     def period(self) -> float:
         """How far it is to the next place that looks alike."""
         return math.inf
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """What a recording says of all frames alike, by the name of the series."""
+        return {}
 
     @property
     def first(self) -> Position:
@@ -501,6 +506,70 @@ class AxialPlan(Plan):
     def way(self, position: Position, expected: float) -> float:
         """Return the phase without jumps, radians."""
         return position.phase + math.tau * round((expected - position.phase) / math.tau)
+
+
+@dataclass(frozen=True, slots=True)
+class RockPlan(_Straight):
+    """Press, lean, and rock about one axis: from a tilt on one side to the same on the other.
+
+    Values that cannot be are an `InputError`.
+
+    Attributes
+    ----------
+    press : float
+        Travel at which the body rocks, mm.
+    tilt : float
+        Greatest half-angle, radians, above 0; it begins at its negative.
+    phase : float
+        Where the body leans to at positive tilts, radians, as the phase of a precession.
+    step : float or None
+        From place to place, radians, where it goes in steps.
+    speed : float or None
+        Where it goes without a halt, rad/s. Either `step` or `speed` is given.
+
+    Examples
+    --------
+    >>> RockPlan(1.0, 0.04, step=0.02).values.tolist()
+    [-0.04, -0.02, 0.0, 0.02, 0.04]
+    """
+
+    press: float
+    tilt: float
+    phase: float = 0.0
+    step: float | None = None
+    speed: float | None = None
+    motion: ClassVar[Motion] = "axial"
+    series: ClassVar[str] = "tilt"
+
+    def __post_init__(self) -> None:
+        _check_number(self.press, "press", "mm")
+        _check_number(self.phase, "phase", "radians")
+        _check_above_zero(self.tilt, "tilt", "radians")
+        self._check("radians")
+
+    @property
+    def length(self) -> float:
+        """From one side to the other, radians."""
+        return 2 * self.tilt
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The phase."""
+        return {"phase": self.phase}
+
+    def place(self, way: float) -> Position:
+        """Return where the body stands so far on its way."""
+        tilt = way - self.tilt
+        return Position(self.press, tilt * math.cos(self.phase), tilt * math.sin(self.phase))
+
+    def recorded(self, ways: Floats) -> Floats:
+        """Return the tilt, (n,), radians."""
+        return ways - self.tilt
+
+    def way(self, position: Position, expected: float) -> float:
+        """Return how far on its way it has come, radians."""
+        tilt = position.pitch * math.cos(self.phase) + position.roll * math.sin(self.phase)
+        return min(max(tilt + self.tilt, 0.0), self.length)
 
 
 def _whole(steps: float) -> int:

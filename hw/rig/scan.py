@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, TwistPlan, check_plan
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, check_plan
 from mirrorskin.hw.rig.references import read_reference
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.stage import Position, Report
@@ -142,6 +142,7 @@ class Scan(Closing):
         self, frames: NDArray[Any], arrival: Floats, place: Floats, dropped: int, origin: float
     ) -> Block:
         known: dict[str, Any] = {self.plan.series: place}
+        known |= {name: np.full(len(frames), value) for name, value in self.plan.constants.items()}
         lent = frames.flags.c_contiguous
         return Block(frames, self.count, arrival - origin, dropped=dropped, lent=lent, **known)
 
@@ -169,6 +170,8 @@ class Scan(Closing):
             return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)
         if isinstance(self.plan, HorizontalPlan | TwistPlan):
             return replace(header, press=self.plan.press)
+        if isinstance(self.plan, RockPlan):
+            return replace(header, press=self.plan.press, pivot=stage.pivot)
         return header
 
 

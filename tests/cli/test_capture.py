@@ -77,6 +77,22 @@ def test_a_slide_in_steps_becomes_a_recording(emulated, tmp_path):
         assert recording.read(np.empty((3, *SHAPE), np.uint8)).frames.max() > 100
 
 
+def test_a_rocking_body_becomes_a_recording_with_a_tilt_of_each_frame(emulated, tmp_path):
+    path = tmp_path / "rock.h5"
+    words = ("--rock", "--press", "0.5mm", "--tilt", "3deg", "--step", "3deg", "--phase", "90deg")
+    ended = capture(emulated, "axial", "-o", path, *words, "--settle", "0s")
+    assert ended.code == 0, ended.said
+    with io.open_recording(path) as recording:
+        assert recording.motion == "axial"
+        np.testing.assert_allclose(np.degrees(recording.tilt), [-3, 0, 3], atol=1e-12)
+        np.testing.assert_allclose(recording.phase, np.pi / 2)
+        assert recording.header.tilt is None
+        np.testing.assert_array_equal(
+            recording.read(np.empty((2, *SHAPE), np.uint8)).tilt, recording.tilt[:2]
+        )
+    assert "-3 to 3 deg" in run("info", path).out
+
+
 def test_a_twist_without_a_halt_becomes_a_recording(emulated, tmp_path):
     path = tmp_path / "twist.h5"
     words = ("--press", "0.5mm", "--angle", "-10deg", "--speed", "20deg/s", "--wait", "0s")
@@ -151,6 +167,13 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         (["horizontal", "--press", "1mm", "--distance", "5mm", "--step", "1mm"], "5 mm of x are beyond"),
         (["horizontal", "--press", "1mm", "--distance", "1mm", "--speed", "9mm/s"], "too fast"),
         (["twist", "--press", "1mm", "--step", "1deg"], "--angle is missing"),
+        (["vertical", "--stop", "1mm", "--step", "1mm", "--rock"], "--rock says nothing"),
+        (
+            ["axial", "--press", "1mm", "--rock", "--rate", "1"],
+            "--rate says nothing of a motion that is rock",
+        ),
+        (["axial", "--press", "1mm", "--step", "1deg"], "--step says nothing of a motion that is axial"),
+        (["axial", "--press", "1mm", "--rock", "--tilt", "20deg", "--step", "1deg"], "beyond the greatest"),
         (["twist", "--press", "1mm", "--angle", "60deg", "--step", "1deg"], "60 degrees of twist are beyond"),
         (["twist", "--press", "1mm", "--angle", "9deg", "--speed", "1deg"], "write e.g. 2deg/s"),
         (["twist", "--press", "1mm", "--angle", "9deg", "--step", "1mm"], "--step 1mm"),

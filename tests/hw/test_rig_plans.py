@@ -8,6 +8,7 @@ from rig_fakes import settings
 from mirrorskin.hw.rig.plans import (
     AxialPlan,
     HorizontalPlan,
+    RockPlan,
     Trapezoid,
     TwistPlan,
     VerticalPlan,
@@ -102,6 +103,17 @@ def test_a_slide_along_an_axis_needs_no_other():
         check_plan(HorizontalPlan(1.0, 0.5, math.pi / 4, step=0.5), stage, "stage")
 
 
+def test_a_rocking_body_leans_from_one_side_to_the_other_about_one_axis():
+    plan = RockPlan(1.0, 0.06, math.radians(30), step=0.02)
+    np.testing.assert_allclose(plan.values, 0.02 * np.arange(-3, 4), atol=1e-12)
+    for place, tilt in zip(plan.places, plan.values, strict=True):
+        assert (place.travel, place.tilt) == (1.0, pytest.approx(abs(tilt)))
+        along, across = math.cos(place.phase - plan.phase), math.sin(place.phase - plan.phase)
+        assert (place.tilt * along, place.tilt * across) == (pytest.approx(tilt), pytest.approx(0))
+        assert plan.recorded(np.array([plan.way(place, 0.0)])) == pytest.approx(tilt)
+    assert plan.constants == {"phase": math.radians(30)}
+
+
 @pytest.mark.parametrize("sense", [1, -1])
 def test_a_twist_turns_the_way_of_its_sign(sense):
     plan = TwistPlan(1.0, sense * 0.4, step=0.1)
@@ -115,6 +127,8 @@ def test_a_twist_turns_the_way_of_its_sign(sense):
     ("plan", "limit"),
     [
         (HorizontalPlan(2.5, 0.5, step=0.1), "2 mm"),
+        (RockPlan(1.0, 0.11, step=0.11), "beyond the greatest"),
+        (RockPlan(1.0, 0.05, speed=21.0), "axis of pitch is too fast"),
         (HorizontalPlan(1.0, 1.2, step=0.1), "1.2 mm of x are beyond"),
         (HorizontalPlan(1.0, 1.2, -math.pi / 2, speed=0.1), "-1.2 mm of y are beyond"),
         (TwistPlan(1.0, -0.6, step=0.1), "degrees of twist are beyond"),
@@ -186,6 +200,9 @@ def test_a_rotation_that_cannot_be_is_refused(values):
         (HorizontalPlan, {"distance": 1, "wait": -1}),
         (HorizontalPlan, {"distance": 1, "step": 2}),
         (HorizontalPlan, {"distance": 1, "speed": 1}),
+        (RockPlan, {"tilt": 0}),
+        (RockPlan, {"tilt": 0.1, "phase": NAN}),
+        (RockPlan, {"tilt": 0.1, "step": 0.3}),
         (TwistPlan, {"angle": 0}),
         (TwistPlan, {"angle": NAN}),
         (TwistPlan, {"angle": 1, "wait": INF}),

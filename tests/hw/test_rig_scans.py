@@ -10,7 +10,7 @@ from rig_fakes import FakeCamera, FakeStage, settings, spreading
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import delay as delays
-from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, TwistPlan, VerticalPlan
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
@@ -120,6 +120,21 @@ def test_each_frame_of_a_stepwise_slide_or_twist_shows_where_it_tells(plan, colu
     end = plan.places[-1]
     assert places[:3] == [Position(-5.0), Position(0.5), Position(0.5)]
     assert places[-2:] == [replace(end, travel=-5.0), Position(-5.0)], "up first, and back above the object"
+
+
+def test_a_rocking_body_tells_its_tilts_and_goes_back_upright():
+    plan = RockPlan(0.5, TILT, math.pi / 2, step=TILT)
+    with make_rig() as rig:
+        with StepScan(rig, plan, settle=0.0) as scan:
+            blocks = drain(scan)
+        assert rig.stage.moves[-2:] == [Position(0.5), Position(-5.0)]
+    frames = joined(blocks, "frames")
+    np.testing.assert_allclose(joined(blocks, "tilt"), [-TILT, 0, TILT])
+    np.testing.assert_allclose(joined(blocks, "phase"), math.pi / 2)
+    np.testing.assert_allclose(frames[:, 2, 0], 100 + 1000 * joined(blocks, "tilt"), atol=1)
+    np.testing.assert_array_equal(frames[:, :2, 0], [[150, 100]] * 3)
+    assert scan.header.tilt is None
+    assert (scan.header.press, scan.header.pivot) == (0.5, (0, 0, 0))
 
 
 def test_a_slide_without_a_halt_waits_pressed_and_then_knows_where_it_is():
