@@ -1,0 +1,200 @@
+// Normal equations of a rigid motion between two maps. Specification: pose.py.
+//
+// TILE     pixels of one work-item of pose_gradient
+// BESIDE   1 where the Jacobian by the first map's own curvature is wanted too
+
+#include "common.clh"
+
+#define AROUND 2
+#define LEAST 7
+#define FLAT 1e-3f
+#define BLOCK 8
+#define SUMS 67
+#define NEAR 1e20f
+#define VAGUE 100.0f
+
+__kernel void pose_gradient(
+    const int rows, const int columns, const float step_x, const float step_y, MAP values, OUT gradient)
+{
+    const int first = (int)get_global_id(0) * TILE;
+    for (int p = first; p < LESSER(first + TILE, rows * columns); ++p) {
+        const int row = p / columns, column = p % columns;
+        const int left = LESSER(AROUND, column), right = LESSER(AROUND, columns - 1 - column);
+        const float here = values[p];
+        float count = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0, z = 0, xz = 0, yz = 0;
+        for (int below = -LESSER(AROUND, row); below <= LESSER(AROUND, rows - 1 - row); ++below)
+            for (int beside = -left; beside <= right; ++beside) {
+                const float value = values[p + below * columns + beside] - here;
+                const int known = value == value;
+                const float one = known ? 1.0f : 0.0f, rise = known ? value : 0.0f, i = beside * one, j = below * one;
+                count += one;
+                x += i;
+                y += j;
+                xx += i * beside;
+                xy += i * below;
+                yy += j * below;
+                z += rise;
+                xz += rise * beside;
+                yz += rise * below;
+            }
+        const float mean_x = x / count, mean_y = y / count;
+        xx -= x * mean_x;
+        xy -= x * mean_y;
+        yy -= y * mean_y;
+        xz -= z * mean_x;
+        yz -= z * mean_y;
+        const float area = xx * yy - xy * xy;
+        const int good = count >= LEAST && area > FLAT * count * count;
+        gradient[2 * p] = good ? (yy * xz - xy * yz) / area / step_x : NAN;
+        gradient[2 * p + 1] = good ? -(xx * yz - xy * xz) / area / step_y : NAN;
+    }
+}
+
+float upright(const float x, const float y) { return root(GREATER(1.0f - x * x - y * y, 1e-6f)); }
+
+// Covariance xx, xy, yy of a normal's x and y after a rotation.
+float3 variances(const float x, const float y, MAP turn, const float square, const float least)
+{
+    const float flat = x * x + y * y, outside = GREATER(flat, least), z = upright(x, y);
+    const float share = 0.5f * least / outside, across = (1.0f - share) * square;
+    const float more = (2.0f * share - 1.0f) * square / outside;
+    const float u = turn[0] * x + turn[1] * y + turn[2] * z, v = turn[3] * x + turn[4] * y + turn[5] * z;
+    const float a = z * (turn[0] * x + turn[1] * y) - turn[2] * flat, b = z * (turn[3] * x + turn[4] * y) - turn[5] * flat;
+    return (float3)(across * (1.0f - u * u) + more * a * a, more * a * b - across * u * v,
+                    across * (1.0f - v * v) + more * b * b);
+}
+
+float3 same_variances(const float x, const float y, const float z, const float square, const float least)
+{
+    const float flat = x * x + y * y, outside = GREATER(flat, least);
+    const float share = 0.5f * least / outside, across = (1.0f - share) * square;
+    const float more = (2.0f * share - 1.0f) * square / outside * z * z - across;
+    return (float3)(across + more * x * x, more * x * y, across + more * y * y);
+}
+
+// A second derivative of F = z - h(x, y) after a rotation.
+#define SECOND(i, j)                                                                                              \
+    -(h.x * turn[3 * i] * turn[3 * j] + h.y * (turn[3 * i] * turn[3 * j + 1] + turn[3 * i + 1] * turn[3 * j])       \
+      + h.z * turn[3 * i + 1] * turn[3 * j + 1])
+
+float3 turn_curvature(const float z_before, const float3 h, MAP turn, const float3 n)
+{
+    const float p = -n.x / n.z, q = -n.y / n.z, scale = z_before / n.z;
+    const float xx = SECOND(0, 0), xy = SECOND(0, 1), yy = SECOND(1, 1), xz = SECOND(0, 2), yz = SECOND(1, 2), zz = SECOND(2, 2);
+    return -scale * (float3)(xx + 2.0f * xz * p + zz * p * p, xy + xz * q + yz * p + zz * p * q, yy + 2.0f * yz * q + zz * q * q);
+}
+
+// Three rows of the Jacobian, six numbers each in a vector of eight; the first two are whitened.
+void jacobian(const float3 n, const float3 h, const float3 arm, const float3 lower, const float sure, float8 *rows)
+{
+    const float8 move_x = (float8)(0, arm.z, -arm.y, 1, 0, 0, 0, 0), move_y = (float8)(-arm.z, 0, arm.x, 0, 1, 0, 0, 0);
+    const float8 move_z = (float8)(arm.y, -arm.x, 0, 0, 0, 1, 0, 0);
+    const float8 turn_x = (float8)(0, n.z, -n.y, 0, 0, 0, 0, 0), turn_y = (float8)(-n.z, 0, n.x, 0, 0, 0, 0, 0);
+    const float8 change_x = h.x * move_x + h.y * move_y, change_y = h.y * move_x + h.z * move_y;
+    const float8 along = n.x * change_x + n.y * change_y;
+    const float8 x = turn_x + n.z * (change_x - n.x * along), y = turn_y + n.z * (change_y - n.y * along);
+    rows[0] = x * lower.x;
+    rows[1] = (y - lower.y * rows[0]) * lower.z;
+    const float by = sure / n.z;
+    rows[2] = sure * move_z + by * n.x * move_x + by * n.y * move_y;
+}
+
+// Of block after block of the first map's pixels: the sums that pose.py names, SUMS numbers each.
+__kernel void pose_equations(
+    const int rows, const int columns, const int other_rows, const int other_columns, const int step, MAP first,
+    MAP second, MAP pose, OUT sums)
+{
+    const int side = BLOCK * step, across = (columns + side - 1) / side, item = get_global_id(0);
+    const int top = item / across * side, begin = item % across * side;
+    if (top >= rows) return;
+    MAP turn = pose;
+    const float east_x = 1.0f / pose[21], south_y = 1.0f / pose[22];
+    float8 upper[6], whole[6], right = 0.0f;
+    float chi = 0, expected = 0, heights = 0, normals = 0;
+    for (int i = 0; i < 6; ++i) upper[i] = whole[i] = 0.0f;
+    for (int row = top; row < LESSER(top + side, rows); row += step)
+        for (int column = begin; column < LESSER(begin + side, columns); column += step) {
+            const float8 mine = vload8(row * columns + column, first);
+            if (mine.s0 != mine.s0) continue;
+            const float x = pose[15] + column * pose[17], y = pose[16] - row * pose[18], z = mine.s3;
+            const float3 place = (float3)(turn[0] * x + turn[1] * y + turn[2] * z + pose[9],
+                                          turn[3] * x + turn[4] * y + turn[5] * z + pose[10],
+                                          turn[6] * x + turn[7] * y + turn[8] * z + pose[11]);
+            const float to_right = (place.x - pose[19]) * east_x, to_below = (pose[20] - place.y) * south_y;
+            if (!(to_right >= 0.0f && to_right < other_columns - 1 && to_below >= 0.0f && to_below < other_rows - 1))
+                continue;
+            const int west = to_right, north = to_below, at = north * other_columns + west;
+            const float u = to_right - west, v = to_below - north;
+            float8 found = 0.0f;
+            for (int k = 0; k < 4; ++k) {
+                const int by_x = k & 1, by_y = k >> 1;
+                const float weight = (by_x ? u : 1.0f - u) * (by_y ? v : 1.0f - v);
+                const float8 record = vload8(at + by_y * other_columns + by_x, second);
+                const float half_of = 0.5f * weight / upright(record.s0, record.s1);
+                found += weight * record;
+                found.s3 -= half_of * (record.s0 * (u - by_x) * pose[21] - record.s1 * (v - by_y) * pose[22]);
+            }
+            if (found.s0 != found.s0) continue;
+            const float share = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
+            const float3 n = (float3)(found.s0, found.s1, upright(found.s0, found.s1)), arm = place - vload3(4, pose);
+            const float z_before = upright(mine.s0, mine.s1);
+            const float3 turned = (float3)(turn[0] * mine.s0 + turn[1] * mine.s1 + turn[2] * z_before,
+                                           turn[3] * mine.s0 + turn[4] * mine.s1 + turn[5] * z_before,
+                                           turn[6] * mine.s0 + turn[7] * mine.s1 + turn[8] * z_before);
+            const float3 other = same_variances(n.x, n.y, n.z, found.s2, pose[24]);
+            const float3 both = variances(mine.s0, mine.s1, turn, mine.s2, pose[23]) + other;
+            const float area = both.x * both.z - both.y * both.y;
+            const float low = inverse_root(both.x), told = both.x + both.z < VAGUE ? 1.0f : 0.0f;
+            const float3 lower = (float3)(told * low, both.y * low, told * inverse_root(area) / low);
+            const float lift = (turn[2] * n.x + turn[5] * n.y + turn[8] * n.z) / n.z, own = lift * lift * mine.s4;
+            const int compared = mine.s4 < NEAR && found.s4 < NEAR;
+            const float sure = compared ? inverse_root(own + found.s4) : 0.0f;
+            float8 mine_rows[3];
+            jacobian(n, (float3)(found.s5, found.s6, found.s7), arm, lower, sure, mine_rows);
+            const float r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
+            const float r2 = sure * (place.z - found.s3);
+            const float8 a = mine_rows[0], b = mine_rows[1], c = mine_rows[2];
+            right += a * r0 + b * r1 + c * r2;
+            chi += r0 * r0 + r1 * r1 + r2 * r2;
+            const float traced = (both.z * other.x - 2.0f * both.y * other.y + both.x * other.z) / area;
+            expected += told * (2.0f - (1.0f - share) * traced) + sure * sure * (own + share * found.s4);
+            heights += compared ? 1.0f : 0.0f;
+            normals += told;
+            upper[0] += a.s0 * a + b.s0 * b + c.s0 * c;
+            upper[1] += a.s1 * a + b.s1 * b + c.s1 * c;
+            upper[2] += a.s2 * a + b.s2 * b + c.s2 * c;
+            upper[3] += a.s3 * a + b.s3 * b + c.s3 * c;
+            upper[4] += a.s4 * a + b.s4 * b + c.s4 * c;
+            upper[5] += a.s5 * a + b.s5 * b + c.s5 * c;
+#if BESIDE
+            const float3 curved = turn_curvature(z_before, (float3)(mine.s5, mine.s6, mine.s7), turn, turned);
+            float8 own_rows[3];
+            jacobian(turned, curved, arm, lower, sure, own_rows);
+            const float8 d = own_rows[0], e = own_rows[1], f = own_rows[2];
+            whole[0] += a.s0 * d + b.s0 * e + c.s0 * f;
+            whole[1] += a.s1 * d + b.s1 * e + c.s1 * f;
+            whole[2] += a.s2 * d + b.s2 * e + c.s2 * f;
+            whole[3] += a.s3 * d + b.s3 * e + c.s3 * f;
+            whole[4] += a.s4 * d + b.s4 * e + c.s4 * f;
+            whole[5] += a.s5 * d + b.s5 * e + c.s5 * f;
+#endif
+        }
+    OUT out = sums + item * SUMS;
+    int k = 0;
+    for (int i = 0; i < 6; ++i) {
+        float line[8];
+        vstore8(upper[i], 0, line);
+        for (int j = i; j < 6; ++j) out[k++] = line[j];
+    }
+    float line[8];
+    vstore8(right, 0, line);
+    for (int j = 0; j < 6; ++j) out[k++] = line[j];
+    out[k++] = chi;
+    out[k++] = expected;
+    out[k++] = heights;
+    out[k++] = normals;
+    for (int i = 0; i < 6; ++i) {
+        vstore8(whole[i], 0, line);
+        for (int j = 0; j < 6; ++j) out[k++] = line[j];
+    }
+}

@@ -1,0 +1,235 @@
+"""Normal equations of a rigid motion between two maps: what ``pose.cl`` computes, in NumPy with float64.
+
+A map is an array of records, (H, W, 8): the normal's x and y, the mean square angular error of the normal
+(radians^2, `VAGUE` or more where it is not to be compared), height (mm) and its variance (mm^2, `FAR` where it is not to be compared), and the second
+derivatives of the height xx, xy and yy (1/mm). A pixel that cannot be used is NaN in its first number.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Doubles = NDArray[np.float64]
+
+BLOCK = 8
+"""Pixels on each side of a block, whose sums are written together."""
+PARTS = (0, 21, 27, 28, 29, 30, 31, 67)
+"""Where the sums of a block begin: upper triangle of J'WJ; J'Wr; chi^2; what is expected of it; compared
+heights; compared normals; and J'WK, K being the Jacobian by the first map's own normals and curvature."""
+SUMS = PARTS[-1]
+FAR = 1e30
+_NEAR = 1e20  # of FAR, the smallest share between pixels is more
+AROUND = 2
+VAGUE = 100.0
+"""Radians^2 from which on a normal is not compared."""
+_LEAST = 7  # pixels that a gradient is taken from
+_FLAT = 1e-3  # of a singular arrangement of them
+
+
+class Shape(NamedTuple):
+    """Normals with what their change needs: rows (n,), of the unit vectors and the second derivatives."""
+
+    x: Doubles
+    y: Doubles
+    z: Doubles
+    xx: Doubles
+    xy: Doubles
+    yy: Doubles
+
+
+def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
+    """Write the slopes along x and y, (H, W, 2), of the plane that fits the known values of 5 x 5 pixels best.
+
+    NaN where the pixel itself is unknown, or fewer than seven are known, or these lie along a line.
+    """
+    rows, columns = values.shape
+    wide = np.pad(values.astype(np.float64), AROUND, constant_values=np.nan)
+    sums = np.zeros((9, rows, columns))
+    for row in range(-AROUND, AROUND + 1):
+        for column in range(-AROUND, AROUND + 1):
+            top, left = AROUND + row, AROUND + column
+            value = wide[top : top + rows, left : left + columns] - values
+            known = np.isfinite(value)
+            value = np.where(known, value, 0)
+            for number, factor in enumerate((1, column, row, column**2, column * row, row**2)):
+                sums[number] += known * factor
+            for number, factor in enumerate((1, column, row), 6):
+                sums[number] += value * factor
+    count, x, y, xx, xy, yy, z, xz, yz = sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+        xz, yz = xz - x * z / count, yz - y * z / count
+        area = xx * yy - xy * xy
+        good = (count >= _LEAST) & (area > _FLAT * count**2)
+        gradient[..., 0] = np.where(good, (yy * xz - xy * yz) / area / step_x, np.nan)
+        gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
+
+
+def pose_equations(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:
+    """Write the sums of each block of the first map's pixels, (blocks, SUMS), of which every ``step``-th counts.
+
+    Parameters
+    ----------
+    step : int
+        A block has `BLOCK` x `BLOCK` pixels that count.
+    first, second : (H, W, 8)
+        Records; the two maps may be of different sizes.
+    pose : (25,)
+        Matrix of the rotation (9), translation (3), the point that further rotations are about (3), x and y of
+        the first map's first pixel and the pixel's size along x and y (4), the same of the second (4), and
+        of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
+        error is the same in all directions.
+    sums : (blocks, SUMS)
+        See `PARTS`.
+    """
+    row, column = (one.ravel() for one in np.indices(first.shape[:2]))
+    across = -(-first.shape[1] // (BLOCK * step))
+    block = row // (BLOCK * step) * across + column // (BLOCK * step)
+    mine = first.reshape(-1, 8).astype(np.float64)
+    turn, shift, centre = pose[:9].reshape(3, 3), pose[9:12], pose[12:15]
+    taken = (row % step == 0) & (column % step == 0) & np.isfinite(mine[:, 0])
+    row, column, block, mine = row[taken], column[taken], block[taken], mine[taken]
+    x0, y0, step_x, step_y = pose[15:19]
+    place = np.stack([x0 + column * step_x, y0 - row * step_y, mine[:, 3]]) if len(mine) else np.zeros((3, 0))
+    place = turn @ place + shift[:, None]
+    theirs, share, inside = _interpolate(second.astype(np.float64), place, pose[19:23])
+    block, mine, place = block[inside], mine[inside], place[:, inside]
+    arm = place - centre[:, None]
+
+    n = _upright(theirs[0], theirs[1])
+    shape = Shape(*n, *theirs[5:8])
+    turned = turn @ _upright(mine[:, 0], mine[:, 1])
+    own = Shape(*turned, *_turn_curvature(turn, mine[:, 0], mine[:, 1], mine[:, 5:8].T))
+    variance = _variances(mine[:, 0], mine[:, 1], turn, mine[:, 2], pose[23])
+    other = _variances(theirs[0], theirs[1], np.eye(3), theirs[2], pose[24])
+    xx, xy, yy = variance + other
+    told = xx + yy < VAGUE
+    lower = told / np.sqrt(xx), xy / np.sqrt(xx), told / np.sqrt(yy - xy * xy / xx)
+    part = (1 - share) * _trace(other, xx, xy, yy)
+    lift = turn[:, 2] @ n / n[2]
+    own_height = lift**2 * mine[:, 4]
+    sure = 1 / np.sqrt(own_height + theirs[4])
+    compared = (mine[:, 4] < _NEAR) & (theirs[4] < _NEAR)
+    sure = np.where(compared, sure, 0)
+    residual = np.stack([*_whiten(turned[0] - n[0], turned[1] - n[1], lower), sure * (place[2] - theirs[3])])
+    jacobian, beside = (_jacobian(one, arm, lower, sure) for one in (shape, own))
+    expected = told * (2 - part) + sure**2 * (own_height + share * theirs[4])
+
+    upper = np.triu_indices(6)
+    whole = np.concatenate(
+        [
+            np.einsum("kin,kjn->ijn", jacobian, jacobian)[upper],
+            np.einsum("kin,kn->in", jacobian, residual),
+            [np.sum(residual**2, axis=0), expected, compared, told],
+            np.einsum("kin,kjn->ijn", jacobian, beside).reshape(36, -1),
+        ]
+    )
+    sums[...] = np.stack([np.bincount(block, one, len(sums)) for one in whole], axis=-1)
+
+
+def _upright(x: Doubles, y: Doubles) -> Doubles:
+    return np.stack([x, y, np.sqrt(1 - x * x - y * y)])
+
+
+def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """Return the records at places, (8, n), sums of squared weights, and which places have four pixels around.
+
+    Between pixels all numbers change linearly. To the height each pixel adds half of what its own slope
+    makes, so that a paraboloid remains one.
+    """
+    rows, columns = second.shape[:2]
+    x0, y0, step_x, step_y = grid
+    right, down = (place[0] - x0) / step_x, (y0 - place[1]) / step_y
+    inside = (right >= 0) & (right < columns - 1) & (down >= 0) & (down < rows - 1)
+    right, down = right[inside], down[inside]
+    west, north = right.astype(np.intp), down.astype(np.intp)
+    found, share = np.zeros((8, len(west))), np.zeros(len(west))
+    for below in (0, 1):
+        for beside in (0, 1):
+            from_x, from_y = right - west - beside, down - north - below
+            weight = (1 - np.abs(from_x)) * (1 - np.abs(from_y))
+            record = second[north + below, west + beside].T
+            n = _upright(record[0], record[1])
+            found += weight * record
+            found[3] -= weight / 2 * (n[0] * from_x * step_x - n[1] * from_y * step_y) / n[2]
+            share += weight**2
+    known = np.isfinite(found[0])
+    inside[inside] = known
+    return found[:, known], share[known], inside
+
+
+def _variances(x: Doubles, y: Doubles, turn: Array, square: Doubles, least: float) -> Doubles:
+    """Return the covariance xx, xy, yy of a normal's x and y after a rotation.
+
+    An angular error has the share ``least`` / (2 sin^2 zenith) of its variance along the meridian.
+    """
+    flat = x * x + y * y
+    share = least / 2 / np.maximum(flat, least)
+    across, more = (1 - share) * square, (2 * share - 1) * square / np.maximum(flat, least)
+    n = _upright(x, y)
+    turned, along = turn @ n, turn @ np.stack([x * n[2], y * n[2], -flat])
+    return np.stack(
+        [
+            across * ((i == j) - turned[i] * turned[j]) + more * along[i] * along[j]
+            for i, j in ((0, 0), (0, 1), (1, 1))
+        ]
+    )
+
+
+def _trace(other: Doubles, xx: Doubles, xy: Doubles, yy: Doubles) -> Doubles:
+    """Return the trace of the inverse of one covariance times another."""
+    traced: Doubles = (yy * other[0] - 2 * xy * other[1] + xx * other[2]) / (xx * yy - xy * xy)
+    return traced
+
+
+def _turn_curvature(turn: Array, x: Doubles, y: Doubles, curvature: Doubles) -> Doubles:
+    """Return the second derivatives of a surface's height after a rotation.
+
+    The surface is F = z - h(x, y) = 0, with gradient G and second derivatives M; those of the turned height are
+    -(M_ab + M_az h_b + M_bz h_a + M_zz h_a h_b) / G_z with h_a = -G_a / G_z.
+    """
+    gradient = turn @ _upright(x, y)
+    xx, xy, yy = curvature
+    u, v = turn[:, 0], turn[:, 1]
+
+    def second(i: int, j: int) -> Doubles:
+        form: Doubles = -(xx * u[i] * u[j] + xy * (u[i] * v[j] + v[i] * u[j]) + yy * v[i] * v[j])
+        return form
+
+    slope = -gradient[:2] / gradient[2]
+    scale = np.sqrt(1 - x * x - y * y) / gradient[2]
+    return np.stack(
+        [
+            -scale * (second(a, b) + second(a, 2) * slope[b] + second(b, 2) * slope[a]
+                      + second(2, 2) * slope[a] * slope[b])  # fmt: skip
+            for a, b in ((0, 0), (0, 1), (1, 1))
+        ]
+    )
+
+
+def _whiten(x: Doubles, y: Doubles, lower: tuple[Doubles, ...]) -> tuple[Doubles, Doubles]:
+    first = x * lower[0]
+    return first, (y - lower[1] * first) * lower[2]
+
+
+def _jacobian(shape: Shape, arm: Doubles, lower: tuple[Doubles, ...], sure: Doubles) -> Doubles:
+    """Return the change, (3, 6, n), of the weighted residuals by a further rotation and translation."""
+    x, y, z = arm
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    move_x, move_y = np.stack([zero, z, -y, one, zero, zero]), np.stack([-z, zero, x, zero, one, zero])
+    move_z = np.stack([y, -x, zero, zero, zero, one])
+    turn_x = np.stack([zero, shape.z, -shape.y, zero, zero, zero])
+    turn_y = np.stack([-shape.z, zero, shape.x, zero, zero, zero])
+    slope_x, slope_y = -shape.x / shape.z, -shape.y / shape.z
+    change = shape.xx * move_x + shape.xy * move_y, shape.xy * move_x + shape.yy * move_y
+    along = shape.x * change[0] + shape.y * change[1]
+    normal = (
+        turn_x + shape.z * (change[0] - shape.x * along),
+        turn_y + shape.z * (change[1] - shape.y * along),
+    )
+    height = sure * (move_z - slope_x * move_x - slope_y * move_y)
+    return np.stack([*_whiten(*normal, lower), height])

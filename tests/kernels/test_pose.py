@@ -1,0 +1,143 @@
+"""Normal equations of a rigid motion: the reference against differences, and the kernel against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from launches import launch
+from scipy.spatial.transform import Rotation
+
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.pose import BLOCK, FAR, PARTS, SUMS, pose_equations, pose_gradient
+
+PIXEL = 0.05, 0.06
+
+
+def quadratic_map(rows: int, columns: int, tilt: float, seed: int = 0) -> np.ndarray:
+    """Records of a wavy surface, some of them unknown, and some with heights that are not compared."""
+    rng = np.random.default_rng(seed)
+    row, column = np.indices((rows, columns))
+    x, y = (column - (columns - 1) / 2) * PIXEL[0], ((rows - 1) / 2 - row) * PIXEL[1]
+    height = 0.1 * np.sin(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05 * x
+    p, q = 0.13 * np.cos(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05, -0.09 * np.sin(1.3 * x + tilt) * np.sin(0.9 * y)
+    length = np.sqrt(1 + p * p + q * q)
+    parts = [-p / length, -q / length, rng.uniform(1e-4, 2e-4, x.shape), height, rng.uniform(1e-6, 2e-6, x.shape)]
+    records = np.stack([*parts, *rng.uniform(-1, 1, (3, *x.shape))], axis=-1)
+    records[rng.random(x.shape) < 0.02] = np.nan
+    records[rng.random(x.shape) < 0.02, 4] = FAR
+    records[rng.random(x.shape) < 0.02, 2] = 1e6
+    return records.astype(np.float32)
+
+
+def pose_of(vector: tuple[float, ...], shape: tuple[int, int], shift: tuple[float, ...], least: float) -> np.ndarray:
+    rows, columns = shape
+    grid = -(columns - 1) / 2 * PIXEL[0], (rows - 1) / 2 * PIXEL[1], *PIXEL
+    turn = Rotation.from_rotvec(vector).as_matrix().ravel()
+    return np.array([*turn, *shift, 0.1, -0.2, 0.05, *grid, *grid, least, least], np.float32)
+
+
+def blocks_of(shape: tuple[int, int], step: int) -> int:
+    return int(np.prod([-(-size // (BLOCK * step)) for size in shape]))
+
+
+def on_device(device: Device, step: int, first, second, pose) -> np.ndarray:
+    count = blocks_of(first.shape[:2], step)
+    given = [device.given(name, one) for name, one in (("first", first), ("second", second), ("pose", pose))]
+    sums = device.array("sums", (count, SUMS), np.float32)
+    kernel = device.kernel("pose", "pose_equations", BESIDE=1)
+    launch(kernel, count, *first.shape[:2], *second.shape[:2], step, *given, sums)
+    return sums.download()
+
+
+@pytest.mark.parametrize(("shape", "step"), [((24, 33), 1), ((3, 2), 1), ((40, 30), 2)])
+@pytest.mark.parametrize("least", [1.0, 0.002])
+def test_sums_agree_with_the_reference(device: Device, shape: tuple[int, int], step: int, least: float) -> None:
+    first, second = quadratic_map(*shape, 0.0), quadratic_map(*shape, 0.1, seed=1)
+    pose = pose_of((0.02, -0.05, 0.3), shape, (0.03, -0.04, 0.01), least)
+    wanted = np.zeros((blocks_of(shape, step), SUMS))
+    pose_equations(step, first, second, pose, wanted)
+    found = on_device(device, step, first, second, pose)
+    scale = np.abs(wanted).max(axis=0)
+    assert wanted[:, PARTS[5]].any()
+    np.testing.assert_allclose(found / (scale + 1e-9), wanted / (scale + 1e-9), atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (40, 37)])
+def test_gradients_agree_with_the_reference(device: Device, shape: tuple[int, int]) -> None:
+    values = quadratic_map(*shape, 0.2)[..., 3]
+    wanted = np.zeros((*shape, 2))
+    pose_gradient(*PIXEL, values, wanted)
+    gradient = device.array("gradient", (*shape, 2), np.float32)
+    kernel, items = device.kernel("pose", "pose_gradient", BESIDE=0), -(-values.size // device.layout.tile)
+    launch(kernel, items, *shape, *PIXEL, device.given("values", values), gradient)
+    np.testing.assert_allclose(gradient.download(), wanted, atol=1e-4)
+
+
+def test_the_gradient_of_a_plane_is_its_slope_up_to_the_border() -> None:
+    row, column = np.indices((9, 11))
+    values = 3 + 0.2 * column * PIXEL[0] - 0.5 * -row * PIXEL[1]
+    values[4, 5] = np.nan
+    gradient = np.zeros((9, 11, 2))
+    pose_gradient(*PIXEL, values, gradient)
+    known = np.isfinite(values)
+    np.testing.assert_allclose(gradient[known], np.broadcast_to([0.2, -0.5], (known.sum(), 2)), atol=1e-9)
+    assert np.isnan(gradient[4, 5]).all()
+
+
+def sphere_map(rows: int, columns: int, radius: float, at: tuple[float, float, float]) -> np.ndarray:
+    """Records of a ball about a point, with its own curvature."""
+    row, column = np.indices((rows, columns))
+    x, y = (column - (columns - 1) / 2) * PIXEL[0] - at[0], ((rows - 1) / 2 - row) * PIXEL[1] - at[1]
+    z = np.sqrt(radius**2 - x * x - y * y)
+    curvature = [-(1 / z + x * x / z**3), -x * y / z**3, -(1 / z + y * y / z**3)]
+    sure = np.full(x.shape, 1e-4), np.full(x.shape, 1e-6)
+    return np.stack([x / radius, y / radius, sure[0], z + at[2], sure[1], *curvature], axis=-1)
+
+
+def test_a_moved_ball_fits_where_it_was_moved_to() -> None:
+    """Chi square is least there, its slope nought, and any turn about the ball's centre changes nothing."""
+    shape, move = (30, 40), np.array([0.11, -0.07, 0.02])
+    first, second = sphere_map(*shape, 5, (0, 0, -5)), sphere_map(*shape, 5, (*move[:2], move[2] - 5))
+    pose = pose_of((0, 0, 0), shape, tuple(move), 1.0).astype(float)
+    pose[12:15] = [*move[:2], move[2] - 5]
+    sums = np.zeros((blocks_of(shape, 1), SUMS))
+    pose_equations(1, first, second, pose, sums)
+    total = sums.sum(axis=0)
+    normal_matrix = np.zeros((6, 6))
+    normal_matrix[np.triu_indices(6)] = total[: PARTS[1]]
+    assert total[PARTS[2]] / total[PARTS[3]] < 1e-4
+    assert np.abs(np.diag(normal_matrix))[:3].max() < 1e-6 * np.diag(normal_matrix)[3:].min()
+    np.testing.assert_allclose(total[PARTS[6] :].reshape(6, 6), np.triu(normal_matrix) + np.triu(normal_matrix, 1).T,
+                               atol=1e-3 * normal_matrix.max())  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_the_jacobian_is_the_residuals_change(number: int) -> None:
+    """Half of chi square changes along each parameter as the right side says."""
+    shape = 60, 50
+    first, second = sphere_map(*shape, 4, (0, 0, -4)), sphere_map(*shape, 4.01, (0, 0.02, -4.01))
+
+    def sums_at(by: float) -> np.ndarray:
+        vector, shift = np.zeros(3), np.array([0.01, 0.02, 0.005])
+        centre = np.array([0.1, -0.2, 0.05])
+        step = np.zeros(6)
+        step[number] = by
+        turn = Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec([0.004, 0.01, 0.05] + vector)
+        moved = Rotation.from_rotvec(step[:3]).apply(shift - centre) + centre + step[3:]
+        pose = pose_of((0, 0, 0), shape, tuple(moved), 1.0).astype(float)
+        pose[:9] = turn.as_matrix().ravel()
+        sums = np.zeros((blocks_of(shape, 1), SUMS))
+        pose_equations(1, first[10:-10, 10:-10], second, shifted(pose), sums)
+        return sums.sum(axis=0)
+
+    small = 1e-4
+    change = (sums_at(small)[PARTS[2]] - sums_at(-small)[PARTS[2]]) / (4 * small)
+    assert change == pytest.approx(sums_at(0.0)[PARTS[1] + number], rel=0.02, abs=1.0)
+
+
+def shifted(pose: np.ndarray) -> np.ndarray:
+    """Let the first map's first pixel be ten to the right and below."""
+    pose = pose.copy()
+    pose[15] += 10 * PIXEL[0]
+    pose[16] -= 10 * PIXEL[1]
+    return pose
