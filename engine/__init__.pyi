@@ -5,6 +5,7 @@ from .integration.integration import Integrator, integrate
 from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
+from .pose.pose import Pose, estimate_pose
 from .press.changepoint import ChangePointSearch, find_change_point
 from .press.holes import fill_holes
 from .press.onset import Onset, OnsetSearch, find_onset
@@ -30,12 +31,14 @@ __all__ = [
     "NotConverged",
     "Onset",
     "OnsetSearch",
+    "Pose",
     "Score",
     "StrokeSearch",
     "Strokes",
     "Surface",
     "correlate",
     "estimate_normals",
+    "estimate_pose",
     "fill_holes",
     "find_change_point",
     "find_displacement",

@@ -1,8 +1,9 @@
 """Normal equations of a rigid motion between two maps: what ``pose.cl`` computes, in NumPy with float64.
 
 A map is an array of records, (H, W, 8): the normal's x and y, the mean square angular error of the normal
-(radians^2, `VAGUE` or more where it is not to be compared), height (mm) and its variance (mm^2, `FAR` where it is not to be compared), and the second
-derivatives of the height xx, xy and yy (1/mm). A pixel that cannot be used is NaN in its first number.
+(radians^2, `VAGUE` or more where it is not to be compared), height (mm) and its variance (mm^2, `FAR` where
+it is not to be compared), and the second derivatives of the height xx, xy and yy (1/mm). A pixel that cannot
+be used is NaN in its first number.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Shape(NamedTuple):
 
 
 def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
-    """Write the slopes along x and y, (H, W, 2), of the plane that fits the known values of 5 x 5 pixels best.
+    """Write the slopes along x and y, (H, W, 2), of the plane that fits what is known of 5 x 5 pixels best.
 
     NaN where the pixel itself is unknown, or fewer than seven are known, or these lie along a line.
     """
@@ -70,7 +71,7 @@ def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) 
 
 
 def pose_equations(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:
-    """Write the sums of each block of the first map's pixels, (blocks, SUMS), of which every ``step``-th counts.
+    """Write sums of each block of the first map's pixels, (blocks, SUMS); every ``step``-th pixel counts.
 
     Parameters
     ----------
@@ -79,9 +80,9 @@ def pose_equations(step: int, first: Array, second: Array, pose: Array, sums: Ar
     first, second : (H, W, 8)
         Records; the two maps may be of different sizes.
     pose : (25,)
-        Matrix of the rotation (9), translation (3), the point that further rotations are about (3), x and y of
-        the first map's first pixel and the pixel's size along x and y (4), the same of the second (4), and
-        of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
+        Matrix of the rotation (9), translation (3), the point that further rotations are about (3), x and y
+        of the first map's first pixel and the pixel's size along x and y (4), the same of the second (4),
+        and of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
         error is the same in all directions.
     sums : (blocks, SUMS)
         See `PARTS`.
@@ -136,7 +137,7 @@ def _upright(x: Doubles, y: Doubles) -> Doubles:
 
 
 def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
-    """Return the records at places, (8, n), sums of squared weights, and which places have four pixels around.
+    """Return the records at places, (8, n), the squared weights' sums, and which places have four pixels.
 
     Between pixels all numbers change linearly. To the height each pixel adds half of what its own slope
     makes, so that a paraboloid remains one.
@@ -189,8 +190,8 @@ def _trace(other: Doubles, xx: Doubles, xy: Doubles, yy: Doubles) -> Doubles:
 def _turn_curvature(turn: Array, x: Doubles, y: Doubles, curvature: Doubles) -> Doubles:
     """Return the second derivatives of a surface's height after a rotation.
 
-    The surface is F = z - h(x, y) = 0, with gradient G and second derivatives M; those of the turned height are
-    -(M_ab + M_az h_b + M_bz h_a + M_zz h_a h_b) / G_z with h_a = -G_a / G_z.
+    The surface is F = z - h(x, y) = 0, with gradient G and second derivatives M; those of the turned height
+    are -(M_ab + M_az h_b + M_bz h_a + M_zz h_a h_b) / G_z with h_a = -G_a / G_z.
     """
     gradient = turn @ _upright(x, y)
     xx, xy, yy = curvature
@@ -200,15 +201,13 @@ def _turn_curvature(turn: Array, x: Doubles, y: Doubles, curvature: Doubles) -> 
         form: Doubles = -(xx * u[i] * u[j] + xy * (u[i] * v[j] + v[i] * u[j]) + yy * v[i] * v[j])
         return form
 
-    slope = -gradient[:2] / gradient[2]
+    p, q = -gradient[:2] / gradient[2]
     scale = np.sqrt(1 - x * x - y * y) / gradient[2]
-    return np.stack(
-        [
-            -scale * (second(a, b) + second(a, 2) * slope[b] + second(b, 2) * slope[a]
-                      + second(2, 2) * slope[a] * slope[b])  # fmt: skip
-            for a, b in ((0, 0), (0, 1), (1, 1))
-        ]
-    )
+    xz, yz, zz = second(0, 2), second(1, 2), second(2, 2)
+    turned_xx = second(0, 0) + 2 * xz * p + zz * p * p
+    turned_xy = second(0, 1) + xz * q + yz * p + zz * p * q
+    turned_yy = second(1, 1) + 2 * yz * q + zz * q * q
+    return -scale * np.stack([turned_xx, turned_xy, turned_yy])
 
 
 def _whiten(x: Doubles, y: Doubles, lower: tuple[Doubles, ...]) -> tuple[Doubles, Doubles]:

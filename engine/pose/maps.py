@@ -49,11 +49,13 @@ class PoseMap:
         grid = _grid(result, pixel_size)
         height, variance = _heights(result)
         normals, square = _normals(result, height, grid, device)
-        usable = np.isfinite(height) & (normals[..., 2] > _STEEPEST) & np.isfinite(square) & ~_doubtful(result)
+        usable = (
+            np.isfinite(height) & (normals[..., 2] > _STEEPEST) & np.isfinite(square) & ~_doubtful(result)
+        )
         if not ((variance < FAR) & usable).any() and not ((square < _UNTOLD) & usable).any():
             raise InputError(
-                "a map has no usable pixel with a sigma: give heights with height_sigma, or heights and normals "
-                "with normal_sigma"
+                "a map has no usable pixel with a sigma: give heights with height_sigma, or with normals and "
+                "normal_sigma"
             )
         records = np.zeros((*height.shape, 8), np.float32)
         records[..., :2], records[..., 2], records[..., 3] = normals[..., :2], square, height
@@ -65,7 +67,7 @@ class PoseMap:
         return cls(records, grid, _least(result), device.given("records", records))
 
     def halved(self, device: Device) -> PoseMap:
-        """Return the map of half as many pixels each way, the means of two by two where all four are known."""
+        """Return the map of half as many pixels each way: means of two by two, where all four are known."""
         rows, columns = (size // 2 for size in self.records.shape[:2])
         fours = self.records[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 8)
         records = fours.mean(axis=(1, 3), dtype=np.float32)
@@ -86,18 +88,17 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> tuple[float, float, f
     height = result.height
     if height is None or np.ndim(height) != 2 or 0 in np.shape(height):
         raise InputError("a motion needs heights, (H, W): integrate the normals, or choose one turn")
+    x, y = result.x, result.y
     if pixel_size is not None:
         size = np.broadcast_to(np.asarray(pixel_size, np.float64), 2)
         if not (np.isfinite(size) & (size > 0)).all():
             raise InputError(f"pixel_size must be above 0 mm, not {pixel_size}")
         x, y = pixel_axes(height.shape, (float(size[0]), float(size[1])))
-    elif result.x is None or result.y is None or min(len(result.x), len(result.y)) < 2:
-        raise InputError("the result does not say where its pixels are: give pixel_size")
-    else:
-        x, y = result.x, result.y
-    ends = [(one[-1] - one[0]) / max(len(one) - 1, 1) for one in (x, y)]
-    steps = (float(size[0]), -float(size[1])) if pixel_size is not None else ends
-    return float(x[0]), float(y[0]), float(steps[0]), -float(steps[1])
+    if x is None or y is None or min(len(x), len(y)) < 2:
+        raise InputError(
+            "the result does not say where its pixels are, or has one row of them: give pixel_size"
+        )
+    return float(x[0]), float(y[0]), float(x[1] - x[0]), float(y[0] - y[1])
 
 
 def _heights(result: Result) -> tuple[Floats, Floats]:
@@ -115,7 +116,7 @@ def _heights(result: Result) -> tuple[Floats, Floats]:
 def _normals(
     result: Result, height: Floats, grid: tuple[float, float, float, float], device: Device
 ) -> tuple[Floats, Floats]:
-    """Return normals and their mean square errors; where a result has none, those of its heights, not compared."""
+    """Return normals and their mean square errors; where there are none, those of the heights, untold."""
     if result.normals is None:
         slopes = _gradient(height, grid, device)
         normals = np.dstack([-slopes, np.ones_like(height)])
@@ -130,7 +131,9 @@ def _normals(
 
 def _same(values: Any, shape: tuple[int, ...], name: str) -> Any:
     if np.shape(values) != shape:
-        raise InputError(f"{name} is {np.shape(values)}, but the height asks for {shape}: give maps of one size")
+        raise InputError(
+            f"{name} is {np.shape(values)}, but the height asks for {shape}: give maps of one size"
+        )
     return values
 
 

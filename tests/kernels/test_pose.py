@@ -19,9 +19,18 @@ def quadratic_map(rows: int, columns: int, tilt: float, seed: int = 0) -> np.nda
     row, column = np.indices((rows, columns))
     x, y = (column - (columns - 1) / 2) * PIXEL[0], ((rows - 1) / 2 - row) * PIXEL[1]
     height = 0.1 * np.sin(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05 * x
-    p, q = 0.13 * np.cos(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05, -0.09 * np.sin(1.3 * x + tilt) * np.sin(0.9 * y)
+    p, q = (
+        0.13 * np.cos(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05,
+        -0.09 * np.sin(1.3 * x + tilt) * np.sin(0.9 * y),
+    )
     length = np.sqrt(1 + p * p + q * q)
-    parts = [-p / length, -q / length, rng.uniform(1e-4, 2e-4, x.shape), height, rng.uniform(1e-6, 2e-6, x.shape)]
+    parts = [
+        -p / length,
+        -q / length,
+        rng.uniform(1e-4, 2e-4, x.shape),
+        height,
+        rng.uniform(1e-6, 2e-6, x.shape),
+    ]
     records = np.stack([*parts, *rng.uniform(-1, 1, (3, *x.shape))], axis=-1)
     records[rng.random(x.shape) < 0.02] = np.nan
     records[rng.random(x.shape) < 0.02, 4] = FAR
@@ -29,7 +38,9 @@ def quadratic_map(rows: int, columns: int, tilt: float, seed: int = 0) -> np.nda
     return records.astype(np.float32)
 
 
-def pose_of(vector: tuple[float, ...], shape: tuple[int, int], shift: tuple[float, ...], least: float) -> np.ndarray:
+def pose_of(
+    vector: tuple[float, ...], shape: tuple[int, int], shift: tuple[float, ...], least: float
+) -> np.ndarray:
     rows, columns = shape
     grid = -(columns - 1) / 2 * PIXEL[0], (rows - 1) / 2 * PIXEL[1], *PIXEL
     turn = Rotation.from_rotvec(vector).as_matrix().ravel()
@@ -51,7 +62,9 @@ def on_device(device: Device, step: int, first, second, pose) -> np.ndarray:
 
 @pytest.mark.parametrize(("shape", "step"), [((24, 33), 1), ((3, 2), 1), ((40, 30), 2)])
 @pytest.mark.parametrize("least", [1.0, 0.002])
-def test_sums_agree_with_the_reference(device: Device, shape: tuple[int, int], step: int, least: float) -> None:
+def test_sums_agree_with_the_reference(
+    device: Device, shape: tuple[int, int], step: int, least: float
+) -> None:
     first, second = quadratic_map(*shape, 0.0), quadratic_map(*shape, 0.1, seed=1)
     pose = pose_of((0.02, -0.05, 0.3), shape, (0.03, -0.04, 0.01), least)
     wanted = np.zeros((blocks_of(shape, step), SUMS))
@@ -107,8 +120,8 @@ def test_a_moved_ball_fits_where_it_was_moved_to() -> None:
     normal_matrix[np.triu_indices(6)] = total[: PARTS[1]]
     assert total[PARTS[2]] / total[PARTS[3]] < 1e-4
     assert np.abs(np.diag(normal_matrix))[:3].max() < 1e-6 * np.diag(normal_matrix)[3:].min()
-    np.testing.assert_allclose(total[PARTS[6] :].reshape(6, 6), np.triu(normal_matrix) + np.triu(normal_matrix, 1).T,
-                               atol=1e-3 * normal_matrix.max())  # fmt: skip
+    both = np.triu(normal_matrix) + np.triu(normal_matrix, 1).T
+    np.testing.assert_allclose(total[PARTS[6] :].reshape(6, 6), both, atol=1e-3 * both.max())
 
 
 @pytest.mark.parametrize("number", range(6))
@@ -118,11 +131,11 @@ def test_the_jacobian_is_the_residuals_change(number: int) -> None:
     first, second = sphere_map(*shape, 4, (0, 0, -4)), sphere_map(*shape, 4.01, (0, 0.02, -4.01))
 
     def sums_at(by: float) -> np.ndarray:
-        vector, shift = np.zeros(3), np.array([0.01, 0.02, 0.005])
+        shift = np.array([0.01, 0.02, 0.005])
         centre = np.array([0.1, -0.2, 0.05])
         step = np.zeros(6)
         step[number] = by
-        turn = Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec([0.004, 0.01, 0.05] + vector)
+        turn = Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec([0.004, 0.01, 0.05])
         moved = Rotation.from_rotvec(step[:3]).apply(shift - centre) + centre + step[3:]
         pose = pose_of((0, 0, 0), shape, tuple(moved), 1.0).astype(float)
         pose[:9] = turn.as_matrix().ravel()

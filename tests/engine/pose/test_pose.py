@@ -1,0 +1,168 @@
+"""The motion of an object between two results against known motions, and its covariance against errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from moved_surfaces import RADIUS, ball, bumpy, error_at, error_of, plane, rod, sampled
+from turned_objects import Moved, turned
+
+from mirrorskin import engine, io
+from mirrorskin.hw.twin.catalogue import make_object
+
+
+def draw(rng: np.random.Generator, size: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    return size * rng.normal(0, 0.02, 3), size * rng.normal(0, 0.05, 3)
+
+
+def mean_chi_square(draws: int, shape: tuple[int, int]) -> float:
+    found = []
+    for seed in range(draws):
+        rng = np.random.default_rng(seed)
+        vector, shift = draw(rng)
+        pair = (sampled(bumpy, *way, rng=rng, shape=shape) for way in ((), (vector, shift)))
+        pose = engine.estimate_pose(*pair)
+        error = error_of(pose, vector, shift)
+        found.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+    return float(np.mean(found))
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    assert mean_chi_square(30, (60, 80)) == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.slow
+def test_errors_of_many_draws_are_as_large_as_the_covariance_says() -> None:
+    assert mean_chi_square(150, (120, 160)) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("form", "free"), [(bumpy, 0), (rod, 2), (ball, 3), (plane, 3)])
+@pytest.mark.parametrize("size", [0.0, 1.0, 4.0])
+def test_what_a_surface_cannot_tell_is_undetermined(form, free: int, size: float) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        pose = engine.estimate_pose(sampled(form, rng=rng), sampled(form, *draw(rng, size), rng=rng))
+        assert len(pose.undetermined) == free
+        assert np.isfinite(pose.rotation).all()
+        assert np.isinf(pose.sigma).any() == (free > 0)
+        np.testing.assert_allclose(pose.undetermined @ pose.undetermined.T, np.eye(free), atol=1e-9)
+
+
+def test_a_ball_is_known_by_its_centre_alone() -> None:
+    centre, found = np.array([0, 0, -RADIUS]), []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        vector, shift = draw(rng)
+        pose = engine.estimate_pose(sampled(ball, rng=rng), sampled(ball, vector, shift, rng=rng))
+        wanted = engine.Pose(vector, shift, *[None] * 4).apply(centre)
+        found.append(error_at(pose, centre, wanted, np.eye(3)))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.4)
+
+
+def test_nothing_moves_where_nothing_is_known_to() -> None:
+    rng = np.random.default_rng(0)
+    pose = engine.estimate_pose(sampled(ball, rng=rng), sampled(ball, (0, 0, 0.8), rng=rng))
+    np.testing.assert_allclose(pose.rotation, 0, atol=2e-3)
+    np.testing.assert_allclose(pose.translation, 0, atol=5e-3)
+
+
+def test_large_motions_are_found_from_nothing() -> None:
+    rng = np.random.default_rng(1)
+    vector, shift = np.array([0.05, -0.1, 1.7]), np.array([0.6, -0.4, 0.1])
+    pose = engine.estimate_pose(sampled(bumpy, rng=rng), sampled(bumpy, vector, shift, rng=rng))
+    assert np.abs(error_of(pose, vector, shift)).max() < 0.005
+    assert pose.chi_square == pytest.approx(1, abs=0.1)
+
+
+def test_a_start_leads_to_the_same_motion() -> None:
+    rng = np.random.default_rng(2)
+    vector, shift = np.array([0.05, -0.1, 1.7]), np.array([0.6, -0.4, 0.1])
+    pair = sampled(bumpy, rng=rng), sampled(bumpy, vector, shift, rng=rng)
+    near = dataclasses.replace(engine.estimate_pose(*pair), rotation=vector, translation=shift)
+    pose = engine.estimate_pose(*pair, start=near)
+    np.testing.assert_allclose(pose.rotation, engine.estimate_pose(*pair).rotation, atol=1e-4)
+
+
+def test_heights_alone_are_enough() -> None:
+    rng = np.random.default_rng(3)
+    vector, shift = draw(rng)
+    pair = [sampled(bumpy, *way, rng=rng) for way in ((), (vector, shift))]
+    pose = engine.estimate_pose(*(dataclasses.replace(one, normals=None, normal_sigma=None) for one in pair))
+    assert np.abs(error_of(pose, vector, shift)).max() < 0.005
+
+
+def test_integrated_heights_leave_z_open() -> None:
+    rng = np.random.default_rng(4)
+    pair = []
+    for way in ((), draw(rng)):
+        made = sampled(bumpy, *way, rng=rng)
+        pieces = np.zeros(made.height.shape, np.int32), np.ones(1, np.uint8)
+        pair.append(dataclasses.replace(made, component=pieces[0], offset_unknown=pieces[1]))
+    (free,) = engine.estimate_pose(*pair).undetermined
+    np.testing.assert_allclose(np.abs(free), [0, 0, 0, 0, 0, 1], atol=1e-6)
+
+
+def test_pixels_near_the_border_of_contact_do_not_count() -> None:
+    rng = np.random.default_rng(5)
+    vector, shift = draw(rng)
+    pair = []
+    for way in ((), (vector, shift)):
+        made = sampled(bumpy, *way, rng=rng)
+        contact = np.ones(made.height.shape, np.uint8)
+        contact[:, 30:34] = 0
+        normals = made.normals.copy()
+        normals[:, 28:36, 0] += 0.2
+        pair.append(dataclasses.replace(made, contact=contact, normals=normals))
+    pose = engine.estimate_pose(*pair)
+    assert pose.chi_square == pytest.approx(1, abs=0.1)
+    assert np.abs(error_of(pose, vector, shift)).max() < 0.005
+
+
+@pytest.mark.parametrize(
+    ("name", "top", "free"), [("sphere", -RADIUS, 4), ("cone", 0.0, 2), ("cylinder", -RADIUS, 3)]
+)
+def test_errors_on_results_from_frames_are_as_large_as_the_covariance_says(
+    name, top: float, free: int
+) -> None:
+    """Of the ball's centre, the cone's tip, or the rod's axis, whether it moved or not."""
+    found = []
+    for seed in range(3):
+        for shift, angle in (((0.0, 0.0), 0.0), ((0.3, -0.2), 0.15)):
+            thing = make_object(name, (128, 128), (0.07, 0.07))
+            before, deep = turned(thing, seed)
+            after, deep_after = turned(Moved(thing, shift, angle), seed + 100)
+            pose = engine.estimate_pose(before, after)
+            assert len(pose.undetermined) == free
+            point, wanted = np.array([0, 0, top + deep]), np.array([*shift, top + deep_after])
+            ways = np.eye(3)[:2]
+            if name == "cylinder":
+                ways = np.array([[-math.sin(angle), math.cos(angle), 0]])
+            found.append(error_at(pose, point, wanted, ways))
+    assert 0.2 < np.mean(found) < 1.8
+
+
+def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
+    rng = np.random.default_rng(6)
+    good = sampled(bumpy, rng=rng)
+    no_height = dataclasses.replace(good, height=None)
+    unsure = dataclasses.replace(good, height_sigma=None, normal_sigma=None)
+    odd = dataclasses.replace(good, normal_sigma=good.normal_sigma[:5])
+    nowhere = dataclasses.replace(good, x=None, y=None)
+    far = dataclasses.replace(good, x=good.x + 100)
+    return {
+        "no height": (no_height, good, "needs heights"),
+        "no sigma": (good, unsure, "with a sigma"),
+        "sizes": (odd, good, "one size"),
+        "no pixel size": (nowhere, good, "give pixel_size"),
+        "no overlap": (good, far, "share too few pixels"),
+    }
+
+
+@pytest.mark.parametrize("name", refusals())
+def test_what_cannot_be_compared_is_refused(name: str) -> None:
+    first, second, said = refusals()[name]
+    with pytest.raises(io.InputError, match=said):
+        engine.estimate_pose(first, second)
