@@ -207,7 +207,7 @@ def _turn_curvature(turn: Array, x: Doubles, y: Doubles, curvature: Doubles) -> 
     turned_xx = second(0, 0) + 2 * xz * p + zz * p * p
     turned_xy = second(0, 1) + xz * q + yz * p + zz * p * q
     turned_yy = second(1, 1) + 2 * yz * q + zz * q * q
-    return -scale * np.stack([turned_xx, turned_xy, turned_yy])
+    return np.asarray(-scale * np.stack([turned_xx, turned_xy, turned_yy]))
 
 
 def _whiten(x: Doubles, y: Doubles, lower: tuple[Doubles, ...]) -> tuple[Doubles, Doubles]:
