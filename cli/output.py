@@ -24,16 +24,19 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     """Write a result and say in a line what it holds, or in JSON how it came about as well."""
     from mirrorskin import io
     from mirrorskin.engine.summary import summarise
+    from mirrorskin.io.types import SCALARS
     from mirrorskin.kernels.device import open_device
 
     io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
+    force = {name: value for name in SCALARS if (value := getattr(result, name)) is not None}
     if as_json:
         profile = open_device(device).profile.records()
-        facts = {"summary": dataclasses.asdict(summary) | pieces, "process": result.process}
+        facts = {"summary": dataclasses.asdict(summary) | pieces | force, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
-        click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))
+        newtons = ["force {force:.4g} +- {force_sigma:.2g} N".format(**force)] if force else []
+        click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces), *newtons])))
 
 
 def _pieces(result: Result) -> dict[str, int]:
@@ -97,13 +100,16 @@ def _plain(value: Any) -> Any:
 
 
 def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
-    """Say which maps a result's process says are missing, why, what would bring them, and what a gel did."""
+    """Say which maps and forces a result lacks, why, what would bring them, and what a gel did."""
     for what, remedy in remedies.items():
         said = str(process.get(what))
         if said.startswith(_UNTOLD):
             said = said.removeprefix(_UNTOLD)
             click.echo(printable(f"{name}: no {what}: {said}; give {remedy}"), err=True)
     gel = str(process.get("gel", ""))
+    force = str(process.get("force", ""))
+    if force.startswith(_UNTOLD):
+        click.echo(printable(f"{name}: no force: {force.removeprefix(_UNTOLD)}"), err=True)
     if gel and gel != _NO_GEL:
         what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
         click.echo(printable(f"{name}: heights {what}"), err=True)

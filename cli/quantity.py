@@ -14,7 +14,14 @@ from mirrorskin.io.units import Kind, in_base
 
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _UNIT = r"[A-Za-z\u00b5\u03bc]+|°"
-_EXAMPLES: dict[Kind, str] = {"length": "0.1mm", "angle": "2.5deg", "time": "10ms", "memory": "512MB"}
+_EXAMPLES: dict[Kind, str] = {
+    "length": "0.1mm",
+    "angle": "2.5deg",
+    "time": "10ms",
+    "memory": "512MB",
+    "force": "1.5N",
+    "pressure": "0.1MPa",
+}
 _PER_ANGLE = "5.7/deg"
 
 
@@ -53,6 +60,22 @@ def compliance(text: str, option: str = "") -> float:
     if not slash or newton.strip() != "N":
         raise _error(text, option, "a length for each newton is needed", "0.01mm/N")
     return length(distance, option)
+
+
+def force(text: str, option: str = "") -> float:
+    """Return a force above 0, as in ``1.5N``, or that of a weight, as in ``150g``, in newtons."""
+    return _above_zero(_read(text, option, "force"), text, option, "force")
+
+
+def pressure(text: str, option: str = "") -> float:
+    """Return a pressure or a modulus above 0, as in ``0.1MPa``, in N/mm^2."""
+    return _above_zero(_read(text, option, "pressure"), text, option, "pressure")
+
+
+def _above_zero(value: float, text: str, option: str, kind: Kind) -> float:
+    if value <= 0:
+        raise _error(text, option, f"a {kind} above 0 is needed", _EXAMPLES[kind])
+    return value
 
 
 def duration(text: str, option: str = "") -> float:

@@ -35,7 +35,18 @@ class MethodName(StrEnum):
 # The options that only one motion has.
 _OWN = {
     MotionName.vertical: {
-        *("travel_step", "travel_start", "dark", "bright", "event", "threshold", "hold", "subframe", "fill")
+        *(
+            "travel_step",
+            "travel_start",
+            "dark",
+            "bright",
+            "event",
+            "threshold",
+            "hold",
+            "subframe",
+            "fill",
+            "modulus",
+        )
     },
     MotionName.axial: {
         *("phase_step", "phases", "tilt", "zenith_gain", "zenith_offset", "robust", "per_turn", "heights")
@@ -100,6 +111,14 @@ def command(
         bool, Option(help="Press: interpolate between frames; without it, eq. 4 as printed.")
     ] = True,
     fill: Annotated[bool, Option(help="Press: fill holes, such as flat tops, smoothly.")] = True,
+    modulus: Annotated[
+        str | None,
+        Option(
+            metavar="PRESSURE",
+            help="Press: Young's, for force and pressure: 0.1MPa.",
+            show_default="the calibration's",
+        ),
+    ] = None,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
     robust: options.Robust = False,
@@ -122,7 +141,7 @@ def command(
     from mirrorskin import engine, io
     from mirrorskin.cli.output import progress, report_missing_maps, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.cli.quantity import per_angle
+    from mirrorskin.cli.quantity import per_angle, pressure
     from mirrorskin.cli.stack import stack_options
 
     known = stack_options(
@@ -153,6 +172,7 @@ def command(
         else:
             arguments |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
             arguments |= {"dark": dark, "bright": bright, "fill": fill}
+            arguments["modulus"] = None if modulus is None else pressure(modulus, "--modulus")
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 calibrated,

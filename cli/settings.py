@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from msgspec import Meta, Struct, field, structs
 
 from mirrorskin.cli.options import MotionName
-from mirrorskin.cli.quantity import angle, per_angle
+from mirrorskin.cli.quantity import angle, per_angle, pressure
 from mirrorskin.cli.stack import stack_options
 from mirrorskin.engine.batch.jobs import Plan
 from mirrorskin.engine.press.onset import Event
@@ -56,6 +56,7 @@ class _Press(Struct, frozen=True, rename="kebab"):
     bright: _Counts | None = None
     noise: _Sigma | None = None
     fill: bool | None = None
+    modulus: Annotated[str, _text("0.1MPa")] | None = None
 
     def __post_init__(self) -> None:
         if self.method == "change-point" and self.subframe is False:
@@ -87,7 +88,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
     opening = _opening(_given(settings.stack), f"{where}stack.")
     return Plan(
         opening,
-        _given(settings.press),
+        _press(_given(settings.press), f"{where}press."),
         _rotation(_given(settings.rotation), f"{where}rotation."),
         memory_limit,
     )
@@ -108,6 +109,13 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     if min(options.get("pixel_size", (1.0,))) <= 0:
         raise InputError(f'{where}pixel-size: a length above 0 is needed; write e.g. "0.03mm"')
     return {**dataset, **options}
+
+
+def _press(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Convert [press] to keywords of ``reconstruct``."""
+    if "modulus" in values:
+        values["modulus"] = pressure(values["modulus"], f"{where}modulus")
+    return values
 
 
 def _rotation(values: dict[str, Any], where: str) -> dict[str, Any]:

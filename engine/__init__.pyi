@@ -1,4 +1,5 @@
 from .errors import NotConverged
+from .force.normal import Force, find_force
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -24,6 +25,7 @@ __all__ = [
     "Correlation",
     "Correlator",
     "Displacement",
+    "Force",
     "Integrator",
     "Measures",
     "NormalEstimator",
@@ -43,6 +45,7 @@ __all__ = [
     "find_change_point",
     "find_displacement",
     "find_edges",
+    "find_force",
     "find_onset",
     "free_memory",
     "fuse",

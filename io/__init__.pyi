@@ -1,7 +1,16 @@
 from .atomic import check_output
 from .calibration.file import open_calibration, save_calibration, update_calibration
 from .calibration.source import Calibrated
-from .calibration.types import Calibration, CameraId, Gel, Lens, Precession, References, WallResponse
+from .calibration.types import (
+    Calibration,
+    CameraId,
+    Gel,
+    Lens,
+    Precession,
+    References,
+    Stiffness,
+    WallResponse,
+)
 from .description import describe
 from .export import export_result, save_table
 from .frames import open_frames
@@ -44,6 +53,7 @@ __all__ = [
     "Result",
     "Source",
     "Steps",
+    "Stiffness",
     "StreamRecorder",
     "Truth",
     "WallResponse",

@@ -134,6 +134,8 @@ def _calibration(calibration: Calibration) -> dict[str, str]:
     facts = {"camera": str(calibration.camera)}
     for name in GROUPS:
         part = calibration.parts().get(name)
+        if part is None and name == "stiffness":
+            continue  # few have one
         if part is None:
             facts[GROUPS[name]] = "none"
         else:

@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
-from mirrorskin.io.types import NO_MAPS, InputError, ProcessValue, Result
+from mirrorskin.io.types import NO_MAPS, SCALARS, InputError, ProcessValue, Result
 from mirrorskin.io.writing import Item, process_items, write_file
 
 MARK = "mirrorskin_result"
 UNITS = (
     dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
+    | {"pressure": "MPa"}
+    | dict.fromkeys(SCALARS, "N")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
 )
 _DTYPES = (
@@ -77,6 +79,9 @@ def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Ite
         yield Item(f"{_RESULT}/{name}", values, attributes)
     if result.offset_unknown is not None:
         yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+    for name in SCALARS:
+        if (value := getattr(result, name)) is not None:
+            yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
     for name, positions in _axes(result, maps).items():
         yield Item(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 
@@ -119,11 +124,17 @@ def open_result(path: str | Path) -> Result:
     (480, 640)
     """
     with _opened(Path(path)) as file:
-        maps: dict[str, NDArray[Any]] = {
+        maps: dict[str, Any] = {
             name: file.read(node, shape, remedy=_AGAIN).astype(_DTYPES.get(name, np.float32), copy=False)
             for name, (node, shape) in _find_maps(file).items()
         }
         maps |= _read_offsets(file, maps.get("component"))
+        numbers = {name: file.find(f"{_RESULT}/{name}") for name in SCALARS}
+        maps |= {
+            name: float(file.read(node, (), unit=UNITS[name], remedy=_AGAIN))
+            for name, node in numbers.items()
+            if node is not None
+        }
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
                 raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")

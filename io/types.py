@@ -275,6 +275,10 @@ class Result:
         Number of the connected piece that a height belongs to, from 0; -1 where there is no height.
     offset_unknown : ndarray, (components,), uint8
         1 of a component whose heights are relative: no absolute one is known in it, and their mean is 0.
+    pressure : ndarray, (H, W), float32
+        MPa between sensor and object at the greatest travel; 0 where nothing touches.
+    force, force_sigma : float
+        Newtons at the greatest travel, normal to the sheet, and the standard deviation that is expected.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
     process : mapping
@@ -303,6 +307,9 @@ class Result:
     contact: NDArray[np.uint8] | None = None
     component: NDArray[np.int32] | None = None
     offset_unknown: NDArray[np.uint8] | None = None
+    pressure: NDArray[np.float32] | None = None
+    force: float | None = None
+    force_sigma: float | None = None
     x: Floats | None = None
     y: Floats | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
@@ -341,7 +348,10 @@ class Result:
         return as_xarray(self)
 
 
-NO_MAPS = ("offset_unknown", "x", "y", "process", "calibration")
+SCALARS = ("force", "force_sigma")
+"""The single numbers that a result has."""
+
+NO_MAPS = ("offset_unknown", *SCALARS, "x", "y", "process", "calibration")
 """What a result has besides maps."""
 
 UNDISTORTED = "undistorted"

@@ -9,10 +9,19 @@ from typing import Any, Literal
 
 from mirrorskin.io.types import InputError
 
-Kind = Literal["length", "angle", "time", "memory"]
+Kind = Literal["length", "angle", "time", "memory", "force", "pressure"]
 
-BASE: dict[Kind, str] = {"length": "mm", "angle": "rad", "time": "s", "memory": "byte"}
+BASE: dict[Kind, str] = {
+    "length": "mm",
+    "angle": "rad",
+    "time": "s",
+    "memory": "byte",
+    "force": "N",
+    "pressure": "N/mm^2",
+}
 """The unit that each kind of quantity is converted to."""
+
+_GRAVITY = 9.80665  # m/s^2, of a weight that is given by its mass
 
 _COMMON: dict[Kind, dict[str, float]] = {
     "length": {
@@ -27,12 +36,16 @@ _COMMON: dict[Kind, dict[str, float]] = {
     "angle": {"rad": 1.0, "mrad": 0.001, "deg": math.pi / 180, "°": math.pi / 180, "turn": math.tau},
     "time": {"s": 1.0, "ms": 0.001, "us": 1e-6, "min": 60.0},
     "memory": {"byte": 1, "B": 1, "kB": 1e3, "MB": 1e6, "GB": 1e9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30},
+    "force": {"N": 1.0, "mN": 1e-3, "g": _GRAVITY / 1000, "kg": _GRAVITY},
+    "pressure": {"MPa": 1.0, "kPa": 1e-3},
 }
 _NOUN: dict[Kind, str] = {
     "length": "a length",
     "angle": "an angle",
     "time": "a time",
     "memory": "an amount of memory",
+    "force": "a force",
+    "pressure": "a pressure",
 }
 _LONGEST = 40  # letters of a unit in a file
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given single names only

@@ -313,7 +313,7 @@ def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> 
 
 def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
     """Draw the parts of a calibration into PNGs."""
-    from mirrorskin.view.calibration_wall import draw_gel, draw_response
+    from mirrorskin.view.calibration_wall import draw_gel, draw_response, draw_stiffness
 
     draw: dict[str, Callable[[Any], Figure]] = {
         "references": draw_references,
@@ -321,6 +321,7 @@ def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
         "zenith": draw_response,
         "precession": draw_precession,
         "gel": draw_gel,
+        "stiffness": draw_stiffness,
     }
     check_drawing()
     try:

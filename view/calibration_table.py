@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Calibration
-from mirrorskin.io.calibration.types import BITS, GROUPS, Gel, Lens, Precession, References, WallResponse
+from mirrorskin.io.calibration.types import (
+    BITS,
+    GROUPS,
+    Gel,
+    Lens,
+    Precession,
+    References,
+    Stiffness,
+    WallResponse,
+)
 
 _DEGREE = math.degrees(1)
 
@@ -111,6 +120,13 @@ def _gel(part: Gel) -> _Numbers:
     yield "left on the ball", 1000 * part.error, math.nan, "um"
 
 
+def _stiffness(part: Stiffness) -> _Numbers:
+    yield "modulus", 1000 * part.modulus, 1000 * part.sigma.get("modulus", math.nan), "kPa"
+    yield "scatter of a force", 100 * part.scatter, math.nan, "%"
+    yield "error of held-out forces", 100 * part.error, math.nan, "%"
+    yield "presses", part.presses
+
+
 def _median(values: NDArray[np.float32]) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else math.nan
@@ -122,4 +138,5 @@ _TABLES: Mapping[str, Callable[[Any], _Numbers]] = {
     "zenith": _zenith,
     "precession": _precession,
     "gel": _gel,
+    "stiffness": _stiffness,
 }

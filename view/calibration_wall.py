@@ -10,7 +10,7 @@ import numpy as np
 
 from mirrorskin.engine.calibration.wall_response import threshold_zenith
 from mirrorskin.engine.press.elastic import threshold_at
-from mirrorskin.io import Gel, WallResponse
+from mirrorskin.io import Gel, Stiffness, WallResponse
 from mirrorskin.io.types import Floats
 from mirrorskin.view.calibration import draw_pixels, new_sheet
 from mirrorskin.view.canvas import explain_colours
@@ -237,6 +237,29 @@ def _draw_give(axes: Axes, gel: Gel) -> None:
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", frameon=False)
+
+
+def draw_stiffness(stiffness: Stiffness) -> Figure:
+    """Draw by which force balls are pressed into the gel (Hertz), and its standard deviation."""
+    figure = new_sheet(8, 5.2)
+    axes = figure.add_subplot()
+    depth = np.linspace(0, _DEEPEST, _FINE)
+    share = math.hypot(stiffness.scatter, stiffness.sigma.get("modulus", 0.0) / stiffness.modulus)
+    for radius in _RADII:
+        force = 16 / 9 * math.sqrt(radius) * stiffness.modulus * depth**1.5
+        axes.plot(depth, force, lw=2, label=f"ball of {2 * radius:g} mm")
+        axes.fill_between(depth, force * (1 - share), force * (1 + share), alpha=0.3)
+    words = _with_error(1000 * stiffness.modulus, 1000 * stiffness.sigma.get("modulus", math.nan), " kPa")
+    axes.set(
+        xlabel="depth in the gel (mm)",
+        ylabel="force (N)",
+        xlim=(0, _DEEPEST),
+        title=f"modulus {words} of {stiffness.presses} presses\nscatter {100 * stiffness.scatter:.2g} %",
+    )
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", frameon=False)
+    return figure
 
 
 def _with_error(value: float, sigma: float, unit: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mirrorskin.cli.calibrate import check, elastic, references, scale, show, tilt, zenith
+from mirrorskin.cli.calibrate import check, elastic, force, references, scale, show, tilt, zenith
 from mirrorskin.cli.groups import Group
 
 app = Group(
@@ -19,6 +19,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "zenith": zenith.command,
     "tilt": tilt.command,
     "elastic": elastic.command,
+    "force": force.command,
     "check": check.command,
     "show": show.command,
 }

@@ -14,7 +14,15 @@ from scipy.sparse.linalg import splu
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
-from mirrorskin.engine.press.halfspace import HalfSpace, SlopeFit, Targets, sweep
+from mirrorskin.engine.press.halfspace import (
+    HalfSpace,
+    Pressed,
+    SlopeFit,
+    Targets,
+    load_gradient,
+    press,
+    sweep,
+)
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 
@@ -83,30 +91,32 @@ def correct_press(
     deepest: float,
     threshold: float,
     gel: Gel | None,
-) -> tuple[Result, str]:
+) -> tuple[Result, str, PressFit | None]:
     """Correct the heights of a press or a release for the elastomer, where all is known that it takes.
 
     Heights are not filled yet; ``deepest`` is the greatest travel of their frames, mm, and ``threshold``
-    what was taken for light, as a share from dark to bright. The text says what was done, for the process.
+    what was taken for light, as a share from dark to bright. The text says what was done, for the process;
+    without a correction there is no fit.
     """
     assert result.height is not None
     assert result.height_sigma is not None
     assert result.status is not None
     pixel_size = source.header.pixel_size
     if gel is None:
-        return result, "none: the calibration has no gel"
+        return result, "none: the calibration has no gel", None
     if pixel_size is None:
-        return result, "none: the recording has no pixel size"
+        return result, "none: the recording has no pixel size", None
     if threshold != LEARNED_AT:
-        return result, f"none: the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
+        said = f"none: the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
+        return result, said, None
     try:
         maps = result.height, result.height_sigma, result.status
-        height, sigma = correct_onset(*maps, pixel_size, gel, deepest=deepest)
+        fit = fit_press(*maps, pixel_size, gel, deepest=deepest)
     except NotConverged as error:
-        return result, f"none: {error}"
-    lost = np.count_nonzero((result.status == _LIT) & np.isnan(height))
+        return result, f"none: {error}", None
+    lost = np.count_nonzero((result.status == _LIT) & np.isnan(fit.height))
     said = f"corrected for the gel; {lost} pixels turned light too far from the touch"
-    return replace(result, height=height, height_sigma=sigma), said
+    return replace(result, height=fit.height, height_sigma=fit.sigma), said, fit
 
 
 def correct_onset(
@@ -153,6 +163,20 @@ def correct_onset(
     mirrorskin.io.InputError
         Maps or sizes that cannot be used.
     """
+    fit = fit_press(height, sigma, status, pixel_size, gel, deepest=deepest)
+    return fit.height, fit.sigma
+
+
+def fit_press(
+    height: ArrayLike,
+    sigma: ArrayLike,
+    status: ArrayLike,
+    pixel_size: ArrayLike,
+    gel: Gel,
+    *,
+    deepest: float | None = None,
+) -> PressFit:
+    """Find the surface whose press explains the onsets; see `correct_onset`."""
     heights, sigmas, state = np.asarray(height, np.float64), np.asarray(sigma, np.float64), np.asarray(status)
     if heights.ndim != 2 or 0 in heights.shape:
         raise InputError(f"heights have shape {heights.shape}: one map (H, W) is needed")
@@ -174,7 +198,42 @@ def correct_onset(
     known = np.isfinite(heights) & (touching | (own <= _FARTHEST**2))
     heights = np.where(known, heights + change, np.nan)
     sigmas = np.where(known, np.sqrt(sigmas**2 + own), np.nan)
-    return heights.astype(np.float32), sigmas.astype(np.float32)
+    return PressFit(heights.astype(np.float32), sigmas.astype(np.float32), scene, factors, fit, form)
+
+
+class PressFit(NamedTuple):
+    """A press that explains when pixels turned light: heights on pixels, and their surface of splines."""
+
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    scene: _Scene
+    factors: Doubles
+    slopes: SlopeFit
+    form: Doubles  # that the factors minimise: the inverse of their covariance
+
+    def pressed(self) -> Pressed:
+        """Return the press on the cells at the greatest travel."""
+        surface = np.where(self.scene.surface, self.scene.splines.surface(self.factors), np.nan)
+        return press(self.scene.space, surface + self.scene.travel[-1], self.scene.gel.compliance)
+
+    def on_pixels(self, values: Doubles) -> Doubles:
+        """Return a map of the cells on the pixels, 0 beyond them."""
+        return _interpolated(self.scene, self.height.shape, values)
+
+    def load_sigma(self, pressed: Pressed) -> tuple[float, float]:
+        """Return the standard errors of the load, mm^2: by the fit, and by what is known of the gel."""
+        gel = self.scene.gel
+        gradient = load_gradient(self.scene.space, pressed.contact, gel.compliance)
+        by_factors = self.scene.splines.basis.T @ gradient.ravel()
+        moved = _solve(self.form, by_factors)
+        variance = _excess(self.slopes) * float(np.sum(by_factors * moved))
+        # The stage gives way by the load, too: more compliance also takes from the depth.
+        lowered = 0.0, -gel.sigma.get("compliance", 0.0) * pressed.load * float(gradient.sum()), 0.0
+        by_gel = [
+            float(np.sum(moved * np.einsum("ki,k->i", self.slopes.jacobian, slope / _SLOPE_ERROR**2))) + less
+            for slope, less in zip(_gel_slopes(self.scene, self.slopes), lowered, strict=True)
+        ]
+        return math.sqrt(variance), math.hypot(*by_gel)
 
 
 class _Scene(NamedTuple):
@@ -227,14 +286,18 @@ def _on_pixels(
     scene: _Scene, shape: tuple[int, ...], factors: Doubles, variances: Doubles, contact: Mask
 ) -> tuple[Doubles, Doubles, Mask]:
     """Return for each pixel a surface's height, the variance, and whether there is contact; 0 elsewhere."""
-    box = scene.cells.box
-    rows, columns = scene.cells.places(shape)
-    at = np.stack(np.meshgrid(rows, columns, indexing="ij"))
-    height, variance, touching = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    height[box] = scene.splines.at(factors, rows, columns)
-    variance[box] = ndimage.map_coordinates(variances, at, order=1, mode="nearest")
-    touching[box] = ndimage.map_coordinates(1.0 * contact, at, order=1, mode="nearest")
-    return height, variance, touching >= 0.5
+    height = np.zeros(shape)
+    height[scene.cells.box] = scene.splines.at(factors, *scene.cells.places(shape))
+    touching = _interpolated(scene, shape, contact.astype(np.float64))
+    return height, _interpolated(scene, shape, variances), touching >= 0.5
+
+
+def _interpolated(scene: _Scene, shape: tuple[int, ...], values: Doubles) -> Doubles:
+    """Return a map of the cells on the pixels, 0 beyond them."""
+    found = np.zeros(shape)
+    at = np.stack(np.meshgrid(*scene.cells.places(shape), indexing="ij"))
+    found[scene.cells.box] = ndimage.map_coordinates(values, at, order=1, mode="nearest")
+    return found
 
 
 def _interpolate(scene: _Scene, heights: Doubles) -> Doubles:
@@ -347,14 +410,18 @@ def _variances(scene: _Scene, fit: SlopeFit, form: Doubles) -> Doubles:
     """Return the variance of the surface at each cell, mm^2: by the fit, and by what is known of the gel."""
     covariance = _solve(form, np.eye(len(form)))
     basis = scene.splines.basis
-    usual = 1.4826 * float(np.median(np.abs(fit.residual)))
-    worse = max(1.0, (usual / _SLOPE_ERROR) ** 2)
-    variance = worse * np.asarray(basis.multiply(basis @ covariance).sum(axis=1)).ravel()
+    variance = _excess(fit) * np.asarray(basis.multiply(basis @ covariance).sum(axis=1)).ravel()
     for slope in _gel_slopes(scene, fit):
         pull = np.einsum("ki,k->i", fit.jacobian, slope / _SLOPE_ERROR**2)
         moved = basis @ np.einsum("ij,j->i", covariance, pull)
         variance += moved**2
     return variance.reshape(scene.cells.shape)
+
+
+def _excess(fit: SlopeFit) -> float:
+    """Return by how much slopes scatter more than expected, as a factor of the variance from 1 on."""
+    usual = 1.4826 * float(np.median(np.abs(fit.residual)))
+    return max(1.0, (usual / _SLOPE_ERROR) ** 2)
 
 
 def _gel_slopes(scene: _Scene, fit: SlopeFit) -> list[Doubles]:

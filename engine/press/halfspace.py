@@ -23,6 +23,7 @@ TOLERANCE = 1e-4
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (pi E*) at E = 1: E* = E / (1 - nu^2), nu = 1/2
 _ROUNDS = 40  # of changes of the contact
 _STEPS = 300  # of conjugate gradients
+_GRADIENT_ERROR = 1e-3  # of a flat punch pressed in by 1
 
 
 class HalfSpace:
@@ -120,6 +121,18 @@ def press(
     return system.rest(contact if contact.any() else reach, strain)
 
 
+def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> Doubles:
+    """Return the derivatives of the load by the heights of the surface in contact, (H, W), mm.
+
+    They are the strain under a flat punch of the contact's shape that is pressed in by 1, times the pixel
+    area: the operator is symmetric, and a contact's border, where nothing presses, adds nothing as it moves.
+    """
+    if not contact.any():
+        return np.zeros(space.shape)
+    system = _System(space, np.ones(space.shape), compliance, _GRADIENT_ERROR)
+    return system.strain_for(contact) * space.pixel_area
+
+
 class _System:
     """One surface at one depth."""
 
@@ -139,6 +152,10 @@ class _System:
                 return Pressed(strain, self._space.displacement(strain), contact, load)
             contact = changed
         raise NotConverged(f"the contact did not converge in {_ROUNDS} rounds")
+
+    def strain_for(self, contact: Mask) -> Doubles:
+        """Return the strain, of either sign, that brings a given contact to the surface."""
+        return self._solve(contact, np.zeros_like(self._surface))[0]
 
     def _solve(self, contact: Mask, strain: Doubles) -> tuple[Doubles, Doubles]:
         """Return the pressure that brings all that is in contact to the surface, and the gap everywhere."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin import io
+from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.press.changepoint import ChangePointSearch
 from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch, check_event
 from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
@@ -20,7 +21,8 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import stroke_starts
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Source
+    from mirrorskin.engine.press.elastic import PressFit
+    from mirrorskin.io import Calibration, Source
     from mirrorskin.io.types import ProcessValue
     from mirrorskin.kernels.device import Device
 
@@ -42,6 +44,7 @@ def reconstruct_press(
     bright: ArrayLike | None = None,
     noise: float | None = None,
     fill: bool = True,
+    modulus: float | None = None,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
@@ -67,6 +70,9 @@ def reconstruct_press(
     fill : bool
         Whether to fill holes, such as flat tops, which never turn light: their heights are guesses, marked in
         ``filled``; see `mirrorskin.engine.fill_holes`. It takes a known pixel size.
+    modulus : float, optional
+        Young's, MPa, for ``pressure`` and ``force``; by default that of the calibration. Forces also take the
+        calibration's gel, by which the contact is found.
     memory_limit : int
         Bytes of host memory for frames on the move.
     device : str or Device, optional
@@ -124,7 +130,7 @@ def reconstruct_press(
         "dark": "each pixel's own" if twice else level_origin(source, "dark", dark),
         "bright": "each pixel's own" if twice else level_origin(source, "bright", bright),
     }
-    result, done = finish_press(onset, source, search.travel, event, threshold, fill)
+    result, done = finish_press(onset, source, search.travel, event, threshold, fill, modulus)
     if isinstance(found, Strokes):
         result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}
     return attach_provenance(result, source, search.device, process | done)
@@ -146,9 +152,15 @@ def add_hysteresis(result: Result, strokes: Strokes, event: Event) -> Result:
 
 
 def finish_press(
-    onset: Onset, source: Source, travel: NDArray[np.float64], event: Event, threshold: float, fill: bool
+    onset: Onset,
+    source: Source,
+    travel: NDArray[np.float64],
+    event: Event,
+    threshold: float,
+    fill: bool,
+    modulus: float | None = None,
 ) -> tuple[Result, dict[str, ProcessValue]]:
-    """Correct onsets for the elastomer, if a calibration describes it, and fill holes.
+    """Correct onsets for the elastomer, and find the force, if a calibration describes it, and fill holes.
 
     Travel, (T,), mm, is that of the frames that the onsets were made of. What was done is for the process.
     """
@@ -158,7 +170,11 @@ def finish_press(
         from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
 
         gel = source.calibration.gel
-        result, done["gel"] = correct_press(result, source, float(np.max(travel)), threshold, gel)
+        result, done["gel"], fit = correct_press(result, source, float(np.max(travel)), threshold, gel)
+        result, said = _with_force(result, fit, source.calibration, modulus)
+        done |= said
+    elif modulus is not None:
+        raise InputError(f"{source.name}: a force takes a calibration with a gel: calibrate elastic first")
     pixel_size = source.header.pixel_size
     if fill and pixel_size is None:
         done["fill"] = "none: the recording has no pixel size"
@@ -185,6 +201,29 @@ def _oscillates(source: Source) -> bool:
     """Tell whether a source's travel does more than go down, and then up, once; as far as it is known."""
     travel: NDArray[np.float64] | None = getattr(source, "travel", None)
     return travel is not None and len(stroke_starts(travel, 1)) > 1
+
+
+def _with_force(
+    result: Result, fit: PressFit | None, calibration: Calibration, modulus: float | None
+) -> tuple[Result, dict[str, ProcessValue]]:
+    """Add pressure and force, where the modulus is known; what was done is for the process."""
+    from mirrorskin.engine.force.normal import check_modulus, force_of_press
+
+    stiffness = calibration.stiffness
+    known = stiffness if modulus is None else check_modulus(float(modulus))
+    if known is None:
+        return result, {}
+    if fit is None:
+        return result, {"force": "none: the heights are not corrected for the gel"}
+    if modulus is None and stiffness is not None and stiffness.gel_threshold != fit.scene.gel.threshold:
+        return result, {"force": "none: the modulus was learned with another gel: calibrate force again"}
+    try:
+        found = force_of_press(fit, known)
+    except NotConverged as error:
+        return result, {"force": f"none: {error}"}
+    said = "by the calibration" if modulus is None else f"modulus {modulus:g} MPa"
+    made = replace(result, pressure=found.pressure, force=found.force, force_sigma=found.sigma)
+    return made, {"force": said}
 
 
 def _frames_of(source: Source, event: Event) -> range:

@@ -94,7 +94,7 @@ def update_calibration(
     Parameters
     ----------
     path : str or Path
-    part : References, Lens, WallResponse, Precession or Gel
+    part : References, Lens, WallResponse, Precession, Gel or Stiffness
     camera : CameraId
         Which camera the part is of.
     process : mapping, optional

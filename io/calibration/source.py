@@ -17,10 +17,13 @@ from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, S
 
 Size = tuple[float, float]
 
-SIZED = ("zenith", "precession", "gel")
+SIZED = ("zenith", "precession", "gel", "stiffness")
 """The parts whose lengths come from the size of a pixel."""
 
-_MEASURED: Mapping[str, tuple[str, ...]] = {"axial": ("zenith", "precession"), "vertical": ("gel",)}
+_MEASURED: Mapping[str, tuple[str, ...]] = {
+    "axial": ("zenith", "precession"),
+    "vertical": ("gel", "stiffness"),
+}
 _SAME_SIZE = 1e-3  # share by which pixel sizes may differ: less than a calibration's lengths are known to
 _SAME_TILT = 1.25  # factor by which a rotation's half-angle may differ from the calibrated one
 

@@ -336,7 +336,35 @@ class Gel:
     sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
 
 
-Part = References | Lens | WallResponse | Precession | Gel
+@dataclass(frozen=True, slots=True, eq=False)
+class Stiffness:
+    """The elastomer's modulus, from presses of known force.
+
+    Attributes
+    ----------
+    modulus : float
+        Young's modulus, MPa.
+    scatter : float
+        Standard deviation of a press's force that neither noise nor the modulus explains, as a share of it.
+    gel_threshold : float
+        That of the gel with which it was learned, radians: a gel learned again needs a modulus learned again.
+    error : float
+        RMS error of each force by the modulus of the other presses, as a share of it; NaN of fewer than 2.
+    presses : int
+        How many it was learned from.
+    sigma : mapping of str to float
+        Standard errors, by the names of the fields.
+    """
+
+    modulus: float = field(metadata=kept("number", "MPa", valid=_above_zero))
+    scatter: float = field(metadata=kept("number", valid=lambda value: value >= 0))
+    gel_threshold: float = field(metadata=kept("number", "rad"))
+    error: float = field(default=math.nan, metadata=kept("number"))
+    presses: int = field(default=1, metadata=kept("integer", valid=lambda value: value >= 1))
+    sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
+
+
+Part = References | Lens | WallResponse | Precession | Gel | Stiffness
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,9 +379,10 @@ class Calibration:
     zenith : WallResponse or None
     precession : Precession or None
     gel : Gel or None
+    stiffness : Stiffness or None
     process : mapping
         How each part came about: "references.program", "zenith.sources" and so on, by the names of the
-        commands: references, scale, zenith, tilt, elastic.
+        commands: references, scale, zenith, tilt, elastic, force.
     name : str
         The file that it was read from, for messages.
     """
@@ -364,6 +393,7 @@ class Calibration:
     zenith: WallResponse | None = None
     precession: Precession | None = None
     gel: Gel | None = None
+    stiffness: Stiffness | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     name: str = ""
 
@@ -384,9 +414,10 @@ GROUPS = {
     "zenith": "zenith",
     "precession": "tilt",
     "gel": "elastic",
+    "stiffness": "force",
 }
 """The attributes of a calibration, and what their groups in a file and the commands are called."""
 
 KINDS: dict[str, type[Part]] = dict(
-    zip(GROUPS, (References, Lens, WallResponse, Precession, Gel), strict=True)
+    zip(GROUPS, (References, Lens, WallResponse, Precession, Gel, Stiffness), strict=True)
 )

@@ -34,6 +34,7 @@ dark = 12
 bright = 200.5
 noise = 1.5
 fill = false
+modulus = "120kPa"
 
 [rotation]
 method = "paper"
@@ -80,6 +81,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "bright": 200.5,
         "noise": 1.5,
         "fill": False,
+        "modulus": 0.12,
     }
     assert plan.rotation == {
         "method": "paper",

@@ -63,6 +63,7 @@ MAPS: Mapping[str, tuple[str, str]] = {
         "connected pixels are one piece, and share a number; heights of two pieces say nothing of "
         "each other. -1: no height",
     ),
+    "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
 }
 """Of each map its unit in the file, and what it says."""
 

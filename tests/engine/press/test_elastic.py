@@ -176,7 +176,7 @@ def test_a_press_that_cannot_be_put_right_stays_and_says_why():
         (GEL, (0.1, 0.1), 0.4, "none: the gel was learned with a threshold of 0.5, not of 0.4"),
         (GEL, (0.1, 0.1), 0.5, "none: nothing turned light"),
     ):
-        same, said = correct_press(result, Pixels(pixel_size), 1.0, threshold, gel)
+        same, said, _ = correct_press(result, Pixels(pixel_size), 1.0, threshold, gel)
         assert same is result
         assert said == why
 

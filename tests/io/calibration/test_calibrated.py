@@ -218,7 +218,7 @@ def test_a_recording_carries_a_copy_and_stays_what_the_source_said(tmp_path):
         np.testing.assert_array_equal(recording.header.dark, OWN.dark)
         assert recording.header.tilt == OWN.tilt
     assert io.describe(path)["carried calibration"] == (
-        "references, scale, zenith, tilt, elastic of camera 'left', 7 x 5, uint8"
+        "references, scale, zenith, tilt, elastic, force of camera 'left', 7 x 5, uint8"
     )
     assert io.describe(path)["camera"] == "left"
     assert_same(io.open_calibration(path), calibration)

@@ -11,7 +11,7 @@ from stacks import record, sphere
 
 from mirrorskin import io
 
-PARTS = ("references", "lens", "zenith", "precession", "gel")
+PARTS = ("references", "lens", "zenith", "precession", "gel", "stiffness")
 CAMERA = io.CameraId("left", SHAPE, np.dtype("uint8"))
 
 
@@ -66,12 +66,14 @@ def test_it_has_the_layout_that_is_documented(saved):
         "zenith": "NXdata",
         "tilt": "NXcollection",
         "elastic": "NXcollection",
+        "force": "NXcollection",
         "process": "NXprocess",
     }
     assert (found["references"]["signal"], found["zenith"]["signal"]) == ("bright", "zenith_sigma")
     assert found["references/dark"] == {"interpretation": "image", "units": "counts"}
     assert found["scale/pixel_size"] == found["tilt/pivot"] == found["tilt/sigma/pivot_z"] == {"units": "mm"}
     assert found["tilt/tilt"] == found["tilt/sigma/tilt"] == {"units": "rad"}
+    assert found["force/modulus"] == found["force/sigma/modulus"] == {"units": "MPa"}
     assert shapes["references/defects"] == shapes["zenith/azimuth_sigma"] == SHAPE
     assert (shapes["camera/name"], shapes["camera/shape"], shapes["zenith/curve"]) == ((), (2,), (3,))
     assert shapes["process/tilt.frames"] == ()

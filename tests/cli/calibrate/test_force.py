@@ -1,0 +1,100 @@
+"""`mirrorskin calibrate force`: from presses of known force to newtons."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import run
+from stacks import record
+
+from mirrorskin import io
+from mirrorskin.hw.twin import Body, Camera, Sphere, Twin, Vertical
+
+GEL = io.Gel(threshold=np.arctan2(17.5, 40) / 2, compliance=0.0, curvature=1 / 17.5)
+MODULUS = 0.12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Presses of a ball to three depths, and their forces."""
+    folder, forces = tmp_path_factory.mktemp("presses"), []
+    for number, deepest in enumerate((0.4, 0.6, 0.8)):
+        twin = Twin(
+            object=Sphere(6.0),
+            shape=(48, 48),
+            pixel_size=0.16,
+            movement=Vertical(np.arange(0.04, deepest, 0.04)),
+            contact="elastic",
+            optics="cylinder",
+            camera=Camera(noise=1.0, seed=number),
+            body=Body(modulus=MODULUS),
+        )
+        record(twin, folder / f"press-{number}.h5")
+        forces.append(float(twin.truth.force[-1, 2]))
+    lines = [f"press-{number}.h5,{force}" for number, force in enumerate(forces)]
+    (folder / "scale.csv").write_text("\n".join(["recording,newtons", *lines]))
+    return folder, forces
+
+
+@pytest.fixture(autouse=True)
+def here(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in folder[0].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    camera = io.CameraId("", (48, 48), np.dtype(np.uint8))
+    io.save_calibration(io.Calibration(camera, gel=GEL), "cal.h5")
+
+
+def test_presses_and_a_scale_become_a_modulus_that_reconstruct_uses(folder):
+    presses = [f"press-{number}.h5" for number in range(3)]
+    ended = run("calibrate", "force", *presses, "--readings", "scale.csv", "-o", "cal.h5")
+    assert ended.code == 0, ended.said
+    assert ended.out.startswith("cal.h5: modulus ")
+    assert "held-out forces wrong by" in ended.out
+    known = io.open_calibration("cal.h5")
+    assert known.stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
+    assert known.process["force.sources"] == ", ".join(presses)
+    ended = run("reconstruct", "press-1.h5", "--calibration", "cal.h5", "-o", "a.h5")
+    result = io.open_result("a.h5")
+    assert "force 0." in ended.out
+    assert result.force == pytest.approx(folder[1][1], rel=0.03)
+    words = [word for force in folder[1] for word in ("--force", f"{1000 * force}mN")]
+    again = run("calibrate", "force", *presses, *words, "--force-sigma", "1mN", "-o", "cal.h5", "--json")
+    told = json.loads(again.out)
+    assert told["stiffness"]["modulus"] == pytest.approx(known.stiffness.modulus, rel=0.01)
+    assert [one["recording"] for one in told["presses"]] == presses
+    shown = run("calibrate", "show", "cal.h5").out
+    assert "modulus" in shown
+    assert "kPa" in shown
+
+
+def test_a_modulus_can_be_given(folder):
+    run("reconstruct", "press-1.h5", "--calibration", "cal.h5", "--modulus", "120kPa", "-o", "a.h5")
+    assert io.open_result("a.h5").force == pytest.approx(folder[1][1], rel=0.03)
+    ended = run("reconstruct", "press-1.h5", "--modulus", "120kPa", "-o", "b.h5")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "calibrate elastic first" in ended.said
+    assert not Path("b.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "either as --force, one a recording, or as --readings"),
+        (["--force", "1N", "--readings", "scale.csv"], "either as --force"),
+        (["--force", "1N", "--force", "2N"], "1 recordings and 2 times --force"),
+        (["--force", "1mm"], "force"),
+        (["--force", "-1N"], "a force above 0 is needed; write e.g. 1.5N"),
+        (["--readings", "none.csv"], "none.csv cannot be read"),
+        (["--readings", "other.csv"], "other.csv has no line of press-0.h5"),
+        (["--readings", "bad.csv"], "is no press: write REC.h5,newtons"),
+        (["--force", "1N", "-o", "new.h5"], "new.h5 has no gel"),
+    ],
+)
+def test_a_wrong_call_is_one_line(words, said):
+    Path("other.csv").write_text("press-9.h5,1.0\n")
+    Path("bad.csv").write_text("name,newtons\npress-0.h5,much\n")
+    ended = run("calibrate", "force", "press-0.h5", "-o", "cal.h5", *words)
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert said in ended.said

@@ -1,0 +1,167 @@
+"""Normal force and pressure: of known shapes by closed forms, and of the twin's presses by its own scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from contact_theory import paraboloid, sphere
+
+from mirrorskin import engine, io
+from mirrorskin.engine.force.normal import find_force
+from mirrorskin.hw.twin import Body, Camera, Sphere, Twin, Vertical
+
+MODULUS, PIXEL = 0.12, 0.05
+GEL = io.Gel(
+    threshold=np.arctan2(17.5, 40) / 2, compliance=0.0, curvature=1 / 17.5, sigma={"threshold": 0.002}
+)
+
+
+def distances(count=80):
+    x = PIXEL * (np.arange(count) - (count - 1) / 2)
+    return np.hypot(x, x[:, np.newaxis])
+
+
+@pytest.mark.parametrize(
+    ("theory", "profile"),
+    [
+        (paraboloid(3.0, 1.2, MODULUS), lambda r: r**2 / 6),
+        (sphere(3.0, 1.2, MODULUS), lambda r: 3 - np.sqrt(np.maximum(9 - r**2, 0))),
+    ],
+    ids=["paraboloid", "ball"],
+)
+def test_a_known_shape_presses_as_the_closed_forms_have_it(theory, profile):
+    r = distances()
+    found = find_force(-profile(r), theory.depth, PIXEL, MODULUS)
+    assert found.force == pytest.approx(theory.force, rel=0.003)
+    assert found.pressure.sum() * PIXEL**2 == pytest.approx(found.force, rel=1e-5)
+    inside = r < 0.9 * theory.radius
+    np.testing.assert_allclose(found.pressure[inside], theory.pressure(r[inside]), rtol=0.03)
+    assert not found.pressure[r > 1.1 * theory.radius].any()
+
+
+def test_a_weak_stage_lowers_the_force_as_its_compliance_says():
+    theory, r = paraboloid(3.0, 1.2, MODULUS), distances()
+    given_way = 0.05 * theory.force / MODULUS
+    found = find_force(-(r**2) / 6, theory.depth + given_way, PIXEL, MODULUS, compliance=0.05)
+    assert found.force == pytest.approx(theory.force, rel=0.004)
+
+
+def test_errors_of_travel_and_modulus_are_propagated():
+    ball = -(distances() ** 2) / 6
+    whole = [find_force(ball, 0.5 + step, PIXEL, MODULUS).force for step in (-0.002, 0.002)]
+    found = find_force(ball, 0.5, PIXEL, MODULUS, travel_sigma=0.002)
+    assert found.sigma == pytest.approx((whole[1] - whole[0]) / 2, rel=0.02)
+    found = find_force(ball, 0.5, PIXEL, MODULUS, modulus_sigma=0.1 * MODULUS)
+    assert found.sigma == pytest.approx(0.1 * found.force)
+
+
+def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
+    generator, ball = np.random.default_rng(4), -(distances(48) ** 2) / 6
+    expected = find_force(ball, 0.4, PIXEL, MODULUS, sigma=0.002).sigma
+    drawn = [
+        find_force(ball + generator.normal(0, 0.002, ball.shape), 0.4, PIXEL, MODULUS).force
+        for _ in range(60)
+    ]
+    assert np.std(drawn) == pytest.approx(expected, rel=0.3)  # 9 % is the error of 60 draws
+
+
+def test_what_is_lifted_presses_with_nothing():
+    found = find_force(-(distances() ** 2) / 6, -0.1, PIXEL, MODULUS, travel_sigma=0.01)
+    assert (found.force, found.sigma, bool(found.contact.any())) == (0.0, 0.0, False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"modulus": 0.0}, "modulus of 0 MPa"),
+        ({"modulus": float("nan")}, "modulus of nan MPa"),
+        ({"height": np.zeros(4)}, "one map"),
+        ({"travel": float("inf")}, "travel inf"),
+        ({"compliance": -1.0}, "compliance -1"),
+        ({"sigma": np.zeros((2, 2))}, "sigma has shape"),
+    ],
+)
+def test_what_cannot_be_is_one_line(changes, said):
+    known = {"height": np.zeros((4, 4)), "travel": 0.1, "pixel_size": 0.1, "modulus": 0.1}
+    with pytest.raises(io.InputError, match=said):
+        find_force(**known | changes)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """The twin's press of a ball, and the force that it knows."""
+    twin = Twin(
+        object=Sphere(6.0),
+        shape=(64, 64),
+        pixel_size=0.12,
+        movement=Vertical(np.arange(0.03, 0.9, 0.03)),
+        contact="elastic",
+        camera=Camera(noise=1.0, seed=3),
+        body=Body(modulus=MODULUS),
+        optics="cylinder",
+    )
+    return twin, float(twin.truth.force[-1, 2])
+
+
+def calibration(**parts):
+    return io.Calibration(io.CameraId("", (64, 64), np.dtype(np.uint8)), gel=GEL, **parts)
+
+
+def test_a_press_has_the_twin_s_force(ball):
+    twin, force = ball
+    result = engine.reconstruct(twin, calibration(), modulus=MODULUS, fill=False)
+    assert result.force == pytest.approx(force, rel=0.03)
+    assert abs(result.force - force) < 3 * result.force_sigma
+    assert 0 < result.force_sigma < 0.05 * force
+    assert result.pressure.sum() * 0.12**2 == pytest.approx(result.force, rel=0.02)
+    assert result.process["force"] == "modulus 0.12 MPa"
+
+
+def test_the_calibration_s_modulus_and_scatter_are_used(ball):
+    twin, _ = ball
+    known = io.Stiffness(2 * MODULUS, 0.05, GEL.threshold, sigma={"modulus": 0.12 * 2 * MODULUS})
+    result = engine.reconstruct(twin, calibration(stiffness=known), fill=False)
+    given = engine.reconstruct(twin, calibration(), modulus=MODULUS, fill=False)
+    assert result.force == pytest.approx(2 * given.force)
+    assert result.force_sigma == pytest.approx(0.13 * result.force, rel=0.01)
+    other = replace(known, gel_threshold=0.1)
+    lacking = engine.reconstruct(twin, calibration(stiffness=other), fill=False)
+    assert lacking.force is None
+    assert "calibrate force again" in lacking.process["force"]
+
+
+def test_without_a_gel_or_a_modulus_there_is_no_force(ball):
+    twin, _ = ball
+    with pytest.raises(io.InputError, match="calibrate elastic first"):
+        engine.reconstruct(twin, modulus=MODULUS)
+    with pytest.raises(io.InputError, match="modulus of -1 MPa"):
+        engine.reconstruct(twin, calibration(), modulus=-1.0)
+    result = engine.reconstruct(twin, calibration(), fill=False)
+    assert (result.force, result.pressure) == (None, None)
+    assert "force" not in result.process
+
+
+def test_a_load_beyond_the_picture_is_no_force():
+    twin = Twin(
+        object=Sphere(10.0),
+        shape=(64, 40),
+        pixel_size=0.05,
+        movement=Vertical(np.arange(0.03, 0.8, 0.03)),
+        contact="elastic",
+        camera=Camera(noise=1.0, seed=3),
+        optics="cylinder",
+    )
+    known = replace(calibration(), camera=io.CameraId("", (64, 40), np.dtype(np.uint8)))
+    result = engine.reconstruct(twin, known, modulus=MODULUS, fill=False)
+    assert result.force is None
+    assert "none: " in result.process["force"]
+
+
+def test_a_force_comes_back_from_a_file(tmp_path):
+    result = io.Result(pressure=np.ones((2, 3), np.float32), force=0.5, force_sigma=0.01)
+    io.save_result(result, tmp_path / "a.h5")
+    found = io.open_result(tmp_path / "a.h5")
+    assert (found.force, found.force_sigma) == (0.5, 0.01)
+    np.testing.assert_array_equal(found.pressure, 1)
