@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-browser|docs|lint|types|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-browser|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-browser docs lint types bench portability gpu-check gpu clean
+.PHONY: demo test test-all test-browser docs lint types fuzz bench portability gpu-check gpu clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -46,6 +46,12 @@ lint: $(READY)
 types: $(READY)
 	@cd tests
 	../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml $(PACKAGES:%=-p mirrorskin.%)
+
+# Damaged files and replies, MINUTES of them; what is neither read nor refused in one line is kept.
+MINUTES ?= 60
+SEED ?= 0
+fuzz: $(READY)
+	@$(BIN)/python tests/fuzz/fuzz.py --minutes $(MINUTES) --seed $(SEED)
 
 bench: $(READY)
 	@$(BIN)/mirrorskin bench

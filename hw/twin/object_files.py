@@ -125,7 +125,7 @@ def _read_array(path: Path) -> NDArray[Any]:
         encoded = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
+    except Exception as error:  # a damaged head is parsed as Python: its errors are of many kinds
         raise InputError(f"{path}: is no NumPy array of numbers: save it with numpy.save") from error
     return _decode_picture(path, encoded)
 
