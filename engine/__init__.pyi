@@ -15,6 +15,7 @@ from .reconstruction import reconstruct
 from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
+from .rotation.normals_pose import PoseEstimator, PoseNormals
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
 from .tiling import free_memory
@@ -34,6 +35,8 @@ __all__ = [
     "Onset",
     "OnsetSearch",
     "Pose",
+    "PoseEstimator",
+    "PoseNormals",
     "Score",
     "StrokeSearch",
     "Strokes",

@@ -12,15 +12,6 @@ typedef struct { F zenith, u1, u2, u3; } Expected;
 // What a direction makes expected of all samples; see `expect`.
 typedef struct { Direction at; F base, lean, high, low, beside_x, beside_y; } Pose;
 
-// An angle by half its sine, to 2e-7, of x = sin^2(angle / 2) up to 0.45 and to 2e-5 up to 0.5; in pairs, so that one
-// need not wait for the other.
-F angle_by_half_sine(const F x)
-{
-    const F y = x * x;
-    return (1.99999977f + x * 1.33340033f) + y * ((1.06356538f + x * 0.968005666f)
-        + y * ((0.36618433f + x * 2.68428173f) + y * (-3.71582798f + x * 5.02326723f)));
-}
-
 Pose pose_of(const Direction at, const float cos_tilt, const float sin_tilt)
 {
     const F apart = at.st * cos_tilt - at.ct * sin_tilt;

@@ -126,22 +126,31 @@ def normals_exact(
     tilt : radians
     """
     samples = Samples(frames, turn, scale, noise)
-    normal = _start(samples, turn, tilt)
-    sums = None
+    normal, sums = most_likely(samples, _start(samples, turn, tilt), *_axes(turn, tilt))
+    with np.errstate(invalid="ignore"):
+        rest = samples.mean < limits.rest
+    return conclude(normal, sums, samples, samples.usable, tilt, limits, limits.model, rest)
+
+
+def most_likely(samples: Samples, start: Doubles, axes: Doubles, tilting: Doubles) -> tuple[Doubles, Sums]:
+    """Return the most likely normals and the normal equations next to them.
+
+    From the normals that are begun with, (n, 3), steps are taken. ``axes`` are the body's in the frames,
+    (N, 3), and ``tilting`` is how they move with the tilt.
+    """
+    normal, sums = start, None
     for number in range(2 + MORE):
         # What is clipped, missing or out of range needs all steps, and only that is treated as such.
         moves = samples.irregular if number >= 2 else np.ones_like(samples.irregular)
         if number == 2:
-            normal = np.where(samples.irregular[:, np.newaxis], _start(samples, turn, tilt), normal)
+            normal = np.where(samples.irregular[:, np.newaxis], start, normal)
         if not moves.any():
             break
-        latest = _look(normal, samples, turn, tilt, closely=number >= 2)
+        latest = _look(normal, samples, axes, tilting, closely=number >= 2)
         sums = latest if sums is None or number < 2 else latest.where(moves, sums)
         normal = np.where(moves[:, np.newaxis], step(normal, latest), normal)
     assert sums is not None
-    with np.errstate(invalid="ignore"):
-        rest = samples.mean < limits.rest
-    return conclude(normal, sums, samples, samples.usable, tilt, limits, limits.model, rest)
+    return normal, sums
 
 
 def normals_paper(
@@ -219,11 +228,17 @@ class Samples:
         self.each = self.error / turn[2][:, np.newaxis]  # standard deviation of each sample
         margin = _MARGIN * self.each
         usable = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
-        self.usable = (usable & ~self.under & ~self.over).sum(axis=0)
-        self.irregular = self.usable < count
+        self.whole = usable & ~self.under & ~self.over
+        self.keep(np.ones_like(self.whole))
         self.mean, self.cosine, self.sine = turn[3:] @ self.zenith
         wave = self.mean + np.multiply.outer(turn[0], self.cosine) + np.multiply.outer(turn[1], self.sine)
         self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
+
+    def keep(self, there: NDArray[np.bool_]) -> None:
+        """Take all samples but those that are there, (N, n), for missing."""
+        self.missing = self.missing | ~there
+        self.usable = (self.whole & there).sum(axis=0)
+        self.irregular = self.usable < len(there)
 
 
 def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,
@@ -237,14 +252,22 @@ def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt:
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
+    unknown = (usable < _LEAST) | ~(sigma < _NO_ANSWER)
+    touching = touches(sums, det, samples, tilt, limits, model, rest)
+    return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
+
+
+def touches(sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Limits,
+            model: float | Doubles, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:  # fmt: skip
+    """Tell where residuals are those of a lasting contact; ``det`` is that of the answer's equations."""
+    with np.errstate(divide="ignore", invalid="ignore"):
         more_tilt, information, residual = _free_tilt(sums, det)
         uncertainty = 3 * samples.error / np.sqrt(information)
         off_tilt = (tilt + more_tilt + uncertainty < limits.still) | (
             tilt + more_tilt - uncertainty > limits.most
         )
-        touching = _like_noise(residual, samples, limits.noise, model) & ~off_tilt & ~rest
-    unknown = (usable < _LEAST) | ~(sigma < _NO_ANSWER)
-    return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
+        like_noise = _like_noise(residual, samples, limits.noise, model)
+    return np.asarray(like_noise & ~off_tilt & ~rest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,13 +319,12 @@ def _start(samples: Samples, turn: Doubles, tilt: float) -> Doubles:
     )
 
 
-def _look(normal: Doubles, samples: Samples, turn: Doubles, tilt: float, closely: bool) -> Sums:
+def _look(normal: Doubles, samples: Samples, axes: Doubles, tilting: Doubles, closely: bool) -> Sums:
     """Form the normal equations at a direction; closely, as clipped or missing samples demand."""
-    axes, tilting = _axes(turn, tilt)
     chord = np.linalg.norm(normal[np.newaxis] - axes[:, np.newaxis], axis=2)
     zenith = 2 * np.arcsin(np.clip(chord / 2, 1e-6, math.sqrt(0.5)))
     along, across = tangents(normal)
-    root = turn[2][:, np.newaxis]
+    root = samples.turn[2][:, np.newaxis]
     # d zenith = -d(n . a) / sin(zenith)
     by_sine = -root / np.sin(zenith)
     u1, u2, u3 = by_sine * (axes @ along.T), by_sine * (axes @ across.T), by_sine * (tilting @ normal.T)

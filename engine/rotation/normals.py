@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -27,6 +27,7 @@ from mirrorskin.engine.rotation.normals_kernel import (
     Samples,
     TurnModel,
 )
+from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
@@ -104,9 +105,11 @@ class Normals:
 
 def estimate_normals(
     frames: NDArray[Any],
-    phase: ArrayLike,
+    phase: ArrayLike | None = None,
     *,
-    tilt: float | Literal["estimate"],
+    tilt: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
+    travel: ArrayLike | None = None,
     gain: ArrayLike | None = None,
     offset: ArrayLike = 0.0,
     method: NormalMethod = "exact",
@@ -126,10 +129,15 @@ def estimate_normals(
     ----------
     frames : ndarray, (T, H, W), uint8, uint16 or float32
         Raw counts. Whole counts at the ends of their type are taken for clipped, a NaN for missing.
-    phase : array_like, (T,)
+    phase : array_like, (T,), optional
         Radians, one a frame, at least three different ones a turn.
-    tilt : float or "estimate"
-        Half-angle of the precession, radians, or to estimate it from the first turn.
+    tilt : float, array_like of (T,), or "estimate"
+        Half-angle of the precession, radians, or to estimate it from the first turn. One a frame: any known
+        poses; see `PoseEstimator`. Of two phases half a turn apart the body rocks.
+    axis : array_like, (T, 3), optional
+        The body's axis in each frame instead of phase and tilt: unit vectors, towards the camera.
+    travel : array_like, (T,), optional
+        Millimetres of each frame, of any known poses where the body presses as well.
     gain, offset : array_like, scalar or (H, W)
         E = offset + gain zenith: counts per radian, and counts.
     method : {"exact", "paper"}
@@ -151,11 +159,12 @@ def estimate_normals(
     Returns
     -------
     Normals
+        `PoseNormals` of any known poses.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Frames, phases, tilt, scale or parameters that cannot be used.
+        Frames, phases, tilt, axes, scale or parameters that cannot be used.
     mirrorskin.kernels.errors.DeviceError
         No device, or one that cannot hold a single row.
 
@@ -174,23 +183,42 @@ def estimate_normals(
     """
     if frames.ndim != 3 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
-    alpha = check_phase(phase, len(frames), "phase")
-    estimator = NormalEstimator(
-        frames.shape[1:],
-        frames.dtype,
-        tilt=tilt,
-        gain=gain,
-        offset=offset,
-        method=method,
-        noise=noise,
-        dark=dark,
-        bright=bright,
-        response=response,
-        device=device,
-        memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
-    )
-    estimator.look_at(frames, alpha, check_weights(frame_weights, len(frames)))
+    options: dict[str, Any] = {
+        "gain": gain,
+        "offset": offset,
+        "method": method,
+        "noise": noise,
+        "dark": dark,
+        "bright": bright,
+        "response": response,
+        "device": device,
+        "memory_limit": min(MEMORY_LIMIT, 2 * frames.nbytes),
+    }
+    estimator: NormalEstimator
+    given = None if tilt is None or isinstance(tilt, str) else np.asarray(tilt, np.float64)
+    varies = given is not None and (given.ndim > 0 or _rocks(phase))
+    if axis is not None or travel is not None or varies:
+        from mirrorskin.engine.rotation.normals_pose import PoseEstimator
+
+        where = check_poses(len(frames), phase, given, axis, travel)
+        estimator = PoseEstimator(
+            frames.shape[1:], frames.dtype, longest=even_windows(len(frames)), **options
+        )
+    else:
+        if tilt is None:
+            raise InputError("tilt is missing: give the half-angle of the precession, such as 2.5deg")
+        where = check_phase(phase, len(frames), "phase")
+        estimator = NormalEstimator(frames.shape[1:], frames.dtype, tilt=cast(Any, tilt), **options)
+    estimator.look_at(frames, where, check_weights(frame_weights, len(frames)))
     return estimator.result()
+
+
+def _rocks(phase: ArrayLike | None) -> bool:
+    """Tell whether there are two phases, half a turn apart."""
+    if phase is None:
+        return False
+    steps: Doubles = np.unique(np.round(np.mod(np.asarray(phase, np.float64), 2 * np.pi), 6))
+    return len(steps) == 2 and bool(abs(steps[1] - steps[0] - np.pi) < 1e-5)
 
 
 class NormalEstimator:
@@ -231,6 +259,8 @@ class NormalEstimator:
     """
 
     position = "phase"
+    _maps: tuple[str, ...] = MAPS
+    _width = 0  # numbers that say where the body was in a frame; 0 for one that is no list
 
     def __init__(
         self,
@@ -244,7 +274,7 @@ class NormalEstimator:
     ) -> None:
         self._shape, self._dtype = shape, np.dtype(dtype)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn
-        self._kernel = NormalKernel(shape, self._dtype, **options)
+        self._kernel = NormalKernel(shape, self._dtype, **options, poses=self._width > 0)
         self.device = self._kernel.device
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         planes = self._kernel.planes
@@ -261,7 +291,8 @@ class NormalEstimator:
     def reset(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
         self._model = self._kernel.model
-        self._phase, self._weights = np.empty((2, 0))  # of the frames in the buffer
+        self._phase = np.empty((0, self._width) if self._width else 0)  # of the frames in the buffer
+        self._weights = np.empty(0)
         self._turns = self._frames = 0  # that are in the maps
         self._each: list[list[NDArray[Any]]] = []
 
@@ -297,12 +328,15 @@ class NormalEstimator:
             frames.
         """
         check_frames(frames, self._dtype, self._shape)
-        alpha = check_phase(phase, len(frames), "phase")
+        self._push(frames, check_phase(phase, len(frames), "phase"), frame_weights)
+
+    def _push(self, frames: NDArray[Any], where: Doubles, frame_weights: ArrayLike | None) -> None:
+        """Take in frames, part by part, as there is room for them."""
         weights = check_weights(frame_weights, len(frames))
         start = 0
         while start < len(frames):
             part = slice(start, start + len(self.room))
-            self._take(frames[part], alpha[part], weights[part])
+            self._take(frames[part], where[part], weights[part])
             start = part.stop
 
     def look_at(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
@@ -311,7 +345,7 @@ class NormalEstimator:
             self._cut(phase)
             self._buffer, self._phase, self._weights = frames, phase, weights
         else:
-            self.push(frames, phase=phase, frame_weights=weights)
+            self._push(frames, phase, weights)
 
     def result(self) -> Normals:
         """Return the maps of all turns, the last of which is taken to end here.
@@ -325,15 +359,15 @@ class NormalEstimator:
         frames = self._buffer[: len(self._phase)].copy() if np.any(self._weights == 0) else None
         closed = [self._copy_maps(band) for band in self._bands] if self._turns and not self._per_turn else []
         try:
-            self._estimate(cut_into_turns(self._phase))
+            self._estimate(self._turns_in(self._phase))
             if self._turns == 0:
-                check_phases(*state[-2:])  # says what is wrong
+                self._explain(*state[-2:])
             assert self._model is not None
             if self._per_turn:
                 maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
             else:
                 maps = self._take_maps()
-            return Normals.of(maps, self._model, self._turns, self._frames)
+            return self._found(maps)
         finally:  # more frames may follow: the last turn is as open as before
             self._model, self._turns, self._frames, self._phase, self._weights = state
             del self._each[self._turns :]
@@ -342,6 +376,23 @@ class NormalEstimator:
                     band.write(name, values)
             if frames is not None:
                 self._buffer[: len(frames)] = frames
+
+    def _found(self, maps: list[NDArray[Any]]) -> Normals:
+        assert self._model is not None
+        return Normals.of(maps, self._model, self._turns, self._frames)
+
+    def _turns_in(self, where: Doubles) -> list[slice]:
+        """Return which frames are estimated together, by where the body was in them."""
+        return cut_into_turns(where)
+
+    def _fit_of(self, where: Doubles, weights: Doubles, first: bool) -> TurnFit | PoseFit | None:
+        """Return how frames are fitted that are estimated together, if they can be."""
+        fit = turn_fit(where, weights)
+        return fit if fit is not None and (fit.goes_round or first) else None
+
+    def _explain(self, where: Doubles, weights: Doubles) -> None:
+        """Raise InputError that says why frames cannot be fitted."""
+        check_phases(where, weights)
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
         """Take in frames that fit into the buffer, and estimate the turns that are then over."""
@@ -359,7 +410,7 @@ class NormalEstimator:
 
     def _cut(self, phase: Doubles) -> list[slice]:
         """Cut frames into turns, none of which may be too long."""
-        turns = cut_into_turns(phase)
+        turns = self._turns_in(phase)
         longest = max(turn.stop - turn.start for turn in turns)
         if longest > self._longest:
             given = f"a turn of {longest} frames or more: normals take {self._longest} at most"
@@ -384,16 +435,16 @@ class NormalEstimator:
                 values[known] = values[there]
         return known
 
-    def _fitted(self, turns: list[slice]) -> list[tuple[slice, TurnFit]]:
+    def _fitted(self, turns: list[slice]) -> list[tuple[slice, TurnFit | PoseFit]]:
         """Return the turns whose phases determine a normal, and, after the first that does, go all round."""
-        fitted: list[tuple[slice, TurnFit]] = []
+        fitted: list[tuple[slice, TurnFit | PoseFit]] = []
         for turn in turns:
-            fit = turn_fit(self._phase[turn], self._weights[turn])
-            if fit is not None and (fit.goes_round or not (self._turns or fitted)):
+            fit = self._fit_of(self._phase[turn], self._weights[turn], first=not (self._turns or fitted))
+            if fit is not None:
                 fitted.append((turn, fit))
         return fitted
 
-    def _estimate_turn(self, turn: slice, fit: TurnFit) -> None:
+    def _estimate_turn(self, turn: slice, fit: TurnFit | PoseFit) -> None:
         """Take a turn into the maps."""
         count = turn.stop - turn.start
         if self._model is None:
@@ -412,14 +463,14 @@ class NormalEstimator:
     def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
         """Return copies of a band's maps, with their padding."""
         with band.resident():
-            return {name: band.maps[name].download().copy() for name in MAPS}
+            return {name: band.maps[name].download().copy() for name in self._maps}
 
     def _take_maps(self) -> list[NDArray[Any]]:
         """Return the maps of all rows, as they are listed; the bands have new ones then."""
         parts = []
         for band in self._bands:
             with band.resident():
-                vectors, *others = (band.detach(name).reshape(-1) for name in MAPS)
+                vectors, *others = (band.detach(name).reshape(-1) for name in self._maps)
             rows = (-1, self._shape[1])
             flat = [one[: band.pixels].reshape(rows) for one in others]
             parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])

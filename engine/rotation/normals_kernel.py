@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, thinning
 from mirrorskin.engine.rotation.design_matrix import LONGEST, TurnFit
+from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.residual_noise import CountNoise, residual_noise
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
@@ -26,9 +27,11 @@ NormalMethod = Literal["exact", "paper"]
 NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
 MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
 """What the kernel leaves, by name."""
+SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
+"""What it leaves besides of a body that rocks."""
 
 _TABLES = 64  # turns whose tables the device has at once
-_TABLE_BYTES = 4 * 6 * LONGEST
+_TURN_PLANES, _POSE_PLANES = 6, 13  # of a table
 _ENOUGH = 500  # pixels to estimate the noise from
 _MAP_BYTES = 33  # of a pixel, in all of them
 
@@ -91,7 +94,10 @@ class Samples:
 
 
 class NormalKernel:
-    """Fits turns on a device; the parameters are those of `mirrorskin.engine.estimate_normals`."""
+    """Fits turns on a device; the parameters are those of `mirrorskin.engine.estimate_normals`.
+
+    With ``poses``, what it fits are windows of frames at any known poses, each of its own tilt.
+    """
 
     def __init__(
         self,
@@ -107,6 +113,7 @@ class NormalKernel:
         bright: ArrayLike | None = None,
         response: Response | None = None,
         device: str | Device | None = None,
+        poses: bool = False,
     ) -> None:
         check_dtype(dtype)
         if method not in NORMAL_METHODS:
@@ -125,9 +132,11 @@ class NormalKernel:
             self._one_scale = self.device.given("scale", self._scale.planes)
         self._wall = None if response is None else self.device.given("wall", response.table)
         # Turns whose tables the device has at once, at most.
-        self.tables_at_once = max(1, min(_TABLES, self.device.max_allocation // _TABLE_BYTES))
-        self._tables = self.device.array("turns", (self.tables_at_once, 6, LONGEST), np.float32)
-        self._places: dict[TurnFit, int] = {}
+        planes = _POSE_PLANES if poses else _TURN_PLANES
+        self._poses = poses
+        self.tables_at_once = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))
+        self._tables = self.device.array("turns", (self.tables_at_once, planes, LONGEST), np.float32)
+        self._places: dict[TurnFit | PoseFit, int] = {}
 
     @property
     def model(self) -> TurnModel | None:
@@ -136,9 +145,14 @@ class NormalKernel:
             return None
         return TurnModel(self._tilt, self._noise)
 
-    def estimate_model(self, samples: NDArray[Any], fit: TurnFit) -> TurnModel:
+    def estimate_model(self, samples: NDArray[Any], fit: TurnFit | PoseFit) -> TurnModel:
         """Estimate what was not given, noise or tilt, from samples, (N, n), of thinned-out pixels."""
         noise, tilt = self._noise, self._tilt
+        if isinstance(fit, PoseFit):
+            deep = fit.deep if fit.presses else np.full(len(samples), True)
+            none = np.zeros(np.count_nonzero(deep))
+            noise = noise or residual_noise(samples[deep], none, fit.weights[deep], fit.waves[deep])
+            return TurnModel(fit.tilt, noise)
         if noise is None:
             with np.errstate(invalid="ignore"):
                 clear = self._scale.clear_pixels(fit.matrix @ samples.astype(np.float64), self._step)
@@ -160,6 +174,8 @@ class NormalKernel:
         kinds |= {"vectors": Planes(3, np.float32), "contact": Planes(1, np.uint8)}
         if self._scale.per_pixel:
             kinds["scale"] = Planes(len(self._scale.planes), np.float32)
+        if self._poses:
+            kinds |= {name: Planes(1, np.float32) for name in SLOPE_MAPS}
         return kinds
 
     def write_scale(self, band: Band) -> None:
@@ -168,7 +184,7 @@ class NormalKernel:
             for plane, values in enumerate(self._scale.planes):
                 band.write("scale", values[band.rows], plane=plane)
 
-    def write_tables(self, fits: Sequence[TurnFit]) -> None:
+    def write_tables(self, fits: Sequence[TurnFit | PoseFit]) -> None:
         """Hand the tables of some turns to the device; unless it has them, that waits for earlier turns."""
         if all(fit in self._places for fit in fits):
             return
@@ -182,7 +198,7 @@ class NormalKernel:
         self,
         band: Band,
         samples: Samples,
-        fit: TurnFit,
+        fit: TurnFit | PoseFit,
         model: TurnModel,
         turns: int,
         bare: bool = False,
@@ -192,15 +208,22 @@ class NormalKernel:
         The maps become the mean of ``turns`` turns, this one included. ``bare`` leaves out those of the wave:
         mean, cosine, sine and residual.
         """
-        count, tilt, noise, layout = samples.count, model.tilt, model.noise, self.device.layout
+        count, noise, layout = samples.count, model.noise, self.device.layout
+        tilt = fit.tilt if isinstance(fit, PoseFit) else model.tilt
         lanes, per_pixel = vector_lanes(self.device), self._scale.per_pixel
         file = "normals" if self._wall is None else "normals_wall"
         name = f"normals_{self._method}" if self._wall is None else "normals_wall"
+        if isinstance(fit, PoseFit):
+            file, name = "normals_pose", "normals_pose" if fit.direction is None else "normals_rock"
         kernel = self.device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
         limits = contact_limits(count - 3, tilt)
         fitted = tilt if self._method == "exact" else 0.0  # exact fits what a pixel's tilt is more than this
         further: dict[str, Any] = {}
-        if isinstance(self._scale, Response):
+        if isinstance(fit, PoseFit):
+            further = {"presses": int(fit.presses)}
+            if fit.direction is not None:
+                further |= {one: band.maps[one] for one in SLOPE_MAPS}
+        elif isinstance(self._scale, Response):
             wall = self._scale.wall
             sizes = {"curve_length": len(wall.curve), "inverse_length": len(wall.inverse)}
             further = {"wall_numbers": self._wall, "follows": int(wall.follows), **sizes}

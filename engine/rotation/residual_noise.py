@@ -36,7 +36,9 @@ class CountNoise:
         return np.sqrt(np.maximum(self.base + self.slope * np.asarray(level, np.float64), self.least))
 
 
-def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> CountNoise:
+def residual_noise(
+    samples: NDArray[Any], phase: Doubles, weights: Doubles, waves: Doubles | None = None
+) -> CountNoise:
     """Estimate the noise of samples of weight 1 from what waves of one and two a turn leave.
 
     Level surfaces show the second one; of fewer than 7 frames a turn it is taken for noise. Pixels are sorted
@@ -46,10 +48,14 @@ def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> C
 
     Samples are (N, n), of n pixels; weights are above 0. Frames that have less than half as many valid
     samples as others are left out, and then pixels of which a sample is clipped by its type or no number.
+    Where the frames are no turn, ``waves`` are what samples show of any normal, (N, n), times the weights'
+    roots; phases do not matter then.
     """
-    if len(samples) == 3:
+    shown = 3 if waves is None else waves.shape[1]
+    if len(samples) <= shown:
         raise InputError(
-            "3 frames a turn leave no residual to estimate the noise from: give its standard deviation"
+            f"{len(samples)} frames a turn leave no residual to estimate the noise from:"
+            " give its standard deviation"
         )
     good = valid(samples)
     quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT_NOISE
@@ -58,7 +64,7 @@ def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> C
     share = good.mean(axis=1)
     frames = share > share.max() / 2
     pixels = good[frames].all(axis=0)
-    if np.count_nonzero(frames) <= 3 or not pixels.any():
+    if np.count_nonzero(frames) <= shown or not pixels.any():
         raise InputError(
             "too few samples are valid to estimate the noise: give a sample's standard deviation, in counts"
         )
@@ -68,7 +74,7 @@ def residual_noise(samples: NDArray[Any], phase: Doubles, weights: Doubles) -> C
     level = total / len(counts)
     floor = quantum * (1.0 if integer else float(np.max(np.abs(counts))))
     root = np.sqrt(weights)[:, np.newaxis]
-    waves = root * _waves(phase)
+    waves = root * _waves(phase) if waves is None else waves[frames]
     freedom = len(counts) - waves.shape[1]
     # Of an orthonormal base, the directions that are no waves.
     beside = np.linalg.qr(waves, mode="complete").Q[:, waves.shape[1] :]

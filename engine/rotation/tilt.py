@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, basis
 from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
@@ -25,6 +25,18 @@ def check_tilt(tilt: float) -> float:
             f"tilt {math.degrees(tilt):g} deg: above 0 and up to 30 deg is needed, such as 2.5deg"
         )
     return float(tilt)
+
+
+def check_tilts(tilt: ArrayLike, count: int) -> Doubles:
+    """Return the tilts of so many frames, radians, from 0 to 30 degrees or the other way, as float64."""
+    values = np.asarray(tilt, np.float64)
+    if values.shape not in ((), (count,)):
+        raise InputError(f"tilt has shape {values.shape} for {count} frames: one number, or one a frame")
+    wrong = ~(np.abs(values) <= _STEEPEST)
+    if np.any(wrong):
+        at = f" at frame {int(np.argmax(wrong))}" if values.ndim else ""
+        raise InputError(f"tilt {math.degrees(values[wrong].flat[0]):g} deg{at}: 30 deg at most is needed")
+    return np.broadcast_to(values, count)
 
 
 def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:

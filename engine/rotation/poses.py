@@ -1,0 +1,143 @@
+"""How frames at any known poses are fitted: the body's axis in each, and what they determine of a normal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles
+from mirrorskin.engine.rotation.tilt import check_tilts
+from mirrorskin.io import InputError
+from mirrorskin.io.positions import check_phase
+
+PRESSES = 0.02
+"""Share of the greatest travel by which travel differs between frames where the body presses as well."""
+
+_SAME = 1e-4  # share of the axes' greatest part up to which a part is none
+_PLANE = 1e-2  # share of the axes' swing in a plane up to which a swing across it is none
+_UPRIGHT = 0.05  # sine of the angle to the vertical up to which a plane is upright
+_FRAMES_OF_SECOND = 9  # least frames to fit second orders with the first
+_UNIT = 1e-6  # by which the length of a unit vector may be wrong
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFit:
+    """How a window of N frames is fitted; two are the same if they are one object.
+
+    ``direction`` is that of rocking, radians from x towards y; None where the axes determine a whole normal.
+    """
+
+    weights: Doubles  # (N,), above 0
+    matrix: Doubles  # (3, N): makes mean, cosine and sine of samples
+    waves: Doubles  # (N, n): orthonormal; what samples of any normal show, nearly
+    table: NDArray[np.float32]  # (13, N): see mirrorskin.kernels.normals_pose
+    tilt: float  # root mean square of the frames', radians
+    presses: bool  # whether travel differs between frames
+    deep: NDArray[np.bool_]  # (N,), frames in which most of what is touched at all is touched
+    direction: float | None
+
+
+def axes_of(phase: ArrayLike, tilt: ArrayLike) -> Doubles:
+    """Return the body's axis at phases and tilts, (N, 3): it leans away from the phase.
+
+    Examples
+    --------
+    >>> axes_of([0.0], 0.1).round(3).tolist()
+    [[-0.1, -0.0, 0.995]]
+    """
+    alpha, lean = np.broadcast_arrays(np.asarray(phase, np.float64), np.asarray(tilt, np.float64))
+    return np.stack([-np.sin(lean) * np.cos(alpha), -np.sin(lean) * np.sin(alpha), np.cos(lean)], axis=-1)
+
+
+def check_poses(
+    count: int,
+    phase: ArrayLike | None = None,
+    tilt: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
+    travel: ArrayLike | None = None,
+) -> Doubles:
+    """Return the axis and the travel of each frame, (count, 4), from what says where the body was.
+
+    InputError: both an axis and a phase, neither, or numbers that cannot be a pose.
+    """
+    if (axis is None) == (phase is None or tilt is None):
+        raise InputError("poses are a phase and a tilt of each frame, or an axis: give one of both")
+    if axis is None:
+        assert phase is not None
+        assert tilt is not None
+        known = axes_of(check_phase(phase, count, "phase"), check_tilts(tilt, count))
+    else:
+        known = np.asarray(axis, np.float64)
+        if known.shape != (count, 3) or not np.allclose(np.linalg.norm(known, axis=1), 1, atol=_UNIT):
+            raise InputError(f"axis of shape {known.shape} for {count} frames: a unit vector each is needed")
+        check_tilts(np.arctan2(np.hypot(known[:, 0], known[:, 1]), known[:, 2]), count)
+    depth = np.zeros(count) if travel is None else np.broadcast_to(np.asarray(travel, np.float64), count)
+    if not np.isfinite(depth).all():
+        raise InputError("travel is not finite: every frame needs a number, mm")
+    return np.column_stack([known, depth])
+
+
+def even_windows(frames: int) -> int:
+    """Return how many frames a window has, for as few as possible that are as even as can be.
+
+    Examples
+    --------
+    >>> even_windows(100)
+    50
+    """
+    return -(-frames // -(-frames // LONGEST))
+
+
+def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
+    """Return how frames are fitted, of poses (N, 4) and weights above 0.
+
+    InputError: fewer than 3 frames, axes that are all the same, or that lie in a plane that is not upright.
+    """
+    axes, travel = pose[:, :3], pose[:, 3]
+    if len(axes) < 3:
+        raise InputError(f"{len(axes)} frames determine no slope: at least 3 are needed")
+    _, swings, planes = np.linalg.svd(axes, full_matrices=False)
+    if swings[1] <= _SAME * swings[0]:
+        raise InputError(f"all {len(axes)} frames have the same tilt and phase: they determine no slope")
+    direction = None
+    if swings[2] <= _PLANE * swings[1]:
+        if abs(planes[2, 2]) > _UPRIGHT:
+            raise InputError(
+                "the body's axes lie in a plane that is not upright: rock it through the vertical, or turn it"
+            )
+        direction = float(np.arctan2(planes[2, 0], -planes[2, 1]) % math.pi)
+        along = axes @ [math.cos(direction), math.sin(direction), 0.0]
+        axes = np.column_stack([along, np.zeros(len(axes)), axes[:, 2]])
+    across = np.hypot(axes[:, 0], axes[:, 1])
+    tilts = np.arctan2(across, axes[:, 2])
+    tilt = math.sqrt(float(np.mean(tilts**2)))
+    leans = -axes[:, :2] / math.sin(tilt)
+    root = np.sqrt(weights)
+    design = np.column_stack([np.ones(len(axes)), leans])
+    matrix = np.linalg.pinv(design * root[:, np.newaxis], rcond=_PLANE) * root
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outwards = np.where(across[:, np.newaxis] > 0, axes[:, :2] / across[:, np.newaxis], 0.0)
+    share = tilts / tilt
+    leaning = share * np.stack([*(np.cos(tilts) * outwards.T), -np.sin(tilts)])
+    return PoseFit(
+        weights,
+        matrix,
+        _waves(leans, root),
+        np.stack([*leans.T, root, *matrix, *axes.T, *leaning, travel]).astype(np.float32),
+        tilt,
+        bool(np.ptp(travel) > PRESSES * np.max(np.abs(travel))),
+        travel >= np.median(travel),
+        direction,
+    )
+
+
+def _waves(leans: Doubles, root: Doubles) -> Doubles:
+    """Return what samples show, to second order of the tilt: an orthonormal base, (N, n)."""
+    x, y = leans.T
+    second = [x * x, x * y, y * y] if len(x) >= _FRAMES_OF_SECOND else []
+    terms = np.column_stack([np.ones(len(x)), x, y, *second]) * root[:, np.newaxis]
+    base, sizes, _ = np.linalg.svd(terms, full_matrices=False)
+    return np.asarray(base[:, sizes > _PLANE * sizes[0]])

@@ -1,0 +1,164 @@
+"""Normals from any known poses: against the Cramer-Rao bound, and against the turn that is one of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rotations
+
+from mirrorskin import engine, io
+from mirrorskin.engine.rotation.poses import axes_of
+
+GAIN, OFFSET, NOISE = 500.0, 40.0, 1.5
+COUNT, SHAPE = 48, (60, 70)
+FRAME = np.arange(COUNT)
+PHASE = FRAME * 2 * np.pi / 12
+GROWING = np.radians(2.5) * (FRAME + 1) / COUNT
+ROCKING = np.radians(2.5) * np.sin(0.385 * FRAME)
+PRESS = 1.5 * (FRAME + 1) / COUNT
+NORMALS = rotations.random_normals(SHAPE[0] * SHAPE[1], seed=7, bins=[(4, 50)])[0].reshape(*SHAPE, 3)
+SCALE = {"gain": GAIN, "offset": OFFSET}
+
+
+def shown(axes, resting=False, seed=5):
+    """Frames that show the normals, and the sheet at rest where they are out of contact."""
+    zenith = np.arccos(np.clip(np.einsum("ki,hwi->khw", axes, NORMALS), -1, 1))
+    counts = OFFSET + GAIN * np.where(resting, 0.0, zenith)
+    return (counts + np.random.default_rng(seed).normal(0, NOISE, counts.shape)).astype(np.float32)
+
+
+def information(axes, directions, seen=1.0):
+    """Fisher's information of the samples on moves of the normal along directions, (H, W, n, n), 1/rad^2."""
+    cosine = np.einsum("ki,hwi->khw", axes, NORMALS)
+    growth = np.einsum("ki,nhwi->nkhw", axes, directions) / np.sqrt(1 - cosine**2)
+    return np.einsum("mkhw,nkhw,khw->hwmn", growth, growth, np.broadcast_to(seen, cosine.shape)) * (
+        (GAIN / NOISE) ** 2
+    )
+
+
+def bound(axes, seen=1.0):
+    """The least mean square angle of an unbiased estimate."""
+    covariance = np.linalg.inv(information(axes, np.stack(rotations.tangents(NORMALS)), seen))
+    return np.trace(covariance, axis1=-2, axis2=-1)
+
+
+def angle(found):
+    return np.arccos(np.clip(np.sum(found.vectors * NORMALS, axis=-1, dtype=float), -1, 1))
+
+
+def test_a_growing_precession_reaches_the_bound_and_says_how_sure_it_is():
+    axes = axes_of(PHASE, GROWING)
+    found = engine.estimate_normals(shown(axes), PHASE, tilt=GROWING, **SCALE)
+    error = angle(found)
+    assert np.sqrt(np.sum(error**2) / np.sum(bound(axes))) < 1.05
+    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.06)
+    assert found.noise == pytest.approx(NOISE, rel=0.02)
+    assert (found.status == 1).all()
+    assert found.contact.mean() > 0.99
+
+
+def test_a_turn_is_one_case_of_poses():
+    tilt = np.radians(2.5)
+    frames = shown(axes_of(PHASE[:12], tilt))[:12]
+    turn = engine.estimate_normals(frames, PHASE[:12], tilt=tilt, noise=NOISE, **SCALE)
+    poses = engine.estimate_normals(frames, axis=axes_of(PHASE[:12], tilt), noise=NOISE, **SCALE)
+    np.testing.assert_allclose(poses.vectors, turn.vectors, atol=3e-4)
+    for name in ("sigma", "mean", "cosine", "sine", "residual"):
+        np.testing.assert_allclose(getattr(poses, name), getattr(turn, name), rtol=2e-3, atol=2e-3)
+    np.testing.assert_array_equal(poses.contact, turn.contact)
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.6, 2.9])
+def test_rocking_tells_the_slope_along_it_at_the_bound_and_nothing_across(direction):
+    phase = np.full(COUNT, direction)
+    axes = axes_of(phase, ROCKING)
+    found = engine.estimate_normals(shown(axes), phase, tilt=ROCKING, **SCALE)
+    along = np.array([np.cos(found.direction), np.sin(found.direction), 0.0])
+    assert np.isclose((found.direction - direction + 0.1) % np.pi, 0.1)
+    p, q = NORMALS @ along, NORMALS[..., 2]
+    error = found.slope + p / q
+    parts = np.broadcast_to(np.stack([along, [0, 0, 1.0]])[:, None, None], (2, *SHAPE, 3))
+    growth = np.stack([-1 / q, p / q**2], axis=-1)
+    best = np.einsum("hwi,hwij,hwj->hw", growth, np.linalg.inv(information(axes, parts)), growth)
+    assert np.sqrt(np.sum(error**2) / np.sum(best)) < 1.05
+    assert np.mean((error / found.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
+    np.testing.assert_allclose(found.zenith, np.arccos(q), atol=6 * NOISE / GAIN / np.sqrt(COUNT))
+    assert (found.status == 4).all()
+    assert np.isnan(found.vectors).all()
+    assert np.isnan(found.sigma).all()
+    assert np.isnan(found.azimuth).all()
+
+
+def test_two_phases_half_a_turn_apart_rock():
+    phase = np.pi * (FRAME % 2) + 0.3
+    frames = shown(axes_of(phase, np.radians(2.5)))
+    found = engine.estimate_normals(frames, phase, tilt=np.radians(2.5), **SCALE)
+    assert (found.status == 4).all()
+    assert found.direction == pytest.approx(0.3)
+
+
+def test_a_spiral_into_the_object_uses_the_frames_in_contact():
+    depth = np.random.default_rng(8).uniform(0.1, 1.2, SHAPE)
+    axes, resting = axes_of(PHASE, GROWING), PRESS[:, np.newaxis, np.newaxis] < depth
+    found = engine.estimate_normals(
+        shown(axes, resting), PHASE, tilt=GROWING, travel=PRESS, noise=NOISE, **SCALE
+    )
+    error, best = angle(found), bound(axes, ~resting)
+    assert np.sqrt(np.sum(error**2) / np.sum(best)) < 1.05
+    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.1)
+    assert found.contact.mean() > 0.97
+    never = engine.estimate_normals(
+        shown(axes, np.True_), PHASE, tilt=GROWING, travel=PRESS, noise=NOISE, **SCALE
+    )
+    assert (never.status == 2).all()
+    assert np.isnan(never.vectors).all()
+
+
+def test_more_than_a_window_of_frames_is_joined():
+    frame = np.arange(130)
+    lean = np.radians(2.5) * np.sin(0.385 * frame)
+    axes = axes_of(np.zeros(130), lean)
+    found = engine.estimate_normals(shown(axes), axis=axes, noise=NOISE, **SCALE)
+    assert (found.turns, found.frames) == (3, 130)
+    slope = -NORMALS[..., 0] / NORMALS[..., 2]
+    assert np.mean(((found.slope - slope) / found.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
+
+
+def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
+    axes = axes_of(PHASE, GROWING)
+    frames = shown(axes)[:, :7, :9]
+    pose = np.column_stack([axes, PRESS])
+    results = []
+    for cuts in ([], [1, 2, 9, 30]):
+        estimator = engine.PoseEstimator((7, 9), np.float32, longest=24, noise=NOISE, device=device, **SCALE)
+        for part in np.split(FRAME, cuts):
+            estimator.push(frames[part], pose=pose[part])
+            if len(part) > 5:
+                estimator.result()
+        results.append(estimator.result())
+    np.testing.assert_array_equal(results[0].vectors, results[1].vectors)
+    np.testing.assert_array_equal(results[0].contact, results[1].contact)
+
+
+@pytest.mark.parametrize(
+    ("where", "line"),
+    [
+        ({"axis": np.tile([0, 0, 1.0], (COUNT, 1))}, "same tilt and phase: they determine no slope"),
+        ({"axis": np.ones((COUNT, 3))}, "a unit vector each is needed"),
+        ({"axis": np.ones((3, 3))}, r"axis of shape \(3, 3\) for 48 frames"),
+        ({"phase": PHASE, "tilt": GROWING[:5]}, r"tilt has shape \(5,\) for 48 frames"),
+        ({"phase": PHASE, "tilt": np.full(COUNT, 0.6)}, "tilt 34.3.* deg at frame 0: 30 deg at most"),
+        ({"tilt": GROWING}, "poses are a phase and a tilt of each frame, or an axis"),
+        ({"phase": PHASE, "tilt": GROWING, "axis": axes_of(PHASE, 0.1)}, "give one of both"),
+        ({"phase": PHASE, "tilt": GROWING, "travel": np.full(COUNT, np.nan)}, "travel is not finite"),
+        ({"phase": PHASE}, "tilt is missing"),
+        (
+            {"axis": axes_of(np.arctan2(ROCKING, 0.2), np.hypot(ROCKING, 0.2))},
+            "axes lie in a plane that is not upright",
+        ),
+    ],
+)
+def test_poses_that_determine_nothing_are_one_line(where, line):
+    with pytest.raises(io.InputError, match=line) as caught:
+        engine.estimate_normals(np.zeros((COUNT, 3, 4), np.float32), noise=NOISE, **where, **SCALE)
+    assert "\n" not in str(caught.value)
