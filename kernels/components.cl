@@ -43,11 +43,12 @@ float chosen(const int which, const float one, const float other)
 // Each item sums over its rows, into its own row of the sums.
 __kernel void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
+    MAP reliefs, const int place, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
     const int strip, const int components, OUT sums, OUT totals)
 {
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;
+    MAP relief = reliefs + (long)place * rows * columns;
     __global float *sum = sums + item * components, *total = totals + item * components;
     for (int component = 0; component < components; ++component) sum[component] = total[component] = 0.0f;
     for (int row = top; row < bottom; ++row) {
@@ -86,11 +87,13 @@ __kernel void components_sum(
 
 __kernel void components_add_offsets(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
-    MAP relief, const float plane_x, const float plane_y, const float plane_z, MAP offsets, OUT height)
+    MAP reliefs, const int place, const float plane_x, const float plane_y, const float plane_z, MAP offsets, OUT heights)
 {
     const int chunks = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int row = item / chunks, begin = item % chunks * CHUNK, end = LESSER(columns, begin + CHUNK);
     if (row >= rows) return;
+    MAP relief = reliefs + (long)place * rows * columns;
+    OUT height = heights + (long)place * rows * columns;
     const float start = plane_z + plane_y * row;
     const int first = row * columns;
     for (int column = begin; column < end; ++column) {

@@ -222,7 +222,8 @@ float chosen(const int linked, const float value)
 #define KEPT_MAPS
 #endif
 
-__kernel void links_join(GRAPH, KEPT_MAPS OUT source)
+// Of several right sides with the same links, one below the other, that in a place.
+__kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
 {
     PIECE(ROWS)
     if (top >= rows) return;
@@ -249,7 +250,7 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source)
             const float weight = ANCHOR(p), rise = heights[p] - LEVEL(row, begin + i);
             sum += chosen(flags[p] & KNOWN, weight * rise);
 #endif
-            source[p] = sum;
+            source[(long)place * rows * columns + p] = sum;
 #if KEEP
             right[p] = chosen(flags[p] & RIGHT, X_WEIGHT(p, p + 1));
             down[p] = chosen(flags[p] & DOWN, Y_WEIGHT(p, p + next));
@@ -282,10 +283,11 @@ float square(const int linked, const float weight, const float left)
 }
 
 // Sums of an item each: squares of what is left over, times their weights.
-__kernel void links_misfit(GRAPH, MAP relief, OUT sums)
+__kernel void links_misfit(GRAPH, MAP reliefs, const int place, OUT sums)
 {
     PIECE(ROWS)
     if (top >= rows) return;
+    MAP relief = reliefs + (long)place * rows * columns;
     float squares[CHUNK];
     for (int i = 0; i < end - begin; ++i) squares[i] = 0.0f;
     for (int row = top; row < bottom; ++row) {

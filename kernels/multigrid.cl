@@ -6,6 +6,7 @@
 // PART       nodes of one part of a sum
 // LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
 // ANCHORED   1 where there are known heights, 0 where there are none
+// LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
 //
 // All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
 // none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has
@@ -14,8 +15,13 @@
 
 #include "common.clh"
 
+#if LANES == 1
+typedef float value;
+#else
+typedef JOIN(float, LANES) value;
+#endif
 #if WIDTH == 8
-typedef float8 reals;
+typedef float8 reals, values;  // of links, and of what nodes have
 typedef int8 ints;
 typedef float8 __attribute__((aligned(4))) loose;  // somewhere in memory
 typedef float4 __attribute__((aligned(4))) half_loose;
@@ -29,6 +35,7 @@ typedef float4 __attribute__((aligned(4))) half_loose;
 #define WHOLE(v) (((v.s0 + v.s1) + (v.s2 + v.s3)) + ((v.s4 + v.s5) + (v.s6 + v.s7)))
 #else
 typedef float reals;
+typedef value values;
 typedef int ints;
 #define AT(p) (*(p))
 #define NEAR(p) (*(p))
@@ -40,8 +47,18 @@ typedef int ints;
 #define WHOLE(v) (v)
 #endif
 #define EVEN(p) EVEN_OF(AT, p)
+#if LANES > 1 && defined(__has_builtin)
+#if __has_builtin(__builtin_nontemporal_store)
+#define STREAM(p, value) __builtin_nontemporal_store(value, p)
+#endif
+#endif
+#ifndef STREAM
+#define STREAM(p, value) PUT(p) = value
+#endif
 #define ODD(p) ODD_OF(AT, p)
 
+#define VALUES __global const value *restrict
+#define OUT_VALUES __global value *restrict
 #define BYTES __global const uchar *restrict
 #define COUNTS __global const int *restrict
 #define LEVEL_ARGS const int base, const int rows, const int stride
@@ -338,26 +355,26 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
 #else
 #define SPREAD(J) e[J]
 #endif
-reals injected(const int i, const int J, const int coarse_stride, MAP e, const int moved, BYTES to)
+values injected(const int i, const int J, const int coarse_stride, VALUES e, const int moved, BYTES to)
 {
-    reals found = SPREAD(J);
+    values found = SPREAD(J);
     if (!moved) return found;
 #if WIDTH == 8
     if (*(__global const ulong *)(to + i) == 0) return found;
 #endif
     for (int k = 0; k < WIDTH; ++k) {
-        if (to[i + k]) ((float *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)];
+        if (to[i + k]) ((value *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)];
     }
     return found;
 }
 
 // The sum of what the members of an aggregate have.
-float gathered(
-    const int J, const int base, const int stride, COARSE_ARGS, BYTES to, MAP values)
+value gathered(
+    const int J, const int base, const int stride, COARSE_ARGS, BYTES to, VALUES had)
 {
     const int row = (J - coarse_base) / coarse_stride - 1, C = (J - coarse_base) % coarse_stride;
-    float sum = 0;
-    EACH_MEMBER sum += values[i];
+    value sum = 0;
+    EACH_MEMBER sum += had[i];
     return sum;
 }
 
@@ -367,8 +384,8 @@ float gathered(
 #define SIDE (WIDTH == 8 ? 8 : AROUND)
 #define ACROSS (COLUMNS + 2 * SIDE)
 #define TILE_ITEMS                                                                                         \
-    __local float one_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE], other_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE]; \
-    __local float *one = one_room + SIDE, *other = other_room + SIDE;                                      \
+    __local value one_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE], other_room[(ROWS + 2 * AROUND) * ACROSS + 2 * SIDE]; \
+    __local value *one = one_room + SIDE, *other = other_room + SIDE;                                      \
     const int lanes = LESSER((int)get_local_size(0), COLUMNS / WIDTH), lane = get_local_id(0) % lanes;     \
     const int lines = get_local_size(0) / lanes;                                                           \
     const int line = (int)get_local_id(0) < lanes * lines ? (int)get_local_id(0) / lanes : ROWS + AROUND;  \
@@ -413,8 +430,8 @@ __kernel void multigrid_find_live(LEVEL_ARGS, MAP inverse, const int first_tile,
 // Three steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
 // side. The residual itself is written if `keep` is 1.
 __kernel void multigrid_descend(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, MAP b, const int again, MAP x_before, OUT t, const int keep,
-    OUT residual, OUT coarse_b)
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, const int again, VALUES x_before, OUT_VALUES t, const int keep,
+    OUT_VALUES residual, OUT_VALUES coarse_b)
 {
     TILE_ITEMS
     if (again) {
@@ -423,21 +440,21 @@ __kernel void multigrid_descend(
         FILL(3, one, PUT_NEAR(one + p) = FIRST * AT(inverse + i) * AT(b + i);)
     }
     FILL(2, other, STEP_NEAR(SECOND, one, other))
-    FILL(1, one, STEP_NEAR(THIRD, other, one) if (MINE) PUT(t + i) = NEAR(one + p);)
+    FILL(1, one, STEP_NEAR(THIRD, other, one) if (MINE) STREAM(t + i, NEAR(one + p));)
     FILL(0, other, SIDES
-        const reals rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
+        const values rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
         PUT_NEAR(other + p) = rest;
         if (keep) PUT(residual + i) = rest;)
     EACH_COARSE_OF_TILE {
-        __local const float *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
-        const reals sum = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
-        PUT(coarse_b + coarse_of_tile + coarse_stride * y + x) = is_live ? sum : (reals)0;
+        __local const value *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
+        const values sum = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
+        PUT(coarse_b + coarse_of_tile + coarse_stride * y + x) = is_live ? sum : (values)0;
     }
 }
 
 // The coarse right side of aggregates that are no blocks.
 #define SOME GREATER(TILE / 16, 1)
-__kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed, const int count, MAP residual, OUT coarse_b)
+__kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed, const int count, VALUES residual, OUT_VALUES coarse_b)
 {
     const int begin = get_global_id(0) * SOME, end = LESSER(begin + SOME, count);
     for (int n = begin; n < end; ++n) {
@@ -449,8 +466,8 @@ __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed
 // What the aggregates have, added to t, and three steps of Jacobi's method; the sums over tiles of the heights times
 // the right side.
 __kernel void multigrid_ascend(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, MAP b, MAP e, const int moved_nodes, BYTES to, MAP t, OUT x_new,
-    OUT parts)
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, VALUES e, const int moved_nodes, BYTES to, VALUES t,
+    OUT_VALUES x_new, OUT_VALUES parts)
 {
     TILE_ITEMS
     FILL(3, one,
@@ -458,10 +475,10 @@ __kernel void multigrid_ascend(
         PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)
     FILL(2, other, STEP_NEAR(THIRD, one, other))
     FILL(1, one, STEP_NEAR(SECOND, other, one))
-    reals sum = 0;
+    values sum = 0;
     FILL(0, other, SIDES
-        const reals height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
-        PUT(x_new + i) = height;
+        const values height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
+        STREAM(x_new + i, height);
         sum += height * AT(b + i);)
     for (int y = line; y < ROWS && top + y < rows && !is_live; y += lines) {
         EACH_OF_LINE(0) PUT(x_new + i) = 0;
@@ -469,7 +486,7 @@ __kernel void multigrid_ascend(
     other[get_local_id(0)] = WHOLE(sum);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) {
-        float total = 0;
+        value total = 0;
         for (int k = 0; k < (int)get_local_size(0); ++k) total += other[k];
         parts[get_group_id(0)] = total;
     }
@@ -495,7 +512,7 @@ typedef struct {
     FENCE
 __kernel void multigrid_tail(
     const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
-    BYTES to, COUNTS changed, const int again, __global float *b, __global float *x, __global float *t)
+    BYTES to, COUNTS changed, const int again, __global value *b, __global value *x, __global value *t)
 {
     int l = from, start = again, gone = 0;  // a bit for each level
     do {
@@ -552,10 +569,21 @@ __kernel void multigrid_tail(
 
 // --- Conjugate gradients ----------------------------------------------------------------------------------------
 //
-// Sums are written in parts, for the host to add up.
+// Sums are written in parts, for the host to add up. Each of several right sides has a factor of its own; nodes without links or
+// anchors are then left as they are.
+
+#if LANES == 1
+#define FACTOR_ARG const float factor
+#define FACTOR factor
+#define EACH_LIVE EACH_PART
+#else
+#define FACTOR_ARG VALUES factor
+#define FACTOR (*factor)
+#define EACH_LIVE EACH_PART if (inverse[i] > 0)
+#endif
 
 // The residual, b - A x.
-__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT residual)
+__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT_VALUES residual)
 {
     ITEMS_NODES
     EACH_NODE {
@@ -567,31 +595,34 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP x, OUT resid
 #define EACH_PART                                                                                          \
     const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
     const int end = LESSER(begin + PART, base + stride * (rows + 1));                                      \
-    reals sum = 0;                                                                                         \
+    values sum = 0;                                                                                        \
     EACH_NODE
 #define WRITE_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
 
 // The next direction, the matrix times it, and the product of both.
-#define DIRECTION(i) (AT(z + (i)) + beta * AT(before + (i)))
+#define DIRECTION(i) (AT(z + (i)) + FACTOR * AT(before + (i)))
 __kernel void multigrid_direct(
-    LEVEL_ARGS, const float beta, GRAPH_ARGS, MAP z, MAP before, OUT direction, OUT image, OUT parts)
+    LEVEL_ARGS, FACTOR_ARG, GRAPH_ARGS, MAP inverse, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES image,
+    OUT_VALUES parts)
 {
-    EACH_PART {
+    EACH_LIVE {
         SIDES
-        const reals p = DIRECTION(i), q = -FLOW(DIRECTION, i, stride);
-        PUT(direction + i) = p;
-        PUT(image + i) = q;
+        const values p = DIRECTION(i), q = -FLOW(DIRECTION, i, stride);
+        STREAM(direction + i, p);
+        STREAM(image + i, q);
         sum += p * q;
     }
     WRITE_PART
 }
 
-// A step along it, the residual then, and the square of that.
-__kernel void multigrid_advance(LEVEL_ARGS, const float alpha, MAP direction, MAP image, OUT b, OUT x, OUT parts)
+// A step along it, from zero if `first` is 1, the residual then, and the square of that.
+__kernel void multigrid_advance(
+    LEVEL_ARGS, FACTOR_ARG, MAP inverse, VALUES direction, VALUES image, const int first, OUT_VALUES b, OUT_VALUES x,
+    OUT_VALUES parts)
 {
-    EACH_PART {
-        const reals r = AT(b + i) - alpha * AT(image + i);
-        PUT(x + i) = AT(x + i) + alpha * AT(direction + i);
+    EACH_LIVE {
+        const values r = AT(b + i) - FACTOR * AT(image + i);
+        PUT(x + i) = (first ? (values)0 : AT(x + i)) + FACTOR * AT(direction + i);
         PUT(b + i) = r;
         sum += r * r;
     }
@@ -649,7 +680,7 @@ __kernel void multigrid_follow(
 }
 
 // The product of two.
-__kernel void multigrid_dot(LEVEL_ARGS, MAP one, MAP other, OUT parts)
+__kernel void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES parts)
 {
     EACH_PART {
         sum += AT(one + i) * AT(other + i);
@@ -658,7 +689,7 @@ __kernel void multigrid_dot(LEVEL_ARGS, MAP one, MAP other, OUT parts)
 }
 
 // What the anchors weigh of heights.
-__kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, MAP x, OUT parts)
+__kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VALUES parts)
 {
     EACH_PART {
         sum += AT(anchor + i) * AT(x + i) * AT(x + i);
@@ -671,6 +702,7 @@ __kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, MAP x, OUT parts)
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;                       \
     const int from = get_global_id(0) % pieces * TILE, upto = LESSER(columns, from + TILE);                \
     if (row >= rows) return;
+#if LANES == 1
 __kernel void multigrid_admit(const int rows, const int columns, const int stride, MAP map, OUT level)
 {
     PICTURE_ITEMS
@@ -686,11 +718,43 @@ __kernel void multigrid_release(const int rows, const int columns, const int str
         map[row * columns + c] = level[(row + 1) * stride + c];
     }
 }
+#else
+// `count` maps from `first` on, one below the other; further lanes have none. Pieces of a row by turns, as maps lie
+// where caches keep few of them at once.
+#define PIECE LESSER(TILE, 64)
+__kernel void multigrid_admit(
+    const int rows, const int columns, const int stride, const int first, const int count, MAP map, OUT level)
+{
+    PICTURE_ITEMS
+    float some[LANES][PIECE];
+    for (int c = from; c < upto; c += PIECE) {
+        const int width = LESSER(PIECE, upto - c);
+        for (int lane = 0; lane < LANES; ++lane)
+            for (int k = 0; k < width; ++k)
+                some[lane][k] = lane < count ? map[((long)(first + lane) * rows + row) * columns + c + k] : 0;
+        for (int k = 0; k < width; ++k)
+            for (int lane = 0; lane < LANES; ++lane)
+                level[((long)(row + 1) * stride + c + k) * LANES + lane] = some[lane][k];
+    }
+}
+
+__kernel void multigrid_release(
+    const int rows, const int columns, const int stride, const int first, const int count, MAP level, OUT map)
+{
+    PICTURE_ITEMS
+    for (int c = from; c < upto; c += PIECE) {
+        const int width = LESSER(PIECE, upto - c);
+        for (int lane = 0; lane < count; ++lane)
+            for (int k = 0; k < width; ++k)
+                map[((long)(first + lane) * rows + row) * columns + c + k] = level[((long)(row + 1) * stride + c + k) * LANES + lane];
+    }
+}
+#endif
 
 // --- Variances --------------------------------------------------------------------------------------------------
 
 // What the aggregates have, brought to their nodes; then spread by a step of Jacobi's method, and added to a part.
-__kernel void multigrid_inject(LEVEL_ARGS, COARSE_ARGS, MAP e, const int moved_nodes, BYTES to, OUT t)
+__kernel void multigrid_inject(LEVEL_ARGS, COARSE_ARGS, VALUES e, const int moved_nodes, BYTES to, OUT_VALUES t)
 {
     ITEMS_NODES
     EACH_NODE {

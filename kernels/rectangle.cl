@@ -323,21 +323,23 @@ __kernel void rectangle_divide(
 #if KNOWN
 #define IF_KNOWN(words) words
 #define SLOPES                                                                                             \
-    const int rows, const int columns, MAP dz_dx, MAP dz_dy, MAP known_heights, const float weight_z
+    const int pictures, const int rows, const int columns, MAP dz_dx, MAP dz_dy, MAP known_heights, const float weight_z
 #else
 #define IF_KNOWN(words)
-#define SLOPES const int rows, const int columns, MAP dz_dx, MAP dz_dy
+#define SLOPES const int pictures, const int rows, const int columns, MAP dz_dx, MAP dz_dy
 #endif
 
-// An item has a piece of some rows. Near the border it does another thing than where links lead to all sides from all neighbours:
+// An item has a piece of some rows of a picture; they lie one below the other and have the same known heights. Near the border it does another thing than where links lead to all sides from all neighbours:
 // PoCL makes vector code of loops without branches.
 #define ROWS 16
 #define COLUMNS (LANES == 8 ? 256 : 1)
 #define ALL_PIXELS(border, inner)                                                                          \
     const int pieces = (columns + COLUMNS - 1) / COLUMNS, item = get_global_id(0);                         \
     const int begin = item % pieces * COLUMNS, end = LESSER(columns, begin + COLUMNS);                     \
-    for (int row = item / pieces * ROWS; row < LESSER(rows, item / pieces * ROWS + ROWS); ++row) {         \
-        const int first = row * columns;                                                                   \
+    const int strips = (rows + ROWS - 1) / ROWS, strip = item / pieces % strips, picture = item / pieces / strips; \
+    const int before = picture * rows * columns, bottom = LESSER(rows, strip * ROWS + ROWS);               \
+    for (int row = strip * ROWS; row < bottom && picture < pictures; ++row) {                              \
+        const int first = before + row * columns;                                                          \
         int column = begin;                                                                                \
         for (; column < (row < 2 || row >= rows - 2 ? end : LESSER(end, 2)); ++column) border(first + column) \
         for (; column < LESSER(end, columns - 2); ++column) inner(first + column)                          \
@@ -357,7 +359,7 @@ float link(MAP slope, const int p, const int next, const int n, const int count)
 // The right side: weights of links times their rise, of those that end in a pixel less those that begin there.
 __kernel void rectangle_source(SLOPES, const float x, const float y, OUT source)
 {
-#define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) IF_KNOWN(+ weight_z * known_heights[p]);
+#define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) IF_KNOWN(+ weight_z * known_heights[p - before]);
 #define ENDS(slope, p, next, n, count) link(slope, p - next, next, n - 1, count) - link(slope, p, next, n, count)
 #define MIDST(slope, p, next)                                                                              \
     14.0f * (slope[p - next] - slope[p + next]) - (slope[p - 2 * next] - slope[p + 2 * next])
@@ -376,7 +378,7 @@ __kernel void rectangle_misfit(
     {                                                                                                      \
         const float x = relief[p + right] - relief[p] - size_x / 24 * (x_link);                            \
         const float y = relief[p + below] - relief[p] + size_y / 24 * (y_link);                            \
-        IF_KNOWN(const float z = relief[p] - known_heights[p];)                                            \
+        IF_KNOWN(const float z = relief[p] - known_heights[p - before];)                                            \
         squares[column - begin] += weight_x * x * x + weight_y * y * y IF_KNOWN(+ weight_z * z * z);       \
     }
 #define MISFIT_BORDER(p)                                                                                   \
@@ -386,5 +388,5 @@ __kernel void rectangle_misfit(
     ALL_PIXELS(MISFIT_BORDER, MISFIT_INNER)
     float sum = 0.0f;
     for (int i = 0; i < COLUMNS; ++i) sum += squares[i];
-    if (item / pieces * ROWS < rows) sums[item] = sum;
+    if (picture < pictures) sums[item] = sum;
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,13 +92,17 @@ class PixelGraph:
         if edges:
             self._run("links_cut", {"MASK": int(bool(mask))}, **slopes, **edges, flags=uncut, cut=self.flags)
 
-    def mean_plane(self) -> Plane:
+    def take_slopes(self, inputs: Inputs) -> None:
+        """Have other slopes where all else, and what the pixels are, stays as it was."""
+        self._inputs, self._slopes = inputs, self._see(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
+
+    def mean_plane(self, inputs: Inputs) -> Plane:
         """Return a plane of the mean slopes, 0 in the middle: above it, heights have more digits."""
         some = tuple(slice(step // 2, None, step) for step in (-(-size // _SAMPLES) for size in self.shape))
         valid = self.flags.host[some] & SLOPE != 0
         if not valid.any():
             return LEVEL
-        x, y = (float(slope[some][valid].mean()) for slope in (self._inputs.dz_dx, self._inputs.dz_dy))
+        x, y = (float(slope[some][valid].mean()) for slope in (inputs.dz_dx, inputs.dz_dy))
         along_x, along_y, _ = self.steps((x, y, 0.0))
         return x, y, -(along_x * (self.shape[1] - 1) + along_y * (self.shape[0] - 1)) / 2
 
@@ -112,20 +116,20 @@ class PixelGraph:
         kept = {name: self.array(name) for name in ("right", "down", "source")}
         if self.known_heights:
             kept["anchor"] = self.array("anchor")
-        self._run("links_join", {"KEEP": 1}, **self._problem(plane, None), **kept)
+        self._run("links_join", {"KEEP": 1}, **self._problem(plane, None), **kept, place=0)
         return Links(self.device, self.shape, kept["right"], kept["down"], kept.get("anchor"), kept["source"])
 
-    def source(self, plane: Plane = LEVEL, links: Links | None = None) -> Array:
-        """Return the right side alone, with the weights of ``links`` if there are any."""
-        source = self.array("source")
-        self._run("links_join", _weighted(links), **self._problem(plane, links), source=source)
-        return source
+    def put_source(self, plane: Plane, sources: Array, place: int) -> None:
+        """Write the right side alone to a place of some, (K, H, W)."""
+        self._run("links_join", {}, **self._problem(plane, None), source=sources, place=place)
 
-    def misfit(self, relief: Array, plane: Plane = LEVEL, links: Links | None = None) -> float:
-        """Return the least-squares sum, without unit, at heights above a plane."""
+    def misfit(
+        self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, place: int = 0
+    ) -> float:
+        """Return the least-squares sum, without unit, at heights above a plane, in a place of some."""
         sums = self.array("sums", shape=(self._items("links_misfit"),))
         problem = self._problem(plane, links)
-        self._run("links_misfit", _weighted(links), **problem, relief=relief, sums=sums)
+        self._run("links_misfit", _weighted(links), **problem, reliefs=reliefs, place=place, sums=sums)
         return float(sums.download().sum(dtype=np.float64)) / self.scale
 
     def _problem(self, plane: Plane, links: Links | None) -> dict[str, Any]:
@@ -246,36 +250,41 @@ class Levelling:
         self._arrays: dict[str, Array] = {}
         self._components: Components | None = None
 
-    def level(self, components: Components, relief: Array, plane: Plane, datum: float = 0.0) -> Floats:
-        """Return heights, (H, W), mm; known heights are above ``datum``."""
+    def level(
+        self, components: Components, reliefs: Array, planes: Sequence[Plane], datum: float = 0.0
+    ) -> Floats:
+        """Return heights, mm, of one relief or several; known heights are above ``datum``."""
+        graph, unknown = self._graph, components.offset_unknown
         if components is not self._components and components.count > 1:
-            self._graph.put("labels", components.labels)
-        self._components, unknown = components, components.offset_unknown
+            graph.put("labels", components.labels)
+        self._components = components
         offsets = self._array("offsets", unknown.shape)
-        offsets.claim()
-        known_heights = self._graph.known_heights
-        parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
-        parts = [(unknown, {}, 0.0), (~unknown, known_heights, datum)]
-        for some, maps, mean in parts:
-            if some.any():
-                offsets.host[some] = mean - self._means(relief, plane, maps)[some]
-        offsets.upload()
-        height = self._device.array("levelled", self._graph.shape, np.float32)
-        rows, columns = self._graph.shape
+        heights = self._device.array("levelled", reliefs.shape, np.float32, zeroed=False)
+        heights.upload()
+        rows, columns = graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
-        self._run("components_add_offsets", items, relief, plane, offsets=offsets, height=height)
-        levelled: Floats = height.detach()
+        parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
+        parts = [(unknown, {}, 0.0), (~unknown, graph.known_heights, datum)]
+        for place, plane in enumerate(planes):
+            steps = dict(zip(("plane_x", "plane_y", "plane_z"), graph.steps(plane), strict=True))
+            relief: dict[str, Any] = {"reliefs": reliefs, "place": place, **steps}
+            offsets.claim()
+            for some, maps, mean in parts:
+                if some.any():
+                    offsets.host[some] = mean - self._means(relief, maps)[some]
+            offsets.upload()
+            self._run("components_add_offsets", items, relief, offsets=offsets, heights=heights)
+        levelled: Floats = heights.detach()
         return levelled
 
-    def _means(self, relief: Array, plane: Plane, maps: Mapping[str, Operand]) -> NDArray[np.float64]:
+    def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
         """Return the mean heights of components, or those above their known ones, (components,), mm."""
         rows, count = self._graph.shape[0], self._count
         strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * count // _MOST_SUMS))
         strips = -(-rows // strip)
         sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
-        sizes = {"strip": strip, "components": count}
-        given = {"heights": None, "height_weights": None, **maps}
-        self._run("components_sum", strips, relief, plane, **given, **sizes, sums=sums, totals=totals)
+        known = {"heights": None, "height_weights": None, **maps, "strip": strip, "components": count}
+        self._run("components_sum", strips, relief, **known, sums=sums, totals=totals)
         sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
@@ -289,11 +298,10 @@ class Levelling:
             self._arrays[name].upload()
         return self._arrays[name]
 
-    def _run(self, name: str, items: int, relief: Array, plane: Plane, **arguments: Any) -> None:
+    def _run(self, name: str, items: int, relief: dict[str, Any], **arguments: Any) -> None:
         one = self._count == 1
         labels = self._graph.flags if one else self._graph.array("labels", np.int32)
-        (rows, columns), steps = self._graph.shape, self._graph.steps(plane)
+        rows, columns = self._graph.shape
         kernel = self._device.kernel("components", name, ONE=int(one))
-        arguments |= dict(zip(("plane_x", "plane_y", "plane_z"), steps, strict=True))
-        arguments |= {"flags": self._graph.flags, "labels": labels, "relief": relief}
-        kernel(items, rows=rows, columns=columns, **arguments, moved=2 * relief.host.nbytes)
+        arguments |= {"flags": self._graph.flags, "labels": labels, **relief}
+        kernel(items, rows=rows, columns=columns, **arguments, moved=8 * rows * columns)

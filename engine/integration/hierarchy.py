@@ -18,8 +18,8 @@ Doubles = NDArray[np.float64]
 STRENGTH = 0.25
 """Of links that join nodes in one aggregate; see ``multigrid_parts``."""
 
-TILE_ROWS = 32
-"""Of the tiles that a group takes in half a cycle."""
+LANES = 16, 8, 4
+"""Right sides that are solved for at once, if there are several."""
 
 _ROUNDS = 4  # an even number, in which parts of blocks find another aggregate
 _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
@@ -93,12 +93,15 @@ class Hierarchy:
         self._touched, self.changed = (self.array(name, dtype=np.int32) for name in ("touched", "changed"))
         self.moves = np.zeros(len(self.levels), np.int32)
         self._splits, self._counts, self._changes = (
-            self.array(name, len(self.levels), np.int32) for name in ("splits", "moves", "changes")
+            self.array(name, len(self.levels), dtype=np.int32) for name in ("splits", "moves", "changes")
         )
 
-    def array(self, name: str, size: int | None = None, dtype: DTypeLike = np.float32) -> Array:
-        """Return an array on the device, of all nodes unless it has another size."""
-        array = self.device.array(name, (size or self.nodes,), dtype)
+    def array(
+        self, name: str, size: int | None = None, *, dtype: DTypeLike = np.float32, lanes: int = 1
+    ) -> Array:
+        """Return an array on the device, of all nodes unless it has another size, with as many lanes."""
+        shape = (size or self.nodes,) if lanes == 1 else (size or self.nodes, lanes)
+        array = self.device.array(name, shape, dtype)
         array.upload()
         return array
 
@@ -162,11 +165,12 @@ class Hierarchy:
         a, b = np.concatenate(ends, axis=1)
         return node, a, b, np.concatenate(weights), pull
 
-    def kernel(self, name: str, links: int) -> Kernel:
-        """Return a pass over nodes with so many links."""
-        width = 8 if self.device.layout.tile > 1 else 1
+    def kernel(self, name: str, links: int, lanes: int = 1) -> Kernel:
+        """Return a pass over nodes with so many links, for as many right sides as there are lanes."""
+        width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         given = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device), "WIDTH": width}
-        given |= {"ROWS": TILE_ROWS, "COLUMNS": tile_columns(self.device)}
+        given |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
+        given["LANES"] = lanes
         return self.device.kernel("multigrid", f"multigrid_{name}", **given)
 
     def places(self, number: int) -> dict[str, int]:
@@ -178,10 +182,10 @@ class Hierarchy:
         """Return how many links a level's nodes may have."""
         return 8 if level is not self.levels[0] and self.moves.any() else 4
 
-    def over(self, name: str, level: Level, **arguments: Any) -> None:
+    def over(self, name: str, level: Level, *, lanes: int = 1, **arguments: Any) -> None:
         """Run a pass over the nodes of a level."""
         items = -(-level.nodes // self.device.layout.tile)
-        kernel = self.kernel(name, self.links_of(level))
+        kernel = self.kernel(name, self.links_of(level), lanes)
         kernel(items, **level.place, **arguments, moved=_bytes(level, arguments))
 
     def between(self, name: str, number: int, **arguments: Any) -> None:
@@ -191,28 +195,28 @@ class Hierarchy:
         kernel = self.kernel(name, 8 if number else 4)
         kernel(items, **self.places(number), **arguments, moved=_bytes(fine, arguments))
 
-    def gather(self, number: int, residual: Array, b: Array) -> None:
+    def gather(self, number: int, residual: Array, b: Array, lanes: int) -> None:
         """Add up the residual over the aggregates of a level that are no blocks."""
         if count := int(self.moves[number]):
             items = -(-count // max(1, self.device.layout.tile // 16))
             known: dict[str, Any] = {"to": self.to, "changed": self.changed, "count": count}
             known |= {"residual": residual, "coarse_b": b}
-            self.kernel("gather", 4)(items, **self.places(number), **known, moved=80 * count)
+            self.kernel("gather", 4, lanes)(items, **self.places(number), **known, moved=80 * count)
 
-    def over_parts(self, name: str, parts: Array, **arguments: Any) -> None:
+    def over_parts(self, name: str, parts: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Run a pass over the finest level that adds up; ``parts`` gets partial sums."""
         level = self.levels[0]
         count = -(-level.nodes // part_of(self.device))
-        kernel = self.kernel(name, 4)
+        kernel = self.kernel(name, 4, lanes)
         kernel(count, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
 
-    def copy_picture(self, name: str, level: Array, map_: Array, **arguments: Any) -> None:
+    def copy_picture(self, name: str, level: Array, map_: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Copy a map of pixels to ("admit") the finest level, or back ("release")."""
         finest = self.levels[0]
         sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
         items = finest.rows * -(-finest.columns // self.device.layout.tile)
-        kernel = self.kernel(name, 4)
-        kernel(items, **sizes, level=level, map=map_, **arguments, moved=8 * finest.nodes)
+        kernel = self.kernel(name, 4, lanes)
+        kernel(items, **sizes, level=level, map=map_, **arguments, moved=8 * lanes * finest.nodes)
 
     def _admit_graph(self, links: Links) -> None:
         for name in ("right", "down", "anchor"):
@@ -231,9 +235,30 @@ def place_of_coarse(coarse: Level) -> dict[str, int]:
     return {f"coarse_{name}": number for name, number in coarse.place.items()}
 
 
-def tile_columns(device: Device) -> int:
+def tile_columns(device: Device, lanes: int) -> int:
     """Return the columns of the tiles that a group takes in half a cycle."""
-    return 128 if device.layout.tile > 1 else 32
+    return 32 if device.layout.tile == 1 else 128 if lanes == 1 else 64
+
+
+def tile_rows(device: Device, lanes: int) -> int:
+    """Return the rows of these tiles."""
+    return 16 if device.layout.tile == 1 and lanes > 1 else 32
+
+
+def choose_lanes(device: Device, sides: int) -> int:
+    """Return how many of some right sides to solve for at once: as many as a group's memory has room for."""
+    if sides == 1:
+        return 1
+    room = device.context.devices[0].local_mem_size
+    return next(
+        lanes
+        for lanes in LANES
+        if lanes == LANES[-1]
+        or (
+            lanes < 2 * sides
+            and 8 * lanes * (tile_rows(device, lanes) + 7) * (tile_columns(device, lanes) + 7) <= room
+        )
+    )
 
 
 def part_of(device: Device) -> int:

@@ -64,8 +64,10 @@ def integrate(
 
     Parameters
     ----------
-    dz_dx, dz_dy : array_like, (H, W), optional
+    dz_dx, dz_dy : array_like, (H, W) or (K, H, W), optional
         Slopes along x (to the right) and along y, which runs up the picture. Not finite where there is none.
+        Of K surfaces with all else the same: they are solved together, several times as fast as one by one. A
+        pixel has slopes where all surfaces have; the first one says to which neighbour ``edges`` are linked.
     pixel_size : array_like, optional
         Millimetres, one number or (x, y). Left out with a camera.
     normals : array_like, (H, W, 3), optional
@@ -139,6 +141,7 @@ def integrate(
         camera=camera,
         robust=robust,
         crop=True,
+        several=not robust and initial_heights is None,
     )
     check_above_zero(bilateral_sharpness=bilateral_sharpness, tolerance=tolerance, budget=budget)
     start = None
@@ -166,8 +169,8 @@ def _put_back(surface: Surface, inputs: Inputs) -> Surface:
     for name, rest in {"height": np.nan, "sigma": np.nan, "component": -1, "filled": 0, "edges": 0}.items():
         part = getattr(surface, name)
         if part is not None:
-            maps[name] = np.full(inputs.picture, rest, part.dtype)
-            maps[name][inputs.box] = part
+            maps[name] = np.full((*part.shape[:-2], *inputs.picture), rest, part.dtype)
+            maps[name][(..., *inputs.box)] = part
     return replace(surface, **maps, invalid=surface.invalid + inputs.lost)
 
 

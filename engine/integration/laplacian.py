@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.graph import Links, find_components
+from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import check_above_zero
-from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
@@ -57,8 +57,9 @@ def invert_laplacian(
     Returns
     -------
     scipy.sparse.linalg.LinearOperator
-        H W by H W, symmetric, for maps that are flattened in C order; for one thread at a time. It raises
-        `NotConverged` where weights are too uneven to meet the tolerance.
+        H W by H W, symmetric, for maps that are flattened in C order; for one thread at a time. Of a matrix
+        its columns are solved for together, several times as fast as one by one. It raises `NotConverged`
+        where weights are too uneven to meet the tolerance.
 
     Raises
     ------
@@ -97,7 +98,8 @@ def invert_laplacian(
     check_above_zero(tolerance=tolerance)
     solve = _Solver(open_device(device), maps, tolerance)
     size = shape[0] * shape[1]
-    return LinearOperator((size, size), matvec=solve, rmatvec=solve, dtype=np.float64)
+    known = {"matvec": solve, "rmatvec": solve, "matmat": solve, "rmatmat": solve}
+    return LinearOperator((size, size), **known, dtype=np.float64)
 
 
 class _Solver:
@@ -121,31 +123,31 @@ class _Solver:
         self._links = Links(device, diagonal.shape, arrays[0], arrays[1], anchor, source)
         self._multigrid = Multigrid(self._links)
 
-    def __call__(self, source: NDArray[Any]) -> Doubles:
-        """Return the solution u of A u = b."""
-        exact = self._centred(np.asarray(source, np.float64).ravel())
-        size = float(np.abs(exact).max())
-        if not size < np.inf:
+    def __call__(self, sources: NDArray[Any]) -> Doubles:
+        """Return the solutions u of A u = b, for b (N,) or (N, K)."""
+        exact = self._centred(np.asarray(sources, np.float64).reshape(len(sources), -1).T)
+        sizes = np.abs(exact).max(axis=1, initial=0)
+        if not (sizes < np.inf).all():
             raise InputError("the right side of the Laplacian has values that are no numbers: leave them out")
-        if size == 0:
-            return exact
-        known = self._links.source
-        known.claim()
-        known.host[...] = (exact / size).reshape(known.host.shape)
-        known.upload()
-        height = self._multigrid.precondition() if self._tolerance is None else self._solve(self._tolerance)
-        return self._centred(height.download().ravel() * (size / self._unit))
+        if not sizes.any():
+            return exact.T.reshape(np.shape(sources))
+        scales = np.where(sizes > 0, sizes, 1)[:, np.newaxis]
+        given = (exact / scales).reshape(-1, *self._links.shape)
+        maps = self._links.device.given("sources", given)
+        height = self._multigrid.precondition(maps) if self._tolerance is None else self._solve(maps)
+        found = self._centred(height.download().reshape(exact.shape) * (scales / self._unit))
+        return found.T.reshape(np.shape(sources))
 
-    def _solve(self, tolerance: float) -> Array:
-        found = self._multigrid.solve(tolerance=tolerance)
+    def _solve(self, maps: Array) -> Array:
+        found = self._multigrid.solve_many(maps, tolerance=self._tolerance)
         if not found.converged:
             raise NotConverged(
                 f"the Laplacian's solution did not converge: {found.iterations} iterations left a residual of"
-                f" {found.residual:.2g}, more than {tolerance:.2g}; give a larger tolerance"
+                f" {found.residual:.2g}, more than {self._tolerance:.2g}; give a larger tolerance"
             )
         return found.height
 
     def _centred(self, values: Doubles) -> Doubles:
-        """Return values less the mean of each component whose offset is free."""
-        mean = np.bincount(self._labels, values) / self._pixels
-        return values - np.where(self._free, mean, 0.0)[self._labels]
+        """Return values, (K, N), less the mean of each component whose offset is free."""
+        means = [np.bincount(self._labels, one) / self._pixels for one in values]
+        return values - np.where(self._free, means, 0.0)[:, self._labels]

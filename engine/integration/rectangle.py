@@ -117,7 +117,7 @@ class Rectangle:
     def __init__(
         self, shape: tuple[int, ...], pixel_size: tuple[float, float], device: Device, scale: float = 1.0
     ) -> None:
-        self._device, self._shape, self._size = device, shape, pixel_size
+        self._device, self.shape, self._size = device, shape, pixel_size
         self._lanes = _LANES if device.layout.tile > 1 else 1
         self._weights = scale / pixel_size[0] ** 2, scale / pixel_size[1] ** 2
         pictures, (rows, columns), at_once = math.prod(shape[:-2]), shape[-2:], 2 * self._lanes
@@ -136,20 +136,20 @@ class Rectangle:
         Their mean is 0: what the right side sums to is left out.
         """
         if self._across is None or self._across[0] != screening:
-            rows = self._shape[-2]
+            rows = self.shape[-2]
             across = self._rates(np.arange(rows + 1), rows, self._weights[1], screening)
             self._across = screening, self._device.given("across", across)
         if height is None:
-            height = self._device.array("height", self._shape, np.float32, zeroed=False)
+            height = self._device.array("height", self.shape, np.float32, zeroed=False)
             height.upload()
         rates = {"along": self._along, "across": self._across[1]}
-        self._transform("rectangle_modes", 0, rows=math.prod(self._shape[:-1]), source=source)
-        self._transform("rectangle_divide", 1, pictures=math.prod(self._shape[:-2]), **rates)
-        self._transform("rectangle_heights", 0, rows=math.prod(self._shape[:-1]), height=height)
+        self._transform("rectangle_modes", 0, rows=math.prod(self.shape[:-1]), source=source)
+        self._transform("rectangle_divide", 1, pictures=math.prod(self.shape[:-2]), **rates)
+        self._transform("rectangle_heights", 0, rows=math.prod(self.shape[:-1]), height=height)
         return height
 
     def integrate(self, inputs: Inputs, sigma: bool) -> tuple[Floats, Floats | None] | None:
-        """Return heights, (H, W), mm, from slopes, and if wanted their standard deviation.
+        """Return heights, mm, from slopes, and if wanted their standard deviation, (H, W).
 
         None where a slope or a known height turns out to be missing. The scale must be a pixel's area.
         """
@@ -158,15 +158,17 @@ class Rectangle:
         maps: dict[str, Any] = {name: self._device.seen(name, getattr(inputs, name)) for name in names}
         if len(names) > 2:
             maps["weight_z"] = screening
-        (rows, columns), tile = self._shape, _PIECE if self._lanes > 1 else (_PIECE[0], 1)
-        items = -(-rows // tile[0]) * -(-columns // tile[1])
+        pictures, (rows, columns) = math.prod(self.shape[:-2]), self.shape[-2:]
+        tile = _PIECE if self._lanes > 1 else (_PIECE[0], 1)
+        items = pictures * -(-rows // tile[0]) * -(-columns // tile[1])
         if self._work is None:
-            self._work = self._array("source", self._shape), self._array("sums", (items,))
+            self._work = self._array("source", self.shape), self._array("sums", (items,))
         source, sums = self._work
 
         def run(name: str, **arguments: Any) -> None:
             kernel = self._kernel(name, 0, KNOWN=int(len(names) > 2))
-            kernel(items, rows=rows, columns=columns, **maps, **arguments, moved=3 * source.nbytes)
+            sizes = {"pictures": pictures, "rows": rows, "columns": columns}
+            kernel(items, **sizes, **maps, **arguments, moved=3 * source.nbytes)
 
         run("rectangle_source", x=along * width / 24, y=-across * height / 24, source=source)
         relief = self.solve(source, screening)
@@ -174,13 +176,14 @@ class Rectangle:
             weights = {"weight_x": along, "weight_y": across, "size_x": width, "size_y": height}
             run("rectangle_misfit", **weights, relief=relief, sums=sums)
         found: Floats = relief.detach()
-        if not math.isfinite(found[0, 0]):  # what is no number anywhere is so everywhere
+        if not np.isfinite(found[..., 0, 0]).all():  # what is no number anywhere is so everywhere
             return None
         deviation = None
         if sigma:
             factor = math.prod(self._size) / inputs.typical_weight
             if not inputs.weights_given:
-                factor *= self._excess(float(sums.download().sum(dtype=np.float64)) / factor, len(names) > 2)
+                misfit = float(sums.download().sum(dtype=np.float64)) / pictures
+                factor *= self._excess(misfit / factor, len(names) > 2)
             deviation = self.deviation(screening) * np.float32(factor**0.5)
         found += np.float32(inputs.datum)
         return found, deviation
@@ -188,14 +191,14 @@ class Rectangle:
     def deviation(self, screening: float = 0.0) -> Floats:
         """Return the standard deviation of heights, (H, W), where weights are inverse variances; kept."""
         if self._deviation is None or self._deviation[0] != screening:
-            rows, columns = self._shape[-2:]
+            rows, columns = self.shape[-2:]
             variance = find_rectangle_variance((rows, columns), self._weights, screening)
             self._deviation = screening, np.sqrt(variance)
         return self._deviation[1]
 
     def _excess(self, misfit: float, known: bool) -> float:
         """Return how much worse slopes fit than noise of variance 1 would; NaN where nothing tells."""
-        rows, columns = self._shape
+        rows, columns = self.shape[-2:]
         links, pixels = rows * (columns - 1) + (rows - 1) * columns, rows * columns
         unit = expected_misfit(links, pixels, pixels * known, int(not known), self._weights)
         return misfit / unit if unit > 0 else math.nan
@@ -205,7 +208,7 @@ class Rectangle:
     ) -> Doubles:
         """Return what links along lines, a screening and all transforms make of a mode."""
         own = 4 * weight * np.sin(np.pi * mode / (2 * length)) ** 2 + screening
-        return 4 * math.prod(self._shape[-2:]) * own
+        return 4 * math.prod(self.shape[-2:]) * own
 
     def _prepare(self, length: int, groups: int) -> tuple[int, dict[str, int], dict[str, Any]]:
         """Return how many groups transform lines of a length, the kernels' macros, and their tables."""

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.graph import Links, Plane
+from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.validation import Flags, Inputs
-from mirrorskin.engine.integration.vcycle import Multigrid, Solution
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 

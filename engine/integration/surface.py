@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,10 @@ from mirrorskin.engine.integration.graph import (
     find_components,
 )
 from mirrorskin.engine.integration.height_variance import expected_misfit
+from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
-from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
@@ -41,8 +41,9 @@ class Surface:
 
     Attributes
     ----------
-    height : ndarray, (H, W), float32
-        Millimetres; with a camera the depth, in the unit of known ones. NaN where there is no answer.
+    height : ndarray, (H, W) or (K, H, W), float32
+        Millimetres; with a camera the depth, in the unit of known ones. NaN where there is no answer. Of
+        several surfaces one after the other; all else is the same for all of them.
     sigma : ndarray, (H, W), float32, or None
         Expected standard deviation of the height, mm: about the mean of its component where that has no known
         height. NaN where there is no answer, and where the noise of the slopes cannot be estimated.
@@ -56,10 +57,10 @@ class Surface:
     edges : ndarray, (H, W), uint8, or None
         1 on either side of a discontinuity that was found; None where none was looked for.
     iterations : int
-        Of the solver, in all.
+        Of the solver, in all; of several surfaces the most.
     residual : float
         Norm of the error over that of the heights above the mean plane, both by the weights of the sum that
-        is minimised; 0 of the direct solver.
+        is minimised; 0 of the direct solver. Of several surfaces the greatest.
     converged : bool
         Whether the residual is within the tolerance; without one, whether it is below 0.3.
     method : {"direct", "multigrid", "robust"}
@@ -93,10 +94,10 @@ class SolverOptions:
 
 @dataclass(frozen=True, slots=True)
 class _Relief:
-    """Heights above a plane as a solver leaves them, on the device."""
+    """Heights above planes as a solver leaves them, on the device."""
 
-    height: Array
-    plane: Plane
+    height: Array  # (H, W) or (K, H, W)
+    planes: list[Plane]
     method: IntegrationMethod
     iterations: int
     residual: float
@@ -143,7 +144,7 @@ class SurfaceSolver:
             full = self._solve_full(inputs, options)
             if full is not None:
                 return full
-        flags = self._graph.upload(inputs)
+        flags = self._graph.upload(inputs.each()[0])
         if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
             raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
         numbers = None
@@ -151,7 +152,13 @@ class SurfaceSolver:
             numbers = inputs.weight, inputs.known_height_weight, inputs.known_heights is None
         if numbers is None or numbers != self._kept.numbers or not np.array_equal(flags, self._kept.flags):
             self._kept = _Kept(numbers, flags.copy())
-        relief = self._find(inputs, options, start)
+        relief = (
+            self._find(inputs, options, start)
+            if inputs.dz_dx.ndim == 2
+            else self._find_several(inputs, options)
+        )
+        if not math.isfinite(relief.residual) and (agreed := inputs.agreed()) is not None:
+            return self.solve(agreed, options)
         if not relief.converged and options.deadline is None:
             raise NotConverged(explain(relief.iterations, relief.residual, options.tolerance))
         begun = time.perf_counter()
@@ -161,9 +168,9 @@ class SurfaceSolver:
 
     def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
         """Return the surface of a full rectangle with even weights; None where a slope is missing."""
-        if self._rectangle is None:
+        if self._rectangle is None or self._rectangle.shape != inputs.dz_dx.shape:
             size, area = inputs.pixel_size, math.prod(inputs.pixel_size)
-            self._rectangle = Rectangle(self._graph.shape, size, self._device, area)
+            self._rectangle = Rectangle(inputs.dz_dx.shape, size, self._device, area)
         found = self._rectangle.integrate(inputs, options.sigma)
         if found is None:
             return None
@@ -184,7 +191,7 @@ class SurfaceSolver:
     def _find(self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None) -> _Relief:
         """Choose a solver and run it."""
         if self._plane is None:
-            self._plane = self._graph.mean_plane()
+            self._plane = self._graph.mean_plane(inputs)
         plane, links = self._plane, self._graph.links(self._plane)
         first = None if start is None else self._above_plane(start, inputs, plane)
         if options.sharpness is not None:
@@ -192,19 +199,38 @@ class SurfaceSolver:
             near = options.tolerance or _GOAL
             one = solve_robust(*known, start=first, tolerance=near, deadline=options.deadline)
             numbers = one.iterations, one.residual, one.converged or options.tolerance is None
-            return _Relief(one.relief, plane, "robust", *numbers, one.links, one.flags, one.edges)
+            return _Relief(one.relief, [plane], "robust", *numbers, one.links, one.flags, one.edges)
         begin = self._last if first is None else self._graph.put("start", first)
+        found = self._build(links).solve(begin, **self._goal(options))
+        self._last = found.height
+        return _relief(found, [plane])
+
+    def _find_several(self, inputs: Inputs, options: SolverOptions) -> _Relief:
+        """Find several reliefs of one graph."""
+        each = inputs.each()
+        planes = [self._graph.mean_plane(one) for one in each]
+        solver = self._build(self._graph.links(planes[0]))
+        sources = self._device.array("sources", inputs.dz_dx.shape, np.float32, zeroed=False)
+        sources.upload()
+        for place, (one, plane) in enumerate(zip(each, planes, strict=True)):
+            self._graph.take_slopes(one)
+            self._graph.put_source(plane, sources, place)
+        return _relief(solver.solve_many(sources, **self._goal(options)), planes)
+
+    def _build(self, links: Links) -> Multigrid:
+        """Return the solver of a graph."""
         if self._multigrid is None:
             self._multigrid = Multigrid(links)
         elif not self._kept.built:
             self._multigrid.rebuild(links)
         self._kept.built = True
-        goal, late = options.tolerance, options.deadline
-        if late is not None:
-            goal, late = goal or _GOAL, late - self._finishing
-        found = self._multigrid.solve(begin, tolerance=goal, deadline=late)
-        self._last = found.height
-        return _Relief(found.height, plane, "multigrid", found.iterations, found.residual, found.converged)
+        return self._multigrid
+
+    def _goal(self, options: SolverOptions) -> dict[str, Any]:
+        """Return how far the solver goes."""
+        if options.deadline is None:
+            return {"tolerance": options.tolerance}
+        return {"tolerance": options.tolerance or _GOAL, "deadline": options.deadline - self._finishing}
 
     def _above_plane(self, start: NDArray[np.floating], inputs: Inputs, plane: Plane) -> Floats:
         """Return heights to begin with above the plane, about 0 where nothing is known of them."""
@@ -220,13 +246,13 @@ class SurfaceSolver:
     def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief) -> Surface:
         """Add plane and offsets to relief, and estimate its standard deviation."""
         components = self._find_components(inputs, relief)
-        height = self._levelling.level(components, relief.height, relief.plane, inputs.datum)
+        height = self._levelling.level(components, relief.height, relief.planes, inputs.datum)
         return Surface(
             height=height,
             sigma=self._find_sigma(inputs, relief, components) if options.sigma else None,
             component=components.labels,
             offset_unknown=components.offset_unknown,
-            filled=np.zeros(height.shape, np.uint8),
+            filled=np.zeros(self._graph.shape, np.uint8),
             edges=relief.edges,
             iterations=relief.iterations,
             residual=relief.residual,
@@ -283,13 +309,22 @@ class SurfaceSolver:
                 one.upload()
         free = int(np.count_nonzero(components.offset_unknown))
         unit = share * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
-        misfit = self._graph.misfit(relief.height, relief.plane, relief.links)
-        return misfit / unit if unit > 0 else math.nan
+        misfit = 0.0
+        each = inputs.each()
+        for place, (surface, plane) in enumerate(zip(each, relief.planes, strict=True)):
+            if len(each) > 1:
+                self._graph.take_slopes(surface)
+            misfit += self._graph.misfit(relief.height, plane, relief.links, place)
+        return misfit / len(each) / unit if unit > 0 else math.nan
 
     def _link_weights(self, inputs: Inputs) -> tuple[float, float]:
         """Return the weights of links to the right and down whose pixels weigh 1."""
         width, height = inputs.pixel_size
         return self._graph.scale / width**2, self._graph.scale / height**2
+
+
+def _relief(found: Solution, planes: list[Plane]) -> _Relief:
+    return _Relief(found.height, planes, "multigrid", found.iterations, found.residual, found.converged)
 
 
 def explain(iterations: int, residual: float, tolerance: float | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ _SAMPLES = 65536  # pixels that the median is taken of
 class Inputs:
     """Maps of one size, (H, W), and numbers, fit to be integrated."""
 
-    # (H, W), float32
+    # (H, W), or of several surfaces with all else the same (K, H, W), float32
     dz_dx: Floats
     dz_dy: Floats
     pixel_size: tuple[float, float]  # width and height, mm
@@ -56,8 +56,24 @@ class Inputs:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        rows, columns = self.dz_dx.shape
+        rows, columns = self.dz_dx.shape[-2:]
         return rows, columns
+
+    def each(self) -> list[Inputs]:
+        """Return those of each surface."""
+        if self.dz_dx.ndim == 2:
+            return [self]
+        slopes = zip(self.dz_dx, self.dz_dy, strict=True)
+        return [replace(self, dz_dx=x, dz_dy=y) for x, y in slopes]
+
+    def agreed(self) -> Inputs | None:
+        """Return the same without slopes where those of any surface are no numbers; None if it is this."""
+        wanted = np.isfinite(self.dz_dx) & np.isfinite(self.dz_dy)
+        lost = ~wanted.all(axis=0, keepdims=True)
+        if self.dz_dx.ndim == 2 or not (lost & wanted).any():
+            return None
+        x, y = (np.where(lost, np.float32(np.nan), one) for one in (self.dz_dx, self.dz_dy))
+        return replace(self, dz_dx=x, dz_dy=y)
 
     @property
     def weight(self) -> float:
@@ -79,13 +95,15 @@ def check_inputs(
     camera: Camera | None = None,
     robust: bool = False,
     crop: bool = False,
+    several: bool = False,
 ) -> Inputs:
     """Return the arguments of ``integrate`` as maps of one size; InputError where they cannot be.
 
     With a camera, heights are logarithms of depths. ``robust``: weights are those of normals; else those of
     the slopes that normals make. ``crop``: only the box of the pixels that may have an answer is kept.
+    ``several``: slopes may be those of several surfaces, (K, H, W).
     """
-    shape, slopes = _find_source(dz_dx, dz_dy, normals, camera)
+    shape, slopes = _find_source(dz_dx, dz_dy, normals, camera, several)
     if camera is not None and pixel_size is not None:
         raise InputError(f"pixel_size {pixel_size!r}: a camera says it; leave one of the two out")
     size = check_pixel_size(pixel_size) if camera is None else camera.pixel_size
@@ -143,7 +161,11 @@ def check_inputs(
 
 
 def _find_source(
-    dz_dx: ArrayLike | None, dz_dy: ArrayLike | None, normals: ArrayLike | None, camera: Camera | None
+    dz_dx: ArrayLike | None,
+    dz_dy: ArrayLike | None,
+    normals: ArrayLike | None,
+    camera: Camera | None,
+    several: bool,
 ) -> tuple[tuple[int, int], Callable[[Box], Slopes]]:
     """Return rows and columns of the picture, and what gives the slopes within a box."""
     if normals is not None:
@@ -158,12 +180,18 @@ def _find_source(
     if dz_dx is None or dz_dy is None:
         raise InputError("there are no slopes: give dz_dx and dz_dy, or normals=")
     x, y = np.asarray(dz_dx), np.asarray(dz_dy)
-    if x.ndim != 2 or x.shape != y.shape or 0 in x.shape:
+    if x.ndim not in ((2, 3) if several else (2,)) or x.shape != y.shape or 0 in x.shape:
+        more = ", or (K, H, W) of several surfaces," if several else ""
         raise InputError(
-            f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W) are needed"
+            f"slopes have shapes {x.shape} and {y.shape}: two maps of one size (H, W){more} are needed"
         )
-    shape = x.shape[0], x.shape[1]
-    return shape, lambda box: (np.asarray(x[box], np.float32), np.asarray(y[box], np.float32), None)
+    shape = x.shape[-2], x.shape[-1]
+    return shape, lambda box: (_part(x, box), _part(y, box), None)
+
+
+def _part(slopes: NDArray[Any], box: Box) -> Floats:
+    """Return a part of slopes; of several maps so that kernels can read each where it lies."""
+    return np.asarray(slopes[(..., *box)], np.float32, order="K" if slopes.ndim == 2 else "C")
 
 
 def _may_answer(
@@ -175,6 +203,8 @@ def _may_answer(
         return wanted
     x, y, _ = slopes(box)
     found: Mask = np.isfinite(x) & np.isfinite(y)
+    if found.ndim == 3:
+        found = np.logical_and.reduce(found)
     if heights is not None:
         found |= np.isfinite(heights[box])
     return found if wanted is None else found & wanted

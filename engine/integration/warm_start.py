@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
+from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import Floats, Inputs, check_pixel_size
-from mirrorskin.engine.integration.vcycle import Multigrid
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
@@ -72,7 +72,7 @@ class WarmStartIntegrator:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)
         relief = self._from_scratch() if self._relief is None else self._relief
-        height = self._levelling.level(components, relief, LEVEL)
+        height = self._levelling.level(components, relief, [LEVEL])
         self._steps += 1
         self._look()
         return height

@@ -35,6 +35,7 @@ QUICK = (
     "call-edges",
     "integrate-mask",
     "integrate-live",
+    "integrate-many",
     "integrate-robust",
     "twin",
     "sweep-onset",

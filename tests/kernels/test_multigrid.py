@@ -6,7 +6,7 @@ import graphs
 import numpy as np
 import pytest
 
-from mirrorskin.engine.integration import vcycle
+from mirrorskin.engine.integration import cycle as cycle_layer
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.height_variance import local_part
 from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, part_of, place_of_coarse
@@ -110,8 +110,8 @@ def test_a_cycle_answers_as_the_reference_wherever_one_group_takes_over(cases, k
     b, given = case.random()
     expected = twin.cycle(case.levels, b)
     for first in (1, 3, 6):
-        monkeypatch.setattr(vcycle, "_TAIL", case.h.levels[first].nodes)
-        cycle = vcycle.VCycle(case.h)
+        monkeypatch.setattr(cycle_layer, "_TAIL", case.h.levels[first].nodes)
+        cycle = cycle_layer.Cycle(case.h)
         cycle.prepare()
         cycle.b = given
         product = cycle.run()
@@ -140,12 +140,14 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
     direction, image = case.h.array("direction"), case.h.array("image")
     arrays = {"z": z_given, "before": before_given, "direction": direction, "image": image}
-    curvature = case.sums("direct", beta=0.7, **case.h.graph, **arrays)
+    inverse = case.h.inverse
+    curvature = case.sums("direct", factor=0.7, **case.h.graph, inverse=inverse, **arrays)
     p = z + 0.7 * before
     close(case.get(direction), p)
     close(case.get(image), -twin.residual(level, zero, p))
     assert curvature == pytest.approx(-(p * twin.residual(level, zero, p)).sum(), rel=1e-5)
-    square = case.sums("advance", alpha=0.3, direction=direction, image=image, b=b_given, x=x_given)
+    arrays = {"inverse": inverse, "direction": direction, "image": image, "b": b_given, "x": x_given}
+    square = case.sums("advance", factor=0.3, first=0, **arrays)
     close(case.get(x_given), x + 0.3 * p)
     close(case.get(b_given), b + 0.3 * twin.residual(level, zero, p))
     assert square == pytest.approx((case.get(b_given).astype(float) ** 2).sum(), rel=1e-5)

@@ -86,19 +86,21 @@ def test_device_and_reference_find_the_same_heights(device, shape, screening):
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("shape", [(1, 5), (3, 2), (4, 4), (37, 41), (3, 300)])
 def test_device_and_reference_make_the_same_of_slopes(device, shape, known):
-    dz_dx, dz_dy, heights = np.random.default_rng(1).normal(size=(3, *shape)).astype(np.float32)
+    slopes = np.random.default_rng(1).normal(size=(2, 3, *shape)).astype(np.float32)
+    heights = np.random.default_rng(2).normal(size=shape).astype(np.float32)
     size, area, weights = (0.3, 0.4), 0.12, (0.4 / 0.3, 0.3 / 0.4)
     given = {"known_heights": heights, "known_height_weights": 5.0} if known else {}
-    inputs = check_inputs(dz_dx, dz_dy, size, **given)
-    solver = Rectangle(shape, size, device, area)
+    inputs = check_inputs(*slopes, size, **given, several=True)
+    solver = Rectangle(slopes[0].shape, size, device, area)
     height, sigma = solver.integrate(inputs, True)
     extra = (5.0 * area, inputs.known_heights) if known else (0.0, None)
-    source = np.empty(shape)
-    rectangle_source(weights[0] * 0.3 / 24, -weights[1] * 0.4 / 24, dz_dx, dz_dy, source, *extra)
-    told = refer(source, extra[0], weights)
-    np.testing.assert_allclose(height, told + inputs.datum, atol=2e-5 * np.ptp(told))
-    links = shape[0] * (shape[1] - 1) + (shape[0] - 1) * shape[1]
-    unit = expected_misfit(links, height.size, height.size * known, 1 - known, weights)
-    misfit = rectangle_misfit(weights, size, (dz_dx, dz_dy), told, *extra)
+    links, misfit = shape[0] * (shape[1] - 1) + (shape[0] - 1) * shape[1], 0.0
+    for dz_dx, dz_dy, found in zip(*slopes, height, strict=True):
+        source = np.empty(shape)
+        rectangle_source(weights[0] * 0.3 / 24, -weights[1] * 0.4 / 24, dz_dx, dz_dy, source, *extra)
+        told = refer(source, extra[0], weights)
+        np.testing.assert_allclose(found, told + inputs.datum, atol=2e-5 * np.ptp(told))
+        misfit += rectangle_misfit(weights, size, (dz_dx, dz_dy), told, *extra) / len(height)
+    unit = expected_misfit(links, sigma.size, sigma.size * known, 1 - known, weights)
     told = solver.deviation(extra[0]) * np.sqrt(misfit / unit) if unit > 0 else np.full(shape, np.nan)
     np.testing.assert_allclose(sigma, told, rtol=1e-4)

@@ -15,7 +15,7 @@ import surfaces
 from slope_oracle import Problem
 
 from mirrorskin import engine, io
-from mirrorskin.engine.integration import vcycle
+from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.kernels.device import open_device
 
 SHAPE, PIXEL = (49, 62), (0.03, 0.05)
@@ -345,12 +345,12 @@ def test_without_tolerance_or_with_a_budget_nothing_is_raised():
 
 
 def test_a_surface_that_did_not_converge_is_not_returned(monkeypatch):
-    found = vcycle.Multigrid.solve
+    found = Multigrid.solve
 
     def stubborn(self, start=None, **options):
         return found(self, start, **{**options, "limit": 1})
 
-    monkeypatch.setattr(vcycle.Multigrid, "solve", stubborn)
+    monkeypatch.setattr(Multigrid, "solve", stubborn)
     expected = r"1 iteration.*residual of .*more than 1e-06.*tolerance"
     with pytest.raises(engine.NotConverged, match=expected) as error:
         integrated(problem(WAVES, 0.2, mask=MASKS["20 % holes"]), tolerance=1e-6)

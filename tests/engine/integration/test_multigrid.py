@@ -4,9 +4,10 @@ import graphs
 import numpy as np
 import pytest
 
+from mirrorskin.engine.integration.cycle import Cycle
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.hierarchy import Hierarchy
-from mirrorskin.engine.integration.vcycle import Multigrid, VCycle
+from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -58,7 +59,7 @@ def test_a_cycle_is_symmetric_and_positive_definite(device, kind, anchored):
     graph = graphs.pixel_graph(kind, (75, 130), anchored)
     hierarchy = Hierarchy(graph.right.shape, anchored, device)
     hierarchy.build(links_of(device, graph))
-    cycle = VCycle(hierarchy)
+    cycle = Cycle(hierarchy)
     cycle.prepare()
     rng = np.random.default_rng(0)
     right = [graph.centred(rng.normal(size=graph.right.shape)) for _ in range(4)]
@@ -99,7 +100,7 @@ def test_corridors_as_wide_as_a_pixel_are_solved(device, kind):
     assert found.converged
     assert error_of(graph, heights_of(found)) < 1e-3
     if kind == "spiral":
-        assert solver._cycle._factors is not None  # of the second level: cycles alone do not do it
+        assert solver._alone.cycle._factors is not None  # of the second level: cycles alone do not do it
 
 
 def spiral(shape):

@@ -1,0 +1,174 @@
+"""A multigrid cycle over all levels of a hierarchy, for one right side or several at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.integration.hierarchy import Hierarchy, Level, tile_columns, tile_rows
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Kernel
+
+_TWICE = 2  # the finest level that is gone through twice: all coarser ones are, or cycles may be indefinite
+_TAIL = 20480  # numbers of a level from which on down one group does all
+_LEAST = 1e-12  # of a component's links: anchors that are weaker leave its offset free
+
+Doubles = NDArray[np.float64]
+
+
+def add_parts(parts: Array) -> Doubles:
+    """Return the sums of parts, (lanes,)."""
+    found = parts.download()
+    lanes: Doubles = np.ascontiguousarray(found.reshape(len(found), -1).T).sum(axis=1, dtype=np.float64)
+    return lanes
+
+
+class Cycle:
+    """A cycle over a hierarchy, and memory for it: of all nodes ``b`` is the right side, ``x`` the answer.
+
+    Of several right sides, ``lanes``, each node's numbers lie together.
+
+    On each level three steps of Jacobi's method smooth on the way down, and on the way up in reverse. Half of
+    that is one pass, whose groups keep a tile of the level in local memory; all small levels are one.
+    """
+
+    def __init__(self, hierarchy: Hierarchy, lanes: int = 1) -> None:
+        h, self._lanes = hierarchy, lanes
+        self._h = h
+        names = "right side", "heights", "other heights", "residual"
+        self.b, self.x, self.spare, self._rest = (h.array(name, lanes=lanes) for name in names)
+        self._tail = next(
+            k
+            for k, one in enumerate(h.levels)
+            if k == len(h.levels) - 1 or (k > 0 and one.nodes <= _TAIL // lanes)
+        )
+        tiles = [self._tiles(one) for one in h.levels[: self._tail]]
+        self._first_tile = np.cumsum([0, *tiles])
+        self.parts = h.array("parts", self._tiles(h.levels[0]), lanes=lanes)
+        self._live = h.array("live", max(1, int(self._first_tile[-1])), dtype=np.uint8)
+
+    def prepare(self) -> None:
+        """Make ready for what the hierarchy holds now."""
+        h = self._h
+        table = [[*one.place.values(), moves] for one, moves in zip(h.levels, h.moves, strict=True)]
+        self._table = h.device.given("levels", np.array(table), np.int32)
+        self._factors: Callable[[Doubles], Doubles] | None = None
+        self.find_tiles()
+
+    def find_tiles(self) -> None:
+        """Find the tiles that have nodes; no cycle goes over the others."""
+        h = self._h
+        for number, level in enumerate(h.levels[: self._tail]):
+            kernel, items = self._kernel("find_live", level), self._tiles(level)
+            known = {"inverse": h.inverse, **self._live_of(number)}
+            kernel(items, **level.place, **known, moved=4 * level.nodes)
+
+    def _live_of(self, number: int) -> dict[str, Any]:
+        return {"live": self._live, "first_tile": int(self._first_tile[number])}
+
+    def factorise(self) -> bool:
+        """Solve the second level directly from now on, on the host; tell whether that is something new.
+
+        Corridors that are narrower than a coarser level's aggregates are no longer apart there.
+        """
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
+
+        if self._tail == 0 or self._factors is not None:
+            return False
+        node, a, b, weight, pull = self._h.equations(1)
+        count, first = len(node), node[0]
+        links = sparse.coo_matrix((weight, (a - first, b - first)), (count, count))
+        links = (links + links.T).tocsr()
+        parts, label = sparse.csgraph.connected_components(links, directed=False)
+        typical = np.asarray(links.sum(axis=1)).ravel()
+        held = np.bincount(label, pull, parts) <= _LEAST * np.bincount(label, typical, parts)
+        hold = np.zeros(count)
+        hold[np.unique(label, return_index=True)[1]] = np.where(held, 1.0, 0.0)  # one node of each free part
+        matrix = sparse.diags(typical + pull + hold) - links
+        options = {"SymmetricMode": True}
+        factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        self._factors = factors.solve
+        return True
+
+    def _solve_directly(self) -> None:
+        """Answer the right side of the second level."""
+        assert self._factors is not None
+        level = self._h.levels[1]
+        inside = slice(level.first, level.end - level.stride)
+        b, x = self.b.download(), self.x.download()
+        with np.errstate(over="ignore"):  # of graphs that nearly come apart: cycles end there
+            x[inside] = self._factors(b[inside].astype(np.float64))
+        self.b.upload()
+        self.x.upload()
+
+    def run(self) -> Doubles:
+        """Do a cycle from heights of zero: x answers b; return the product of both, (lanes,)."""
+        self.launch()
+        return self.product()
+
+    def launch(self) -> None:
+        """Put a cycle on the queue, and the parts of its product."""
+        self._go(0, again=False)
+        if self._tail == 0:
+            self._h.over_parts("dot", self.parts, one=self.b, other=self.x, lanes=self._lanes)
+
+    def _go(self, number: int, *, again: bool) -> None:
+        """Do a cycle from a level on, from heights of zero or ``again`` from those that it has."""
+        h = self._h
+        if number == 1 and self._factors is not None:
+            self._solve_directly()
+            return
+        if number == self._tail:
+            self._run_tail(again)
+            return
+        keep = int(h.moves[number] > 0)
+        self._half(
+            "descend",
+            number,
+            again=again,
+            x_before=self.x,
+            keep=keep,
+            t=self.spare,
+            residual=self._rest,
+            coarse_b=self.b,
+        )
+        h.gather(number, self._rest, self.b, self._lanes)
+        for second in (False, True)[: 1 + (number + 1 >= _TWICE)]:
+            self._go(number + 1, again=second)
+        arrays = {"e": self.x, "to": h.to, "t": self.spare, "x_new": self.x, "parts": self.parts}
+        self._half("ascend", number, moved_nodes=h.moves[number], **arrays)
+
+    def _run_tail(self, again: bool) -> None:
+        """Do all small levels."""
+        h = self._h
+        last = len(h.levels) - 1
+        kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
+        known: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
+        known |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
+        known |= {"from": self._tail, "last": last, "again": again}
+        kernel(kernel.group, **known, moved=moved)
+
+    def product(self) -> Doubles:
+        """Return the last cycle's product of right side and answer, (lanes,)."""
+        return add_parts(self.parts)
+
+    def _tiles(self, level: Level) -> int:
+        return -(-level.rows // tile_rows(self._h.device, self._lanes)) * -(
+            -level.stride // tile_columns(self._h.device, self._lanes)
+        )
+
+    def _kernel(self, name: str, level: Level) -> Kernel:
+        return self._h.kernel(name, self._h.links_of(level), self._lanes)
+
+    def _half(self, name: str, number: int, **arguments: Any) -> None:
+        """Go down or up by one level."""
+        h = self._h
+        fine = h.levels[number]
+        kernel = self._kernel(name, fine)
+        known = {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
+        items = self._tiles(fine) * kernel.group
+        kernel(items, **h.places(number), **known, **arguments, moved=21 * fine.nodes)
