@@ -113,14 +113,22 @@ class PoseScene:
     """The body wherever it is, for a camera that watches a stage.
 
     Upright above its own place it is seen by the `Imprint`, where there is one. Of other poses the light of
-    the last few is kept: a body that stands still is rendered once.
+    the last few is kept: a body that stands still is rendered once. ``shade`` turns that light into what is
+    seen of it, by the sheet's height and the pose, where that depends on the poses before.
     """
 
-    def __init__(self, skin: Skin, optics: Optics, imprint: Imprint | None, exposure: float) -> None:
-        self._skin, self._optics, self._imprint = skin, optics, imprint
+    def __init__(
+        self,
+        skin: Skin,
+        optics: Optics,
+        imprint: Imprint | None,
+        exposure: float,
+        shade: Callable[[Light, Floats, Pose], Light] | None = None,
+    ) -> None:
+        self._skin, self._optics, self._imprint, self._shade = skin, optics, imprint, shade
         self._ends = exposure * np.array([-0.5, 0.0, 0.5]) if exposure > 0 else np.zeros(1)
         self._moments = exposure * _BLUR if exposure > 0 else np.zeros(1)
-        self._kept: dict[bytes, Light] = {}
+        self._kept: dict[bytes, tuple[Light, Floats]] = {}
 
     def light(self, pose_at: Callable[[float], Pose], /) -> Light:
         """Return the mean light over an exposure; it holds until the next call.
@@ -139,8 +147,10 @@ class PoseScene:
         if key not in self._kept:
             if len(self._kept) >= _BLUR_POSES:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._optics.light(self._skin.drape(pose))
-        return self._kept[key]
+            sheet = self._skin.drape(pose)
+            self._kept[key] = self._optics.light(sheet), sheet.height
+        light, height = self._kept[key]
+        return light if self._shade is None else self._shade(light, height, pose)
 
 
 class Imprint:

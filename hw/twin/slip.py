@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import rectangle
+from mirrorskin.hw.twin.elastic import HalfSpace, rectangle
 from mirrorskin.hw.twin.friction import Friction
 from mirrorskin.hw.twin.movement import Horizontal, Twist, pose_at_press
 from mirrorskin.hw.twin.skin import Elastic
@@ -95,15 +95,7 @@ class SkinHistory:
 
         ``frame`` is a number with fractions, which may lie half a frame before the first or after the last.
         """
-        from scipy.ndimage import map_coordinates
-
-        place = self._place(frame)
-        at = _on_object(place, points)
-        rows, columns = self._space.shape
-        along_x, along_y = self._space.pixel_size
-        index = np.stack([(rows - 1) / 2 - at[1] / along_y, at[0] / along_x + (columns - 1) / 2])
-        shifted = [map_coordinates(part, index, order=1, mode="nearest") for part in self._shift(frame)]
-        return _behind(place, at, _drive(place, at) - np.stack(shifted))
+        return _material(self._space, self._shift(frame), self._place(frame), points)
 
     def displacement(self, frame: int, start: Floats) -> Floats:
         """Return how far points of the skin that lay at the pixels at the press have moved, (2, H, W), mm.
@@ -164,6 +156,49 @@ class SkinHistory:
         return self._kept[1]
 
 
+class SkinState:
+    """Stick and slip of a pressed body as it is moved along, of which only the present is known.
+
+    The same as `SkinHistory` of a movement that goes to the same places, at none of which a press is renewed.
+
+    Parameters
+    ----------
+    skin : Elastic
+    travel : float
+        How far the body was pressed, mm.
+    coefficient : float
+        Coulomb's, between sheet and object.
+    """
+
+    def __init__(self, skin: Elastic, travel: float, coefficient: float) -> None:
+        self._skin = skin
+        pressure = skin.solve(pose_at_press(travel)).pressure
+        self._friction = Friction(skin.space, pressure, coefficient)
+        self._slide = _Slide(self._friction, skin, coefficient * pressure)
+        self._place: Floats | None = None
+        self._space, self._margin = skin.space, (0, 0)
+
+    def go(self, place: Floats) -> None:
+        """Move the body straight on to a place: x and y, (2,), mm, or a twist, (1,), radians."""
+        before = np.zeros_like(place) if self._place is None else self._place
+        if self._place is not None and np.array_equal(before, place):
+            return
+        self._slide.go(place - before)
+        self._place = place
+        rows, columns = map(max, _margin(self._skin, place[np.newaxis]), self._margin)
+        if (rows, columns) != self._margin:
+            height, width = self._skin.space.shape
+            self._space = self._skin.space.window(height + 2 * rows, width + 2 * columns)
+            self._margin = rows, columns
+        padding = (0, 0), (rows, rows), (columns, columns)
+        self._shift = self._space.tangential(np.pad(self._friction.traction, padding))
+
+    def material(self, frame: float, points: Floats) -> Floats:
+        """Return where the skin was at the press that lies at points now, whatever the frame."""
+        assert self._place is not None  # it has gone somewhere
+        return _material(self._space, self._shift, self._place, points)
+
+
 class _Slide:
     """One body that goes on, in steps that are small against what full sliding takes, and where it slips."""
 
@@ -196,6 +231,18 @@ class _Slide:
         middle = np.full_like(falls, (travel - now) / 2)
         more = np.divide(lacks[new] * (now - before), falls, out=middle, where=falls > 0)
         self.onset[new] = np.minimum(now + more, travel)
+
+
+def _material(space: HalfSpace, shift: Floats, place: Floats, points: Floats) -> Floats:
+    """Return where the skin was that lies at points; the traction's shift is that of the object's frame."""
+    from scipy.ndimage import map_coordinates
+
+    at = _on_object(place, points)
+    rows, columns = space.shape
+    along_x, along_y = space.pixel_size
+    index = np.stack([(rows - 1) / 2 - at[1] / along_y, at[0] / along_x + (columns - 1) / 2])
+    shifted = [map_coordinates(part, index, order=1, mode="nearest") for part in shift]
+    return _behind(place, at, _drive(place, at) - np.stack(shifted))
 
 
 def _margin(skin: Elastic, path: Floats) -> tuple[int, int]:

@@ -10,10 +10,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.hw.twin.movement import Pose
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.scene import Light
-from mirrorskin.hw.twin.skin import Sheet
-from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.skin import Elastic, Sheet
+from mirrorskin.hw.twin.slip import SkinHistory, SkinState
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, InputError
 
@@ -24,6 +25,7 @@ _TILE = 512  # random numbers along each axis, after which a texture repeats its
 _PIXELS_MIN = 2.0  # of a flake or a dot
 _PITCH = 2.0  # from dot to dot, in diameters
 _RIM = 0.3  # width of a dot's soft rim, in diameters
+_STILL = 1e-7  # mm and radians that are no motion
 _JITTER = (_PITCH - 1 - _RIM) / 2  # by which a dot may lie off its place along x and y, in diameters
 
 
@@ -149,7 +151,7 @@ class Coat:
         return self.shade(self.optics.light(sheet), sheet.height)
 
     def shade(
-        self, light: Light, height: Floats, frame: float = 0.0, history: SkinHistory | None = None
+        self, light: Light, height: Floats, frame: float = 0.0, history: SkinHistory | SkinState | None = None
     ) -> Light:
         """Return what pixels show that get a light from the mirror, of a sheet as high as this at a frame."""
         view = self._view
@@ -159,3 +161,34 @@ class Coat:
         if history is not None:
             seen = history.material(frame, seen)
         return self.texture.shown(self.texture.reflectance(seen), light)
+
+
+class DraggedCoat:
+    """The same of a body that is moved from pose to pose, whose skin friction drags along.
+
+    While it is pressed as before and upright, it slides or twists from where it was pressed: one of both. A
+    press anew, or a lean, frees the skin.
+    """
+
+    def __init__(self, coat: Coat, skin: Elastic, coefficient: float) -> None:
+        self._coat, self._skin, self._coefficient = coat, skin, coefficient
+        self._travel, self._pressed_at = math.nan, np.zeros(3)
+        self._state: SkinState | None = None
+        self._twists = False
+
+    def shade(self, light: Light, height: Floats, pose: Pose) -> Light:
+        """Return what pixels show that get a light from the mirror, in the pose after those before."""
+        rotation, travel = pose.rotation, float(pose.shift[2])
+        x, y, _ = -rotation.T @ pose.shift
+        place = np.array([x, y, math.atan2(rotation[0, 1], rotation[0, 0])])
+        if abs(travel - self._travel) > _STILL or rotation[2, 2] < 1 - _STILL:
+            self._travel, self._pressed_at, self._state = travel, place, None
+        way = place - self._pressed_at
+        twists = bool(abs(way[2]) > _STILL)
+        if twists != self._twists:
+            self._twists, self._state = twists, None
+        if self._state is None and abs(way).max() > _STILL:
+            self._state = SkinState(self._skin, travel, self._coefficient)
+        if self._state is not None:
+            self._state.go(way[2:] if twists else way[:2])
+        return self._coat.shade(light, height, history=self._state)

@@ -21,7 +21,7 @@ from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
 from mirrorskin.hw.twin.scene import CachedScene, Imprint, PoseScene, Press, Scene
 from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
 from mirrorskin.hw.twin.slip import SkinHistory
-from mirrorskin.hw.twin.texture import Coat, SheetTexture
+from mirrorskin.hw.twin.texture import Coat, DraggedCoat, SheetTexture
 from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, make_truth
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
@@ -226,7 +226,8 @@ class Twin(Closing):
     def look(self, pose_at: Callable[[float], Pose], number: int, out: NDArray[Any]) -> None:
         """Render one frame with the body wherever it is, as a camera beside a stage sees it.
 
-        The counts are those that `read` gives of a frame of this number with the body at the same places. The
+        The counts are those that `read` gives of a frame of this number with the body at the same places: in
+        elastic contact what friction does to the skin depends on the poses that were looked at before. The
         movement only bounds how far the body may go: in elastic contact what the object reaches elsewhere is
         not looked for.
 
@@ -243,7 +244,10 @@ class Twin(Closing):
 
     @functools.cached_property
     def _anywhere(self) -> PoseScene:
-        return PoseScene(self._skin, self._optics, self._imprint, self._camera.exposure)
+        coat, skin, optics, shade = self._optics, self._skin, self._optics, None
+        if isinstance(coat, Coat) and isinstance(skin, Elastic):
+            optics, shade = coat.optics, DraggedCoat(coat, skin, self._body.friction).shade
+        return PoseScene(skin, optics, self._imprint, self._camera.exposure, shade)
 
     @functools.cached_property
     def _imprint(self) -> Imprint | None:

@@ -17,10 +17,20 @@ import pytest
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Frames
-from mirrorskin.hw.emulator.camera import TwinCamera
+from mirrorskin.hw.emulator.camera import TwinCamera, pose_at
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import Axial, Body, Camera, Twin, Vertical
+from mirrorskin.hw.twin import (
+    Axial,
+    Body,
+    Camera,
+    Horizontal,
+    SheetTexture,
+    Sphere,
+    Twin,
+    Twist,
+    Vertical,
+)
 from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_lean
 from mirrorskin.io import InputError
 
@@ -181,3 +191,29 @@ def test_a_lost_camera_tells_readers() -> None:
 def test_what_cannot_be_is_refused(given: dict[str, float]) -> None:
     with pytest.raises(InputError, match=f"^{next(iter(given))} .* cannot be"):
         TwinCamera(make_twin(MOVEMENTS["press"]), still, **given)
+
+
+@pytest.mark.parametrize(
+    "movement",
+    [
+        Horizontal(np.outer([0.0, 0.1, 0.25, 0.2], [0.6, 0.8]), 0.4),
+        Twist(np.radians([0.0, 4.0, 9.0, 7.0]), 0.4),
+    ],
+    ids=["horizontal", "twist"],
+)
+def test_a_skin_with_a_texture_is_dragged_as_in_the_twin_itself(movement: Horizontal | Twist) -> None:
+    given: dict[str, Any] = {"object": Sphere(8.0), "shape": (40, 50), "pixel_size": 0.12}
+    camera = Camera(noise=0.0, exposure=0.0)
+    twin = Twin(
+        movement=movement, contact="elastic", texture=SheetTexture("flakes", 0.4), camera=camera, **given
+    )
+    expected = read_all(twin)
+    places = [
+        Position(0.4, twist=float(at)) if movement.motion == "twist" else Position(0.4, x=at[0], y=at[1])
+        for at in movement.positions
+    ]
+    look(twin, 0, lambda late: pose_at(Position(0.2)))
+    for place, frame in zip(places, expected, strict=True):
+        seen = look(twin, 0, lambda late, at=place: pose_at(at))
+        np.testing.assert_allclose(seen.astype(int), frame, atol=1)
+    assert (expected[0] != expected[-1]).any()

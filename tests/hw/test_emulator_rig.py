@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.rig_file import load_rig
 from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import Axial, Camera, Horizontal, Twin, Twist, Vertical
+from mirrorskin.hw.twin import Axial, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
 from mirrorskin.io import InputError
 
 PATIENCE = 20.0  # seconds, for a busy machine
@@ -113,6 +113,22 @@ def test_x_y_and_twist_are_those_of_the_twins_movements() -> None:
         twist = Twist(np.full(number + 1, math.radians(30)), 1.0)
         assert np.mean(turned != direct(rig.twin(twist), number)) < 0.001  # the angle is rounded
         assert np.any(turned != seen)
+
+
+def test_friction_drags_the_skin_and_its_texture_along() -> None:
+    scene: dict[str, Any] = {"shape": (40, 50), "pixel_size": 0.15, "rate": 30.0, "contact": "elastic"}
+    texture = SheetTexture("flakes", 0.5)
+    with EmulatedRig(Sphere(8.0), texture=texture, **scene) as rig, say(rig) as command:
+        command("G21 G90 G1 Z-4.4 F600")
+        rest(rig)
+        _, pressed = newest(rig)
+        command("A0.2 F60")
+        rest(rig)
+        number, seen = newest(rig)
+        slide = Horizontal(np.tile((0.2, 0.0), (number + 1, 1)), 0.4)
+        expected = direct(rig.twin(slide), number).astype(int)
+    assert abs(seen - expected).mean() < 0.3
+    assert abs(seen.astype(int) - pressed).mean() > 3
 
 
 def test_an_arc_goes_round_at_the_tilt() -> None:
