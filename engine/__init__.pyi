@@ -1,5 +1,6 @@
 from .errors import NotConverged
 from .force.normal import Force, find_force
+from .force.tangential import TangentialForce, find_tangential_force
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -41,6 +42,7 @@ __all__ = [
     "StrokeSearch",
     "Strokes",
     "Surface",
+    "TangentialForce",
     "correlate",
     "estimate_normals",
     "estimate_pose",
@@ -50,6 +52,7 @@ __all__ = [
     "find_edges",
     "find_force",
     "find_onset",
+    "find_tangential_force",
     "free_memory",
     "fuse",
     "integrate",

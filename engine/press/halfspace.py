@@ -221,12 +221,18 @@ def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: flo
 @lru_cache(maxsize=128)
 def _spectrum(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Doubles:
     """Return the transform of the weights on the padded grid; they are even, so it is real."""
-    weights = _influence(shape, pixel_size)
-    whole = np.zeros(_padded(shape))
-    rows, columns = shape
+    return spectrum_of(_influence(shape, pixel_size))
+
+
+def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:
+    """Return the transform of weights (H, W) on the padded grid; they are even, or odd along both axes."""
+    rows, columns = weights.shape
+    whole = np.zeros(_padded((rows, columns)))
     whole[:rows, :columns] = weights
-    whole[-rows + 1 :, :columns] = weights[:0:-1] if rows > 1 else whole[-rows + 1 :, :columns]
-    whole[:, -columns + 1 :] = whole[:, columns - 1 : 0 : -1] if columns > 1 else whole[:, -columns + 1 :]
+    if rows > 1:
+        whole[-rows + 1 :, :columns] = sign * weights[:0:-1]
+    if columns > 1:
+        whole[:, -columns + 1 :] = sign * whole[:, columns - 1 : 0 : -1]
     return np.ascontiguousarray(fft.rfft2(whole).real)
 
 

@@ -1,0 +1,251 @@
+"""Traction and force along the sheet, in newtons, from how far the skin is displaced."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft, ndimage, special
+from scipy.optimize import brentq
+
+from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.force.normal import check_modulus
+from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.press.halfspace import spectrum_of
+from mirrorskin.io import InputError
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
+_UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y runs up, rows run down
+_TOLERANCE, _ROUGH = 1e-5, 1e-3  # of the greatest displacement; the second, of damped tractions
+_STEPS = 400  # of conjugate gradients
+_LEAST_KNOWN = 0.8  # of the contact that must have a displacement
+_DAMPING = 1e-4, 1e4  # of what a contact as a whole gives way by
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TangentialForce:
+    """The force along the sheet.
+
+    Attributes
+    ----------
+    traction : ndarray, (H, W, 2), float32
+        MPa along x and y that the object exerts on the sensor; 0 outside the contact.
+    force, sigma : ndarray, (2,), float64
+        Newtons along x and y, and the standard deviations that are expected.
+    """
+
+    traction: NDArray[np.float32]
+    force: Doubles
+    sigma: Doubles
+
+
+def find_tangential_force(
+    displacement: ArrayLike,
+    pixel_size: ArrayLike,
+    modulus: float,
+    *,
+    contact: ArrayLike | None = None,
+    normal_pressure: ArrayLike | None = None,
+    sigma: ArrayLike = 0.0,
+    window: int = 1,
+    modulus_sigma: float = 0.0,
+) -> TangentialForce:
+    """Find the traction that displaces the skin along the sheet, and the force.
+
+    The elastomer is an incompressible half-space, in which pressure displaces nothing along the surface. A
+    force Q along x displaces it by 3 / (4 pi E) times Q (1 / r + x^2 / r^3) along x and Q x y / r^3 along y
+    (Cerruti; Johnson, Contact Mechanics, 1985, 3.6). Its inverse in the contact, where alone there is
+    traction, needs no law of friction: it holds where the skin sticks and where it slips.
+
+    The operator is symmetric, so the force is a sum of the displacements, weighted with the traction under
+    which the contact would be displaced by 1 as a whole; its error follows from theirs. Tractions amplify
+    noise of short waves: they are damped, such that displacements are missed by their standard deviation
+    (Morozov's discrepancy principle).
+
+    Parameters
+    ----------
+    displacement : array_like, (H, W, 2)
+        Of the skin against the body, mm, x right and y up.
+    pixel_size : float or (float, float)
+        Millimetres, along x and y.
+    modulus : float
+        Young's, MPa.
+    contact : array_like, (H, W), optional
+        Where the object touches; by default where the pressure is above 0. One that is too large costs
+        accuracy only by noise, one that is too small loses force.
+    normal_pressure : array_like, (H, W), optional
+        As a result's ``pressure``; needed without a contact.
+    sigma : array_like, scalar or (H, W)
+        Standard deviation of each component of the displacement, mm.
+    window : int
+        Pixels along a side of the windows in which displacements were found: neighbours share their errors.
+    modulus_sigma : float
+        Standard deviation of the modulus, MPa.
+
+    Returns
+    -------
+    TangentialForce
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        No contact, a shape or number that cannot be, or less than 80 % of the contact with a displacement.
+    mirrorskin.engine.NotConverged
+        The traction was not found.
+
+    Examples
+    --------
+    A disc of 2 mm that sticks and is displaced by 0.1 mm: by Mindlin 16/3 G a times that, 0.0178 N.
+
+    >>> import numpy as np
+    >>> x = np.linspace(-1.5, 1.5, 61)
+    >>> disc = np.hypot(x, x[:, np.newaxis]) <= 1
+    >>> moved = np.broadcast_to([0.1, 0.0], (61, 61, 2))
+    >>> find_tangential_force(moved, 0.05, modulus=0.1, contact=disc).force.round(3)[0].tolist()
+    0.018
+    """
+    moved, spread, touches = _checked(displacement, sigma, contact, normal_pressure, window)
+    size = check_pixel_size(pixel_size)
+    check_modulus(modulus)
+    rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
+    traction = np.zeros((*touches.shape, 2), np.float32)
+    touches, spread = touches[rows, columns], spread[rows, columns]
+    target = np.where(touches, moved[:, rows, columns] * _UP, 0.0)
+    system = _System(touches, size)
+    units = [touches * unit for unit in np.eye(2)[:, :, np.newaxis, np.newaxis]]
+    weights = np.stack([system.solve(unit, _TOLERANCE) for unit in units]) * size[0] * size[1]
+    force = modulus * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
+    shared = ndimage.uniform_filter(weights * spread, (0, 0, window, window), mode="constant") * window
+    own = modulus * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
+    strain = system.damped(target, spread)
+    traction[rows, columns] = np.moveaxis(modulus * strain * _UP, 0, -1)
+    return TangentialForce(traction, force, np.hypot(own, modulus_sigma / modulus * force))
+
+
+def _checked(
+    displacement: ArrayLike,
+    sigma: ArrayLike,
+    contact: ArrayLike | None,
+    pressure: ArrayLike | None,
+    window: int,
+) -> tuple[Doubles, Doubles, Mask]:
+    """Return displacements without gaps, their standard deviations, and the contact."""
+    moved = np.asarray(displacement, np.float64)
+    if moved.ndim != 3 or moved.shape[2] != 2 or 0 in moved.shape:
+        raise InputError(f"displacements have shape {moved.shape}: one map (H, W, 2) is needed")
+    if contact is None and pressure is None:
+        raise InputError("where the object touches is not said: give contact, or normal_pressure")
+    touches = np.asarray(contact if contact is not None else np.asarray(pressure, np.float64) > 0) > 0
+    spread = np.asarray(sigma, np.float64)
+    for name, shape in (("contact", touches.shape), ("sigma", spread.shape or moved.shape[:2])):
+        if shape != moved.shape[:2]:
+            raise InputError(f"{name} has shape {shape}: it must be that of the map, {moved.shape[:2]}")
+    if window < 1:
+        raise InputError(f"window {window} cannot be: give pixels, 1 or more")
+    if not touches.any():
+        raise InputError("nothing touches: there is no traction to find")
+    known = np.isfinite(moved).all(axis=-1)
+    share = np.count_nonzero(known & touches) / np.count_nonzero(touches)
+    if share < _LEAST_KNOWN:
+        raise InputError(f"{share:.0%} of the contact has a displacement: {_LEAST_KNOWN:.0%} are needed")
+    moved = np.stack([fill_with_nearest(np.where(known, part, np.nan)) for part in np.moveaxis(moved, -1, 0)])
+    return moved, np.broadcast_to(spread, touches.shape), touches
+
+
+class _System:
+    """Tractions over Young's modulus, (2, H, W), on a contact, and how they displace it, along x and rows."""
+
+    def __init__(self, contact: Mask, pixel_size: tuple[float, float]) -> None:
+        self._contact, shape = contact, contact.shape
+        self._padded = fft.next_fast_len(2 * shape[0] - 1), fft.next_fast_len(2 * shape[1] - 1, real=True)
+        reach = math.hypot(shape[0] * pixel_size[1], shape[1] * pixel_size[0])
+        wide = [
+            fft.next_fast_len(count + math.ceil(reach / size))
+            for count, size in zip(shape, pixel_size[::-1], strict=True)
+        ]
+        weights = [
+            fft.irfft2(part, wide)[: shape[0], : shape[1]] for part in _tensor(wide, pixel_size, reach)
+        ]
+        self._along, self._up, self._across = (
+            spectrum_of(part, sign) for part, sign in zip(weights, (1.0, 1.0, -1.0), strict=True)
+        )
+        along, up, across = _tensor(shape, pixel_size, reach)
+        determinant = along * up - across**2
+        self._inverse = up / determinant, along / determinant, -across / determinant
+
+    def displaced(self, strain: Doubles) -> Doubles:
+        """Return by how much tractions displace the contact, mm."""
+        spectra = self._along, self._up, self._across
+        return np.where(self._contact, _filtered(strain, spectra, self._padded), 0.0)
+
+    def solve(self, target: Doubles, tolerance: float, damping: float = 0.0) -> Doubles:
+        """Return the traction that displaces the contact, by conjugate gradients."""
+        goal = tolerance * float(np.abs(target).max())
+        strain, residual = np.zeros_like(target), target
+        direction, last = np.zeros_like(target), np.inf
+        for _ in range(_STEPS):
+            if float(np.abs(residual).max()) <= goal:
+                return strain
+            steepest = np.where(self._contact, _filtered(residual, self._inverse, self._contact.shape), 0.0)
+            square = float(np.sum(residual * steepest))
+            direction = steepest + square / last * direction
+            moved = self.displaced(direction) + damping * direction
+            length = square / float(np.sum(direction * moved))
+            strain = strain + length * direction
+            residual = residual - length * moved
+            last = square
+        raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
+
+    def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
+        """Return the traction that misses displacements by their standard deviation."""
+        noise = float(np.mean(np.broadcast_to(sigma, self._contact.shape)[self._contact] ** 2))
+        if not noise:
+            return self.solve(target, _TOLERANCE)
+        softness = _SOFTNESS * math.sqrt(np.count_nonzero(self._contact))
+
+        def excess(power: float) -> float:
+            damping = softness * 10**power
+            missed = damping * self.solve(target, _ROUGH, damping)
+            return float(np.mean(missed[:, self._contact] ** 2)) / noise - 1
+
+        low, high = (math.log10(end) for end in _DAMPING)
+        if excess(high) < 0:  # noise explains all displacements
+            return np.zeros_like(target)
+        found = low if excess(low) > 0 else float(brentq(excess, low, high, xtol=0.05))
+        return self.solve(target, _ROUGH, softness * 10**found)
+
+
+def _filtered(values: Doubles, spectra: tuple[Doubles, Doubles, Doubles], shape: tuple[int, ...]) -> Doubles:
+    """Return a symmetric tensor, by its spectra xx, yy and xy, applied to vectors (2, H, W)."""
+    x, y = fft.rfft2(values, shape)
+    xx, yy, xy = spectra
+    both = np.stack([xx * x + xy * y, xy * x + yy * y])
+    found: Doubles = fft.irfft2(both, shape)[:, : values.shape[1], : values.shape[2]]
+    return found
+
+
+def _tensor(
+    shape: tuple[int, ...] | list[int], pixel_size: tuple[float, float], reach: float
+) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the spectra xx, yy and xy of a point force's displacements, cut off at a reach, mm.
+
+    At the wavenumber q towards phi they are 3 / (2 E q) times ``3/2 S0 - cos(2 phi) S2 / 2`` of xx, the same
+    with plus of yy, and ``- sin(2 phi) S2 / 2`` of xy; S0 and S2 are the integrals of the Bessel functions J0
+    and J2 from 0 to q times the reach, which go to 1.
+    """
+    q_y = 2 * math.pi * fft.fftfreq(shape[0], pixel_size[1])[:, np.newaxis]
+    q_x = 2 * math.pi * fft.rfftfreq(shape[1], pixel_size[0])[np.newaxis]
+    q = np.hypot(q_x, q_y)
+    q[0, 0] = 1.0
+    even = special.itj0y0(q * reach)[0]
+    odd = even - 2 * special.j1(q * reach)
+    even, odd = 2 * math.pi * _SOFTNESS * even / q, math.pi * _SOFTNESS * odd / q
+    even[0, 0], odd[0, 0] = 2 * math.pi * _SOFTNESS * reach, 0.0
+    cosine, sine = (q_x**2 - q_y**2) / q**2, 2 * q_x * q_y / q**2
+    return 1.5 * even - odd * cosine, 1.5 * even + odd * cosine, -odd * sine

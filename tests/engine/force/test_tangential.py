@@ -1,0 +1,158 @@
+"""Tangential force and traction: of Mindlin's and Cattaneo's contacts, and of the twin's skin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from contact_theory import paraboloid, pushed, traction_response
+
+from mirrorskin import io
+from mirrorskin.engine.force.normal import find_force
+from mirrorskin.engine.force.tangential import find_tangential_force
+from mirrorskin.hw.twin import Body, Horizontal, Sphere, Twin
+
+MODULUS, PIXEL = 0.1, 0.05
+SHEAR = MODULUS / 3
+
+
+def places(count=61, pixel=PIXEL):
+    x = pixel * (np.arange(count) - (count - 1) / 2)
+    return x[np.newaxis], -x[:, np.newaxis]
+
+
+def half_ellipsoid(radius, peak, *grid):
+    """The traction peak sqrt(1 - r^2 / a^2) along x, and the displacement in it: Johnson, eq. 3.91."""
+    x, y = places(*grid)
+    inside = np.hypot(x, y) < radius
+    traction = np.where(inside, peak * np.sqrt(np.maximum(1 - (x**2 + y**2) / radius**2, 0)), 0)
+    size = np.pi * peak / (32 * SHEAR * radius)
+    moved = np.stack([size * (6 * radius**2 - 2.5 * x**2 - 3.5 * y**2), size * x * y], axis=-1)
+    return inside, traction, moved
+
+
+def test_a_disc_that_sticks_is_mindlin_s():
+    x, y = places()
+    disc = np.hypot(x, y) <= 1
+    moved = np.broadcast_to([0.1, -0.05], (61, 61, 2))
+    found = find_tangential_force(moved, PIXEL, MODULUS, contact=disc)
+    np.testing.assert_allclose(found.force, 16 / 3 * SHEAR * np.array([0.1, -0.05]), rtol=0.01)
+    assert not found.traction[~disc].any()
+
+
+def test_a_traction_is_found_from_its_displacement_alone():
+    inside, traction, moved = half_ellipsoid(1.0, 0.02)
+    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
+    np.testing.assert_allclose(found.force, [2 / 3 * np.pi * 0.02, 0], atol=1e-4)
+    assert np.abs(found.traction[..., 0] - traction)[inside].mean() < 0.01 * 0.02
+    turned = np.stack([-moved[..., 1].T, moved[..., 0].T], axis=-1)[::-1, ::-1]
+    up = find_tangential_force(turned, PIXEL, MODULUS, contact=inside)
+    np.testing.assert_allclose(up.force, found.force[::-1], atol=1e-4)
+
+
+def test_partial_slip_is_cattaneo_s():
+    """The displacement is the sum over the pixels of the traction, by quadrature of Cerruti's solution."""
+    hertz = paraboloid(3.0, 0.9, MODULUS)
+    case = pushed(hertz, 0.5, MODULUS, 0.03)
+    count, size = 21, 0.1
+    x = size * (np.arange(count) - (count - 1) / 2)
+    r = np.hypot(x, x[:, np.newaxis])
+    peak = 0.5 * float(hertz.pressure(np.zeros(())))
+    whole, stuck = (
+        np.sqrt(np.maximum(1 - (r / radius) ** 2, 0)) * radius for radius in (0.9, case.stick_radius)
+    )
+    traction = peak / 0.9 * (whole - stuck)
+    responses = {
+        (i, j): traction_response(i * size, j * size, (size, size), MODULUS)[:, 0]
+        for i in range(-count + 1, count)
+        for j in range(-count + 1, count)
+    }
+    moved = np.array(
+        [
+            [
+                sum(
+                    traction[row, column] * responses[j - column, row - i]
+                    for row in range(count)
+                    for column in range(count)
+                    if traction[row, column]
+                )
+                for j in range(count)
+            ]
+            for i in range(count)
+        ]
+    )
+    found = find_tangential_force(moved, size, MODULUS, contact=r <= 1.0)
+    # So coarse a grid misses 4 % of the traction itself.
+    assert traction.sum() * size**2 == pytest.approx(case.force, rel=0.05)
+    np.testing.assert_allclose(found.force, [traction.sum() * size**2, 0], atol=0.01 * case.force)
+
+
+def test_the_error_of_the_force_is_honest_for_windows_too():
+    from scipy import ndimage
+
+    inside, traction, moved = half_ellipsoid(1.0, 0.02, 27, 0.08)
+    generator = np.random.default_rng(1)
+    for window in (1, 5):
+        drawn = []
+        for _ in range(40):
+            noise = generator.normal(0, 0.001 * window, moved.shape)
+            noise = ndimage.uniform_filter(noise, (window, window, 0))
+            found = find_tangential_force(
+                moved + noise, 0.08, MODULUS, contact=inside, sigma=0.001, window=window
+            )
+            drawn.append(found.force)
+        assert np.std(drawn, axis=0).mean() == pytest.approx(found.sigma.mean(), rel=0.25)
+    assert np.sqrt(np.mean((found.traction[..., 0] - traction)[inside] ** 2)) < 0.15 * 0.02
+
+
+def test_the_modulus_s_error_counts():
+    inside, _, moved = half_ellipsoid(1.0, 0.02)
+    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside, modulus_sigma=0.05 * MODULUS)
+    assert found.sigma[0] == pytest.approx(0.05 * found.force[0])
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.8])
+def test_the_twin_s_skin_is_pushed_with_the_twin_s_force(friction):
+    """Held-out loads: 3 % is required, of partial slip and of sliding."""
+    path = np.stack([np.linspace(0, 0.35, 6), np.linspace(0, -0.1, 6)], axis=1)
+    twin = Twin(
+        object=Sphere(6.0),
+        shape=(64, 64),
+        pixel_size=0.09,
+        movement=Horizontal(path, 0.6),
+        contact="elastic",
+        body=Body(modulus=0.12, friction=friction),
+    )
+    truth = twin.truth
+    pressed = find_force(truth.height, 0.6, 0.09, 0.12)
+    generator = np.random.default_rng(0)
+    for number in (2, 5):
+        moved = truth.displacement[number] + generator.normal(0, 5e-4, (64, 64, 2))
+        found = find_tangential_force(moved, 0.09, 0.12, normal_pressure=pressed.pressure, sigma=5e-4)
+        expected = truth.force[number, :2]
+        assert np.hypot(*(found.force - expected)) < 0.03 * np.hypot(*expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"displacement": np.zeros((9, 9))}, "one map"),
+        ({"contact": None}, "give contact, or normal_pressure"),
+        ({"contact": np.zeros((9, 9))}, "nothing touches"),
+        ({"contact": np.ones((9, 8))}, "contact has shape"),
+        ({"sigma": np.ones(4)}, "sigma has shape"),
+        ({"window": 0}, "window 0"),
+        ({"modulus": -1.0}, "modulus of -1 MPa"),
+        ({"displacement": np.full((9, 9, 2), np.nan)}, "0% of the contact has a displacement"),
+    ],
+)
+def test_what_cannot_be_is_one_line(changes, said):
+    known = {"displacement": np.zeros((9, 9, 2)), "modulus": 0.1, "contact": np.ones((9, 9))}
+    with pytest.raises(io.InputError, match=said):
+        find_tangential_force(pixel_size=0.1, **known | changes)
+
+
+def test_a_few_gaps_are_bridged():
+    inside, _, moved = half_ellipsoid(1.0, 0.02)
+    moved[28:31, 28:31] = np.nan
+    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
+    assert found.force[0] == pytest.approx(2 / 3 * np.pi * 0.02, rel=0.01)
