@@ -287,24 +287,30 @@ def _brightness(picture: NDArray[Any]) -> Finding:
 
 
 def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
-    """Home the stage if the file says so, set it upright within its limits, and move each axis from there."""
+    """Home the stage if the file says so, set it upright within its limits, and move each axis from there.
+
+    For x, y and twist the body is lifted first, so that it is not dragged over anything.
+    """
     if settings.home:
         stage.home()
         yield Finding("move", "homing", f"done; now {_in_words(stage.report().position, settings)}")
-    home = Position(stage.limits.nearest(stage.report().position).travel)
+    home = stage.limits.nearest(stage.report().position)
     stage.move(home)
     stage.wait()
     for name in settings.axes:
+        if name in ("x", "y", "twist"):
+            home = replace(home, travel=stage.limits.travel[0])
+            stage.move(home)
+            stage.wait()
         yield _there_and_back(stage, settings, name, home)
 
 
 def _step(limits: Limits, name: str, unit: str, value: float) -> float:
-    """Return how far an axis is moved: travel goes up if it can, so that nothing is pressed."""
-    if name != "travel":
-        farthest = limits.tilt if name in ("pitch", "roll") else getattr(limits, name)[1]
-        return min(_MOVE_MAX[unit], _MOVE_SHARE * farthest)
-    low = limits.travel[0]
-    step = min(_MOVE_MAX[unit], _MOVE_SHARE * (limits.press - low))
+    """Return how far an axis is moved: down if it can, so that travel goes up, and nothing is pressed."""
+    if name in ("pitch", "roll"):
+        return min(_MOVE_MAX[unit], _MOVE_SHARE * limits.tilt)
+    low, high = (limits.travel[0], limits.press) if name == "travel" else getattr(limits, name)
+    step = min(_MOVE_MAX[unit], _MOVE_SHARE * (high - low))
     return step if value - step < low else -step
 
 

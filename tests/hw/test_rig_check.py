@@ -12,7 +12,15 @@ from msgspec import structs
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.check import check_camera, check_moves, check_rig, check_stage
-from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings, TiltAxis, TravelAxis
+from mirrorskin.hw.rig_file import (
+    CameraSettings,
+    RigSettings,
+    ShiftAxis,
+    StageSettings,
+    TiltAxis,
+    TravelAxis,
+    TwistAxis,
+)
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 
@@ -237,6 +245,26 @@ def test_travel_goes_up_where_it_can_and_the_body_is_set_upright_first():
     stage = Stage(settings, at=(5.0, 0.2, 0.1))
     moves(stage, settings)
     assert stage.did[:3] == [Position(2.0), Position(1.5), Position(2.0)]
+
+
+def test_x_y_and_twist_are_moved_of_a_lifted_body():
+    x = ShiftAxis(letter="A", limits=(-0.1, 0.9), speed=1.0)
+    twist = TwistAxis(letter="C", limits=(-1.0, 2.0), speed=1.0)
+    settings = structs.replace(STAGE, home=False, x=x, twist=twist)
+    stage = Stage(settings, at=(1.0, 0.0, 0.0, 0.05, 0.0, 0.01))
+    found = moves(stage, settings)
+    assert {one.verdict for one in found} == {"ok"}
+    assert [one.what for one in found[-2:]] == ["x (A)", "twist (C)"]
+    assert stage.did[0] == Position(1.0, x=0.05, twist=0.01), "it stays where it may touch something"
+    lifted = Position(-10.0, x=0.05, twist=0.01)
+    assert stage.did[-6:] == [
+        lifted,
+        replace(lifted, x=pytest.approx(-0.05)),
+        lifted,
+        lifted,
+        replace(lifted, twist=pytest.approx(0.01 - 0.3 * DEGREE)),
+        lifted,
+    ]
 
 
 def test_an_axis_that_stops_elsewhere_fails():
