@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.positions import check_phase, check_strokes
+from mirrorskin.io.positions import check_finite, check_phase, check_strokes
 from mirrorskin.io.selection import Selection
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
@@ -41,7 +41,7 @@ SERIES = {
 }
 # Of recordings that are written while frames come: the positions as they were known then, whether a frame
 # was used, how many were lost before it, and whether all is well.
-LIVE = {"travel": (f"{STAGE}/travel_live", "mm"), "phase": (f"{STAGE}/phase_live", "rad")}
+LIVE = {name: (f"{place}_live", unit) for name, (place, unit) in SERIES.items() if name != "time"}
 USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
 # The CRC-32 of each frame's bytes, as it was recorded.
 CHECKSUM = f"{DETECTOR}/frame_checksum"
@@ -102,6 +102,11 @@ def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
     return isinstance(node, h5py.Dataset) and node.ndim > 0 and node.maxshape[0] is None
 
 
+def _width(name: str) -> Shape:
+    """Return how many numbers a series has of each frame, as further dimensions."""
+    return (2,) if name == "displacement" else ()
+
+
 class Layout:
     """What a file says of a part of its stack; of a file that is not ours, nothing."""
 
@@ -149,8 +154,7 @@ class Layout:
         """Read when each frame was taken, and where the body was; travel or phase may be given; check it."""
         name, time = POSITIONS[motion], self._cut(self._series("time", (self._count,)))
         if name not in _CHECKS:
-            width = (2,) if name == "displacement" else ()
-            return {"time": time, name: self._cut(self._series(name, (self._count, *width)))}
+            return {"time": time, name: self._cut(self._series(name, (self._count, *_width(name))))}
         where = f"{self._file.path}: {SERIES[name][0]}"
         if given is not None:
             where = f"{self._file.path}: the {name} given"
@@ -160,19 +164,22 @@ class Layout:
             remedy = _REMEDIES[name]
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
         found = {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
-        return found | {"tilt": self._cut(self._tilts())} if motion == "axial" else found
+        return found | {"tilt": self._tilts()} if motion == "axial" else found
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
         """Read when some frames of the part were taken, and where a live run thought the body to be then."""
         name = POSITIONS[motion]
-        place, unit = LIVE.get(name, ("", ""))
-        values = self._cut(self._per_frame(place, (self._count,), unit)) if place else None
-        if values is None:
-            raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
+        known = [name, "tilt"] if motion == "axial" and self._has_tilts() else [name]
         time = self._cut(self._series("time", (self._count,)))
-        where = f"{self._file.path}: {place} of the frames that were used"
-        used = _CHECKS[name](values[chosen], len(chosen), where)
-        return {name: used, "time": None if time is None else time[chosen]}
+        found = {"time": None if time is None else time[chosen]}
+        for one in known:
+            place, unit = LIVE[one]
+            values = self._cut(self._per_frame(place, (self._count, *_width(one)), unit))
+            if values is None:
+                raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
+            where = f"{self._file.path}: {place} of the frames that were used"
+            found[one] = check_finite(values[chosen], len(chosen), where, width=_width(one))
+        return found
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
@@ -246,14 +253,10 @@ class Layout:
         return self._scalar(SERIES["tilt"][0], "rad", "give --tilt")
 
     def _tilts(self) -> Floats | None:
-        """Read the half-angle of each frame, if that is what there is."""
+        """Read the half-angle of each frame of the part, if that is what there is."""
         tilts = self._series("tilt", (self._count,)) if self._has_tilts() else None
-        if tilts is not None and not np.isfinite(tilts).all():
-            frame = int(np.argmin(np.isfinite(tilts)))
-            raise InputError(
-                f"{self._file.path}: {SERIES['tilt'][0]} is not finite at frame {frame}: correct it"
-            )
-        return tilts
+        where = f"{self._file.path}: {SERIES['tilt'][0]}"
+        return None if tilts is None else check_finite(tilts, self._count, where, self._part.frames)
 
     def _has_tilts(self) -> bool:
         node = self._find(SERIES["tilt"][0])

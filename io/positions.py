@@ -111,7 +111,7 @@ def check_phase(
     """
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
-    return _finite(phase, count, name, within)
+    return check_finite(phase, count, name, within)
 
 
 def _known(
@@ -119,17 +119,31 @@ def _known(
 ) -> NDArray[np.float64]:
     if travel is None:
         raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
-    return _finite(travel, count, name, within)
+    return check_finite(travel, count, name, within)
 
 
-def _finite(values: ArrayLike, count: int, name: str, within: tuple[int, int] | None) -> NDArray[np.float64]:
+def check_finite(
+    values: ArrayLike,
+    count: int,
+    name: str,
+    within: tuple[int, int] | None = None,
+    width: tuple[int, ...] = (),
+) -> NDArray[np.float64]:
+    """Return the positions of so many frames as float64, (T, *width); ``within`` as for ``check_strokes``.
+
+    Examples
+    --------
+    >>> check_finite([[0, 1], [2, 3]], 2, "displacement", width=(2,)).tolist()
+    [[0.0, 1.0], [2.0, 3.0]]
+    """
     array: NDArray[Any] = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise InputError(f"{name} is of type {array.dtype}: numbers are needed")
-    if array.shape != (count,):
-        raise InputError(f"{name} has shape {array.shape} for {count} frames: one number a frame is needed")
+    if array.shape != (count, *width):
+        needed = "two numbers a frame are" if width else "one number a frame is"
+        raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
-    known = np.isfinite(array[start:stop])
+    known = np.isfinite(array[start:stop]).reshape(stop - start, -1).all(axis=1)
     if not np.all(known):
         frame = start + int(np.argmin(known))
         raise InputError(f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number")

@@ -89,8 +89,11 @@ def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
         assert recording.header.press == (None if motion == "vertical" else 1.0)
     for series, values in Feed(motion=motion).positions_of(np.arange(8), 0.001).items():
         np.testing.assert_array_equal(getattr(found, series), values)
-    live = {"vertical": {"travel_live"}, "axial": {"phase_live"}}.get(motion, set())
-    assert {series for series in held(tmp_path / "a.h5") if series.endswith("_live")} == live
+    moved = {"horizontal": "displacement"}.get(motion, name)
+    found = held(tmp_path / "a.h5")
+    assert {series for series in found if series.endswith("_live")} == {f"{moved}_live"}
+    with io.open_recording(tmp_path / "a.h5", live=True) as recording:
+        np.testing.assert_array_equal(getattr(recording, moved), found[f"{moved}_live"])
 
 
 def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
