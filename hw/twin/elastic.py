@@ -288,12 +288,7 @@ def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
     """
     from scipy import fft
 
-    rows, columns = (fft.next_fast_len(n, real=True) for n in space.shape)
-    q_x = 2 * np.pi * fft.rfftfreq(columns, space.pixel_size[0])
-    q_y = 2 * np.pi * fft.fftfreq(rows, space.pixel_size[1])
-    q = np.hypot(q_x[np.newaxis, :], q_y[:, np.newaxis])
-    # An even load is as soft as half a wave over the grid.
-    q[0, 0] = np.pi / max(rows * space.pixel_size[1], columns * space.pixel_size[0])
+    (rows, columns), _, _, q = wavenumbers(space)
     stiffness = (2 * space.modulus / 3 * q).astype(np.float32)
 
     def apply(values: Floats) -> Floats:
@@ -303,3 +298,18 @@ def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
         return back[: space.shape[0], : space.shape[1]]
 
     return apply
+
+
+def wavenumbers(space: HalfSpace) -> tuple[tuple[int, int], Floats, Floats, Floats]:
+    """Return the size of a grid that comes round on itself, and its transform's q_x, q_y and q, 1/mm."""
+    from scipy import fft
+
+    rows, columns = (fft.next_fast_len(n, real=True) for n in space.shape)
+    q_x, q_y = np.meshgrid(
+        2 * np.pi * fft.rfftfreq(columns, space.pixel_size[0]),
+        -2 * np.pi * fft.fftfreq(rows, space.pixel_size[1]),
+    )
+    q = np.hypot(q_x, q_y)
+    # An even load is as soft as half a wave over the grid.
+    q[0, 0] = np.pi / max(rows * space.pixel_size[1], columns * space.pixel_size[0])
+    return (rows, columns), q_x, q_y, q

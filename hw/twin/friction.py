@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import HalfSpace, inner, rectangle
+from mirrorskin.hw.twin.elastic import HalfSpace, inner, rectangle, wavenumbers
 from mirrorskin.io.types import Floats
 
 TOLERANCE = 1e-3
@@ -31,7 +32,8 @@ class Friction:
     goes on by dU and the surface by du = C dq, C being Cerruti's response to the traction q. Where |q| < mu p
     it sticks, du = dU; where |q| = mu p it may slip, and then q points along the slip dU - du. Among all |q|
     <= mu p this q is the one of least dq C dq / 2 - dq dU (Kalker's principle for one step). It is found by
-    conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure.
+    conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure, from
+    the traction of a step that goes on as the one before.
 
     ``traction``, (2, H, W), is that of the object on the body, N/mm^2, along x and y.
     """
@@ -46,6 +48,8 @@ class Friction:
             self._limit = np.where(self._touches, coefficient * pressure[self._window], 0.0)
             self._space = space.window(*self._touches.shape)
             self._before = self._shift = np.zeros((2, *self._touches.shape))
+            self._step = self._growth = np.zeros_like(self._before)
+            self._inverse = _inverse(self._space)
             # How far a pixel shifts itself.
             self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
 
@@ -70,12 +74,20 @@ class Friction:
         # Steps of rounding are put together until they are worth a step.
         if far > _NO_STEP * max(float(_length(place).max()) for place in (here, self._shift)):
             tolerance = TOLERANCE * far
-            traction = self.traction[:, *self._window]
-            traction, self._shift, limited = self._follow(traction, self._shift + step, tolerance)
+            held = self.traction[:, *self._window]
+            likely = held + self._likeness(step) * self._growth
+            likely *= _shrink(likely, self._limit)
+            traction, self._shift, limited = self._follow(likely, self._shift + step, tolerance)
+            self._step, self._growth = step, traction - held
             self.traction[:, *self._window] = traction
             self._before = here
             slips[self._window] = limited.where & (limited.slip > tolerance)
         return slips
+
+    def _likeness(self, step: Floats) -> float:
+        """Return how much of the last step is in this one; 0 if it goes back."""
+        before = inner(self._step, self._step)
+        return max(0.0, inner(step, self._step) / before) if before > 0 else 0.0
 
     def _follow(self, traction: Floats, target: Floats, tolerance: float) -> tuple[Floats, Floats, _Limited]:
         """Return the traction that shifts the surface to the target where the limit allows, and its shift."""
@@ -88,8 +100,12 @@ class Friction:
             residual = limited.turn(lag)
             if float(_length(residual).max()) <= tolerance:
                 return traction, shift, limited
-            # Jacobi's preconditioner: where it slips far, only tiny turns of the traction are called for.
-            steepest = residual / (self._own + limited.curvature)
+            # What may stick moves together. Where it slips far, only tiny turns of the traction are called
+            # for: Jacobi's preconditioner.
+            free = np.where(limited.where, 0.0, residual)
+            steepest = np.where(
+                limited.where, residual / (self._own + limited.curvature), self._touches * self._inverse(free)
+            )
             gain = inner(residual, steepest)
             memory = max(0.0, (gain - inner(last, steepest)) / last_gain)
             direction = steepest + memory * limited.turn(direction)
@@ -121,6 +137,29 @@ class _Limited:
         """Return vectors without their part along the traction where that cannot grow."""
         turned: Floats = vectors - np.sum(vectors * self.along, axis=0) * self.along
         return turned
+
+
+def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
+    """Return a rough inverse of Cerruti's response, by its spectrum.
+
+    At wavenumber q a traction is softened by 1 / (2 G q) along q, and twice as much across. The grid comes
+    round on itself here, and single precision will do: it only steers the search.
+    """
+    from scipy import fft
+
+    padded, q_x, q_y, q = wavenumbers(space)
+    along_x, along_y, stiff = q_x / q, q_y / q, q / (4 * np.pi * space.softness)
+    xx, xy, yy = (
+        (stiff * part).astype(np.float32) for part in (1 + along_x**2, along_x * along_y, 1 + along_y**2)
+    )
+
+    def apply(values: Floats) -> Floats:
+        spectrum = fft.rfft2(values.astype(np.float32), padded, workers=2, overwrite_x=True)
+        along = np.stack([xx * spectrum[0] + xy * spectrum[1], xy * spectrum[0] + yy * spectrum[1]])
+        back: Floats = fft.irfft2(along, padded, workers=2, overwrite_x=True)
+        return back[:, : space.shape[0], : space.shape[1]]
+
+    return apply
 
 
 def _limited(traction: Floats, lag: Floats, limit: Floats) -> _Limited:
