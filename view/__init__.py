@@ -1,6 +1,7 @@
 """Pictures for people."""
 
 from mirrorskin.view.canvas import check_drawing
+from mirrorskin.view.force import force_figure
 from mirrorskin.view.truth import height_figure, normal_figure, surface_figure
 
-__all__ = ["check_drawing", "height_figure", "normal_figure", "surface_figure"]
+__all__ = ["check_drawing", "force_figure", "height_figure", "normal_figure", "surface_figure"]

@@ -8,7 +8,7 @@ from typing import Annotated
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.demo import presses, rotation, shapes
+from mirrorskin.cli.demo import force, presses, rotation, shapes
 from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json
 
@@ -33,13 +33,16 @@ def command(
     pressed = {one.name: presses.run(one, output, device) for one in presses.EXPERIMENTS}
     turned = {one.name: rotation.run(one, output, device) for one in rotation.EXPERIMENTS}
     shaped = shapes.run(output, device)
+    forces = force.run(force.EXPERIMENT, output, device)
     if as_json:
-        print_json({**pressed, **turned, **shaped})
+        print_json({**pressed, **turned, **shaped, "force": forces})
         return
     presses.print_outcomes(pressed)
     click.echo()
     rotation.print_outcomes(turned)
     click.echo()
     shapes.print_outcomes(shaped)
+    click.echo()
+    force.print_outcomes(forces)
     first = presses.EXPERIMENTS[0].name
     click.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Doubles = NDArray[np.float64]
 
 _ENOUGH = 3  # presses whose scatter says how far one is wrong
-_MODEL_ERROR = 0.006  # of a load, by splines and cells: measured on the twin with balls and cones
+_MODEL_ERROR = 0.004  # of a load, by splines and cells: measured on the twin with balls and cones
 _EXACT = 1e-12  # share of a force to which nothing is known better
 
 
@@ -102,7 +102,7 @@ def fit_stiffness(presses: Sequence[KnownPress], gel: Gel) -> StiffnessFit:
 
     The force is the modulus times the load, by least squares weighted with the errors of load and scale, and
     with a scatter in proportion to the force: as large as makes chi^2 of the residuals their degrees of
-    freedom (Paule and Mandel, J. Res. NBS 87, 1982, 377-385), and at least 0.6 %. The scatter holds
+    freedom (Paule and Mandel, J. Res. NBS 87, 1982, 377-385), and at least 0.4 %. The scatter holds
     what the presses do not have in common of the gel's errors and of the model's; what they have in common is
     in the modulus. Of fewer than three presses it is the largest share that the gel's errors have of a load.
 

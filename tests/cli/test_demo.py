@@ -11,14 +11,15 @@ import pytest
 from commands import run, small_experiments, small_rotations
 
 from mirrorskin import io, view
-from mirrorskin.cli.demo import presses, rotation
+from mirrorskin.cli.demo import force, presses, rotation
 
 FULL, ROTATIONS = presses.EXPERIMENTS, rotation.EXPERIMENTS
 WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
-DRAWN = *MADE, "fig10a", "fig10b", "fused"
+DRAWN = *MADE, "fig10a", "fig10b", "fused", "force"
+FORCES = force.Experiment(scale=(), found=(force.Press(6, 0.6),), size=48)
 
 # The table's rows.
 EXPECTED = [
@@ -50,6 +51,7 @@ def shown(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presses, "EXPERIMENTS", small_experiments())
         patch.setattr(rotation, "EXPERIMENTS", small_rotations())
+        patch.setattr(force, "EXPERIMENT", FORCES)
         patch.setattr(view, "height_figure", watch)
         patch.setattr(view, "normal_figure", watch_normals)
         patch.setattr(view, "surface_figure", watch_surfaces)
@@ -63,7 +65,7 @@ def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
     files = {f"{name}-{sensor}{end}" for name, each in MADE.items() for sensor in each for end in
              (".h5", "-result.h5")}  # fmt: skip
     files |= {"fig10a.h5"} | {f"fig10a-{way.replace(', ', '-')}-result.h5" for way in WAYS}
-    files |= {"fused-result.h5"} | {f"{name}.png" for name in DRAWN}
+    files |= {"force-cal.h5", "force-0-result.h5", "fused-result.h5"} | {f"{name}.png" for name in DRAWN}
     assert {path.name for path in folder.iterdir()} == files
     for name in DRAWN:
         assert cv2.imread(str(folder / f"{name}.png")).shape[0] > 300
@@ -137,6 +139,16 @@ def test_the_table_of_surfaces_tells_what_was_measured_apart_from_what_was_fille
         assert f"{word}: " in legend
 
 
+def test_the_table_of_forces_tells_found_and_true_newtons(shown):
+    start = next(number for number, line in enumerate(shown[0]) if "error / sigma" in line)
+    head, row = cells(shown[0][start]), cells(shown[0][start + 1])
+    told = dict(zip(head, row, strict=True))
+    assert (told["press"], told["depth"]) == ("ball 6 mm", "0.6 mm")
+    assert abs(float(told["error"].split()[0])) < 5
+    assert float(told["force"]) == pytest.approx(float(told["truth"]), rel=0.05)
+    assert "truth: the twin's" in " ".join(shown[0][start + 2 : -1])
+
+
 def cells(row):
     return [cell.strip() for cell in row.split("  ") if cell.strip()]
 
@@ -146,7 +158,8 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     sphere, only = (dataclasses.replace(one, sensors=presses.SENSORS[:1]) for one in small_experiments()[:2])
     monkeypatch.setattr(presses, "EXPERIMENTS", (sphere, only))
     monkeypatch.setattr(rotation, "EXPERIMENTS", small_rotations())
-    for figure in ("height_figure", "normal_figure", "surface_figure"):
+    monkeypatch.setattr(force, "EXPERIMENT", FORCES)
+    for figure in ("force_figure", "height_figure", "normal_figure", "surface_figure"):
         monkeypatch.setattr(view, figure, lambda *given, **style: None)
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
