@@ -110,6 +110,16 @@ def command(
     pivot: Annotated[
         str | None, _of(_AXIAL, "pivot", "X,Y,Z", "Axial: what it turns about, from the sheet's centre.")
     ] = None,
+    rock: Annotated[
+        str | None,
+        Option(
+            metavar="ANGLE",
+            help="Axial: rock towards this phase, --tilt far, as a sine of the phases of --phase-step.",
+        ),
+    ] = None,
+    spiral: Annotated[
+        bool, Option("--spiral", help="Axial: tilt and press grow from nothing, frame by frame.")
+    ] = False,
     displacement_step: Annotated[
         str | None, _of(_HORIZONTAL, "displacement-step", "X,Y", "Horizontal: from frame to frame.")
     ] = None,
@@ -173,7 +183,7 @@ def command(
         object=thing,
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
-        movement=make_movement(motion, frames, release, given, strokes),
+        movement=make_movement(motion, frames, release, given, strokes, rock, spiral),
         contact=contact.value,
         optics=optics.value,
         pattern=pattern,
@@ -218,6 +228,8 @@ def make_movement(
     release: bool,
     given: Mapping[str, str | None],
     strokes: int | None = None,
+    rock: str | None = None,
+    spiral: bool = False,
 ) -> Movement:
     """Return the twin's movement that options describe; those not given have the values of ``DEFAULTS``."""
     import numpy as np
@@ -228,9 +240,9 @@ def make_movement(
 
     own = DEFAULTS[motion]
     foreign = [f"--{name}" for name, value in given.items() if value is not None and name not in own]
-    for option, value in (("--release", release), ("--strokes", strokes)):
-        if value and motion != options.MotionName.vertical:
-            foreign.append(option)
+    own_of = {"--release": _VERTICAL, "--strokes": _VERTICAL, "--rock": _AXIAL, "--spiral": _AXIAL}
+    special = zip(own_of.items(), (release, strokes, rock, spiral), strict=True)
+    foreign += [option for (option, own_motion), value in special if value and own_motion != motion]
     if foreign:
         raise io.InputError(
             f"{foreign[0]} says nothing of a motion that is {motion.value}: leave it out, or choose another"
@@ -251,7 +263,14 @@ def make_movement(
         step = angle(words["phase-step"], "--phase-step")
         x, y, z = vector(words["pivot"], 3, "--pivot")
         tilt = angle(words["tilt"], "--tilt")
-        return twin.Axial(io.Steps(step).positions(frames or _frames_of_a_turn(step)), tilt, press, (x, y, z))
+        phase = io.Steps(step).positions(frames or _frames_of_a_turn(step))
+        grown = np.arange(1, len(phase) + 1) / len(phase) if spiral else 1.0
+        if rock is not None:
+            towards = np.full(len(phase), angle(rock, "--rock"))
+            return twin.Leaning(towards, grown * tilt * np.sin(phase), grown * press, (x, y, z))
+        if spiral:
+            return twin.Leaning(phase, grown * tilt, grown * press, (x, y, z))
+        return twin.Axial(phase, tilt, press, (x, y, z))
     if motion == options.MotionName.horizontal:
         along = vector(words["displacement-step"], 2, "--displacement-step")
         return twin.Horizontal(np.stack([io.Steps(one).positions(count) for one in along], axis=1), press)

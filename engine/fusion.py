@@ -19,7 +19,7 @@ from mirrorskin.engine.reconstruction import calibrated, undistorted
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, find_slopes
 from mirrorskin.engine.rotation.response import wall_response_of
-from mirrorskin.engine.rotation.rotation import Rotation, estimate_rotation, rotation_maps
+from mirrorskin.engine.rotation.rotation import Rotation, at_poses, estimate_rotation, rotation_maps
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source
@@ -257,6 +257,8 @@ def _check_rotation(axial: Source, rotation: Mapping[str, Any]) -> None:
         raise InputError(
             f"{axial.name} has no zenith gain, so no normals to fuse: give the gain, or a calibration"
         )
+    if at_poses(axial, rotation.get("tilt")):
+        raise InputError(f"{axial.name} has a tilt of each frame: a fusion needs turns of one tilt")
     if rotation.get("per_turn"):
         raise InputError(f"{axial.name}: all turns make one surface: do not ask for each turn's own")
 

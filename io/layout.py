@@ -142,8 +142,8 @@ class Layout:
             pixel_size=pixel_size,
             dark=self._reference("dark"),
             bright=self._reference("bright"),
-            press=self._scalar(f"{STAGE}/travel", "mm", "correct it") if pressed else None,
-            tilt=self._tilt() if tilt is None else tilt,
+            press=self._one("travel", "correct it") if pressed else None,
+            tilt=self._one("tilt", "give --tilt") if tilt is None else tilt,
             pivot=self._pivot(pixel_size),
             zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
@@ -164,7 +164,9 @@ class Layout:
             remedy = _REMEDIES[name]
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
         found = {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
-        return found | {"tilt": self._tilts()} if motion == "axial" else found
+        pressed = self._text(f"{STAGE}/motion") != "vertical"
+        also = ("tilt", "travel") if motion == "axial" and pressed else ()
+        return found | {one: self._each(one) for one in also}
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
         """Read when some frames of the part were taken, and where a live run thought the body to be then."""
@@ -246,20 +248,19 @@ class Layout:
             return values
         return np.ascontiguousarray(values[self._part.region.slices])
 
-    def _tilt(self) -> float | None:
-        """Read the half-angle of all frames; None if there is one of each."""
-        if self._has_tilts():
-            return None
-        return self._scalar(SERIES["tilt"][0], "rad", "give --tilt")
+    def _one(self, name: str, remedy: str) -> float | None:
+        """Read a number of all frames; None if there is one of each."""
+        place, unit = SERIES[name]
+        return None if self._is_of_each(name) else self._scalar(place, unit, remedy)
 
-    def _tilts(self) -> Floats | None:
-        """Read the half-angle of each frame of the part, if that is what there is."""
-        tilts = self._series("tilt", (self._count,)) if self._has_tilts() else None
-        where = f"{self._file.path}: {SERIES['tilt'][0]}"
-        return None if tilts is None else check_finite(tilts, self._count, where, self._part.frames)
+    def _each(self, name: str) -> Floats | None:
+        """Read a number of each frame of the part, if that is what there is."""
+        values = self._series(name, (self._count,)) if self._is_of_each(name) else None
+        where = f"{self._file.path}: {SERIES[name][0]}"
+        return None if values is None else check_finite(values, self._count, where, self._part.frames)
 
-    def _has_tilts(self) -> bool:
-        node = self._find(SERIES["tilt"][0])
+    def _is_of_each(self, name: str) -> bool:
+        node = self._find(SERIES[name][0])
         return isinstance(node, h5py.Dataset) and (_grows(node) or (node.size or 0) > 1)
 
     def _pivot(self, pixel_size: tuple[float, float] | None) -> tuple[float, float, float] | None:

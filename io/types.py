@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     import xarray
@@ -42,7 +42,7 @@ class Block:
     time : ndarray, (n,), float64, or None
         Seconds since the recording began.
     travel : ndarray, (n,), float64, or None
-        Millimetres that the body has been lowered (vertical motion).
+        Millimetres that the body has been lowered (vertical motion, and axial where it presses as well).
     phase : ndarray, (n,), float64, or None
         Radians, counter-clockwise, of the precession (axial motion).
     displacement : ndarray, (n, 2), float64, or None
@@ -71,6 +71,17 @@ class Block:
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
     lent: bool = False
+
+    @property
+    def pose(self) -> Floats | None:
+        """The body's axis and travel in each frame, (n, 4): unit vectors, and mm, 0 where it is unknown.
+
+        None without phases and tilts.
+        """
+        if self.phase is None or self.tilt is None:
+            return None
+        travel = np.zeros(len(self.phase)) if self.travel is None else self.travel
+        return np.column_stack([body_axes(self.phase, self.tilt), travel])
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,11 +262,15 @@ class Result:
         Millimetres, and the standard deviation that is expected of the height; NaN where there is no answer.
     status : ndarray, (H, W), uint8
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
-        2 dark at start, 3 light to the end.
+        2 dark at start, 3 light to the end. Of a body with a tilt of each frame: 1 normal, 2 none, 4 only the
+        slope along one direction.
     hysteresis, hysteresis_sigma : ndarray, (H, W), float32
         Millimetres by which the release is higher than the onset, and the standard deviation of that.
     strokes : ndarray, (H, W), uint16
         In how many strokes of an oscillating press there was what the height is made of.
+    slope, slope_sigma : ndarray, (H, W), float32
+        Millimetres that the surface rises for each along the direction of rocking, ``slope_direction`` in the
+        process, and the standard deviation.
     normals : ndarray, (H, W, 3), float32
         Unit vectors along x, y and z in the mean pose; NaN where there is no answer.
     zenith, azimuth : ndarray, (H, W), float32
@@ -293,6 +308,8 @@ class Result:
     hysteresis: NDArray[np.float32] | None = None
     hysteresis_sigma: NDArray[np.float32] | None = None
     strokes: NDArray[np.uint16] | None = None
+    slope: NDArray[np.float32] | None = None
+    slope_sigma: NDArray[np.float32] | None = None
     normals: NDArray[np.float32] | None = None
     zenith: NDArray[np.float32] | None = None
     azimuth: NDArray[np.float32] | None = None
@@ -356,6 +373,20 @@ NO_MAPS = ("offset_unknown", *SCALARS, "x", "y", "process", "calibration")
 
 UNDISTORTED = "undistorted"
 """What the process of a result says once its maps lie on the sheet, and no longer in the camera's pixels."""
+
+
+def body_axes(phase: ArrayLike, tilt: ArrayLike) -> Floats:
+    """Return the body's axis at phases and tilts, radians, as unit vectors towards the camera, (n, 3).
+
+    At phase alpha it leans towards alpha + pi.
+
+    Examples
+    --------
+    >>> body_axes([0.0], 0.1).round(3).tolist()
+    [[-0.1, -0.0, 0.995]]
+    """
+    alpha, lean = np.broadcast_arrays(np.asarray(phase, np.float64), np.asarray(tilt, np.float64))
+    return np.stack([-np.sin(lean) * np.cos(alpha), -np.sin(lean) * np.sin(alpha), np.cos(lean)], axis=-1)
 
 
 def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:

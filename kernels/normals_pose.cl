@@ -27,16 +27,17 @@ Vector axis_of(const Samples of, const int k)
 
 F product(const Vector a, const Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-// The deepest travel at which a pixel shows the zenith 0, as a sheet at rest, and how many samples are left, whole and in
-// range.
+// The deepest travel at which a pixel shows the zenith 0 as a sheet at rest, or the least that it can, and how many samples
+// are left, whole and in range.
 INLINE Kept keep(const Samples of, const Known known, const float rest_below, const int presses)
 {
     Kept kept = {NOTHING, known.usable};
     if (!presses) return kept;
     for (int k = 0; k < of.count; ++k) {
-        const F raw = raw_of(of, k), own = AT_REST * known.error_of_one / entry(of, ROOT_WEIGHT, k);
+        const F raw = raw_of(of, k);
+        const F least = GREATER(of.low, (F)0.0f) + AT_REST * known.error_of_one / entry(of, ROOT_WEIGHT, k);
         const I clipped = COUNTED ? (of.per_count > 0.0f ? raw <= 0.0f : raw >= TOP) : (I)0;
-        const I resting = (zenith_of(of, raw) < GREATER(own, (F)rest_below)) | clipped;
+        const I resting = (zenith_of(of, raw) < GREATER(least, (F)rest_below)) | clipped;
         kept.lost = resting & (kept.lost < entry(of, TRAVEL, k)) ? (F)entry(of, TRAVEL, k) : kept.lost;
     }
     kept.usable = 0;
@@ -226,7 +227,7 @@ __kernel void normals_rock(ARGUMENTS, const int presses, OUT slopes, OUT slope_e
         }
         const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det, per_up = 1.0f / found.z;
         const F slope = -found.x * per_up, across = 1.0f - found.z * found.z;
-        const F variance = (sums.m22 + 2.0f * slope * sums.m12 + slope * slope * sums.m11) * scaled * per_up * per_up;
+        const F variance = (sums.m22 - 2.0f * slope * sums.m12 + slope * slope * sums.m11) * scaled * per_up * per_up;
         const F error = known.error_of_one * roots(variance);
         const I answered = (kept.usable >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.z > 0.0f);
         const F zenith = atan2(roots(GREATER(across, (F)0.0f)), found.z), none = NAN;

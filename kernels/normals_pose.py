@@ -8,8 +8,8 @@ Where all axes lie in one upright plane, as of a body that rocks about one axis,
 plane has no influence. `normals_rock` finds the other two, p along the plane and q upwards, in the same way:
 the slope of the surface along the plane is -p / q.
 
-Where travel differs from frame to frame, a pixel may be out of contact in some: it shows the zenith 0 then.
-What was sampled no deeper than the deepest frame in which it did is left out.
+Where travel differs from frame to frame, a pixel may be out of contact in some: it shows the zenith 0 then,
+or the least that it can. What was sampled no deeper than the deepest frame in which it did is left out.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def normals_rock(
     with np.errstate(divide="ignore", invalid="ignore"):
         p, q = part.T
         slope = -p / q
-        variance = (sums.m22 + 2 * slope * sums.m12 + slope**2 * sums.m11) / det / q**2
+        variance = (sums.m22 - 2 * slope * sums.m12 + slope**2 * sums.m11) / det / q**2
         sigma = samples.error * np.sqrt(np.where(det > 0, variance, np.inf))
         answered = (samples.usable >= _LEAST) & (sigma < _NO_ANSWER) & (q > 0)
         zenith = np.arctan2(np.sqrt(np.maximum(1 - q**2, 0)), q)
@@ -133,7 +133,8 @@ def _samples(
     samples = Samples(frames, table[:6], scale, noise)
     if presses:
         with np.errstate(invalid="ignore"):
-            resting = samples.zenith < np.maximum(limits.rest, _AT_REST * samples.each)
+            least = np.maximum(samples.low, 0.0) + _AT_REST * samples.each
+            resting = samples.zenith < np.maximum(limits.rest, least)
             resting |= np.where(samples.per_count > 0, samples.under, samples.over)
         travel = table[TRAVEL][:, np.newaxis]
         lost = np.where(resting, travel, -np.inf).max(axis=0)

@@ -27,7 +27,7 @@ from mirrorskin.engine.rotation.normals_kernel import (
     Samples,
     TurnModel,
 )
-from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows
+from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, rocks
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
@@ -196,7 +196,7 @@ def estimate_normals(
     }
     estimator: NormalEstimator
     given = None if tilt is None or isinstance(tilt, str) else np.asarray(tilt, np.float64)
-    varies = given is not None and (given.ndim > 0 or _rocks(phase))
+    varies = given is not None and (given.ndim > 0 or rocks(phase))
     if axis is not None or travel is not None or varies:
         from mirrorskin.engine.rotation.normals_pose import PoseEstimator
 
@@ -211,14 +211,6 @@ def estimate_normals(
         estimator = NormalEstimator(frames.shape[1:], frames.dtype, tilt=cast(Any, tilt), **options)
     estimator.look_at(frames, where, check_weights(frame_weights, len(frames)))
     return estimator.result()
-
-
-def _rocks(phase: ArrayLike | None) -> bool:
-    """Tell whether there are two phases, half a turn apart."""
-    if phase is None:
-        return False
-    steps: Doubles = np.unique(np.round(np.mod(np.asarray(phase, np.float64), 2 * np.pi), 6))
-    return len(steps) == 2 and bool(abs(steps[1] - steps[0] - np.pi) < 1e-5)
 
 
 class NormalEstimator:

@@ -12,6 +12,7 @@ from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles
 from mirrorskin.engine.rotation.tilt import check_tilts
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.types import body_axes
 
 PRESSES = 0.02
 """Share of the greatest travel by which travel differs between frames where the body presses as well."""
@@ -40,18 +41,6 @@ class PoseFit:
     direction: float | None
 
 
-def axes_of(phase: ArrayLike, tilt: ArrayLike) -> Doubles:
-    """Return the body's axis at phases and tilts, (N, 3): it leans away from the phase.
-
-    Examples
-    --------
-    >>> axes_of([0.0], 0.1).round(3).tolist()
-    [[-0.1, -0.0, 0.995]]
-    """
-    alpha, lean = np.broadcast_arrays(np.asarray(phase, np.float64), np.asarray(tilt, np.float64))
-    return np.stack([-np.sin(lean) * np.cos(alpha), -np.sin(lean) * np.sin(alpha), np.cos(lean)], axis=-1)
-
-
 def check_poses(
     count: int,
     phase: ArrayLike | None = None,
@@ -68,7 +57,7 @@ def check_poses(
     if axis is None:
         assert phase is not None
         assert tilt is not None
-        known = axes_of(check_phase(phase, count, "phase"), check_tilts(tilt, count))
+        known = body_axes(check_phase(phase, count, "phase"), check_tilts(tilt, count))
     else:
         known = np.asarray(axis, np.float64)
         if known.shape != (count, 3) or not np.allclose(np.linalg.norm(known, axis=1), 1, atol=_UNIT):
@@ -78,6 +67,14 @@ def check_poses(
     if not np.isfinite(depth).all():
         raise InputError("travel is not finite: every frame needs a number, mm")
     return np.column_stack([known, depth])
+
+
+def rocks(phase: ArrayLike | None) -> bool:
+    """Tell whether there are two phases, half a turn apart."""
+    if phase is None:
+        return False
+    steps: Doubles = np.unique(np.round(np.mod(np.asarray(phase, np.float64), 2 * np.pi), 6))
+    return len(steps) == 2 and bool(abs(steps[1] - steps[0] - np.pi) < 1e-5)
 
 
 def even_windows(frames: int) -> int:

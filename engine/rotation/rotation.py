@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,18 +21,21 @@ from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
 from mirrorskin.engine.rotation.normals_kernel import NORMAL_METHODS, NormalMethod, options_from
+from mirrorskin.engine.rotation.normals_pose import PoseEstimator, PoseNormals
 from mirrorskin.engine.rotation.normals_to_height import integrate_normals
+from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import Header, InputError, Result, Source, WallResponse
+from mirrorskin.io import Block, Header, InputError, Result, Source, WallResponse
 from mirrorskin.io.frames import FrameSequence
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
+_ROCKED = "none: rocking tells the slope along one direction"
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
 _REACH = 5  # pixels across, of which a registered sample may be made
 _ROUNDS = 2  # in which it is found how high the object stands
@@ -76,6 +79,9 @@ def reconstruct_rotation(
     Without one, it is taken to be linear in the zenith between the source's dark and bright references, where
     it has them. Without a zenith gain, there are azimuth, mean, modulation and residual only; without a pixel
     size, no heights. Heights are relative: the mean of each component is 0.
+
+    Where the source has a tilt of each frame, or two phases half a turn apart, its frames are at any known
+    poses: see `mirrorskin.engine.PoseEstimator`. Rocking tells a slope and no heights.
 
     Parameters
     ----------
@@ -140,6 +146,8 @@ def reconstruct_rotation(
         progress=progress,
     )
     result, pixel_size = rotation_maps(found), source.header.pixel_size
+    if result.slope is not None:
+        return attach_provenance(result, source, found.device, found.process | {"height": _ROCKED})
     if pixel_size is None:
         return attach_provenance(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
     with naming(source):
@@ -176,6 +184,18 @@ def estimate_rotation(
     header = _header(source, tilt, gain, offset)
     wall = wall_response_of(source) if gain is None else None
     passes = _Passes(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
+    if at_poses(source, tilt):
+        found = passes.at_poses(heights)
+        known = found.normals
+        poses: dict[str, ProcessValue] = {
+            "tilt": known.tilt,
+            "tilt_from": "each frame: this is their root mean square",
+            "frames": known.frames,
+            "noise": known.noise,
+        }
+        if isinstance(known, PoseNormals) and known.direction is not None:
+            poses["slope_direction"] = known.direction
+        return replace(found, process={"method": method, **poses})
     if heights is not None and tilt == "estimate":
         raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
     if wall is None:
@@ -231,7 +251,7 @@ def correlate_source(
 def rotation_maps(rotation: Rotation) -> Result:
     """Return the maps of a rotation, but heights."""
     normals, systematic = rotation.normals, rotation.systematic
-    return Result(
+    result = Result(
         normals=normals.vectors,
         zenith=normals.zenith,
         azimuth=normals.azimuth,
@@ -242,6 +262,31 @@ def rotation_maps(rotation: Rotation) -> Result:
         edges=rotation.edges,
         contact=normals.contact,
     )
+    if not isinstance(normals, PoseNormals):
+        return result
+    result = replace(result, status=normals.status, slope=normals.slope, slope_sigma=normals.slope_sigma)
+    if normals.direction is None:
+        return result
+    return replace(result, normals=None, azimuth=None, normal_sigma=None, edges=None)
+
+
+def at_poses(source: Source, tilt: float | Literal["estimate"] | None = None) -> bool:
+    """Tell whether the frames of a source are at any known poses, not on whole turns of one tilt.
+
+    A source that does not know its positions beforehand is asked for its first frame, if it can be rewound.
+    """
+    if tilt is not None or source.motion != "axial":
+        return False
+    phase = getattr(source, "phase", None)
+    if phase is not None:
+        each: NDArray[np.float64] | None = getattr(source, "tilt", None)
+        return each is not None if source.header.tilt is None else rocks(phase)
+    if source.header.tilt is not None or not source.rewindable:
+        return False
+    source.rewind()
+    first = source.read()
+    source.rewind()
+    return first is not None and first.tilt is not None
 
 
 def _check_method(source: Source, method: str) -> None:
@@ -258,6 +303,8 @@ def _header(
 ) -> Header:
     """Return the source's header with what is given instead; a tilt of None is one to estimate."""
     header = source.header
+    if at_poses(source, tilt):
+        tilt = "estimate"  # each frame has its own
     used = header.tilt if tilt is None else None if tilt == "estimate" else tilt
     if used is None and tilt != "estimate":
         raise InputError(
@@ -308,6 +355,27 @@ class _Passes:
             "registered": isinstance(frames, Registered),
         }
         return replace(self._rotation(frames, response), process=process, systematic=response.sigma)
+
+    def at_poses(self, heights: ArrayLike | None) -> Rotation:
+        """Find normals, or slopes, from frames at any known poses."""
+        name = self.source.name
+        if heights is not None or self.method != "exact":
+            what = "registering frames with heights" if heights is not None else f"method {self.method!r}"
+            raise InputError(f"{name}: {what} needs one tilt for all frames: leave it out")
+        count, size = self.source.shape[0], math.prod(self.source.shape) * self.source.dtype.itemsize
+        options = options_from(self.header, self.method, self.noise, None, self.device)
+        with naming(self.source):
+            estimator = PoseEstimator(
+                self.source.shape[1:],
+                self.source.dtype,
+                longest=even_windows(count),
+                per_turn=self.per_turn,
+                memory_limit=min(self.memory_limit, 2 * size),
+                **options,
+            )
+            feed(cast(Source, _Posed(self.source)), estimator, range(count), self.progress)
+            normals = estimator.result()
+        return self._with_edges(normals)
 
     def _first_heights(self, response: Response) -> Doubles:
         """Find from the first turn how high the object is, less the press, (H, W), mm."""
@@ -363,18 +431,39 @@ class _Passes:
 
     def _rotation(self, frames: Source, response: Response | None) -> Rotation:
         """Find normals and edges, and account for a registration."""
-        normals = self._normals(frames, response)
+        found = self._with_edges(self._normals(frames, response))
+        if not isinstance(frames, Registered):
+            return found
+        given, gain = self.noise is not None, frames.noise_gain
+        independent = found.independent_sigma if given else found.independent_sigma / gain
+        normals = _account_for_registration(found.normals, gain if given else None)
+        return replace(found, normals=normals, independent_sigma=independent)
+
+    def _with_edges(self, normals: Normals) -> Rotation:
+        """Find the edges that belong to normals."""
         maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact]
         if normals.contact.ndim == 3:
             edges = np.stack([find_edges(*turn, device=self.device) for turn in zip(*maps, strict=True)])
         else:
             edges = find_edges(*maps, device=self.device)
-        independent = normals.sigma
-        if isinstance(frames, Registered):
-            given, gain = self.noise is not None, frames.noise_gain
-            independent = independent if given else independent / gain
-            normals = _account_for_registration(normals, gain if given else None)
-        return Rotation(normals, independent, edges, self.device)
+        return Rotation(normals, normals.sigma, edges, self.device)
+
+
+class _Posed:
+    """A source whose blocks have a tilt of each frame, though all may be the same."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the source's next frames."""
+        block, tilt = self._source.read(out), self._source.header.tilt
+        if block is None or (block.tilt is not None and tilt is None):
+            return block
+        return replace(block, tilt=np.full(len(block.frames), np.nan if tilt is None else tilt))
 
 
 def _account_for_registration(normals: Normals, noise_gain: NDArray[np.float32] | None) -> Normals:

@@ -5,7 +5,15 @@ from mirrorskin.hw.twin.camera import Camera
 from mirrorskin.hw.twin.catalogue import OBJECT_NAMES, check_fits, make_object
 from mirrorskin.hw.twin.coin import Coin
 from mirrorskin.hw.twin.live import Live
-from mirrorskin.hw.twin.movement import Axial, Horizontal, Movement, Twist, Vertical, oscillating_travel
+from mirrorskin.hw.twin.movement import (
+    Axial,
+    Horizontal,
+    Leaning,
+    Movement,
+    Twist,
+    Vertical,
+    oscillating_travel,
+)
 from mirrorskin.hw.twin.object_files import HeightMap, load_height_map, load_mesh
 from mirrorskin.hw.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture
 from mirrorskin.hw.twin.optics import design_range, visible_zenith
@@ -24,6 +32,7 @@ __all__ = [
     "Cylinder",
     "HeightMap",
     "Horizontal",
+    "Leaning",
     "Live",
     "Movement",
     "Object",

@@ -43,9 +43,12 @@ class Movement:
         The same without jumps, for what lies between two frames.
     deepest : float
         Greatest travel, mm.
+    presses : bool
+        Whether travel differs from frame to frame.
     """
 
     motion: Motion
+    presses = False
     _recorded_as: str
 
     def __init__(self, positions: Floats, name: str, deepest: float) -> None:
@@ -119,6 +122,7 @@ class Vertical(Movement):
     """
 
     motion = "vertical"
+    presses = True
     _recorded_as = "travel"
 
     def __init__(self, travel: ArrayLike, *, compliance: float = 0.0) -> None:
@@ -195,13 +199,11 @@ class Axial(Movement):
 
     def rise(self, radius: float, /) -> float:
         """Add to the press what tilting about the pivot and the object's own width can raise."""
-        x, y, z = self.pivot
-        outwards = radius + math.hypot(x, y)
-        return z + (self.deepest - z) * math.cos(self.tilt) + outwards * math.sin(self.tilt)
+        return _rise(radius, self.deepest, self.tilt, self.pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns, and what of the phase rounding may differ by."""
-        return np.asarray(2 * np.pi * (np.round(path / (2 * np.pi) % 1, 12) % 1))
+        return _within_turn(path)
 
     def pose(self, place: Floats, /) -> Pose:
         """Tilt the body about its pivot at a phase, radians."""
@@ -211,6 +213,73 @@ class Axial(Movement):
         """Return motion, press, tilt and pivot."""
         x, y, z = map(float, self.pivot)
         return Header(self.motion, press=self.deepest, tilt=self.tilt, pivot=(x, y, z))
+
+
+class Leaning(Movement):
+    """Lean at any phase by any tilt, and press as deep as one likes, frame by frame; see `Axial`.
+
+    A body that rocks has one phase, and a tilt that is negative on the other side.
+
+    Parameters
+    ----------
+    phase, tilt : array_like, (T,)
+        Radians; at most 30 degrees of tilt to either side.
+    travel : float or array_like of (T,)
+        Millimetres that the body is lowered, upright, before it tilts.
+    pivot : (float, float, float)
+        As for `Axial`.
+
+    Raises
+    ------
+    InputError
+        A value cannot be.
+    """
+
+    motion = "axial"
+
+    def __init__(
+        self,
+        phase: ArrayLike,
+        tilt: ArrayLike,
+        travel: ArrayLike,
+        pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        alpha = check_phase(phase, _count(phase), "phase")
+        try:
+            lean, depth = (np.broadcast_to(np.asarray(v, np.float64), alpha.shape) for v in (tilt, travel))
+        except ValueError:
+            raise InputError(f"tilt and travel: one number, or {len(alpha)} as of the phase") from None
+        super().__init__(np.column_stack([alpha, lean, depth]), "pose", depth.max(initial=-math.inf))
+        self.path = np.column_stack([np.unwrap(alpha), lean, depth])
+        if not (np.abs(lean) <= TILT_MAX).all():
+            raise InputError(f"tilt cannot be: give {math.degrees(TILT_MAX):g} degrees at most")
+        self.presses, self.pivot = bool(np.ptp(depth) > 0), pivot
+
+    def rise(self, radius: float, /) -> float:
+        """Do as a precession of the greatest tilt."""
+        tilt = float(np.max(np.abs(self.positions[:, 1])))
+        return _rise(radius, self.deepest, tilt, self.pivot)
+
+    def reduced(self, path: Floats, /) -> Floats:
+        """Drop whole turns."""
+        reduced = path.copy()
+        reduced[..., 0] = _within_turn(path[..., 0])
+        return reduced
+
+    def pose(self, place: Floats, /) -> Pose:
+        """Lower the body by the third number, mm, and tilt it by the second at the first, radians."""
+        phase, tilt, travel = map(float, place)
+        return pose_at_lean(travel, tilt, phase, self.pivot)
+
+    def header(self) -> Header:
+        """Return motion, pivot, and the press if there is one."""
+        x, y, z = map(float, self.pivot)
+        return Header(self.motion, press=None if self.presses else self.deepest, pivot=(x, y, z))
+
+    def mark(self, block: Block, /) -> Block:
+        """Add phases and tilts, and travels that differ."""
+        phase, tilt, travel = self.positions[block.index : block.index + len(block.frames)].T
+        return replace(block, phase=phase, tilt=tilt, travel=travel if self.presses else None)
 
 
 class Horizontal(Movement):
@@ -271,6 +340,17 @@ class Twist(Movement):
     def pose(self, place: Floats, /) -> Pose:
         """Turn the body by an angle: the object goes the other way in the picture."""
         return Pose(_about_z(-float(place)), np.array([0.0, 0.0, self.deepest]))
+
+
+def _rise(radius: float, deepest: float, tilt: float, pivot: tuple[float, float, float]) -> float:
+    """Bound how far an object of a radius can rise when the body leans by a tilt, mm."""
+    x, y, z = pivot
+    return z + (deepest - z) * math.cos(tilt) + (radius + math.hypot(x, y)) * math.sin(tilt)
+
+
+def _within_turn(phase: Floats) -> Floats:
+    """Drop whole turns, and what of a phase rounding may differ by."""
+    return np.asarray(2 * np.pi * (np.round(phase / (2 * np.pi) % 1, 12) % 1))
 
 
 def _count(values: ArrayLike) -> int:

@@ -169,7 +169,7 @@ class Twin(Closing):
         Computed at the first access; after the last frame most of it is known.
         """
         film = self._scene if isinstance(self._scene, CachedScene) else None
-        touched = None if film is None or self.motion == "vertical" else film.touched_throughout()
+        touched = None if film is None or self.movement.presses else film.touched_throughout()
         pressing = film.forces() if film is not None and isinstance(self._skin, Elastic) else None
         return make_truth(
             self._thing, self.movement, self._skin, self._view, self._history, touched, pressing

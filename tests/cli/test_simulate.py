@@ -84,6 +84,21 @@ def test_strokes_go_up_and_down_as_far_as_the_steps_would():
     assert_refused(["vertical", "--strokes", "3", "--release", "-o", "a.h5"], "leave --release out")
 
 
+def test_a_body_rocks_or_spirals_as_it_is_told():
+    phases = np.arange(5) * np.pi / 4
+    _, rocked = simulate("axial", "--tilt", "4deg", "--rock", "30deg", "--frames", "5")
+    np.testing.assert_allclose(rocked.tilt, np.radians(4) * np.sin(phases), atol=1e-12)
+    np.testing.assert_allclose(rocked.phase, np.radians(30))
+    assert (rocked.header.tilt, rocked.header.press) == (None, 1.0)
+    _, wound = simulate("axial", "--tilt", "4deg", "--spiral", "--press", "1.5mm", "--frames", "5")
+    np.testing.assert_allclose(wound.tilt, np.radians(4) * np.arange(1, 6) / 5)
+    np.testing.assert_allclose(wound.travel, 1.5 * np.arange(1, 6) / 5)
+    np.testing.assert_allclose(wound.phase, phases)
+    assert wound.header.press is None
+    for motion, option in (("vertical", ["--rock", "0deg"]), ("twist", ["--spiral"])):
+        assert_refused([motion, *option, "-o", "a.h5"], f"{option[0]} says nothing of a motion")
+
+
 @pytest.mark.parametrize("contact", ["conform", "elastic"])
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_each_motion_is_recorded_as_it_is_given(motion, contact):

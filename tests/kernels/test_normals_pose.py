@@ -5,7 +5,8 @@ import pytest
 import rotations
 
 from mirrorskin import engine
-from mirrorskin.engine.rotation.poses import axes_of, check_poses, pose_fit
+from mirrorskin.engine.rotation.poses import check_poses, pose_fit
+from mirrorskin.io.types import body_axes
 from mirrorskin.kernels import normals_pose
 from mirrorskin.kernels.normals import Variance, contact_limits
 
@@ -23,7 +24,7 @@ def made_frames(where, dtype, pixels=61, pressed=False, seed=3):
     """Frames of normals of all directions, some samples clipped or missing, and the fit of their poses."""
     random = np.random.default_rng(seed)
     normals = rotations.random_normals(pixels, seed=seed, bins=[(4, 58)])[0]
-    zenith = np.arccos(np.clip(axes_of(**where) @ normals.T, -1, 1))
+    zenith = np.arccos(np.clip(body_axes(**where) @ normals.T, -1, 1))
     if pressed:
         zenith[PRESS[:, np.newaxis] < random.uniform(-0.2, 0.9, pixels)] = 0.0
     frames = OFFSET + GAINS[dtype] * zenith + random.normal(0, NOISE, zenith.shape)

@@ -41,11 +41,13 @@ MAPS: Mapping[str, tuple[str, str]] = {
     "status": (
         "",
         "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
-        "2 dark at start, 3 light to the end",
+        "2 dark at start, 3 light to the end; of a tilt of each frame: 1 normal, 2 none, 4 only a slope",
     ),
     "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
     "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),
     "strokes": ("", "in how many strokes there was what the height is made of"),
+    "slope": ("", "how much the surface rises along the direction in which the body rocked"),
+    "slope_sigma": ("", "the standard deviation that is expected of the slope"),
     "normals": ("", "unit normals of the surface: x, y and z"),
     "zenith": ("rad", "angle between the normal and the direction to the camera"),
     "azimuth": ("rad", "direction in which the normal leans, counter-clockwise from x"),
@@ -97,6 +99,7 @@ _FIRST = (
 
 _UNITS = {
     "tilt": "rad",
+    "slope_direction": "rad",
     "zenith_error": "rad",
     "zenith_gain": "counts/rad",
     **dict.fromkeys(("zenith_offset", "noise", "dark", "bright", "low", "high"), "counts"),

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import rotations
 
-from mirrorskin import engine, io
-from mirrorskin.engine.rotation.poses import axes_of
+from mirrorskin import engine, hw, io
+from mirrorskin.hw.twin import Leaning
+from mirrorskin.io.types import body_axes
 
 GAIN, OFFSET, NOISE = 500.0, 40.0, 1.5
 COUNT, SHAPE = 48, (60, 70)
@@ -47,7 +48,7 @@ def angle(found):
 
 
 def test_a_growing_precession_reaches_the_bound_and_says_how_sure_it_is():
-    axes = axes_of(PHASE, GROWING)
+    axes = body_axes(PHASE, GROWING)
     found = engine.estimate_normals(shown(axes), PHASE, tilt=GROWING, **SCALE)
     error = angle(found)
     assert np.sqrt(np.sum(error**2) / np.sum(bound(axes))) < 1.05
@@ -59,20 +60,20 @@ def test_a_growing_precession_reaches_the_bound_and_says_how_sure_it_is():
 
 def test_a_turn_is_one_case_of_poses():
     tilt = np.radians(2.5)
-    frames = shown(axes_of(PHASE[:12], tilt))[:12]
+    frames = shown(body_axes(PHASE[:12], tilt))[:12]
     turn = engine.estimate_normals(frames, PHASE[:12], tilt=tilt, noise=NOISE, **SCALE)
-    poses = engine.estimate_normals(frames, axis=axes_of(PHASE[:12], tilt), noise=NOISE, **SCALE)
+    poses = engine.estimate_normals(frames, axis=body_axes(PHASE[:12], tilt), noise=NOISE, **SCALE)
     np.testing.assert_allclose(poses.vectors, turn.vectors, atol=3e-4)
     for name in ("sigma", "mean", "cosine", "sine", "residual"):
         np.testing.assert_allclose(getattr(poses, name), getattr(turn, name), rtol=2e-3, atol=2e-3)
     np.testing.assert_array_equal(poses.contact, turn.contact)
 
 
-@pytest.mark.parametrize("direction", [0.0, 0.6, 2.9])
-def test_rocking_tells_the_slope_along_it_at_the_bound_and_nothing_across(direction):
+@pytest.mark.parametrize(("direction", "middle"), [(0.0, 0.0), (0.6, np.radians(5)), (2.9, 0.0)])
+def test_rocking_tells_the_slope_along_it_at_the_bound_and_nothing_across(direction, middle):
     phase = np.full(COUNT, direction)
-    axes = axes_of(phase, ROCKING)
-    found = engine.estimate_normals(shown(axes), phase, tilt=ROCKING, **SCALE)
+    axes = body_axes(phase, ROCKING + middle)
+    found = engine.estimate_normals(shown(axes), phase, tilt=ROCKING + middle, **SCALE)
     along = np.array([np.cos(found.direction), np.sin(found.direction), 0.0])
     assert np.isclose((found.direction - direction + 0.1) % np.pi, 0.1)
     p, q = NORMALS @ along, NORMALS[..., 2]
@@ -91,7 +92,7 @@ def test_rocking_tells_the_slope_along_it_at_the_bound_and_nothing_across(direct
 
 def test_two_phases_half_a_turn_apart_rock():
     phase = np.pi * (FRAME % 2) + 0.3
-    frames = shown(axes_of(phase, np.radians(2.5)))
+    frames = shown(body_axes(phase, np.radians(2.5)))
     found = engine.estimate_normals(frames, phase, tilt=np.radians(2.5), **SCALE)
     assert (found.status == 4).all()
     assert found.direction == pytest.approx(0.3)
@@ -99,7 +100,7 @@ def test_two_phases_half_a_turn_apart_rock():
 
 def test_a_spiral_into_the_object_uses_the_frames_in_contact():
     depth = np.random.default_rng(8).uniform(0.1, 1.2, SHAPE)
-    axes, resting = axes_of(PHASE, GROWING), PRESS[:, np.newaxis, np.newaxis] < depth
+    axes, resting = body_axes(PHASE, GROWING), PRESS[:, np.newaxis, np.newaxis] < depth
     found = engine.estimate_normals(
         shown(axes, resting), PHASE, tilt=GROWING, travel=PRESS, noise=NOISE, **SCALE
     )
@@ -117,7 +118,7 @@ def test_a_spiral_into_the_object_uses_the_frames_in_contact():
 def test_more_than_a_window_of_frames_is_joined():
     frame = np.arange(130)
     lean = np.radians(2.5) * np.sin(0.385 * frame)
-    axes = axes_of(np.zeros(130), lean)
+    axes = body_axes(np.zeros(130), lean)
     found = engine.estimate_normals(shown(axes), axis=axes, noise=NOISE, **SCALE)
     assert (found.turns, found.frames) == (3, 130)
     slope = -NORMALS[..., 0] / NORMALS[..., 2]
@@ -125,7 +126,7 @@ def test_more_than_a_window_of_frames_is_joined():
 
 
 def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
-    axes = axes_of(PHASE, GROWING)
+    axes = body_axes(PHASE, GROWING)
     frames = shown(axes)[:, :7, :9]
     pose = np.column_stack([axes, PRESS])
     results = []
@@ -149,11 +150,11 @@ def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
         ({"phase": PHASE, "tilt": GROWING[:5]}, r"tilt has shape \(5,\) for 48 frames"),
         ({"phase": PHASE, "tilt": np.full(COUNT, 0.6)}, "tilt 34.3.* deg at frame 0: 30 deg at most"),
         ({"tilt": GROWING}, "poses are a phase and a tilt of each frame, or an axis"),
-        ({"phase": PHASE, "tilt": GROWING, "axis": axes_of(PHASE, 0.1)}, "give one of both"),
+        ({"phase": PHASE, "tilt": GROWING, "axis": body_axes(PHASE, 0.1)}, "give one of both"),
         ({"phase": PHASE, "tilt": GROWING, "travel": np.full(COUNT, np.nan)}, "travel is not finite"),
         ({"phase": PHASE}, "tilt is missing"),
         (
-            {"axis": axes_of(np.arctan2(ROCKING, 0.2), np.hypot(ROCKING, 0.2))},
+            {"axis": body_axes(np.arctan2(ROCKING, 0.2), np.hypot(ROCKING, 0.2))},
             "axes lie in a plane that is not upright",
         ),
     ],
@@ -162,3 +163,59 @@ def test_poses_that_determine_nothing_are_one_line(where, line):
     with pytest.raises(io.InputError, match=line) as caught:
         engine.estimate_normals(np.zeros((COUNT, 3, 4), np.float32), noise=NOISE, **where, **SCALE)
     assert "\n" not in str(caught.value)
+
+
+PLANE = hw.twin.Plane(np.radians(24), 0.7, 2.0)
+
+
+def recorded(movement, tmp_path):
+    """A twin's recording of a plane, opened again."""
+    twin = hw.Twin(
+        object=PLANE,
+        shape=(44, 44),
+        pixel_size=0.08,
+        movement=movement,
+        pattern="linear",
+        camera=hw.twin.Camera(np.uint16, noise=2.0, seed=3),
+    )
+    with io.Recorder(twin, tmp_path / "a.h5", truth=lambda: twin.truth) as recorder:
+        recorder.drain(lambda count: None)
+    return twin, io.open_recording(tmp_path / "a.h5")
+
+
+def test_a_rocked_recording_gives_its_slope(tmp_path):
+    twin, recording = recorded(Leaning(np.full(COUNT, 0.5), ROCKING, 0.8), tmp_path)
+    with recording:
+        np.testing.assert_allclose(recording.tilt, ROCKING)
+        assert recording.header.tilt is None
+        result = engine.reconstruct(recording)
+    slope = -np.tan(PLANE.zenith) * np.cos(PLANE.azimuth - result.process["slope_direction"])
+    known = result.contact == 1
+    assert known.sum() > 600
+    assert np.mean(((result.slope - slope) / result.slope_sigma)[known] ** 2) == pytest.approx(1, abs=0.15)
+    assert np.all(result.status[known] == 4)
+    assert result.normals is None
+    assert result.height is None
+    live = engine.reconstruct(twin)
+    np.testing.assert_array_equal(live.slope, result.slope)
+    io.save_result(result, tmp_path / "r.h5")
+    np.testing.assert_array_equal(io.open_result(tmp_path / "r.h5").slope, result.slope)
+
+
+def test_a_recorded_spiral_gives_normals_and_heights(tmp_path):
+    _, recording = recorded(Leaning(PHASE, GROWING, PRESS), tmp_path)
+    with recording:
+        np.testing.assert_allclose(recording.travel, PRESS)
+        assert recording.header.press is None
+        result = engine.reconstruct(recording)
+        with pytest.raises(io.InputError, match="registering frames with heights needs one tilt"):
+            engine.reconstruct(recording, heights=np.zeros((44, 44)))
+        with pytest.raises(io.InputError, match="method 'paper' needs one tilt"):
+            engine.reconstruct(recording, method="paper")
+    normal = rotations.direction(PLANE.zenith, PLANE.azimuth)
+    error = np.arccos(np.clip(result.normals @ normal, -1, 1))
+    known = result.contact == 1
+    assert known.sum() > 900
+    assert np.mean((error / result.normal_sigma)[known] ** 2) == pytest.approx(1, abs=0.2)
+    assert np.isfinite(result.height[known]).all()
+    assert set(np.unique(result.status)) <= {1, 2}
