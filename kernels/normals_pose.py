@@ -103,7 +103,7 @@ def normals_rock(
     level, weight = _levels(samples)
     gram = np.einsum("kn,ki,kj->nij", weight, axes, axes)
     right = np.einsum("kn,ki->ni", weight * level, axes)
-    start = np.einsum("nij,nj->ni", np.linalg.pinv(gram), right)
+    start = _within(np.einsum("nij,nj->ni", np.linalg.pinv(gram), right))
     part, sums = start, None
     for number in range(2 + MORE):
         moves = samples.irregular if number >= 2 else np.ones_like(samples.irregular)
@@ -111,7 +111,7 @@ def normals_rock(
             part = np.where(samples.irregular[:, np.newaxis], start, part)
         latest = _look(part, samples, axes, leaning, closely=number >= 2)
         sums = latest if sums is None or number < 2 else latest.where(moves, sums)
-        part = np.where(moves[:, np.newaxis], part + _step(latest), part)
+        part = np.where(moves[:, np.newaxis], _within(part + _step(latest)), part)
     assert sums is not None
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -167,6 +167,11 @@ def _look(part: Doubles, samples: Samples, axes: Doubles, leaning: Doubles, clos
         inside = (zenith > samples.low) & (zenith < samples.high)
         share, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
     return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit)
+
+
+def _within(part: Doubles) -> Doubles:
+    """Keep parts of a unit vector no longer than that."""
+    return np.asarray(part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1))
 
 
 def _step(sums: Sums) -> Doubles:

@@ -133,7 +133,7 @@ def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
 
 def _waves(leans: Doubles, root: Doubles) -> Doubles:
     """Return what samples show, to second order of the tilt: an orthonormal base, (N, n)."""
-    x, y = leans.T
+    x, y = ((leans - leans.mean(axis=0)) / np.max(leans.std(axis=0))).T
     second = [x * x, x * y, y * y] if len(x) >= _FRAMES_OF_SECOND else []
     terms = np.column_stack([np.ones(len(x)), x, y, *second]) * root[:, np.newaxis]
     base, sizes, _ = np.linalg.svd(terms, full_matrices=False)
