@@ -132,10 +132,10 @@ INLINE Vector begin_at(const Samples of, const F lost, const int in_plane)
 }
 
 // Keeps the part of a unit vector no longer than that.
-Vector within(const F x, const F z)
+Vector within(const Vector part)
 {
-    const F square = x * x + z * z, shorter = inverse_roots(GREATER(square, (F)1.0f));
-    return (Vector){x * shorter, 0.0f, z * shorter};
+    const F square = product(part, part), shorter = square > 1.0f ? inverse_roots(square) : (F)1.0f;
+    return (Vector){part.x * shorter, 0.0f, part.z * shorter};
 }
 
 Vector step_part(const Vector part, const Sums sums)
@@ -143,7 +143,7 @@ Vector step_part(const Vector part, const Sums sums)
     const F scale = 1.0f / (sums.m11 * sums.m22 - sums.m12 * sums.m12);
     const F d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) * scale, d2 = (sums.m11 * sums.b2 - sums.m12 * sums.b1) * scale;
     const F length = d1 * d1 + d2 * d2, shorter = REACH * inverse_roots(GREATER(length, (F)(REACH * REACH)));
-    return within(part.x + shorter * d1, part.z + shorter * d2);
+    return (Vector){part.x + shorter * d1, 0.0f, part.z + shorter * d2};
 }
 
 INLINE F waves_of(const Samples of, const Wave wave)
@@ -214,17 +214,19 @@ __kernel void normals_rock(ARGUMENTS, const int presses, OUT slopes, OUT slope_e
         const Samples of = SAMPLES(SCALE(2), SCALE(3));
         const Known known = survey(of, noise);
         const Kept kept = keep(of, known, limits.rest, presses);
-        const Vector free = begin_at(of, kept.lost, 1), begin = within(free.x, free.z);
+        const Vector begin = begin_at(of, kept.lost, 1);
         Vector found = begin;
         Sums sums = {0};
         for (int number = 0; number < STEPS; ++number) {
-            sums = look_part(found, of, kept.lost, known.error_of_one, 0);
-            found = step_part(found, sums);
+            const Vector at = within(found);
+            sums = look_part(at, of, kept.lost, known.error_of_one, 0);
+            found = step_part(at, sums);
         }
         const I irregular = (kept.usable < count) & (kept.usable >= LEAST);
         if (any_of(irregular)) {
             Vector at = begin;
             for (int more = 0; more < MORE; ++more) {
+                at = within(at);
                 const Sums closer = look_part(at, of, kept.lost, known.error_of_one, 1);
                 sums = blend_sums(sums, closer, irregular);
                 at = step_part(at, closer);

@@ -103,15 +103,15 @@ def normals_rock(
     level, weight = _levels(samples)
     gram = np.einsum("kn,ki,kj->nij", weight, axes, axes)
     right = np.einsum("kn,ki->ni", weight * level, axes)
-    start = _within(np.einsum("nij,nj->ni", np.linalg.pinv(gram), right))
+    start = np.einsum("nij,nj->ni", np.linalg.pinv(gram), right)
     part, sums = start, None
     for number in range(2 + MORE):
         moves = samples.irregular if number >= 2 else np.ones_like(samples.irregular)
         if number == 2:
             part = np.where(samples.irregular[:, np.newaxis], start, part)
-        latest = _look(part, samples, axes, leaning, closely=number >= 2)
+        latest = _look(_within(part), samples, axes, leaning, closely=number >= 2)
         sums = latest if sums is None or number < 2 else latest.where(moves, sums)
-        part = np.where(moves[:, np.newaxis], _within(part + _step(latest)), part)
+        part = np.where(moves[:, np.newaxis], _within(part) + _step(latest), part)
     assert sums is not None
     det = sums.m11 * sums.m22 - sums.m12**2
     with np.errstate(divide="ignore", invalid="ignore"):
