@@ -171,7 +171,7 @@ class Layout:
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
         """Read when some frames of the part were taken, and where a live run thought the body to be then."""
         name = POSITIONS[motion]
-        known = [name, "tilt"] if motion == "axial" and self._has_tilts() else [name]
+        known = [name, "tilt"] if motion == "axial" and self._is_of_each("tilt") else [name]
         time = self._cut(self._series("time", (self._count,)))
         found = {"time": None if time is None else time[chosen]}
         for one in known:
