@@ -143,7 +143,7 @@ def check_finite(
         needed = "two numbers a frame are" if width else "one number a frame is"
         raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
-    known = np.isfinite(array[start:stop]).reshape(stop - start, -1).all(axis=1)
+    known = np.isfinite(array[start:stop]).all(axis=tuple(range(1, array.ndim)))
     if not np.all(known):
         frame = start + int(np.argmin(known))
         raise InputError(f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number")
