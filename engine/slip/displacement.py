@@ -95,7 +95,7 @@ def find_displacement(
     >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
     >>> moved = np.roll(texture, 3, axis=1)[None]
     >>> found = find_displacement(texture, moved, 0.1, noise=0.1)
-    >>> np.round(found.displacement[0, 30, 40], 3).tolist()
+    >>> found.displacement[0, 30, 40].astype(float).round(3).tolist()
     [0.3, 0.0]
     """
     frames = np.asarray(frames)

@@ -529,7 +529,7 @@ class RockPlan(_Straight):
 
     Examples
     --------
-    >>> RockPlan(1.0, 0.04, step=0.02).values.tolist()
+    >>> RockPlan(1.0, 0.04, step=0.02).values.round(3).tolist()
     [-0.04, -0.02, 0.0, 0.02, 0.04]
     """
 

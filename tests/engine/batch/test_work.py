@@ -90,7 +90,8 @@ def cut(path):
 
 def overwritten(path):
     content = path.read_bytes()
-    path.write_bytes(content[:300] + bytes(1000) + content[1300:])
+    place = content.index(b"OHDR")  # what describes a group or a dataset
+    path.write_bytes(content[:place] + bytes(1000) + content[place + 1000 :])
 
 
 def of_reconstruct(path):
