@@ -78,6 +78,14 @@ def _above_zero(value: float, text: str, option: str, kind: Kind) -> float:
     return value
 
 
+def share(text: str, option: str = "") -> float:
+    """Return a plain number, as in ``0.25``."""
+    try:
+        return float(text)
+    except ValueError:
+        raise _error(text, option, "a share from 0 to 1 is needed", "0.25") from None
+
+
 def duration(text: str, option: str = "") -> float:
     """Return a time, as in ``10ms``, in seconds."""
     return _read(text, option, "time")

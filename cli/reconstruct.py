@@ -42,6 +42,7 @@ _OWN = {
             "bright",
             "event",
             "threshold",
+            "inclination",
             "hold",
             "subframe",
             "fill",
@@ -103,9 +104,18 @@ def command(
         EventName, Option(help="Press: dark to light on the way down, or light to dark on the way up.")
     ] = EventName.onset,
     threshold: Annotated[
-        float,
-        Option(help="Press: fraction of the range from dark to bright at which a pixel is bright."),
-    ] = 0.5,
+        list[str] | None,
+        Option(
+            metavar="SHARE",
+            help="Press: fraction of the range from dark to bright at which a pixel is bright; several, from"
+            " the lowest on, of a wall with levels.",
+            show_default="0.5",
+        ),
+    ] = None,
+    inclination: Annotated[
+        list[str] | None,
+        Option(metavar="ANGLE", help="Press: of the sheet where a threshold is passed, one for each: 12deg."),
+    ] = None,
     hold: Annotated[int, Option(help="Press: consecutive frames that confirm the event.")] = 2,
     subframe: Annotated[
         bool, Option(help="Press: interpolate between frames; without it, eq. 4 as printed.")
@@ -170,7 +180,8 @@ def command(
             arguments["tilt"] = _ESTIMATE if tilt == _ESTIMATE else given_tilt
             arguments["heights"] = None if heights is None else io.open_heights(heights, source)
         else:
-            arguments |= {"event": event.value, "threshold": threshold, "hold": hold, "subframe": subframe}
+            arguments |= {"event": event.value, "hold": hold, "subframe": subframe}
+            arguments |= _levels(threshold, inclination)
             arguments |= {"dark": dark, "bright": bright, "fill": fill}
             arguments["modulus"] = None if modulus is None else pressure(modulus, "--modulus")
         with progress("reconstructing", source.shape[0]) as show:
@@ -183,6 +194,18 @@ def command(
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
     save_and_report(result, target, device, as_json)
+
+
+def _levels(thresholds: list[str] | None, inclinations: list[str] | None) -> dict[str, Any]:
+    """Convert thresholds and inclinations, each given several times or with commas between."""
+    from mirrorskin.cli.quantity import angle, share
+
+    shares, angles = (
+        [part for text in texts or () for part in text.split(",")] for texts in (thresholds, inclinations)
+    )
+    read = [share(part, "--threshold") for part in shares]
+    known: dict[str, Any] = {"threshold": read[0] if len(read) == 1 else read} if read else {}
+    return known | ({"inclinations": [angle(part, "--inclination") for part in angles]} if angles else {})
 
 
 def _calibrated(source: Recording, path: Path | None, pixel_size: str | None) -> Source:

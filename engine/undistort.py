@@ -62,6 +62,7 @@ def _rays(lens: Lens, points: Doubles) -> Doubles:
 Maps = dict[str, NDArray[Any]]
 
 _NOTHING = {"status": 0, "edges": 0, "filled": 0, "contact": 0, "component": -1}
+_BOUNDS = ("slope_min", "slope_max")  # of a few values: nothing lies between two
 _OF_PIECES = ("height", "height_sigma")
 _BAND = 1 << 14  # pixels that are worked on at once
 
@@ -138,7 +139,9 @@ def _resampled(maps: Maps, points: SamplePoints) -> Maps:
     )
     made: Maps = {}
     for name, values in maps.items():
-        if name in _NOTHING:
+        if name in _BOUNDS:
+            made[name] = points.nearest_values(values, np.nan)
+        elif name in _NOTHING:
             made[name] = points.nearest_values(values, _NOTHING[name])
         elif name == "normals":
             made[name] = points.interpolate_vectors(values, touched)

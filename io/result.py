@@ -19,7 +19,7 @@ from mirrorskin.io.writing import Item, process_items, write_file
 MARK = "mirrorskin_result"
 UNITS = (
     dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
-    | dict.fromkeys(("zenith", "azimuth", "normal_sigma"), "rad")
+    | dict.fromkeys(("zenith", "azimuth", "normal_sigma", "slope_min", "slope_max"), "rad")
     | {"pressure": "MPa"}
     | dict.fromkeys(SCALARS, "N")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")

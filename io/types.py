@@ -290,6 +290,8 @@ class Result:
         Number of the connected piece that a height belongs to, from 0; -1 where there is no height.
     offset_unknown : ndarray, (components,), uint8
         1 of a component whose heights are relative: no absolute one is known in it, and their mean is 0.
+    slope_min, slope_max : ndarray, (H, W), float32
+        Radians: bounds of the sheet's zenith, by a wall with levels; NaN where there is none.
     pressure : ndarray, (H, W), float32
         MPa between sensor and object at the greatest travel; 0 where nothing touches.
     force, force_sigma : float
@@ -324,6 +326,8 @@ class Result:
     contact: NDArray[np.uint8] | None = None
     component: NDArray[np.int32] | None = None
     offset_unknown: NDArray[np.uint8] | None = None
+    slope_min: NDArray[np.float32] | None = None
+    slope_max: NDArray[np.float32] | None = None
     pressure: NDArray[np.float32] | None = None
     force: float | None = None
     force_sigma: float | None = None

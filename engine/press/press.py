@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.press.changepoint import ChangePointSearch
+from mirrorskin.engine.press.levels import Levels, LevelSearch, check_levels
 from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch, check_event
 from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, level_origin
@@ -37,7 +39,8 @@ def reconstruct_press(
     *,
     event: Event = "onset",
     method: PressMethod = "threshold",
-    threshold: float = 0.5,
+    threshold: float | Sequence[float] = 0.5,
+    inclinations: Sequence[float] | None = None,
     hold: int = 2,
     subframe: bool = True,
     dark: ArrayLike | None = None,
@@ -62,7 +65,11 @@ def reconstruct_press(
     method : {"threshold", "change-point"}
         The first crossing of the threshold, or the most likely change.
     threshold, hold, subframe
-        As for ``find_onset``.
+        As for ``find_onset``. Several thresholds, of a wall with levels, tell between which inclinations the
+        sheet lies; heights are by the lowest.
+    inclinations : sequence of float, optional
+        The sheet's inclinations at which thresholds are passed, radians, for ``slope_min`` and ``slope_max``;
+        one for each threshold.
     dark, bright : array_like, scalar or (H, W), optional
         Counts without and with full light, instead of the source's own.
     noise : float, optional
@@ -94,6 +101,11 @@ def reconstruct_press(
         known = ", ".join(METHODS)
         raise InputError(f"{source.name} is a press, which method {method!r} cannot do: take {known}")
     check_event(event)
+    levels = None
+    if inclinations is not None or not isinstance(threshold, float | int):
+        shares = [threshold] if isinstance(threshold, float | int) else threshold
+        levels = check_levels(shares, inclinations)
+        threshold = levels[0][0]
     oscillates = _oscillates(source)
     frames = range(source.shape[0]) if oscillates else _frames_of(source, event)
     size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
@@ -102,6 +114,7 @@ def reconstruct_press(
         method,
         subframe,
         oscillates,
+        levels and levels[0],
         dark=source.header.dark if dark is None else dark,
         bright=source.header.bright if bright is None else bright,
         threshold=threshold,
@@ -117,7 +130,8 @@ def reconstruct_press(
         search.start_second_pass()
         feed(source, search, frames, progress)
     found = search.result()
-    onset = choose_event(found, event) if isinstance(found, Strokes) else found
+    onset = found.onset if isinstance(found, Levels) else found
+    onset = choose_event(onset, event) if isinstance(onset, Strokes) else onset
     process: dict[str, ProcessValue] = {
         "first_frame": frames.start,
         "frames": len(frames),
@@ -133,6 +147,10 @@ def reconstruct_press(
     result, done = finish_press(onset, source, search.travel, event, threshold, fill, modulus)
     if isinstance(found, Strokes):
         result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}
+    if isinstance(found, Levels) and levels is not None:
+        lower, upper = found.bounds(levels[1])
+        result = replace(result, slope_min=lower, slope_max=upper)
+        done |= {"thresholds": str(levels[0]), "inclinations": str(levels[1])}
     return attach_provenance(result, source, search.device, process | done)
 
 
@@ -243,10 +261,22 @@ def _frames_of(source: Source, event: Event) -> range:
 
 
 def _search(
-    source: Source, method: PressMethod, subframe: bool, oscillates: bool, **options: Any
-) -> OnsetSearch | ChangePointSearch | StrokeSearch:
+    source: Source,
+    method: PressMethod,
+    subframe: bool,
+    oscillates: bool,
+    levels: list[float] | None,
+    **options: Any,
+) -> OnsetSearch | ChangePointSearch | StrokeSearch | LevelSearch:
     """Return the estimator of a method, if the source can feed it."""
     shape, dtype = source.shape[1:], source.dtype
+    if levels is not None and (oscillates or method != "threshold"):
+        raise InputError(
+            f"{source.name}: inclinations take method 'threshold' and a press that goes down once"
+        )
+    if levels is not None:
+        del options["threshold"]
+        return LevelSearch(shape, dtype, levels, subframe=subframe, **options)
     if oscillates and method != "threshold":
         raise InputError(f"{source.name}: travel oscillates, for which method 'threshold' is needed")
     if oscillates:

@@ -65,6 +65,8 @@ MAPS: Mapping[str, tuple[str, str]] = {
         "connected pixels are one piece, and share a number; heights of two pieces say nothing of "
         "each other. -1: no height",
     ),
+    "slope_min": ("rad", "least inclination of the sheet, by the highest level of light that it passes"),
+    "slope_max": ("rad", "greatest inclination of the sheet, by the lowest level that it does not pass"),
     "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
 }
 """Of each map its unit in the file, and what it says."""
