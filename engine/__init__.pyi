@@ -15,6 +15,7 @@ from .press.strokes import Strokes, StrokeSearch
 from .reconstruction import reconstruct
 from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
+from .rotation.frequency import Frequency, estimate_frequency
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
 from .rotation.normals_pose import PoseEstimator, PoseNormals
 from .scoring import Score, score
@@ -28,6 +29,7 @@ __all__ = [
     "Correlator",
     "Displacement",
     "Force",
+    "Frequency",
     "Integrator",
     "Measures",
     "NormalEstimator",
@@ -44,6 +46,7 @@ __all__ = [
     "Surface",
     "TangentialForce",
     "correlate",
+    "estimate_frequency",
     "estimate_normals",
     "estimate_pose",
     "fill_holes",

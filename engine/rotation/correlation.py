@@ -76,6 +76,7 @@ def correlate(
     frames: NDArray[Any],
     phase: ArrayLike,
     *,
+    harmonic: int = 1,
     frame_weights: ArrayLike | None = None,
     device: str | Device | None = None,
 ) -> Correlation:
@@ -92,6 +93,9 @@ def correlate(
         Raw counts.
     phase : array_like, (T,)
         Radians, one a frame.
+    harmonic : int
+        Which multiple of the phase is fitted: alpha stands for that. Waves of other multiples are kept out by
+        phases that go evenly over whole turns.
     frame_weights : array_like, (T,), optional
         How much each frame counts; 0 for a missing one. By default, all count the same.
     device : str or Device, optional
@@ -120,6 +124,7 @@ def correlate(
     if frames.ndim != 3 or 0 in frames.shape:
         raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
     alpha, weights = check_phase(phase, len(frames), "phase"), check_weights(frame_weights, len(frames))
+    alpha = check_harmonic(harmonic) * alpha
     check_phases(alpha, weights)
     if StackSums.take(frames, weights):
         stack = StackSums(open_device(device), frames.shape[1:], frames.dtype, len(frames))
@@ -129,6 +134,13 @@ def correlate(
     correlator = Correlator(frames.shape[1:], frames.dtype, device=device, memory_limit=limit)
     correlator.push(frames, phase=alpha, frame_weights=weights)
     return correlator.result()
+
+
+def check_harmonic(harmonic: int) -> int:
+    """Return the harmonic if it is a whole number from 1 on, else raise InputError."""
+    if harmonic != int(harmonic) or harmonic < 1:
+        raise InputError(f"harmonic {harmonic}: a whole number from 1 on is needed")
+    return int(harmonic)
 
 
 class Correlator:
@@ -142,6 +154,8 @@ class Correlator:
         uint8, uint16 or float32.
     window : int, optional
         Frames, 3 to 64, that count: the last ones of an endless rotation. By default, all of them.
+    harmonic : int
+        As for `correlate`.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
     memory_limit : int
@@ -171,10 +185,12 @@ class Correlator:
         dtype: DTypeLike,
         *,
         window: int | None = None,
+        harmonic: int = 1,
         device: str | Device | None = None,
         memory_limit: int = MEMORY_LIMIT,
     ) -> None:
         dtype = np.dtype(dtype)
+        self._harmonic = check_harmonic(harmonic)
         check_dtype(dtype)
         self.device = open_device(device)
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
@@ -217,7 +233,7 @@ class Correlator:
             the sums hold.
         """
         check_frames(frames, self._dtype, self._shape)
-        alpha = check_phase(phase, len(frames), "phase")
+        alpha = self._harmonic * check_phase(phase, len(frames), "phase")
         self._sums.push(frames, alpha, check_weights(frame_weights, len(frames)), lent)
 
     def result(self) -> Correlation:

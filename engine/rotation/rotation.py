@@ -7,8 +7,10 @@ depends on the height of what it sees as well: that is found in the first turn, 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +21,7 @@ from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlator
 from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_turns, longest_turn
 from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.frequency import Frequency, frequency_of
 from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
 from mirrorskin.engine.rotation.normals_kernel import NORMAL_METHODS, NormalMethod, options_from
 from mirrorskin.engine.rotation.normals_pose import PoseEstimator, PoseNormals
@@ -31,7 +34,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Block, Header, InputError, Result, Source, WallResponse
 from mirrorskin.io.frames import FrameSequence
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.types import Closing, ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
@@ -227,25 +230,72 @@ def estimate_rotation(
 def correlate_source(
     source: Source,
     *,
+    harmonic: int = 1,
+    frequency: float | Literal["estimate"] | None = None,
+    frame_rate: float | None = None,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Fit mean, cosine and sine of the phase to each pixel's brightness, over all frames of a source.
 
-    The source is rewound first, if it can be; other arguments are as for `reconstruct_rotation`. InputError
-    where its phases do not determine the fit.
+    Parameters
+    ----------
+    source : Source
+        It is rewound first, if it can be.
+    harmonic : int
+        As for `mirrorskin.engine.correlate`.
+    frequency : float or "estimate", optional
+        Hertz: the phase is 2 pi times that and the time since the first frame, not the source's own. An
+        estimate takes a source that can be rewound; see `mirrorskin.engine.estimate_frequency`.
+    frame_rate : float, optional
+        Frames a second, instead of the times that the source knows.
+    memory_limit, device, progress
+        As for `reconstruct_rotation`.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The phases do not determine the fit, times are unknown, or no frequency can be estimated.
     """
     opened = open_device(device)
     limit = min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize)
+    process: dict[str, ProcessValue] = {"method": "correlation"}
+    if harmonic != 1:
+        process["harmonic"] = harmonic
     with naming(source):
-        correlator = Correlator(source.shape[1:], source.dtype, device=opened, memory_limit=limit)
-        feed(source, correlator, range(source.shape[0]), progress, long=True)
+        frames = source
+        if frequency is not None:
+            time = _times_of(source, frame_rate)
+            found = frequency_of(source, time) if frequency == "estimate" else Frequency(frequency, math.nan)
+            process |= {"frequency": found.hertz}
+            if frequency == "estimate":
+                process["frequency_sigma"] = found.sigma
+            frames = _Edited(source, partial(_rephased, 2 * math.pi * found.hertz * (time - time[0])))
+        correlator = Correlator(
+            source.shape[1:], source.dtype, harmonic=harmonic, device=opened, memory_limit=limit
+        )
+        feed(frames, correlator, range(source.shape[0]), progress, long=True)
         wave = correlator.result()
     names = "azimuth", "mean", "cosine", "sine", "modulation", "residual"
     result = Result(**{name: getattr(wave, name) for name in names})
-    process: dict[str, ProcessValue] = {"method": "correlation", "frames": wave.frames, "zenith": _NO_GAIN}
-    return attach_provenance(result, source, opened, process)
+    return attach_provenance(result, source, opened, process | {"frames": wave.frames, "zenith": _NO_GAIN})
+
+
+def _times_of(source: Source, frame_rate: float | None) -> Doubles:
+    """Return when each frame was taken, s, by the frame rate or else as the source says."""
+    if frame_rate is not None:
+        if not 0 < frame_rate < math.inf:
+            raise InputError(f"frame rate {frame_rate}: frames a second, above 0, are needed")
+        return np.arange(source.shape[0]) / frame_rate
+    time: Doubles | None = getattr(source, "time", None)
+    if time is None or not np.isfinite(time).all():
+        raise InputError("the time of each frame is unknown: give the frame rate")
+    return time
+
+
+def _rephased(phase: Doubles, block: Block) -> Block:
+    return replace(block, phase=phase[block.index : block.index + len(block.frames)])
 
 
 def rotation_maps(rotation: Rotation) -> Result:
@@ -373,7 +423,8 @@ class _Passes:
                 memory_limit=min(self.memory_limit, 2 * size),
                 **options,
             )
-            feed(cast(Source, _Posed(self.source)), estimator, range(count), self.progress)
+            frames = _Edited(self.source, partial(_with_tilts, self.source.header.tilt))
+            feed(frames, estimator, range(count), self.progress)
             normals = estimator.result()
         return self._with_edges(normals)
 
@@ -449,21 +500,27 @@ class _Passes:
         return Rotation(normals, normals.sigma, edges, self.device)
 
 
-class _Posed:
-    """A source whose blocks have a tilt of each frame, though all may be the same."""
+class _Edited(Closing):
+    """A source whose blocks are edited as they go by."""
 
-    def __init__(self, source: Source) -> None:
-        self._source = source
+    def __init__(self, source: Source, edit: Callable[[Block], Block]) -> None:
+        self._source, self._edit = source, edit
+        self.name, self.header, self.shape = source.name, source.header, source.shape
+        self.dtype, self.motion, self.rewindable = source.dtype, source.motion, source.rewindable
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._source, name)
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self._source.rewind()
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the source's next frames."""
-        block, tilt = self._source.read(out), self._source.header.tilt
-        if block is None or (block.tilt is not None and tilt is None):
-            return block
-        return replace(block, tilt=np.full(len(block.frames), np.nan if tilt is None else tilt))
+        block = self._source.read(out)
+        return block and self._edit(block)
+
+
+def _with_tilts(tilt: float | None, block: Block) -> Block:
+    """Give each frame the tilt of all, if there is one."""
+    return block if tilt is None else replace(block, tilt=np.full(len(block.frames), tilt))
 
 
 def _account_for_registration(normals: Normals, noise_gain: NDArray[np.float32] | None) -> Normals:

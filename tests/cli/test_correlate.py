@@ -148,3 +148,41 @@ def test_bad_input_is_one_line(case):
     assert ended.said.startswith("mirrorskin: ")
     assert ended.said.count("\n") == 1
     assert set(Path().iterdir()) == before
+
+
+def oscillating(hertz=3.0, count=64, rate=25.0):
+    """A stack in which all pixels oscillate, with a second harmonic."""
+    angle = 2 * np.pi * hertz * np.arange(count) / rate
+    counts = 100 + 30 * np.cos(angle - 0.5) + 10 * np.cos(2 * angle)
+    noise = np.random.default_rng(4).normal(0, 1, (count, 5, 7))
+    with h5py.File("dither.h5", "w") as file:
+        file["x"] = np.rint(counts[:, None, None] + noise).astype(np.uint8)
+    return "dither.h5"
+
+
+@pytest.mark.parametrize(("harmonic", "amplitude"), [(1, 30), (2, 10)])
+@pytest.mark.parametrize("frequency", ["3", "estimate"])
+def test_a_frequency_takes_the_place_of_the_phase(frequency, harmonic, amplitude):
+    words = ["--frequency", frequency, "--frame-rate", "25", "--harmonic", str(harmonic)]
+    ended = run("correlate", oscillating(), *words)
+    assert ended.code == 0, ended.said
+    result = io.open_result("dither-correlation.h5")
+    np.testing.assert_allclose(result.modulation, amplitude, atol=2)
+    assert result.process["frequency"] == pytest.approx(3, abs=0.01)
+    assert ("frequency_sigma" in result.process) == (frequency == "estimate")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--frequency", "3"], "the time of each frame is unknown"),
+        (["--frequency", "fast"], "--frequency fast: hertz above 0 are needed"),
+        (["--frequency", "3", "--phase-step", "45deg"], "leave --phase-step and --phases out"),
+        (["--frequency", "3", "--frame-rate", "0"], "frame rate 0"),
+    ],
+)
+def test_a_frequency_that_cannot_be_is_one_line(words, line):
+    ended = run("correlate", oscillating(), *words)
+    assert ended.code == 2
+    assert line in ended.said
+    assert ended.said.count("\n") == 1

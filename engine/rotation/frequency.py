@@ -1,0 +1,143 @@
+"""The frequency at which brightness oscillates: the maximum of the periodogram, refined by least squares."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize
+
+from mirrorskin.engine.rotation.design_matrix import Doubles, basis
+from mirrorskin.io import InputError, Source
+
+_FEWEST = 8  # frames
+_PIXELS, _SAMPLES = 4096, 2**22  # pixels that are looked at, and samples, at most
+_FINER = 4  # lines of the periodogram for each that is independent
+_SPARSE = 64  # times the median step between frames, by which there may be more steps than frames
+_SIGNIFICANT = 8.0  # standard deviations of what noise alone explains
+_STEPS = 3  # Gauss-Newton
+
+
+class Frequency(NamedTuple):
+    """A frequency, and its standard deviation.
+
+    Attributes
+    ----------
+    hertz, sigma : float
+    """
+
+    hertz: float
+    sigma: float
+
+
+def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
+    """Estimate the frequency that all pixels share, by any amplitude and phase of each.
+
+    The sum of all pixels' periodograms has its maximum near it, from one period of the recording up to half
+    the frame rate. From there, Gauss-Newton steps lead to the least squares of mean + cosine cos(2 pi f t) +
+    sine sin(2 pi f t) over f and the pixels' waves: the most likely frequency, of white noise. Its variance
+    is the inverse of Fisher's information, the Cramer-Rao bound (Rife and Boorstyn 1974).
+
+    Parameters
+    ----------
+    samples : ndarray, (T, ...), uint8, uint16 or float
+        Frames, or samples of some pixels.
+    time : array_like, (T,)
+        Seconds; evenly spaced or not, increasing.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Fewer than 8 frames, times that do not increase, or nothing that oscillates beyond the noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> time = np.arange(100) / 30
+    >>> wave = 100 + 20 * np.cos(2 * np.pi * 3.21 * time) + np.random.default_rng(1).normal(0, 1, 100)
+    >>> found = engine.estimate_frequency(wave, time)
+    >>> round(found.hertz, 2), found.sigma < 0.01
+    (3.21, True)
+    """
+    seconds = np.asarray(time, np.float64)
+    if len(samples) < _FEWEST or seconds.shape != (len(samples),):
+        raise InputError(f"{len(samples)} frames with {seconds.size} times: at least {_FEWEST} are needed")
+    if not np.all(np.diff(seconds) > 0):
+        raise InputError("frame times do not increase: give the frame rate instead")
+    flat = samples.reshape(len(samples), -1)
+    flat = flat[:, :: max(1, flat.shape[1] * len(flat) // min(_SAMPLES, _PIXELS * len(flat)))].astype(float)
+    counts = flat[:, np.isfinite(flat).all(axis=0)]
+    if counts.shape[1] == 0:
+        raise InputError("every pixel has a missing sample: no frequency can be estimated")
+    counts -= counts.mean(axis=0)
+    apart = seconds - seconds.mean()
+
+    def unexplained(frequency: float) -> float:
+        return -float(np.sum((_waves(apart, frequency).T @ counts) ** 2))
+
+    start, width = _periodogram_peak(counts, seconds)
+    frequency = float(
+        optimize.minimize_scalar(
+            unexplained, bounds=(max(start - width, width / 2), start + width), method="bounded"
+        ).x
+    )
+    for _ in range(_STEPS):
+        step, information, variance = _newton(counts, apart, frequency)
+        frequency += step
+    explained = -unexplained(frequency) / max(variance, np.finfo(float).tiny)
+    pixels = counts.shape[1]
+    if not explained > 2 * pixels + _SIGNIFICANT * math.sqrt(4 * pixels) + 4 * math.log(len(counts)):
+        raise InputError("nothing oscillates beyond the noise: give the frequency")
+    return Frequency(frequency, math.sqrt(variance / information))
+
+
+def frequency_of(source: Source, time: Doubles) -> Frequency:
+    """Estimate the frequency of a source's frames, which is rewound before and after; see above."""
+    step = max(1, math.prod(source.shape[1:]) // min(_PIXELS, max(1, _SAMPLES // source.shape[0])))
+    source.rewind()
+    samples: list[NDArray[Any]] = []
+    while (block := source.read()) is not None:
+        samples += [frame.reshape(-1)[::step].copy() for frame in block.frames]
+    source.rewind()
+    return estimate_frequency(np.stack(samples), time)
+
+
+def _periodogram_peak(counts: Doubles, time: Doubles) -> tuple[float, float]:
+    """Return where the pixels' periodograms have their maximum, and the width of a line, hertz."""
+    step = float(np.median(np.diff(time)))
+    place = np.rint((time - time[0]) / step).astype(np.intp)
+    if place[-1] > _SPARSE * len(time):
+        raise InputError("frame times are too uneven to find a frequency in: give it")
+    grid = np.zeros((place[-1] + 1, counts.shape[1]))
+    grid[place] = counts
+    lines = np.fft.rfft(grid, _FINER * len(grid), axis=0)
+    power = np.sum(lines.real**2 + lines.imag**2, axis=1)
+    hertz = np.fft.rfftfreq(_FINER * len(grid), step)
+    width = 1 / (step * len(grid))
+    power[hertz < width] = 0
+    return float(hertz[np.argmax(power)]), width / 2
+
+
+def _waves(time: Doubles, frequency: float) -> Doubles:
+    """Return an orthonormal base of the waves, (T, 2), free of constants."""
+    base = basis(2 * math.pi * frequency * time)[:, 1:]
+    return np.asarray(np.linalg.qr(base - base.mean(axis=0)).Q)
+
+
+def _newton(counts: Doubles, time: Doubles, frequency: float) -> tuple[float, float, float]:
+    """Return a Gauss-Newton step of the frequency, its information in variances, and a sample's variance."""
+    full = basis(2 * math.pi * frequency * time)
+    parts = np.linalg.lstsq(full, counts, rcond=None)[0]
+    residual = counts - full @ parts
+    variance = float(np.sum(residual**2)) / (counts.shape[1] * (len(counts) - 3) - 1)
+    turn = 2 * math.pi * time[:, np.newaxis] * np.stack([-full[:, 2], full[:, 1]], axis=1)
+    turn -= full @ np.linalg.lstsq(full, turn, rcond=None)[0]
+    growth = turn @ parts[1:]
+    square = float(np.sum(growth**2))
+    # The waves that noise makes tell nothing, and are not counted.
+    by_noise = variance * np.trace(turn.T @ turn @ np.linalg.inv(full.T @ full)[1:, 1:])
+    told = max(square - counts.shape[1] * float(by_noise), np.finfo(float).tiny)
+    return float(np.sum(growth * residual)) / square, told, variance

@@ -1,0 +1,118 @@
+"""The estimated frequency against the Cramer-Rao bound, and what it is used for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+from mirrorskin.engine.rotation.rotation import correlate_source
+from mirrorskin.io.frames import FrameSequence
+
+RATE, COUNT, HERTZ = 60.0, 150, 7.321
+TIME = np.arange(COUNT) / RATE
+NOISE = 2.0
+
+
+def waves(amplitude, phase, time=TIME, hertz=HERTZ, seed=1, harmonic=0.0):
+    """Samples of pixels with any amplitude and phase, (T, n)."""
+    angle = 2 * np.pi * hertz * time[:, np.newaxis]
+    noise = np.random.default_rng(seed).normal(0, NOISE, (len(time), len(amplitude)))
+    return 100 + amplitude * np.cos(angle - phase) + harmonic * np.cos(2 * angle - 0.4) + noise
+
+
+def bound(amplitude, time=TIME):
+    """The standard deviation of an unbiased estimate, Hz, of waves of many periods (Rife and Boorstyn)."""
+    spread = np.sum((time - time.mean()) ** 2)
+    return NOISE / np.sqrt(np.sum(amplitude**2) / 2 * spread) / (2 * np.pi)
+
+
+@pytest.mark.parametrize("case", ["one pixel", "pixels", "uneven", "few of many"])
+def test_it_reaches_the_cramer_rao_bound_and_says_so(case):
+    random = np.random.default_rng(5)
+    time = np.sort(TIME + random.uniform(0, 0.3 / RATE, COUNT)) if case == "uneven" else TIME
+    time = time[random.uniform(size=COUNT) > 0.1] if case == "uneven" else time
+    amplitude = np.full({"one pixel": 1, "pixels": 30}.get(case, 200), 3.0)
+    if case == "few of many":
+        amplitude[20:] = 0
+    phase = random.uniform(0, 2 * np.pi, len(amplitude))
+    found = [engine.estimate_frequency(waves(amplitude, phase, time, seed=seed), time) for seed in range(250)]
+    error = np.array([one.hertz for one in found]) - HERTZ
+    assert np.sqrt(np.mean(error**2)) / bound(amplitude, time) == pytest.approx(1, abs=0.12)
+    assert np.mean([(e / one.sigma) ** 2 for e, one in zip(error, found, strict=True)]) == pytest.approx(
+        1, abs=0.22
+    )
+    assert abs(error.mean()) < 4 * bound(amplitude, time) / np.sqrt(len(found))
+
+
+class Stack(FrameSequence):
+    """Frames in memory, with times."""
+
+    def __init__(self, frames, time):
+        self.frames, self.time = frames, time
+        super().__init__("memory", io.Header("axial"), frames.shape, frames.dtype, time=time)
+
+    def _fill(self, start, out):
+        out[:] = self.frames[start : start + len(out)]
+
+
+@pytest.mark.parametrize("harmonic", [1, 2])
+def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
+    phase = np.linspace(-1, 1, 12)
+    clean = waves(np.full(12, 20.0), phase, harmonic=8.0)
+    frames = np.clip(np.rint(clean), 0, 255).astype(np.uint8).reshape(COUNT, 3, 4)
+    result = correlate_source(Stack(frames, TIME), harmonic=harmonic, frequency="estimate", device=device)
+    assert result.process["frequency"] == pytest.approx(HERTZ, abs=4 * result.process["frequency_sigma"])
+    assert result.process.get("harmonic", 1) == harmonic
+    expected = {1: phase, 2: np.full(12, 0.4)}[harmonic].reshape(3, 4)
+    np.testing.assert_allclose(result.modulation, {1: 20.0, 2: 8.0}[harmonic], atol=1.2)
+    np.testing.assert_allclose(result.azimuth, expected, atol=0.2)
+    given = correlate_source(Stack(frames, None), harmonic=harmonic, frequency=HERTZ, frame_rate=RATE)
+    np.testing.assert_allclose(given.modulation, result.modulation, rtol=1e-2)
+
+
+@pytest.mark.parametrize("harmonic", [1, 2, 3])
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, device):
+    frames = np.random.default_rng(2).integers(0, 4096, (16, 5, 7)).astype(dtype)
+    phase = np.arange(16) * np.pi / 8 + 0.1
+    found = engine.correlate(frames, phase, harmonic=harmonic, device=device)
+    same = engine.correlate(frames, harmonic * phase, device=device)
+    blocks = engine.Correlator((5, 7), dtype, harmonic=harmonic, device=device)
+    for part in np.split(np.arange(16), [5, 6]):
+        blocks.push(frames[part], phase=phase[part])
+    for name in ("mean", "cosine", "sine", "residual"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(same, name))
+        np.testing.assert_allclose(getattr(blocks.result(), name), getattr(same, name), rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: engine.estimate_frequency(np.zeros(5), np.arange(5)), "5 frames .* at least 8"),
+        (lambda: engine.estimate_frequency(np.zeros(9), np.arange(9)[::-1]), "times do not increase"),
+        (
+            lambda: engine.estimate_frequency(waves(np.zeros(3), np.zeros(3)), TIME),
+            "nothing oscillates beyond the noise",
+        ),
+        (lambda: engine.estimate_frequency(np.full((9, 2), np.nan), np.arange(9)), "a missing sample"),
+        (
+            lambda: engine.correlate(np.zeros((9, 2, 2), "u1"), np.arange(9), harmonic=0),
+            "harmonic 0: a whole",
+        ),
+        (
+            lambda: correlate_source(Stack(np.zeros((9, 2, 2), "u1"), None), frequency=1.0),
+            "memory: the time of each frame is unknown: give the frame rate",
+        ),
+        (
+            lambda: correlate_source(
+                Stack(np.zeros((9, 2, 2), "u1"), None), frequency="estimate", frame_rate=-1.0
+            ),
+            "frame rate -1.0: frames a second",
+        ),
+    ],
+)
+def test_what_has_no_frequency_is_one_line(call, line):
+    with pytest.raises(io.InputError, match=line) as caught:
+        call()
+    assert "\n" not in str(caught.value)
