@@ -36,7 +36,7 @@ def command(
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Fit mean, cosine and sine of the phase, or of a frequency, to each pixel's brightness."""
+    """Fit mean, cosine and sine of the phase to each pixel's brightness."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
