@@ -81,8 +81,8 @@ def find_tangential_force(
         accuracy only by noise, one that is too small loses force.
     normal_pressure : array_like, (H, W), optional
         As a result's ``pressure``; needed without a contact.
-    sigma : array_like, scalar or (H, W)
-        Standard deviation of each component of the displacement, mm.
+    sigma : array_like, scalar, (H, W) or (H, W, 2)
+        Standard deviation of each component of the displacement, mm; where it is NaN, that of the nearest.
     window : int
         Pixels along a side of the windows in which displacements were found: neighbours share their errors.
     modulus_sigma : float
@@ -115,7 +115,7 @@ def find_tangential_force(
     check_modulus(modulus)
     rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
     traction = np.zeros((*touches.shape, 2), np.float32)
-    touches, spread = touches[rows, columns], spread[rows, columns]
+    touches, spread = touches[rows, columns], spread[:, rows, columns]
     target = np.where(touches, moved[:, rows, columns] * _UP, 0.0)
     system = _System(touches, size)
     units = [touches * unit for unit in np.eye(2)[:, :, np.newaxis, np.newaxis]]
@@ -142,20 +142,27 @@ def _checked(
     if contact is None and pressure is None:
         raise InputError("where the object touches is not said: give contact, or normal_pressure")
     touches = np.asarray(contact if contact is not None else np.asarray(pressure, np.float64) > 0) > 0
+    if touches.shape != moved.shape[:2]:
+        raise InputError(f"contact has shape {touches.shape}: it must be that of the map, {moved.shape[:2]}")
     spread = np.asarray(sigma, np.float64)
-    for name, shape in (("contact", touches.shape), ("sigma", spread.shape or moved.shape[:2])):
-        if shape != moved.shape[:2]:
-            raise InputError(f"{name} has shape {shape}: it must be that of the map, {moved.shape[:2]}")
+    if spread.shape not in ((), moved.shape[:2], moved.shape):
+        raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
+    spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
     if window < 1:
         raise InputError(f"window {window} cannot be: give pixels, 1 or more")
     if not touches.any():
         raise InputError("nothing touches: there is no traction to find")
     known = np.isfinite(moved).all(axis=-1)
     share = np.count_nonzero(known & touches) / np.count_nonzero(touches)
+    if not np.isfinite(spread).any() or np.any(spread < 0):
+        raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")
     if share < _LEAST_KNOWN:
         raise InputError(f"{share:.0%} of the contact has a displacement: {_LEAST_KNOWN:.0%} are needed")
-    moved = np.stack([fill_with_nearest(np.where(known, part, np.nan)) for part in np.moveaxis(moved, -1, 0)])
-    return moved, np.broadcast_to(spread, touches.shape), touches
+    filled = (
+        np.stack([fill_with_nearest(np.where(known, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
+        for values in (moved, spread)
+    )
+    return next(filled), next(filled), touches
 
 
 class _System:
@@ -204,7 +211,7 @@ class _System:
 
     def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
         """Return the traction that misses displacements by their standard deviation."""
-        noise = float(np.mean(np.broadcast_to(sigma, self._contact.shape)[self._contact] ** 2))
+        noise = float(np.mean(sigma[:, self._contact] ** 2))
         if not noise:
             return self.solve(target, _TOLERANCE)
         softness = _SOFTNESS * math.sqrt(np.count_nonzero(self._contact))

@@ -9,7 +9,9 @@ from contact_theory import paraboloid, pushed, traction_response
 from mirrorskin import io
 from mirrorskin.engine.force.normal import find_force
 from mirrorskin.engine.force.tangential import find_tangential_force
-from mirrorskin.hw.twin import Body, Horizontal, Sphere, Twin
+from mirrorskin.engine.slip.displacement import find_displacement
+from mirrorskin.hw.twin import Body, Camera, Horizontal, Sphere, Twin
+from mirrorskin.hw.twin.texture import SheetTexture
 
 MODULUS, PIXEL = 0.1, 0.05
 SHEAR = MODULUS / 3
@@ -132,6 +134,37 @@ def test_the_twin_s_skin_is_pushed_with_the_twin_s_force(friction):
         assert np.hypot(*(found.force - expected)) < 0.03 * np.hypot(*expected)
 
 
+def test_frames_of_a_texture_give_the_force_to_three_percent():
+    """From frames to newtons: the skin's displacement is found in them, in windows of 8 pixels."""
+    path = np.stack([np.linspace(0, 0.3, 7), np.zeros(7)], axis=1)
+    twin = Twin(
+        object=Sphere(6.0),
+        shape=(112, 112),
+        pixel_size=0.05,
+        movement=Horizontal(path, 0.7),
+        contact="elastic",
+        optics="cylinder",
+        body=Body(modulus=0.12, friction=0.6),
+        camera=Camera(noise=1.0, seed=1),
+        texture=SheetTexture(size=0.2),
+    )
+    frames = np.empty(twin.shape, twin.dtype)
+    twin.read(frames)
+    moved = find_displacement(frames[0], frames, 0.05, window=8, step=2)
+    pressed = find_force(twin.truth.height, 0.7, 0.05, 0.12)
+    for number in (3, 6):
+        found = find_tangential_force(
+            moved.displacement[number],
+            0.05,
+            0.12,
+            contact=pressed.contact,
+            sigma=moved.sigma[number],
+            window=8,
+        )
+        expected = twin.truth.force[number, :2]
+        assert np.hypot(*(found.force - expected)) < 0.03 * np.hypot(*expected)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -140,6 +173,8 @@ def test_the_twin_s_skin_is_pushed_with_the_twin_s_force(friction):
         ({"contact": np.zeros((9, 9))}, "nothing touches"),
         ({"contact": np.ones((9, 8))}, "contact has shape"),
         ({"sigma": np.ones(4)}, "sigma has shape"),
+        ({"sigma": np.nan}, "nowhere known"),
+        ({"sigma": -1.0}, "below 0"),
         ({"window": 0}, "window 0"),
         ({"modulus": -1.0}, "modulus of -1 MPa"),
         ({"displacement": np.full((9, 9, 2), np.nan)}, "0% of the contact has a displacement"),
