@@ -26,6 +26,10 @@ def command(
         str | None,
         Option(metavar="HZ", help="Phase by the time of the frames, instead of a turn: 12.5, or 'estimate'."),
     ] = None,
+    dither: Annotated[
+        bool,
+        Option("--dither", help="Phase by the travel of a press that dithers: the contact's growth, too."),
+    ] = False,
     frame_rate: Annotated[
         float | None, Option(metavar="HZ", help="Of the frames, where the file has no times.")
     ] = None,
@@ -43,9 +47,9 @@ def command(
     from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.rotation.rotation import correlate_source
 
-    rate = _frequency(frequency, phase_step, phases)
+    rate = _frequency(frequency, phase_step, phases, dither)
     known = stack_options(
-        motion=options.MotionName.axial,
+        motion=None if dither else options.MotionName.axial,
         phase_step=phase_step if rate is None else "0deg",
         phases=phases,
         pixel_size=pixel_size,
@@ -54,7 +58,7 @@ def command(
     )
     limit = bytes_of(memory, "--memory")
     with io.open_recording(
-        stack, dataset=dataset, memory_limit=limit, override_motion=True, **known
+        stack, dataset=dataset, memory_limit=limit, override_motion=not dither, **known
     ) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
         io.check_output(target, stack, phases)
@@ -64,6 +68,7 @@ def command(
                 harmonic=harmonic,
                 frequency=rate,
                 frame_rate=frame_rate,
+                dither=dither,
                 memory_limit=limit,
                 device=device,
                 progress=show,
@@ -72,11 +77,13 @@ def command(
 
 
 def _frequency(
-    text: str | None, phase_step: str | None, phases: Path | None
+    text: str | None, phase_step: str | None, phases: Path | None, dither: bool
 ) -> float | Literal["estimate"] | None:
     """Read a frequency, hertz."""
     from mirrorskin.io import InputError
 
+    if dither and (text or phase_step or phases):
+        raise InputError("--dither takes the phases from the travel: leave out those given")
     if text is None:
         return None
     if phase_step is not None or phases is not None:

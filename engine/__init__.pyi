@@ -9,6 +9,7 @@ from .integration.surface import Surface
 from .metrology.measures import Measures, measure
 from .pose.pose import Pose, estimate_pose
 from .press.changepoint import ChangePointSearch, find_change_point
+from .press.growth import Growth, find_growth
 from .press.holes import fill_holes
 from .press.onset import Onset, OnsetSearch, find_onset
 from .press.strokes import Strokes, StrokeSearch
@@ -30,6 +31,7 @@ __all__ = [
     "Displacement",
     "Force",
     "Frequency",
+    "Growth",
     "Integrator",
     "Measures",
     "NormalEstimator",
@@ -54,6 +56,7 @@ __all__ = [
     "find_displacement",
     "find_edges",
     "find_force",
+    "find_growth",
     "find_onset",
     "find_tangential_force",
     "free_memory",

@@ -20,7 +20,7 @@ MARK = "mirrorskin_result"
 UNITS = (
     dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma", "slope_min", "slope_max"), "rad")
-    | {"pressure": "MPa"}
+    | {"pressure": "MPa", "growth": "1/mm", "growth_sigma": "1/mm"}
     | dict.fromkeys(SCALARS, "N")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
 )

@@ -268,6 +268,9 @@ class Result:
         Millimetres by which the release is higher than the onset, and the standard deviation of that.
     strokes : ndarray, (H, W), uint16
         In how many strokes of an oscillating press there was what the height is made of.
+    growth, growth_sigma : ndarray, (H, W), float32
+        Share of full light that a pixel gains for each mm of travel of a dithering press, 1/mm, and the
+        standard deviation.
     slope, slope_sigma : ndarray, (H, W), float32
         Millimetres that the surface rises for each along the direction of rocking, ``slope_direction`` in the
         process, and the standard deviation.
@@ -310,6 +313,8 @@ class Result:
     hysteresis: NDArray[np.float32] | None = None
     hysteresis_sigma: NDArray[np.float32] | None = None
     strokes: NDArray[np.uint16] | None = None
+    growth: NDArray[np.float32] | None = None
+    growth_sigma: NDArray[np.float32] | None = None
     slope: NDArray[np.float32] | None = None
     slope_sigma: NDArray[np.float32] | None = None
     normals: NDArray[np.float32] | None = None

@@ -73,6 +73,8 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     if counts.shape[1] == 0:
         raise InputError("every pixel has a missing sample: no frequency can be estimated")
     counts -= counts.mean(axis=0)
+    if not counts.any():
+        raise InputError("nothing oscillates: all samples of a pixel are the same")
     apart = seconds - seconds.mean()
 
     def unexplained(frequency: float) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.press.growth import Growth, travel_wave
 from mirrorskin.engine.provenance import attach_provenance, level_origin, naming, parameter_origin
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlator
@@ -233,6 +234,7 @@ def correlate_source(
     harmonic: int = 1,
     frequency: float | Literal["estimate"] | None = None,
     frame_rate: float | None = None,
+    dither: bool = False,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
@@ -250,6 +252,9 @@ def correlate_source(
         estimate takes a source that can be rewound; see `mirrorskin.engine.estimate_frequency`.
     frame_rate : float, optional
         Frames a second, instead of the times that the source knows.
+    dither : bool
+        Whether the phase is that of a dithering press, by its travel; what it tells of the contact's growth
+        is added. See `mirrorskin.engine.find_growth`.
     memory_limit, device, progress
         As for `reconstruct_rotation`.
 
@@ -272,6 +277,9 @@ def correlate_source(
             if frequency == "estimate":
                 process["frequency_sigma"] = found.sigma
             frames = _Edited(source, partial(_rephased, 2 * math.pi * found.hertz * (time - time[0])))
+        if dither:
+            travel = travel_wave(getattr(source, "travel", None), source.shape[0])
+            frames = _Edited(source, partial(_rephased, travel.phase))
         correlator = Correlator(
             source.shape[1:], source.dtype, harmonic=harmonic, device=opened, memory_limit=limit
         )
@@ -279,6 +287,13 @@ def correlate_source(
         wave = correlator.result()
     names = "azimuth", "mean", "cosine", "sine", "modulation", "residual"
     result = Result(**{name: getattr(wave, name) for name in names})
+    if dither:
+        header = source.header
+        grown = Growth.of(wave, travel, header.dark, header.bright, source.dtype, header.pixel_size)
+        result = replace(result, growth=grown.growth, growth_sigma=grown.sigma)
+        process |= {"travel": grown.travel, "travel_amplitude": grown.amplitude}
+        if grown.area is not None and grown.area_sigma is not None:
+            process |= {"area_growth": grown.area, "area_growth_sigma": grown.area_sigma}
     return attach_provenance(result, source, opened, process | {"frames": wave.frames, "zenith": _NO_GAIN})
 
 

@@ -46,6 +46,8 @@ MAPS: Mapping[str, tuple[str, str]] = {
     "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
     "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),
     "strokes": ("", "in how many strokes there was what the height is made of"),
+    "growth": ("1/mm", "share of full light that a pixel gains with the travel of a dithering press"),
+    "growth_sigma": ("1/mm", "the standard deviation that is expected of the growth"),
     "slope": ("", "how much the surface rises along the direction in which the body rocked"),
     "slope_sigma": ("", "the standard deviation that is expected of the slope"),
     "normals": ("", "unit normals of the surface: x, y and z"),
@@ -102,6 +104,9 @@ _FIRST = (
 _UNITS = {
     "tilt": "rad",
     "slope_direction": "rad",
+    **dict.fromkeys(("travel", "travel_amplitude"), "mm"),
+    **dict.fromkeys(("area_growth", "area_growth_sigma"), "mm^2/mm"),
+    **dict.fromkeys(("frequency", "frequency_sigma"), "Hz"),
     "zenith_error": "rad",
     "zenith_gain": "counts/rad",
     **dict.fromkeys(("zenith_offset", "noise", "dark", "bright", "low", "high"), "counts"),
