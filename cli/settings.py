@@ -49,7 +49,8 @@ class _Stack(Struct, frozen=True, rename="kebab"):
 class _Press(Struct, frozen=True, rename="kebab"):
     event: Event | None = None
     method: PressMethod | None = None
-    threshold: _Share | None = None
+    threshold: _Share | list[_Share] | None = None
+    inclination: list[Annotated[str, _text("12deg")]] | None = None
     hold: _Frames | None = None
     subframe: bool | None = None
     dark: _Counts | None = None
@@ -113,6 +114,8 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
 
 def _press(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [press] to keywords of ``reconstruct``."""
+    if "inclination" in values:
+        values["inclinations"] = [angle(text, f"{where}inclination") for text in values.pop("inclination")]
     if "modulus" in values:
         values["modulus"] = pressure(values["modulus"], f"{where}modulus")
     return values

@@ -28,6 +28,7 @@ frames = "10:200"
 event = "release"
 method = "change-point"
 threshold = 0.25
+inclination = ["12deg"]
 hold = 3
 subframe = true
 dark = 12
@@ -75,6 +76,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "event": "release",
         "method": "change-point",
         "threshold": 0.25,
+        "inclinations": [pytest.approx(math.radians(12))],
         "hold": 3,
         "subframe": True,
         "dark": 12.0,
