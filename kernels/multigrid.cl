@@ -575,10 +575,14 @@ __kernel void multigrid_tail(
 #if LANES == 1
 #define FACTOR_ARG const float factor
 #define FACTOR factor
+#define STEP_ARGS const float taken, const int step
+#define STEP_FACTOR taken
 #define EACH_LIVE EACH_PART
 #else
 #define FACTOR_ARG VALUES factor
 #define FACTOR (*factor)
+#define STEP_ARGS VALUES taken, const int step
+#define STEP_FACTOR (*taken)
 #define EACH_LIVE EACH_PART if (inverse[i] > 0)
 #endif
 
@@ -599,34 +603,44 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
     EACH_NODE
 #define WRITE_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
 
-// The next direction, the matrix times it, and the product of both.
+// The next direction, and the product of it with the matrix times it. The last step, along the direction before, is taken here, as it is
+// read anyway: `taken` of it, if `step` is 1 from zero, if 2 from x.
 #define DIRECTION(i) (AT(z + (i)) + FACTOR * AT(before + (i)))
+#define TAKEN(along) ((step == 1 ? (values)0 : AT(x + i)) + STEP_FACTOR * AT(along + i))
 __kernel void multigrid_direct(
-    LEVEL_ARGS, FACTOR_ARG, GRAPH_ARGS, MAP inverse, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES image,
+    LEVEL_ARGS, FACTOR_ARG, STEP_ARGS, GRAPH_ARGS, MAP inverse, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES x,
     OUT_VALUES parts)
 {
     EACH_LIVE {
         SIDES
-        const values p = DIRECTION(i), q = -FLOW(DIRECTION, i, stride);
+        const values p = DIRECTION(i);
         STREAM(direction + i, p);
-        STREAM(image + i, q);
-        sum += p * q;
+        sum += p * -FLOW(DIRECTION, i, stride);
+        if (step) PUT(x + i) = TAKEN(before);
     }
     WRITE_PART
 }
 
-// A step along it, from zero if `first` is 1, the residual then, and the square of that.
+// The residual after a step along it, and the square of that.
 __kernel void multigrid_advance(
-    LEVEL_ARGS, FACTOR_ARG, MAP inverse, VALUES direction, VALUES image, const int first, OUT_VALUES b, OUT_VALUES x,
-    OUT_VALUES parts)
+    LEVEL_ARGS, FACTOR_ARG, GRAPH_ARGS, MAP inverse, VALUES direction, OUT_VALUES b, OUT_VALUES parts)
 {
     EACH_LIVE {
-        const values r = AT(b + i) - FACTOR * AT(image + i);
-        PUT(x + i) = (first ? (values)0 : AT(x + i)) + FACTOR * AT(direction + i);
+        SIDES
+        const values image = -FLOW(AT, direction + i, stride), r = AT(b + i) - FACTOR * image;
         PUT(b + i) = r;
         sum += r * r;
     }
     WRITE_PART
+}
+
+// A step, where no direction follows.
+__kernel void multigrid_take(LEVEL_ARGS, STEP_ARGS, VALUES direction, OUT_VALUES x)
+{
+    ITEMS_NODES
+    EACH_NODE {
+        PUT(x + i) = TAKEN(direction);
+    }
 }
 
 // Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,

@@ -140,6 +140,7 @@ class Multigrid:
         cycle = one.cycle
         h.follow(links, deep=deep)
         cycle.find_tiles()
+        one.started = True
         one.copy("admit", one.source, links.source)
         one.find_residual()
         cycle.launch()
@@ -162,7 +163,7 @@ class Multigrid:
         if uneven:
             self.rebuild(self._links, strength=JOINED)
         h, one = self._hierarchy, self._alone
-        rooms = one.cycle.x, one.cycle.b, one.cycle.spare, one.before, one.image
+        rooms = one.cycle.x, one.cycle.b, one.cycle.spare, one.before, one.p
         find_graph_variance(h, answered, rooms)
         found = self._device.array("sigma", self._links.shape, np.float32)
         known: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN, "flags": flags}
@@ -194,12 +195,14 @@ class _Gradients:
         h, self.lanes = hierarchy, lanes
         self._h, finest = h, h.levels[0]
         size = None if lanes == 1 else finest.end + finest.stride
-        names = "x", "direction", "direction before", "image"
-        self.x, self.p, self.before, self.image = (h.array(name, size, lanes=lanes) for name in names)
+        names = "x", "direction", "direction before"
+        self.x, self.p, self.before = (h.array(name, size, lanes=lanes) for name in names)
         # Of several the right side is seldom needed twice.
-        self.source = h.array("source") if lanes == 1 else self.image
+        self.source = h.array("source") if lanes == 1 else self.p
         self.parts = h.array("parts", -(-finest.nodes // part_of(h.device)), lanes=lanes)
-        self._factor = h.device.array("factor", (lanes,), np.float32)
+        names = "factor", "taken"
+        self._factors = {name: h.device.array(name, (lanes,), np.float32) for name in names}
+        self._alpha: Doubles | None = None  # how far the last step goes, until the heights have it
         self.cycle = Cycle(h, lanes)
 
     def copy(self, name: str, level: Array, map_: Array, some: slice = slice(0, 1)) -> None:
@@ -210,7 +213,8 @@ class _Gradients:
     def begin(self, sources: Array, start: Array | None, some: slice = slice(0, 1)) -> None:
         """Take some right sides, and heights to begin with."""
         self._sources, self._some, b = sources, some, self.cycle.b
-        self._gained = np.zeros(self.lanes)
+        self._gained, self._alpha = np.zeros(self.lanes), None
+        self.started = start is not None
         self.copy("admit", b, sources, some)
         if self.lanes == 1:
             self.copy("admit", self.source, sources)
@@ -219,9 +223,7 @@ class _Gradients:
             self.copy("admit", self.x, start)
             self.find_residual()
             self._rest = self._dot(b, b)
-        self._fresh = (
-            start is None or not self._rest <= self._given
-        )  # a start that is worse than none is none
+        self._fresh = start is None or not self._rest <= self._given  # one that is worse than none is none
         if self._fresh:
             if start is not None:
                 self.copy("admit", b, sources)
@@ -232,12 +234,8 @@ class _Gradients:
         enough = _FAILED if tolerance is None else tolerance
         count, goal = (_CYCLES, 0.0) if tolerance is None else (limit, tolerance)
         done, residual = self._iterate(goal, min(count, _USUAL), deadline)
-        if self._fresh:  # no step was done
-            self.x.claim()
-            self.x.host[...] = 0
-            self.x.upload()
         late = deadline is not None and time.perf_counter() > deadline
-        left = _CYCLES if tolerance is None else count - done
+        left = 0 if np.isnan(self._rest).any() else _CYCLES if tolerance is None else count - done
         if (residual > enough).any() and left > 0 and not late and self.cycle.factorise():
             if self.lanes > 1:
                 self.copy("admit", self.source, self._sources, self._some)
@@ -254,7 +252,11 @@ class _Gradients:
 
     def energy(self) -> Doubles:
         """Return the heights' energy in the links; firm anchors, if they counted fully, would hide that."""
-        energy = self._dot(self.source, self.x) if self.lanes == 1 else self._gained
+        energy = self._gained
+        if self.started or self._h.anchored:
+            self._take()
+        if self.started:
+            energy = self._dot(self.source, self.x)
         if not self._h.anchored:
             return energy
         anchored = self._sum("weigh", anchor=self._h.graph["anchor"], x=self.x)
@@ -289,30 +291,49 @@ class _Gradients:
             now = time.perf_counter()
             if deadline is not None and now + (now - begun) > deadline:
                 break
+        self._take()
         return done, residual
 
     def _step(self, beta: Doubles | None, product: Doubles, moving: NDArray[np.bool_]) -> Doubles:
-        """Take a step; return the squares of the residuals."""
-        cycle = self.cycle
+        """Go on in another direction, by beta that of the last; return the squares of the residuals."""
+        h, cycle = self._h, self.cycle
         before = cycle.x if beta is None else self.before  # of the last solution there may be infinities
-        arrays = {"z": cycle.x, "before": before, "direction": self.p, "image": self.image}
-        factor = self._by(np.zeros(self.lanes) if beta is None else beta)
-        curvature = self._sum("direct", factor=factor, **self._h.graph, inverse=self._h.inverse, **arrays)
+        known: dict[str, Any] = {**h.graph, "inverse": h.inverse}
+        known |= {"factor": self._by("factor", beta), **self._last_step()}
+        arrays = {"z": cycle.x, "before": before, "direction": self.p, "x": self.x}
+        curvature = self._sum("direct", **known, **arrays)
         self.p, self.before = self.before, self.p
-        alpha = _ratio(product, curvature, moving & (curvature > 0))
+        alpha = self._alpha = _ratio(product, curvature, moving & (curvature > 0))
         self._gained = self._gained + alpha * product
-        arrays = {"direction": self.before, "image": self.image, "b": cycle.b, "x": self.x}
-        first, self._fresh = int(self._fresh), False
-        return self._sum("advance", factor=self._by(alpha), inverse=self._h.inverse, first=first, **arrays)
+        known = {**h.graph, "inverse": h.inverse, "factor": self._by("factor", alpha)}
+        return self._sum("advance", **known, direction=self.before, b=cycle.b)
 
-    def _by(self, factors: Doubles) -> float | Array:
-        """Return factors of the right sides as passes take them."""
+    def _last_step(self) -> dict[str, Any]:
+        """Return how far the heights are still to go along the last direction, which is then done."""
+        alpha, self._alpha = self._alpha, None
+        step = 0 if alpha is None else 2 - self._fresh
+        self._fresh = self._fresh and alpha is None
+        return {"taken": self._by("taken", alpha), "step": step}
+
+    def _take(self) -> None:
+        """Have the heights after the last step, or of zero if there was none."""
+        if self._alpha is not None:
+            arrays = {"direction": self.before, "x": self.x}
+            self._h.over("take", self._h.levels[0], lanes=self.lanes, **self._last_step(), **arrays)
+        elif self._fresh:
+            self.x.claim()
+            self.x.host[...], self._fresh = 0, False
+            self.x.upload()
+
+    def _by(self, name: str, factors: Doubles | None) -> float | Array:
+        """Return factors of the right sides as passes take them, 0 where there are none."""
         if self.lanes == 1:
-            return float(factors[0])
-        self._factor.claim()
-        self._factor.host[...] = factors
-        self._factor.upload()
-        return self._factor
+            return 0.0 if factors is None else float(factors[0])
+        array = self._factors[name]
+        array.claim()
+        array.host[...] = 0 if factors is None else factors
+        array.upload()
+        return array
 
     def _dot(self, one: Array, other: Array) -> Doubles:
         return self._sum("dot", one=one, other=other)

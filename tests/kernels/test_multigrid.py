@@ -138,19 +138,20 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
     if case.h.anchored:
         weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
-    direction, image = case.h.array("direction"), case.h.array("image")
-    arrays = {"z": z_given, "before": before_given, "direction": direction, "image": image}
-    inverse = case.h.inverse
-    curvature = case.sums("direct", factor=0.7, **case.h.graph, inverse=inverse, **arrays)
-    p = z + 0.7 * before
+    direction, known = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
+    arrays = {"z": z_given, "before": before_given, "direction": direction, "x": x_given}
+    curvature = case.sums("direct", factor=0.7, taken=0.2, step=2, **known, **arrays)
+    p, x = z + 0.7 * before, x + 0.2 * before
+    image = -twin.residual(level, zero, p)
     close(case.get(direction), p)
-    close(case.get(image), -twin.residual(level, zero, p))
-    assert curvature == pytest.approx(-(p * twin.residual(level, zero, p)).sum(), rel=1e-5)
-    arrays = {"inverse": inverse, "direction": direction, "image": image, "b": b_given, "x": x_given}
-    square = case.sums("advance", factor=0.3, first=0, **arrays)
-    close(case.get(x_given), x + 0.3 * p)
-    close(case.get(b_given), b + 0.3 * twin.residual(level, zero, p))
+    close(case.get(x_given), x)
+    assert curvature == pytest.approx((p * image).sum(), rel=1e-5)
+    square = case.sums("advance", factor=0.3, **known, direction=direction, b=b_given)
+    close(case.get(b_given), b - 0.3 * image)
     assert square == pytest.approx((case.get(b_given).astype(float) ** 2).sum(), rel=1e-5)
+    for step, expected in ((2, x + 0.3 * p), (1, 0.3 * p)):
+        case.h.over("take", case.h.levels[0], taken=0.3, step=step, direction=direction, x=x_given)
+        close(case.get(x_given), expected)
 
 
 @pytest.mark.parametrize("same", [False, True], ids=["plane", "line"])
