@@ -200,8 +200,8 @@ class _Gradients:
         # Of several the right side is seldom needed twice.
         self.source = h.array("source") if lanes == 1 else self.p
         self.parts = h.array("parts", -(-finest.nodes // part_of(h.device)), lanes=lanes)
-        names = "factor", "taken"
-        self._factors = {name: h.device.array(name, (lanes,), np.float32) for name in names}
+        factors = "factor", "taken"
+        self._factors = {name: h.device.array(name, (lanes,), np.float32) for name in factors}
         self._alpha: Doubles | None = None  # how far the last step goes, until the heights have it
         self.cycle = Cycle(h, lanes)
 
