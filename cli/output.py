@@ -29,14 +29,14 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
 
     io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
-    force = {name: value for name in SCALARS if (value := getattr(result, name)) is not None}
     if as_json:
         profile = open_device(device).profile.records()
-        facts = {"summary": dataclasses.asdict(summary) | pieces | force, "process": result.process}
+        told = dataclasses.asdict(summary)
+        told = {name: value for name, value in told.items() if value is not None or name not in SCALARS}
+        facts = {"summary": told | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
-        newtons = ["force {force:.4g} +- {force_sigma:.2g} N".format(**force)] if force else []
-        click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces), *newtons])))
+        click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))
 
 
 def _pieces(result: Result) -> dict[str, int]:

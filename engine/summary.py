@@ -32,6 +32,8 @@ class Summary:
         Of the pixels with a height, those that were filled, if holes were looked for.
     relief : (float, float) or None
         Lowest and highest of the heights that go with normals and are relative, mm.
+    force, force_sigma : float or None
+        Of a press, and the standard deviation that is expected, N.
     """
 
     what: str
@@ -45,6 +47,8 @@ class Summary:
     turns: int | None = None
     filled: int | None = None
     relief: tuple[float, float] | None = None
+    force: float | None = None
+    force_sigma: float | None = None
 
     def __str__(self) -> str:
         turns = "" if self.turns is None else f" in {self.turns} turns"
@@ -60,6 +64,8 @@ class Summary:
             parts.append(f"in contact at {self.in_contact}")
         if self.relief is not None:
             parts.append("relative height from {:.3f} to {:.3f} mm".format(*self.relief))
+        if self.force is not None and self.force_sigma is not None:
+            parts.append(f"force {self.force:.4g} +- {self.force_sigma:.2g} N")
         return ", ".join(parts)
 
 
@@ -91,6 +97,8 @@ def summarise(result: Result) -> Summary:
         turns=len(answers) if answers.ndim == 3 else None,
         filled=None if result.filled is None else int(np.count_nonzero(result.filled)),
         relief=_range(height) if relative else None,
+        force=result.force,
+        force_sigma=result.force_sigma,
     )
 
 

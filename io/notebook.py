@@ -49,6 +49,7 @@ def as_xarray(result: Result) -> xarray.Dataset:
         name: (dimensions[name], values, {"units": UNITS[name]} if name in UNITS else {})
         for name, values in maps.items()
     }
+    data |= {name: ((), value, {"units": UNITS[name]}) for name, value in result.numbers().items()}
     if result.offset_unknown is not None:
         data["offset_unknown"] = ("components", result.offset_unknown)
     coordinates: dict[str, Any] = {
@@ -71,7 +72,7 @@ def _rows(result: Result) -> list[tuple[str, str, str]]:
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
         unit = f" {UNITS[name]}" if name in UNITS and known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
-    return rows
+    return rows + [(name, "", f"{value:.4g} {UNITS[name]}") for name, value in result.numbers().items()]
 
 
 def _origin(result: Result) -> str:

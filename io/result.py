@@ -79,9 +79,8 @@ def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Ite
         yield Item(f"{_RESULT}/{name}", values, attributes)
     if result.offset_unknown is not None:
         yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
-    for name in SCALARS:
-        if (value := getattr(result, name)) is not None:
-            yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
+    for name, value in result.numbers().items():
+        yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
     for name, positions in _axes(result, maps).items():
         yield Item(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
 

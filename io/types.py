@@ -346,6 +346,11 @@ class Result:
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in NO_MAPS}
         return {name: value for name, value in values.items() if value is not None}
 
+    def numbers(self) -> dict[str, float]:
+        """Return the single numbers that were computed, by name."""
+        values = {name: getattr(self, name) for name in SCALARS}
+        return {name: value for name, value in values.items() if value is not None}
+
     def __repr__(self) -> str:
         from mirrorskin.io.notebook import as_text
 
