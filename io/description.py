@@ -114,6 +114,7 @@ def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str
 def _result(result: Result) -> dict[str, str]:
     maps = {f"map {name}": f"{' x '.join(map(str, m.shape))} {m.dtype}" for name, m in result.maps().items()}
     facts = {"kind": "result", **maps}
+    facts |= {name: f"{value:.4g} N" for name, value in result.numbers().items()}
     if result.filled is not None:
         facts["filled"] = f"{np.count_nonzero(result.filled)} pixels"
     if result.offset_unknown is not None:

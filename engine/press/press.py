@@ -239,9 +239,10 @@ def _with_force(
         found = force_of_press(fit, known)
     except NotConverged as error:
         return result, {"force": f"none: {error}"}
-    said = "by the calibration" if modulus is None else f"modulus {modulus:g} MPa"
     made = replace(result, pressure=found.pressure, force=found.force, force_sigma=found.sigma)
-    return made, {"force": said}
+    if isinstance(known, float):
+        return made, {"modulus": f"{known:g} MPa, given"}
+    return made, {"modulus": f"{known.modulus:.4g} MPa of the calibration"}
 
 
 def _frames_of(source: Source, event: Event) -> range:

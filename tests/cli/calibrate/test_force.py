@@ -58,6 +58,9 @@ def test_presses_and_a_scale_become_a_modulus_that_reconstruct_uses(folder):
     ended = run("reconstruct", "press-1.h5", "--calibration", "cal.h5", "-o", "a.h5")
     result = io.open_result("a.h5")
     assert "force 0." in ended.out
+    told = run("info", "a.h5").out
+    assert "force_sigma" in told
+    assert "MPa of the calibration" in told
     assert result.force == pytest.approx(folder[1][1], rel=0.03)
     words = [word for force in folder[1] for word in ("--force", f"{1000 * force}mN")]
     again = run("calibrate", "force", *presses, *words, "--force-sigma", "1mN", "-o", "cal.h5", "--json")

@@ -116,7 +116,7 @@ def test_a_press_has_the_twin_s_force(ball):
     assert abs(result.force - force) < 3 * result.force_sigma
     assert 0 < result.force_sigma < 0.05 * force
     assert result.pressure.sum() * 0.12**2 == pytest.approx(result.force, rel=0.02)
-    assert result.process["force"] == "modulus 0.12 MPa"
+    assert result.process["modulus"] == "0.12 MPa, given"
 
 
 def test_the_calibration_s_modulus_and_scatter_are_used(ball):
