@@ -3,5 +3,14 @@
 from mirrorskin.view.canvas import check_drawing
 from mirrorskin.view.force import force_figure
 from mirrorskin.view.truth import height_figure, normal_figure, surface_figure
+from mirrorskin.view.vibration import Vibration, vibration_figure
 
-__all__ = ["check_drawing", "force_figure", "height_figure", "normal_figure", "surface_figure"]
+__all__ = [
+    "Vibration",
+    "check_drawing",
+    "force_figure",
+    "height_figure",
+    "normal_figure",
+    "surface_figure",
+    "vibration_figure",
+]

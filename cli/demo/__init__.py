@@ -8,7 +8,7 @@ from typing import Annotated
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.demo import force, presses, rotation, shapes
+from mirrorskin.cli.demo import force, presses, rotation, shapes, vibration
 from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json
 
@@ -34,8 +34,9 @@ def command(
     turned = {one.name: rotation.run(one, output, device) for one in rotation.EXPERIMENTS}
     shaped = shapes.run(output, device)
     forces = force.run(force.EXPERIMENT, output, device)
+    vibrated = vibration.run(vibration.EXPERIMENT, output, device)
     if as_json:
-        print_json({**pressed, **turned, **shaped, "force": forces})
+        print_json({**pressed, **turned, **shaped, "force": forces, "vibration": vibrated})
         return
     presses.print_outcomes(pressed)
     click.echo()
@@ -44,5 +45,7 @@ def command(
     shapes.print_outcomes(shaped)
     click.echo()
     force.print_outcomes(forces)
+    click.echo()
+    vibration.print_outcomes(vibrated)
     first = presses.EXPERIMENTS[0].name
     click.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -18,6 +18,7 @@ from mirrorskin.kernels.device import Device
 _FOUND = 1  # of an onset's status
 _ALIKE = 1e-3  # relative difference of numbers that are the same but for rounding
 _CONTRADICT = 0.001  # share of pixels without a place in all their intervals from which travel is not exact
+_NOISY = 2.0  # standard deviations by which noise may move a crossing out of its interval
 _UNLIKELY = 1e-3  # chance of a scatter that is taken to be more than what is predicted
 
 
@@ -231,9 +232,10 @@ class _JoinedOnsets:
         self._guessed[at] += np.where(guessed, weight, 0.0)
         self._moment[at] += weight * apart
         self._square[at] += weight * apart**2
-        inside = at[guessed]
-        self._low[inside] = np.maximum(self._low[inside], low[guessed])
-        self._high[inside] = np.minimum(self._high[inside], high[guessed])
+        noisy = _NOISY * np.sqrt(np.maximum(sigma**2 - np.where(guessed, guess, 0.0) ** 2, 0.0))
+        noisy[sudden] = 0.0
+        self._low[at] = np.maximum(self._low[at], low - noisy)
+        self._high[at] = np.minimum(self._high[at], high + noisy)
         self._frame[at] = end - len(travel) + frame
 
     def onset(self, noise: float) -> Onset:
@@ -251,15 +253,21 @@ class _JoinedOnsets:
             guessed = np.maximum(1 / self._guessed, width.clip(0) ** 2 / 12)
             predicted = 1 / (self._weight - self._guessed + 1 / guessed)
             square = np.where(several, self._square - mean * self._moment, 0.0)
-            overall = np.sum(square) / max(1.0, np.sum(freedom[several]))
             limits = special.chdtri(np.arange(1, freedom.max() + 1), _UNLIKELY)
-            more = np.where(square > limits[freedom.astype(np.intp) - 1], square / freedom, overall)
+            apart = square > limits[freedom.astype(np.intp) - 1]
+            alike = several & ~apart
+            overall = np.sum(square[alike]) / max(1.0, np.sum(freedom[alike]))
+            more = np.where(apart, square / freedom, overall)
             variance = np.maximum(predicted, np.where(several, more / self._weight, 0.0))
             sudden = several & (self._sudden == self._count)
-            shared = sudden & (width > 0)
-            if np.count_nonzero(shared) < (1 - _CONTRADICT) * np.count_nonzero(sudden):
+            height = self._height + np.where(several, mean, 0)
+            # Samples on the way may tell less than they are taken to, or than the intervals do.
+            outside = (height < self._low) | (height > self._high)
+            better = sudden | apart | outside | (width**2 / 12 < variance)
+            shared = several & (width > 0) & better
+            if np.count_nonzero(shared & sudden) < (1 - _CONTRADICT) * np.count_nonzero(sudden):
                 shared[:] = False
-            height = np.where(shared, (self._low + self._high) / 2, self._height + np.where(several, mean, 0))
+            height = np.where(shared, (self._low + self._high) / 2, height)
             sigma = np.sqrt(np.where(shared, width**2 / 12, variance))
         found = self.count > 0
         maps = (one.astype(np.float32).reshape(self._shape) for one in (height, sigma))

@@ -11,14 +11,15 @@ import pytest
 from commands import run, small_experiments, small_rotations
 
 from mirrorskin import io, view
-from mirrorskin.cli.demo import force, presses, rotation
+from mirrorskin.cli.demo import force, presses, rotation, vibration
 
 FULL, ROTATIONS = presses.EXPERIMENTS, rotation.EXPERIMENTS
 WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
-DRAWN = *MADE, "fig10a", "fig10b", "fused", "force"
+DRAWN = *MADE, "fig10a", "fig10b", "fused", "force", "vibration"
+SHAKEN = vibration.Experiment(strokes=4, size=60)
 FORCES = force.Experiment(scale=(), found=(force.Press(6, 0.6),), size=48)
 
 # The table's rows.
@@ -52,6 +53,7 @@ def shown(tmp_path_factory):
         patch.setattr(presses, "EXPERIMENTS", small_experiments())
         patch.setattr(rotation, "EXPERIMENTS", small_rotations())
         patch.setattr(force, "EXPERIMENT", FORCES)
+        patch.setattr(vibration, "EXPERIMENT", SHAKEN)
         patch.setattr(view, "height_figure", watch)
         patch.setattr(view, "normal_figure", watch_normals)
         patch.setattr(view, "surface_figure", watch_surfaces)
@@ -65,6 +67,7 @@ def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
     files = {f"{name}-{sensor}{end}" for name, each in MADE.items() for sensor in each for end in
              (".h5", "-result.h5")}  # fmt: skip
     files |= {"fig10a.h5"} | {f"fig10a-{way.replace(', ', '-')}-result.h5" for way in WAYS}
+    files |= {f"vibration-{one}-result.h5" for one in ("strokes", "rocked", "dither")}
     files |= {"force-cal.h5", "force-0-result.h5", "fused-result.h5"} | {f"{name}.png" for name in DRAWN}
     assert {path.name for path in folder.iterdir()} == files
     for name in DRAWN:
@@ -159,7 +162,8 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     monkeypatch.setattr(presses, "EXPERIMENTS", (sphere, only))
     monkeypatch.setattr(rotation, "EXPERIMENTS", small_rotations())
     monkeypatch.setattr(force, "EXPERIMENT", FORCES)
-    for figure in ("force_figure", "height_figure", "normal_figure", "surface_figure"):
+    monkeypatch.setattr(vibration, "EXPERIMENT", SHAKEN)
+    for figure in ("force_figure", "height_figure", "normal_figure", "surface_figure", "vibration_figure"):
         monkeypatch.setattr(view, figure, lambda *given, **style: None)
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
@@ -175,6 +179,15 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     assert told["fig10a"]["exact"]["normal"]["rms"] > 0
     rms = {way: shape["measured"]["rms"] for way, shape in told["fused"].items()}
     assert 0 < rms["press and rotation"] < rms["press"]
+
+
+def test_vibrations_are_found_as_well_as_predicted(tmp_path):
+    found = vibration.run(SHAKEN, tmp_path, None)
+    assert found["height"]["found"] < 25
+    assert abs(found["hysteresis"]["found"] - found["hysteresis"]["truth"]) < 8
+    assert 0.7 < found["slope"]["chi2"] < 1.3
+    assert found["height"]["sigma"] == pytest.approx(found["height"]["found"], rel=0.5)
+    assert found["growth"]["found"] == pytest.approx(found["growth"]["truth"], rel=0.02)
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
