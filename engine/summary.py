@@ -16,7 +16,7 @@ class Summary:
 
     Attributes
     ----------
-    what : {"height", "normals", "azimuth"}
+    what : {"height", "slope", "normals", "azimuth"}
         The maps that count.
     pixels, answered : int
         All, and those with an answer; in each turn, where each has maps of its own.
@@ -72,13 +72,15 @@ class Summary:
 def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have an answer, and find the range of the answers.
 
-    They are heights; normals where there are some and all heights are relative; else azimuths, whose
-    modulation is given.
+    They are heights; slopes of a body that rocked; normals where there are some and all heights are relative;
+    else azimuths, whose modulation is given.
     """
     height = np.empty(0, np.float32) if result.height is None else result.height
     relative = result.offset_unknown is not None and bool(np.all(result.offset_unknown))
     answers, values, names = height, height, ("height", "height", "mm")
-    if result.zenith is not None and (result.height is None or relative):
+    if result.slope is not None:
+        answers, values, names = result.slope, result.slope, ("slope", "slope", "along it")
+    elif result.zenith is not None and (result.height is None or relative):
         answers, values, names = result.zenith, np.degrees(result.zenith), ("normals", "zenith", "deg")
     elif result.height is None and result.azimuth is not None and result.modulation is not None:
         answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")

@@ -39,7 +39,6 @@ from mirrorskin.io.types import Closing, ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
 _NO_GAIN = "none: the recording has no zenith gain"
-_ROCKED = "none: rocking tells the slope along one direction"
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
 _REACH = 5  # pixels across, of which a registered sample may be made
 _ROUNDS = 2  # in which it is found how high the object stands
@@ -151,7 +150,7 @@ def reconstruct_rotation(
     )
     result, pixel_size = rotation_maps(found), source.header.pixel_size
     if result.slope is not None:
-        return attach_provenance(result, source, found.device, found.process | {"height": _ROCKED})
+        return attach_provenance(result, source, found.device, found.process)
     if pixel_size is None:
         return attach_provenance(result, source, found.device, found.process | {"height": _NO_PIXEL_SIZE})
     with naming(source):

@@ -17,6 +17,7 @@ from mirrorskin.view.result.maps import (
     draw_modulation,
     draw_normal_sigma,
     draw_normals,
+    draw_signed,
     draw_status,
 )
 from mirrorskin.view.result.section import draw_histogram, draw_section
@@ -322,3 +323,19 @@ def test_heights_that_are_all_the_same_are_shown(value):
     result = io.Result(height=np.full((3, 4), value, np.float32), x=np.arange(4.0), y=np.arange(3.0)[::-1])
     for draw in (draw_height, draw_histogram):
         rendered(panel_of(draw, result).figure)
+
+
+@pytest.mark.parametrize("name", ["slope", "hysteresis", "growth"])
+def test_a_map_of_either_sign_has_colours_that_are_white_at_zero(name):
+    values = np.linspace(-1, 2, 12 * 16).reshape(12, 16).astype(np.float32)
+    values[0, 0] = np.nan
+    axes = panel_of(draw_signed, io.Result(**{name: values}), name)
+    low, high = axes.images[0].get_clim()
+    assert low == -high < 0
+
+
+def test_the_status_of_poses_has_its_own_words():
+    status = np.array([[1, 2], [4, 4]], np.uint8)
+    axes = panel_of(draw_status, io.Result(status=status, zenith=np.zeros((2, 2), np.float32)))
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert [text.splitlines()[0] for text in said] == ["normal", "none", "slope only"]

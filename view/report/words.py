@@ -31,6 +31,15 @@ PICTURES: Mapping[str, tuple[str, str]] = {
         "Expected errors: the standard deviation that is expected of each pixel's answer.",
         "Map of the expected errors",
     ),
+    "slope": ("Slope along the direction in which the body rocked.", "Map of the slope along one direction"),
+    "hysteresis": (
+        "Hysteresis: by how much the release is higher than the onset.",
+        "Map of the hysteresis in micrometres",
+    ),
+    "growth": (
+        "Growth: the share of full light that a pixel gains with the travel of a dithering press.",
+        "Map of the growth of the light, per millimetre",
+    ),
     "histogram": ("How often each height occurs.", "Histogram of the heights"),
 }
 """Caption and alternative text of each picture."""

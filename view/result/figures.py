@@ -22,6 +22,7 @@ from mirrorskin.view.result.maps import (
     draw_modulation,
     draw_normal_sigma,
     draw_normals,
+    draw_signed,
     draw_status,
 )
 from mirrorskin.view.result.section import draw_histogram, draw_section
@@ -36,7 +37,10 @@ if TYPE_CHECKING:
 Ends = tuple[tuple[float, float], tuple[float, float]]
 """Where a section begins and ends, x and y, mm."""
 
-MAPS = ("height", "section", "normals", "edges", "status", "sigma", "histogram", "azimuth", "modulation")
+MAPS = (
+    *("height", "section", "normals", "edges", "status", "sigma", "histogram"),
+    *("slope", "hysteresis", "growth", "azimuth", "modulation"),
+)
 """What can be drawn, where a result has it."""
 
 _GRAPHS = "section", "histogram"  # which are no maps
@@ -136,6 +140,9 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
     ):
         if values is not None:
             yield _Panel(name, partial(draw, sheet=sheet))
+    for name in ("slope", "hysteresis", "growth"):
+        if getattr(result, name) is not None:
+            yield _Panel(name, partial(draw_signed, sheet=sheet, name=name))
     if result.normals is None:  # normals show more
         if result.azimuth is not None:
             yield _Panel("azimuth", partial(draw_azimuth, sheet=sheet))

@@ -241,6 +241,17 @@ def draw_modulation(axes: Axes, sheet: Sheet) -> None:
     )
 
 
+def draw_signed(axes: Axes, sheet: Sheet, name: str) -> None:
+    """Draw a map whose values may be of either sign: a slope, a hysteresis or a growth."""
+    title, label, unit = _SIGNED[name]
+    values = unit * getattr(sheet.result, name).astype(np.float64)
+    known = np.abs(values[np.isfinite(values)])
+    side = float(np.percentile(known, _SPAN)) if known.any() else 1.0
+    ends = exceeded(values, -side, side)
+    draw_map(axes, sheet, values, label, extend=ends, cmap="RdBu", vmin=-side, vmax=side)
+    entitle(axes, title.capitalize())
+
+
 def draw_azimuth(axes: Axes, sheet: Sheet) -> None:
     """Draw the azimuth of the normal, in degrees, in colours that go round as it does."""
     assert sheet.result.azimuth is not None
@@ -271,8 +282,16 @@ def _draw_positive(
 
 _ONSET = "invalid input", "onset", "never light", "light at start"
 _RELEASE = "invalid input", "release", "dark at start", "light to the end"
+_POSES = "invalid input", "normal", "none", "", "slope only"
 _UNKNOWN = "unknown number"
 _STATUS_COLOURS = "#d55e00", "#009e73", "0.25", "#f0e442", "white"
+_POSE_COLOURS = *_STATUS_COLOURS[:4], "#56b4e9", "white"
+_SIGNED = {  # what colours say, in a unit of so many
+    "slope": ("slope along the rocking", "slope", 1.0),
+    "hysteresis": ("hysteresis", "release less onset (µm)", 1e3),
+    "growth": ("growth of the light", "growth (1/mm)", 1.0),
+}
+_SPAN = 99.0  # per cent of the values that colours tell apart
 _EDGE_COLOURS = "0.85", "black", MISSING
 
 
@@ -290,13 +309,13 @@ def draw_edges(axes: Axes, sheet: Sheet) -> None:
 
 
 def draw_status(axes: Axes, sheet: Sheet) -> None:
-    """Draw what became of each pixel in a press or a release."""
+    """Draw what became of each pixel in a press or a release, or of what poses determine."""
     status = sheet.result.status
     assert status is not None
     released = sheet.result.process.get("event") == "release"
-    names = *(_RELEASE if released else _ONSET), _UNKNOWN
+    names = *(_POSES if sheet.result.zenith is not None else _RELEASE if released else _ONSET), _UNKNOWN
     classes = np.minimum(status, names.index(_UNKNOWN)).astype(np.uint8)
-    _draw_shares(axes, sheet, classes, _STATUS_COLOURS, names)
+    _draw_shares(axes, sheet, classes, _POSE_COLOURS if names[:-1] == _POSES else _STATUS_COLOURS, names)
     entitle(axes, "Status")
 
 
