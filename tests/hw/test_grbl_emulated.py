@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import time
 
+import numpy as np
 import pytest
 from msgspec import structs
 from scripted_grbl import stage_settings
@@ -55,6 +56,18 @@ def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(stage):
     assert len(tilts) > 5
     assert tilts == pytest.approx([LEAN] * len(tilts), abs=math.radians(5e-3))
     assert time.monotonic() - begun > 1.25 / 2
+
+
+def test_places_are_gone_to_one_after_the_other_without_anyone_waiting(stage):
+    opened, machine, _ = stage
+    begun = time.monotonic()
+    opened.follow([Position(1.0), Position(0.2), Position(0.6)], 4.0)
+    assert opened.wait().position.travel == pytest.approx(0.6, abs=2e-3)
+    travel = [-machine.position(float(at))["Z"] for at in np.linspace(begun, time.monotonic(), 400)]
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(travel)[np.abs(np.diff(travel)) > 1e-9])))
+    assert len(turns) == 2
+    assert max(travel) == pytest.approx(1.0, abs=0.05)
+    assert min(travel[int(np.argmax(travel)) :]) == pytest.approx(0.2, abs=0.05)
 
 
 def test_a_stage_that_was_homed_knows_its_place_at_once_and_goes_on():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,12 +22,12 @@ def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
 
 @contextmanager
 def served_rig(
-    folder: Path, shape: tuple[int, int], rate: float, delay: float
+    folder: Path, shape: tuple[int, int], rate: float, delay: float, **scene: Any
 ) -> Iterator[tuple[EmulatedRig, Path]]:
     """Run the emulators, and give them and the rig's file."""
     with (
         pytest.MonkeyPatch.context() as patch,
-        EmulatedRig(shape=shape, pixel_size=0.2, rate=rate, delay=delay) as rig,
+        EmulatedRig(shape=shape, pixel_size=0.2, rate=rate, delay=delay, **scene) as rig,
         rig.serve() as server,
     ):
         allow_delays(patch)
