@@ -121,7 +121,7 @@ def _gel(part: Gel) -> _Numbers:
 
 
 def _stiffness(part: Stiffness) -> _Numbers:
-    yield "modulus", 1000 * part.modulus, 1000 * part.sigma.get("modulus", math.nan), "kPa"
+    yield "modulus", 1000 * part.modulus, 1000 * part.modulus_sigma, "kPa"
     yield "scatter of a force", 100 * part.scatter, math.nan, "%"
     yield "error of held-out forces", 100 * part.error, math.nan, "%"
     yield "presses", part.presses

@@ -244,12 +244,12 @@ def draw_stiffness(stiffness: Stiffness) -> Figure:
     figure = new_sheet(8, 5.2)
     axes = figure.add_subplot()
     depth = np.linspace(0, _DEEPEST, _FINE)
-    share = math.hypot(stiffness.scatter, stiffness.sigma.get("modulus", 0.0) / stiffness.modulus)
+    share = math.hypot(stiffness.scatter, stiffness.modulus_sigma / stiffness.modulus)
     for radius in _RADII:
         force = 16 / 9 * math.sqrt(radius) * stiffness.modulus * depth**1.5
         axes.plot(depth, force, lw=2, label=f"ball of {2 * radius:g} mm")
         axes.fill_between(depth, force * (1 - share), force * (1 + share), alpha=0.3)
-    words = _with_error(1000 * stiffness.modulus, 1000 * stiffness.sigma.get("modulus", math.nan), " kPa")
+    words = _with_error(1000 * stiffness.modulus, 1000 * stiffness.modulus_sigma, " kPa")
     axes.set(
         xlabel="depth in the gel (mm)",
         ylabel="force (N)",

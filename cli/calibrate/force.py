@@ -107,9 +107,11 @@ def _report(output: Path, presses: list[Path], fit: StiffnessFit, as_json: bool)
             {"recording": str(path), "residual": float(left), "held_out": float(out), "sigma": float(sigma)}
             for path, left, out, sigma in zip(presses, fit.residual, fit.held_out, fit.sigma, strict=True)
         ]
-        print_json({"output": str(output), "stiffness": known, "presses": each})
+        names = "modulus", "modulus_sigma", "gel_shift", "scatter", "error"
+        told = {name: getattr(known, name) for name in names}
+        print_json({"output": str(output), "stiffness": told, "presses": each})
         return
-    modulus, sigma = 1000 * known.modulus, 1000 * known.sigma["modulus"]
+    modulus, sigma = 1000 * known.modulus, 1000 * known.modulus_sigma
     parts = [
         f"modulus {modulus:.4g} +- {sigma:.2g} kPa of {known.presses} presses",
         f"scatter {100 * known.scatter:.2g} %",

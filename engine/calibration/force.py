@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-_ENOUGH = 3  # presses whose scatter says how far one is wrong
-_MODEL_ERROR = 0.004  # of a load, by splines and cells: measured on the twin with balls and cones
+_PRIOR = 6.0  # standard errors of the gel's numbers that they may well be off
+_MODEL_ERROR = 0.003  # of a load, by splines and cells: measured on the twin with balls and cones
 _EXACT = 1e-12  # share of a force to which nothing is known better
 
 
@@ -32,7 +32,7 @@ class KnownPress(NamedTuple):
 
     load: float  # force over Young's modulus, mm^2, as the heights have it
     load_sigma: float  # by the noise of the heights, mm^2
-    gel_sigma: float  # by what is known of the gel, mm^2
+    by_gel: Doubles  # (3,): what a standard error of each of the gel's numbers changes, mm^2
     force: float  # by the scale, N
     force_sigma: float  # of the scale, N
 
@@ -94,61 +94,80 @@ def known_press(
         raise InputError(
             f"{source.name} shows no force: {error}; press otherwise, or leave it out"
         ) from error
-    return KnownPress(pressed.load, *fit.load_sigma(pressed), force, force_sigma)
+    return KnownPress(pressed.load, *fit.load_errors(pressed), force, force_sigma)
 
 
 def fit_stiffness(presses: Sequence[KnownPress], gel: Gel) -> StiffnessFit:
     """Find Young's modulus of the elastomer from presses of known force.
 
-    The force is the modulus times the load, by least squares weighted with the errors of load and scale, and
-    with a scatter in proportion to the force: as large as makes chi^2 of the residuals their degrees of
-    freedom (Paule and Mandel, J. Res. NBS 87, 1982, 377-385), and at least 0.4 %. The scatter holds
-    what the presses do not have in common of the gel's errors and of the model's; what they have in common is
-    in the modulus. Of fewer than three presses it is the largest share that the gel's errors have of a load.
+    A force is the modulus times the load. Loads are wrong by what the gel's numbers are wrong by, in a way of
+    its own at each press: so three shifts of these are found as well, with a standard deviation of six of
+    their standard errors beforehand (those are of one or two balls, and not much is known of their errors).
+    It is linear least squares, weighted by the errors of load and scale and by a scatter in proportion to the
+    force, at least 0.3 % and as large as makes chi^2 its degrees of freedom (Paule and Mandel, J. Res. NBS
+    87, 1982, 377-385).
 
-    InputError without presses, or where the loads or forces are not above 0.
+    InputError without presses, or where the loads are not above 0.
     """
     if not presses:
         raise InputError("a modulus is learned from presses of known force: give at least one")
-    load, load_sigma, by_gel, force, reading = np.array(presses, np.float64).T
-    if not (load > 0).all():
+    table = _Presses(
+        np.array([[one.load, *one.by_gel] for one in presses], np.float64),
+        *np.array([[one.load_sigma, one.force, one.force_sigma] for one in presses], np.float64).T,
+    )
+    if not (table.terms[:, 0] > 0).all():
         raise InputError("a press without load shows no modulus: press deeper")
-    modulus = float(np.median(force / load))
-    few = len(presses) < _ENOUGH
-    scatter = float(np.max(by_gel / load)) if few else _scatter(load, load_sigma, force, reading)
-    scatter = max(scatter, _MODEL_ERROR)
-    for _ in range(3):  # errors of loads count by the modulus
-        sigma = _sigma(modulus, scatter, load, load_sigma, reading)
-        modulus, spread = _modulus(load, force, sigma)
+    scatter = max(table.scatter(), _MODEL_ERROR)
+    found, covariance, _ = table.solve(scatter)
     held_out = np.full(len(presses), np.nan)
     for number in range(len(presses) if len(presses) > 1 else 0):
-        rest = np.arange(len(presses)) != number
-        held_out[number] = _modulus(load[rest], force[rest], sigma[rest])[0] * load[number] - force[number]
-    error = float(np.sqrt(np.mean((held_out / force) ** 2)))
-    known = Stiffness(modulus, scatter, gel.threshold, error, len(presses), {"modulus": spread})
-    return StiffnessFit(known, modulus * load - force, held_out, sigma)
+        others = table.but(number).solve(scatter)[0]
+        held_out[number] = table.terms[number] @ others - table.force[number]
+    modulus = float(found[0])
+    shift = tuple((found[1:] / modulus).tolist())
+    error = float(np.sqrt(np.mean((held_out / table.force) ** 2)))
+    known = Stiffness(modulus, shift, covariance, scatter, gel.threshold, error, len(presses))
+    residual = table.terms @ found - table.force
+    return StiffnessFit(known, residual, held_out, table.sigma(scatter, modulus))
 
 
-def _modulus(load: Doubles, force: Doubles, sigma: Doubles) -> tuple[float, float]:
-    """Return the modulus by weighted least squares, and its standard error."""
-    weight = load / sigma**2
-    form = float(np.sum(weight * load))
-    return float(np.sum(weight * force)) / form, 1 / math.sqrt(form)
+class _Presses(NamedTuple):
+    """Presses as rows: loads and their changes by the gel, (n, 4), mm^2; the rest (n,)."""
 
+    terms: Doubles
+    load_sigma: Doubles
+    force: Doubles
+    reading: Doubles
 
-def _sigma(modulus: float, scatter: float, load: Doubles, load_sigma: Doubles, reading: Doubles) -> Doubles:
-    return np.asarray(np.sqrt(reading**2 + (modulus * load_sigma) ** 2 + (scatter * modulus * load) ** 2))
+    def but(self, number: int) -> _Presses:
+        """Return all presses but one."""
+        return _Presses(*(np.delete(part, number, axis=0) for part in self))
 
+    def sigma(self, scatter: float, modulus: float) -> Doubles:
+        """Return the standard deviations that are expected of the residuals, N."""
+        own = self.reading**2 + (modulus * self.load_sigma) ** 2
+        return np.asarray(np.sqrt(own + (scatter * modulus * self.terms[:, 0]) ** 2))
 
-def _scatter(load: Doubles, load_sigma: Doubles, force: Doubles, reading: Doubles) -> float:
-    """Return the scatter at which chi^2 of the residuals is their degrees of freedom, or 0."""
-    from scipy.optimize import brentq
+    def solve(self, scatter: float) -> tuple[Doubles, Doubles, float]:
+        """Return the modulus and its products with the gel's shifts, their covariance, and chi^2."""
+        usual = float(np.median(self.force / self.terms[:, 0]))
+        sigma = np.maximum(self.sigma(scatter, usual), _EXACT * self.force)
+        before = np.hstack([np.zeros((3, 1)), np.eye(3) / (_PRIOR * usual)])
+        rows = np.vstack([self.terms / sigma[:, np.newaxis], before])
+        values = np.append(self.force / sigma, np.zeros(3))
+        # Loads and their changes differ by orders of magnitude.
+        scale = np.linalg.norm(rows, axis=0)
+        inverse = np.linalg.pinv(rows / scale) / scale[:, np.newaxis]
+        found = inverse @ values
+        return found, inverse @ inverse.T, float(np.sum((rows @ found - values) ** 2))
 
-    def excess(scatter: float) -> float:
-        modulus = float(np.median(force / load))
-        for _ in range(3):
-            sigma = np.maximum(_sigma(modulus, scatter, load, load_sigma, reading), _EXACT * force)
-            modulus = _modulus(load, force, sigma)[0]
-        return float(np.sum(((modulus * load - force) / sigma) ** 2)) - (len(load) - 1)
+    def scatter(self) -> float:
+        """Return the scatter at which chi^2 is the degrees of freedom, or 0."""
+        from scipy.optimize import brentq
 
-    return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, 10.0))
+        def excess(scatter: float) -> float:
+            return self.solve(scatter)[2] - (len(self.force) - 1)
+
+        if len(self.force) == 1 or excess(0.0) <= 0:
+            return 0.0
+        return float(brentq(excess, 0.0, 10.0))

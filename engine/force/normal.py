@@ -136,22 +136,24 @@ def _check(**values: tuple[float, float]) -> None:
 def force_of_press(fit: PressFit, known: Stiffness | float) -> Force:
     """Return the force of a press whose surface was fitted to the onsets, at the greatest travel.
 
-    With a modulus from presses of known force, that calibration's scatter tells what the gel's errors are
-    worth; with one that is merely given, they are propagated. NotConverged where much of the load lies beyond
+    Presses of known force correct for the gel's errors, and tell what is left; with a modulus that is merely
+    given, these errors are propagated. NotConverged where much of the load lies beyond
     the picture.
     """
     pressed = press_within(fit)
-    load = pressed.load
-    own, by_gel = fit.load_sigma(pressed)
+    own, by_gel = fit.load_errors(pressed)
     if isinstance(known, float):
-        modulus, spread = known, known * math.hypot(own, by_gel)
+        modulus = known
+        force, spread = modulus * pressed.load, modulus * math.hypot(own, *by_gel)
     else:
         modulus = known.modulus
-        relative = math.hypot(known.scatter, known.sigma.get("modulus", 0.0) / modulus)
-        spread = math.hypot(modulus * own, relative * modulus * load)
-    pressure = (modulus * fit.on_pixels(pressed.strain)).astype(np.float32)
+        force = modulus * (pressed.load + float(np.sum(by_gel * known.gel_shift)))
+        terms = np.append(pressed.load, by_gel)
+        learned = math.sqrt(np.einsum("i,ij,j", terms, known.covariance, terms))
+        spread = math.hypot(modulus * own, learned, known.scatter * force)
+    pressure = (force / pressed.load * fit.on_pixels(pressed.strain)).astype(np.float32)
     contact = fit.on_pixels(pressed.contact.astype(np.float64)) >= 0.5
-    return Force(np.where(contact, pressure, np.float32(0)), contact, modulus * load, spread)
+    return Force(np.where(contact, pressure, np.float32(0)), contact, force, spread)
 
 
 def press_within(fit: PressFit) -> Pressed:

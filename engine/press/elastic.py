@@ -220,20 +220,23 @@ class PressFit(NamedTuple):
         """Return a map of the cells on the pixels, 0 beyond them."""
         return _interpolated(self.scene, self.height.shape, values)
 
-    def load_sigma(self, pressed: Pressed) -> tuple[float, float]:
-        """Return the standard errors of the load, mm^2: by the fit, and by what is known of the gel."""
+    def load_errors(self, pressed: Pressed) -> tuple[float, Doubles]:
+        """Return the load's standard error by the fit, and its changes by those of the gel's numbers, mm^2.
+
+        The changes, (3,), are by a standard error of threshold, compliance and curvature.
+        """
         gel = self.scene.gel
         gradient = load_gradient(self.scene.space, pressed.contact, gel.compliance)
         by_factors = self.scene.splines.basis.T @ gradient.ravel()
         moved = _solve(self.form, by_factors)
         variance = _excess(self.slopes) * float(np.sum(by_factors * moved))
-        # The stage gives way by the load, too: more compliance also takes from the depth.
-        lowered = 0.0, -gel.sigma.get("compliance", 0.0) * pressed.load * float(gradient.sum()), 0.0
         by_gel = [
-            float(np.sum(moved * np.einsum("ki,k->i", self.slopes.jacobian, slope / _SLOPE_ERROR**2))) + less
-            for slope, less in zip(_gel_slopes(self.scene, self.slopes), lowered, strict=True)
+            np.sum(moved * np.einsum("ki,k->i", self.slopes.jacobian, slope / _SLOPE_ERROR**2))
+            for slope in _gel_slopes(self.scene, self.slopes)
         ]
-        return math.sqrt(variance), math.hypot(*by_gel)
+        # The stage gives way by the load, too: more compliance also takes from the depth.
+        by_gel[1] -= gel.sigma.get("compliance", 0.0) * pressed.load * float(gradient.sum())
+        return math.sqrt(variance), np.array(by_gel, np.float64)
 
 
 class _Scene(NamedTuple):

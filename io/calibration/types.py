@@ -344,24 +344,32 @@ class Stiffness:
     ----------
     modulus : float
         Young's modulus, MPa.
+    gel_shift : (float, float, float)
+        By how many standard errors the gel's threshold, compliance and curvature are off, as forces show.
+    covariance : ndarray, (4, 4), float64
+        Of the modulus and of its products with the shifts, MPa^2.
     scatter : float
-        Standard deviation of a press's force that neither noise nor the modulus explains, as a share of it.
+        Standard deviation of a press's force that neither noise nor these numbers explain, as a share of it.
     gel_threshold : float
         That of the gel with which it was learned, radians: a gel learned again needs a modulus learned again.
     error : float
-        RMS error of each force by the modulus of the other presses, as a share of it; NaN of fewer than 2.
+        RMS error of each force by what the other presses show, as a share of it; NaN of fewer than 2.
     presses : int
         How many it was learned from.
-    sigma : mapping of str to float
-        Standard errors, by the names of the fields.
     """
 
     modulus: float = field(metadata=kept("number", "MPa", valid=_above_zero))
+    gel_shift: tuple[float, float, float] = field(metadata=kept("numbers", shape=(3,)))
+    covariance: NDArray[np.float64] = field(metadata=kept("array", shape=(4, 4)))
     scatter: float = field(metadata=kept("number", valid=lambda value: value >= 0))
     gel_threshold: float = field(metadata=kept("number", "rad"))
     error: float = field(default=math.nan, metadata=kept("number"))
     presses: int = field(default=1, metadata=kept("integer", valid=lambda value: value >= 1))
-    sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
+
+    @property
+    def modulus_sigma(self) -> float:
+        """Standard error of the modulus, MPa."""
+        return math.sqrt(self.covariance[0, 0])
 
 
 Part = References | Lens | WallResponse | Precession | Gel | Stiffness

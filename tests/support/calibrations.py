@@ -81,7 +81,7 @@ def a_calibration(shape=SHAPE, dtype="uint8", name="left", only=None):
         "zenith": a_response(shape),
         "precession": a_precession(),
         "gel": io.Gel(threshold=0.2, compliance=0.05, axis=(0.1, 0.3), sigma={"threshold": 0.01}),
-        "stiffness": io.Stiffness(0.12, 0.01, 0.2, error=0.011, presses=6, sigma={"modulus": 0.001}),
+        "stiffness": io.Stiffness(0.12, (0.5, -1.0, 0.1), 1e-6 * np.eye(4), 0.01, 0.2, 0.011, 6),
     }
     process = {"references.program": "mirrorskin", "tilt.frames": 8, "zenith.weight": 0.5, "scale.dots": True}
     chosen = {part: value for part, value in parts.items() if only is None or part in only}

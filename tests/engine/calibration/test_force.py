@@ -13,7 +13,7 @@ from mirrorskin.hw.twin import Axial, Body, Camera, Sphere, Twin, Vertical
 
 GEL = io.Gel(threshold=np.arctan2(17.5, 40) / 2, compliance=0.0, curvature=1 / 17.5)
 KNOWN = io.Calibration(io.CameraId("", (48, 48), np.dtype(np.uint8)), gel=GEL)
-MODULUS = 0.12
+MODULUS, NO_GEL = 0.12, np.zeros(3)
 
 
 def presses(count, scatter, generator, reading=0.002):
@@ -21,20 +21,20 @@ def presses(count, scatter, generator, reading=0.002):
     load = generator.uniform(0.5, 5.0, count)
     force = MODULUS * load * (1 + scatter * generator.normal(size=count))
     read = force + reading * generator.normal(size=count)
-    return [KnownPress(one, 0.0, 0.02 * one, seen, reading) for one, seen in zip(load, read, strict=True)]
+    return [KnownPress(one, 0.0, NO_GEL, seen, reading) for one, seen in zip(load, read, strict=True)]
 
 
 def test_the_standard_error_of_the_modulus_is_honest():
     generator = np.random.default_rng(2)
     fits = [fit_stiffness(presses(12, 0.02, generator), GEL).stiffness for _ in range(400)]
-    wrong = np.array([(one.modulus - MODULUS) / one.sigma["modulus"] for one in fits])
+    wrong = np.array([(one.modulus - MODULUS) / one.modulus_sigma for one in fits])
     assert np.mean(wrong**2) == pytest.approx(1.15, abs=0.2)  # Student's t of 11 degrees of freedom: 11 / 9
     assert np.median([one.scatter for one in fits]) == pytest.approx(0.02, rel=0.15)
 
 
 def test_a_scatter_that_noise_explains_is_that_of_the_model():
     fit = fit_stiffness(presses(8, 0.0, np.random.default_rng(3), reading=0.01), GEL)
-    assert fit.stiffness.scatter == pytest.approx(0.004)
+    assert fit.stiffness.scatter == pytest.approx(0.003)
 
 
 def test_each_force_is_held_out_once():
@@ -48,10 +48,27 @@ def test_each_force_is_held_out_once():
     )
 
 
-def test_of_one_press_the_scatter_is_the_gel_s_error():
-    fit = fit_stiffness([KnownPress(2.0, 0.0, 0.1, 0.25, 0.0)], GEL)
-    assert fit.stiffness.modulus == pytest.approx(0.125)
-    assert fit.stiffness.scatter == pytest.approx(0.05)
+def test_forces_correct_what_the_gel_is_wrong_by():
+    """Loads that are wrong by two standard errors of the compliance, which counts more for deep presses."""
+    generator = np.random.default_rng(6)
+    true = generator.uniform(0.5, 5.0, 20)
+    by_gel = np.stack([0.005 * true, -0.004 * true**2, 0.002 * true], axis=1)
+    load, reading = true - 2 * by_gel[:, 1], 1e-4
+    force = MODULUS * true + reading * generator.normal(size=20)
+    rows = [KnownPress(*row, reading) for row in zip(load, 0 * load, by_gel, force, strict=True)]
+    fit = fit_stiffness(rows[:10], GEL)
+    assert fit.stiffness.gel_shift[1] == pytest.approx(2, abs=0.5)
+    found = [
+        fit.stiffness.modulus * (row.load + np.dot(row.by_gel, fit.stiffness.gel_shift)) for row in rows[10:]
+    ]
+    np.testing.assert_allclose(found, force[10:], rtol=0.005)
+    assert abs(fit_stiffness(rows[:10], GEL).stiffness.error) < 0.005
+
+
+def test_one_press_gives_a_modulus_that_is_as_sure_as_the_gel():
+    fit = fit_stiffness([KnownPress(2.0, 0.0, np.array([0.1, 0.0, 0.0]), 0.25, 0.0)], GEL)
+    assert fit.stiffness.modulus == pytest.approx(0.125, rel=0.001)
+    assert fit.stiffness.modulus_sigma == pytest.approx(6 * 0.05 * 0.125, rel=0.1)
     assert np.isnan(fit.stiffness.error)
     assert np.isnan(fit.held_out).all()
 

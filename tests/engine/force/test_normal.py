@@ -121,11 +121,17 @@ def test_a_press_has_the_twin_s_force(ball):
 
 def test_the_calibration_s_modulus_and_scatter_are_used(ball):
     twin, _ = ball
-    known = io.Stiffness(2 * MODULUS, 0.05, GEL.threshold, sigma={"modulus": 0.12 * 2 * MODULUS})
+    covariance = np.diag([(0.12 * 2 * MODULUS) ** 2, 0, 0, 0])
+    known = io.Stiffness(2 * MODULUS, (0.0, 0.0, 0.0), covariance, 0.05, GEL.threshold)
     result = engine.reconstruct(twin, calibration(stiffness=known), fill=False)
     given = engine.reconstruct(twin, calibration(), modulus=MODULUS, fill=False)
     assert result.force == pytest.approx(2 * given.force)
     assert result.force_sigma == pytest.approx(0.13 * result.force, rel=0.01)
+    shifted = engine.reconstruct(
+        twin, calibration(stiffness=replace(known, gel_shift=(1.0, 0, 0))), fill=False
+    )
+    assert 0.001 < abs(shifted.force / result.force - 1) < 0.05
+    assert shifted.pressure.sum() / result.pressure.sum() == pytest.approx(shifted.force / result.force)
     other = replace(known, gel_threshold=0.1)
     lacking = engine.reconstruct(twin, calibration(stiffness=other), fill=False)
     assert lacking.force is None

@@ -73,7 +73,8 @@ def test_it_has_the_layout_that_is_documented(saved):
     assert found["references/dark"] == {"interpretation": "image", "units": "counts"}
     assert found["scale/pixel_size"] == found["tilt/pivot"] == found["tilt/sigma/pivot_z"] == {"units": "mm"}
     assert found["tilt/tilt"] == found["tilt/sigma/tilt"] == {"units": "rad"}
-    assert found["force/modulus"] == found["force/sigma/modulus"] == {"units": "MPa"}
+    assert found["force/modulus"] == {"units": "MPa"}
+    assert shapes["force/covariance"] == (4, 4)
     assert shapes["references/defects"] == shapes["zenith/azimuth_sigma"] == SHAPE
     assert (shapes["camera/name"], shapes["camera/shape"], shapes["zenith/curve"]) == ((), (2,), (3,))
     assert shapes["process/tilt.frames"] == ()
