@@ -97,7 +97,7 @@ class LivePress:
         """Return the heights so far; none before the second frame."""
         if len(self._search.travel) < 2:
             return {}
-        onset = self._search.result().onset
+        onset = self._search.onset()
         contact = np.asarray((onset.status == _ONSET) | (onset.status == _LIGHT_AT_START), np.uint8)
         return {"height": onset.height, "contact": contact, "contact_area": area_of(contact, self._source)}
 

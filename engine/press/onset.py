@@ -287,6 +287,11 @@ class OnsetSearch:
         """The travel of the frames so far, (T,), mm."""
         return np.array(self._travel.values, np.float64)
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a sample, given or estimated, counts; 0 before the second frame."""
+        return self._noise.value or 0.0
+
     def _tolerances(self, noise: float) -> dict[str, float]:
         """Return the noise, and what a sample may differ from the dark and the light plateau it sits on."""
         light = _PLATEAU * np.sqrt(2) * noise  # from the plateau, which is a sample itself

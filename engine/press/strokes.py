@@ -150,18 +150,25 @@ class StrokeSearch:
         mirrorskin.io.InputError
             There were fewer than two frames.
         """
-        found = self._searches[self._direction].result()
-        joined = {sign: self._with_open(sign, found) for sign in self._searches}
-        noise = found.noise if self._noise is None else self._noise
-        down, up = joined[1], joined[-1]
+        down, up = (self._with_open(sign) for sign in self._searches)
+        noise = self._known_noise
         return Strokes(down.onset(noise), up.onset(noise), down.count, up.count, down.strokes + up.strokes)
 
-    def _with_open(self, sign: int, found: Onset) -> _JoinedOnsets:
+    def onset(self) -> Onset:
+        """Return only the onsets so far; see `result`."""
+        return self._with_open(1).onset(self._known_noise)
+
+    @property
+    def _known_noise(self) -> float:
+        """The noise, given or of the first stroke, counts."""
+        return self._searches[self._direction].noise if self._noise is None else self._noise
+
+    def _with_open(self, sign: int) -> _JoinedOnsets:
         """Return the onsets of a direction's strokes, that of the open one included."""
         if sign != self._direction:
             return self._joined[sign]
-        joined = self._joined[sign].copy()
-        joined.add(found, self._searches[sign].travel, len(self._travel))
+        joined, search = self._joined[sign].copy(), self._searches[sign]
+        joined.add(search.result(), search.travel, len(self._travel))
         return joined
 
     def _turn(self, turning: NDArray[Any] | None) -> None:
@@ -171,7 +178,8 @@ class StrokeSearch:
         if len(search.travel) > 1:
             found = search.result()
             self._noise = found.noise if self._noise is None else self._noise
-            self._joined[self._direction].add(found, search.travel, len(self._travel))
+            if np.ptp(search.travel) > 0:  # else it was a rest
+                self._joined[self._direction].add(found, search.travel, len(self._travel))
         self._direction = -self._direction
         search = self._searches[self._direction]
         search.reset(self._noise)
@@ -181,18 +189,12 @@ class StrokeSearch:
 class _JoinedOnsets:
     """The onsets, or releases, of several strokes: sums and bounds of each pixel, (H W,).
 
-    Heights are counted from the pixel's first, mm.
+    Heights are counted from the pixel's first, mm. Of a single stroke nothing is summed.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        pixels = shape[0] * shape[1]
         self._shape, self.strokes = shape, 0
         self._first: Onset | None = None
-        self._count, self._sudden = np.zeros((2, pixels), np.uint16)
-        self._height = np.full(pixels, np.nan, np.float32)
-        self._weight, self._guessed, self._moment, self._square = np.zeros((4, pixels))
-        self._low, self._high = np.full(pixels, -np.inf), np.full(pixels, np.inf)
-        self._frame = np.full(pixels, -1, np.int32)
 
     def copy(self) -> _JoinedOnsets:
         """Return the same, to which more can be added."""
@@ -205,12 +207,32 @@ class _JoinedOnsets:
     @property
     def count(self) -> NDArray[np.uint16]:
         """Strokes that had one, (H, W)."""
-        return self._count.reshape(self._shape)
+        if self.strokes > 1:
+            return self._count.reshape(self._shape)
+        none = np.zeros(self._shape, np.uint16)
+        return none if self._first is None else (self._first.status == _FOUND).astype(np.uint16)
 
     def add(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
         """Take in a stroke: its travel, and the number of the frame after it."""
-        self.strokes += int(np.ptp(travel) > 0)
-        self._first = self._first or found
+        self.strokes += 1
+        if self._first is None:
+            self._first, self._alone = found, (travel, end)
+            return
+        if self.strokes == 2:
+            self._begin()
+            self._sum(self._first, *self._alone)
+        self._sum(found, travel, end)
+
+    def _begin(self) -> None:
+        """Make room for sums."""
+        pixels = self._shape[0] * self._shape[1]
+        self._count, self._sudden = np.zeros((2, pixels), np.uint16)
+        self._height = np.full(pixels, np.nan, np.float32)
+        self._weight, self._guessed, self._moment, self._square = np.zeros((4, pixels))
+        self._low, self._high = np.full(pixels, -np.inf), np.full(pixels, np.inf)
+        self._frame = np.full(pixels, -1, np.int32)
+
+    def _sum(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
         at = np.flatnonzero(found.status == _FOUND)
         frame = found.frame.reshape(-1)[at]
         height = found.height.reshape(-1)[at].astype(np.float64)
@@ -241,11 +263,13 @@ class _JoinedOnsets:
     def onset(self, noise: float) -> Onset:
         """Join what was found in all strokes; noise is that of a sample, counts."""
         if self._first is None:
-            nothing = np.full(self._shape, np.nan, np.float32)
-            frame = self._frame.reshape(self._shape)
+            nothing, frame = np.full(self._shape, np.nan, np.float32), np.full(self._shape, -1, np.int32)
             return Onset(nothing, nothing.copy(), np.zeros(self._shape, np.uint8), frame, noise)
         if self.strokes == 1:
-            return replace(self._first, noise=noise)
+            travel, end = self._alone
+            frame, earlier = self._first.frame, np.int32(end - len(travel))
+            shifted = np.where(frame < 0, frame, frame + earlier) if earlier else frame
+            return replace(self._first, noise=noise, frame=shifted)
         several, freedom = self._count > 1, np.maximum(self._count, 2) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             mean, width = self._moment / self._weight, self._high - self._low

@@ -121,6 +121,17 @@ def test_a_first_stroke_up_is_one_of_releases():
     assert chi_square(found.onset, -DEPTH) < 1.5
 
 
+def test_a_rest_before_a_stroke_up_is_no_stroke():
+    travel = np.concatenate([np.full(5, 1.2), 1.2 - oscillating_travel(0.0, 1.2, 3, 46)])
+    found = strokes_of(made_press(travel, DEPTH), travel)
+    same = strokes_of(made_press(travel, DEPTH), travel, blocks=range(1, len(travel)))
+    assert found.strokes == 3
+    assert np.all(found.onsets[DEPTH > 0.2] == 1)
+    assert chi_square(found.onset, -DEPTH) < 1.5
+    np.testing.assert_array_equal(found.onset.height, same.onset.height)
+    assert np.all(np.diff(travel)[found.onset.frame[DEPTH > 0.2] - 1] > 0)
+
+
 def test_a_search_that_was_reset_remembers_nothing():
     frames = made_press(UNEVEN, DEPTH)
     search = engine.StrokeSearch(DEPTH.shape, np.uint8, dark=DARK, bright=BRIGHT)
