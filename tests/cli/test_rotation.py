@@ -259,7 +259,7 @@ CASES = {
     "a gain of no number": ({}, ["--zenith-gain", "nan/deg"], "--zenith-gain nan/deg"),
     "an offset of NaN": ({}, ["--zenith-offset", "nan"], "offset"),
     "a noise of 0": ({}, ["--noise", "0"], "noise"),
-    "two phases": ({}, ["--phase-step", "180deg"], "2 different phases"),
+    "two phases": ({}, ["--phases", "two.txt"], "2 different phases"),
     "one phase": ({}, ["--phase-step", "360deg"], "1 different phases"),
     "phases side by side": ({}, ["--phase-step", "0.001deg"], "too close together"),
     "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
@@ -275,10 +275,19 @@ CASES = {
 def test_bad_input_is_one_line(case):
     changes, words, said_of = CASES[case]
     turn(**changes)
+    Path("two.txt").write_text("0deg 90deg " * 4)
     Path("seven.txt").write_text("0deg 45deg 90deg 135deg 180deg 225deg 270deg")
     io.save_result(io.Result(zenith=np.zeros(SHAPE, np.float32)), "flat.h5")
     io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "small.h5")
     assert said_of in refused("reconstruct", "turn.h5", *words)
+
+
+def test_two_phases_half_a_turn_apart_are_a_body_that_rocks():
+    turn()
+    ended = run("reconstruct", "turn.h5", "--phase-step", "180deg", "-o", "rocked.h5")
+    assert ended.code == 0, ended.said
+    assert "slope at" in ended.out
+    assert io.open_result("rocked.h5").normals is None
 
 
 def test_two_frames_are_no_rotation():
