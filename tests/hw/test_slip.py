@@ -128,6 +128,22 @@ def test_stuck_skin_goes_with_the_object_and_far_skin_stays() -> None:
     assert np.abs(found[:, 0, 0]).max() < 0.02
 
 
+def test_a_sliding_ball_drags_the_skin_as_johnson_says() -> None:
+    radius, friction, shear = 0.8, 0.5, 1 / 3
+    press = contact_theory.paraboloid(10.0, radius, 1.0)
+    way = 1.5 * contact_theory.sliding_distance(press, friction, 1.0)
+    found = history(Horizontal([[0.0, 0.0], [way / 2, 0.0], [way, 0.0]], press.depth), friction, 0.03)
+    x, y = found._skin.places
+    object_s = np.stack([x - way, y])  # where the object's points of the press have gone
+    dragged = object_s - found.material(2, object_s)
+    most = friction * float(press.pressure(np.zeros(())))
+    # Eq. 3.91 at Poisson ratio 0.5; the object goes to the left, and so does the skin.
+    scale, inside = np.pi * most / (32 * shear * radius), np.hypot(x, y) < 0.9 * radius
+    along, across = -scale * (6 * radius**2 - 2.5 * x**2 - 3.5 * y**2), -scale * x * y
+    np.testing.assert_allclose(dragged[0][inside], along[inside], rtol=0.02)
+    np.testing.assert_allclose(dragged[1][inside], across[inside], atol=0.02 * np.abs(along).max())
+
+
 def test_displacement_and_material_are_each_other_s_inverse() -> None:
     case = pushed(0.9, 1.6)
     there = case.found._skin.places + case.found.displacement(7, np.zeros((2, SIDE, SIDE)))
