@@ -7,6 +7,7 @@ centre meets them, so depth and normal are exact, whether rays are parallel or c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -398,3 +399,22 @@ def folds(shape: Shape, noise: float = NOISE) -> Scene:
 SCENES: dict[str, Callable[[Shape], Scene]] = {
     scene.__name__: scene for scene in (ball, torus, stairs, balls, goblet, bowl, bear, leaves, folds)
 }
+
+
+def heap(number: int, shape: Shape) -> Scene:
+    """Return a random heap of bodies, some cut open, on a ground or before nothing, by its seed."""
+    generator = np.random.default_rng(number)
+    ground = _Solid(_plane((*generator.uniform(-0.3, 0.3, 2), 1.0), 0.0))
+    things: list[_Solid | _Sheet] = [ground] if number % 3 else []
+    for _ in range(generator.integers(8, 20)):
+        centre, radii = generator.uniform((-38, -38, -5), (38, 38, 30)), generator.uniform(6, 22, 3)
+        way = generator.normal(size=3)
+        near = float(generator.uniform(-0.3, 0.5) * radii.min())
+        cuts = (_plane([*way / np.linalg.norm(way)], near),) if generator.random() < 0.4 else ()
+        things.append(_ellipsoid([*centre], [*radii], _turn(*generator.uniform(-90, 90, 3)), cuts))
+    noise = NOISE if number % 2 else 0.0
+    return _see(shape, things, perspective=number % 4 > 1, noise=noise, ragged=bool(number % 2))
+
+
+HELD_OUT: dict[str, Callable[[Shape], Scene]] = {f"heap {k}": partial(heap, k) for k in range(10)}
+"""Of no part of which any setting was chosen: heaps from 100 on are there for that."""

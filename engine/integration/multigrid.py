@@ -21,6 +21,7 @@ _CYCLES = 2  # that are enough where no tolerance is given
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must fall by so much: float32 does no more
 _WORSE = 10  # times the least residual so far, at which rounding has taken over
 _FAILED = 0.3  # residual from which on up two cycles have failed
+_FACTORS = 8e-6  # seconds that elimination takes of a node of the second level, at most
 _ROUNDING = 1e-6  # of the right side: what is left over of an exact answer
 _FIRM = 1e-3  # share of known heights in the energy that errors are measured against
 _NEAR = 0.03  # residual from which on down the heights' energy is known well enough
@@ -234,7 +235,8 @@ class _Gradients:
         enough = _FAILED if tolerance is None else tolerance
         count, goal = (_CYCLES, 0.0) if tolerance is None else (limit, tolerance)
         done, residual = self._iterate(goal, min(count, _USUAL), deadline)
-        late = deadline is not None and time.perf_counter() > deadline
+        ready = time.perf_counter() + _FACTORS * sum(level.nodes for level in self._h.levels[1:2])
+        late = deadline is not None and ready > deadline
         left = 0 if np.isnan(self._rest).any() else _CYCLES if tolerance is None else count - done
         if (residual > enough).any() and left > 0 and not late and self.cycle.factorise():
             if self.lanes > 1:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.bench.bilateral import integrate_bilaterally
-from mirrorskin.bench.depth_scenes import SCENES
+from mirrorskin.bench.depth_scenes import HELD_OUT, SCENES
 from mirrorskin.engine import Camera
 
 SHAPE = 96, 128
@@ -27,10 +27,10 @@ def rises(scene):
         yield np.diff(ends[0], axis=0)[kept] / unit, np.stack([ends[1][1:], ends[1][:-1]])[:, kept] / unit
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [*SCENES, "heap 0", "heap 2", "heap 4"])
 def test_heights_rise_as_normals_say(name):
     known = {"noise": 0.0} if name in ("bear", "folds") else {}
-    scene = SCENES[name](SHAPE, **known)
+    scene = (SCENES | HELD_OUT)[name](SHAPE, **known)
     assert scene.mask[SHAPE[0] // 2].any()
     assert np.array_equal(np.isfinite(scene.height), scene.mask)
     assert np.array_equal(scene.piece >= 0, scene.mask)
@@ -38,6 +38,14 @@ def test_heights_rise_as_normals_say(name):
         smooth = np.abs(said[0] - said[1]) < 0.1
         away = np.abs(rise - said.mean(axis=0))[smooth]
         assert np.quantile(away, 0.9) < 0.01  # the rest are cliffs between level steps
+
+
+def test_heaps_are_the_same_each_time_and_differ_from_each_other():
+    one, again, other = (HELD_OUT[f"heap {k}"]((48, 64)) for k in (2, 2, 3))
+    np.testing.assert_array_equal(one.height, again.height)
+    assert one.mask.mean() > 0.2
+    assert one.piece.max() > 3
+    assert not np.array_equal(one.height, other.height)
 
 
 def test_errors_are_after_each_piece_s_offset_or_scale():
