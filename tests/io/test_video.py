@@ -1,3 +1,4 @@
+import os
 import struct
 import subprocess
 import sys
@@ -188,6 +189,8 @@ for path in sys.argv[1:]:
 assert not [name for name in os.environ if name.startswith("OPENCV_FFMPEG")]
 """
     arguments = [sys.executable, "-c", program, video, cut, __file__]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    # The camera's part sets some for the process that it runs in, which may be this one.
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_FFMPEG")}
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True, env=clean)
     assert done.stdout.split() == ["read", "refused", "refused"]
     assert done.stderr == ""
