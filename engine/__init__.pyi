@@ -8,6 +8,7 @@ from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
 from .pose.pose import Pose, estimate_pose
+from .pose.tracker import PoseTracker
 from .press.changepoint import ChangePointSearch, find_change_point
 from .press.growth import Growth, find_growth
 from .press.holes import fill_holes
@@ -42,6 +43,7 @@ __all__ = [
     "Pose",
     "PoseEstimator",
     "PoseNormals",
+    "PoseTracker",
     "Score",
     "StrokeSearch",
     "Strokes",

@@ -53,7 +53,7 @@ __kernel void pose_gradient(
 float upright(const float x, const float y) { return root(GREATER(1.0f - x * x - y * y, 1e-6f)); }
 
 // Covariance xx, xy, yy of a normal's x and y after a rotation.
-float3 variances(const float x, const float y, MAP turn, const float square, const float least)
+float3 variances(const float x, const float y, const float *turn, const float square, const float least)
 {
     const float flat = x * x + y * y, outside = GREATER(flat, least), z = upright(x, y);
     const float share = 0.5f * least / outside, across = (1.0f - share) * square;
@@ -77,7 +77,7 @@ float3 same_variances(const float x, const float y, const float z, const float s
     -(h.x * turn[3 * i] * turn[3 * j] + h.y * (turn[3 * i] * turn[3 * j + 1] + turn[3 * i + 1] * turn[3 * j])       \
       + h.z * turn[3 * i + 1] * turn[3 * j + 1])
 
-float3 turn_curvature(const float z_before, const float3 h, MAP turn, const float3 n)
+float3 turn_curvature(const float z_before, const float3 h, const float *turn, const float3 n)
 {
     const float p = -n.x / n.z, q = -n.y / n.z, scale = z_before / n.z;
     const float xx = SECOND(0, 0), xy = SECOND(0, 1), yy = SECOND(1, 1), xz = SECOND(0, 2), yz = SECOND(1, 2), zz = SECOND(2, 2);
@@ -107,8 +107,12 @@ __kernel void pose_equations(
     const int side = BLOCK * step, across = (columns + side - 1) / side, item = get_global_id(0);
     const int top = item / across * side, begin = item % across * side;
     if (top >= rows) return;
-    MAP turn = pose;
-    const float east_x = 1.0f / pose[21], south_y = 1.0f / pose[22];
+    float turn[9];
+    for (int i = 0; i < 9; ++i) turn[i] = pose[i];
+    const float3 shift = vload3(3, pose), centre = vload3(4, pose);
+    const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], least = pose[23];
+    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_least = pose[24];
+    const float east_x = 1.0f / wide, south_y = 1.0f / high;
     float8 upper[6], whole[6], right = 0.0f;
     float chi = 0, expected = 0, heights = 0, normals = 0;
     for (int i = 0; i < 6; ++i) upper[i] = whole[i] = 0.0f;
@@ -116,33 +120,32 @@ __kernel void pose_equations(
         for (int column = begin; column < LESSER(begin + side, columns); column += step) {
             const float8 mine = vload8(row * columns + column, first);
             if (mine.s0 != mine.s0) continue;
-            const float x = pose[15] + column * pose[17], y = pose[16] - row * pose[18], z = mine.s3;
-            const float3 place = (float3)(turn[0] * x + turn[1] * y + turn[2] * z + pose[9],
-                                          turn[3] * x + turn[4] * y + turn[5] * z + pose[10],
-                                          turn[6] * x + turn[7] * y + turn[8] * z + pose[11]);
-            const float to_right = (place.x - pose[19]) * east_x, to_below = (pose[20] - place.y) * south_y;
+            const float x = x0 + column * step_x, y = y0 - row * step_y, z = mine.s3;
+            const float3 place = (float3)(turn[0] * x + turn[1] * y + turn[2] * z + shift.x,
+                                          turn[3] * x + turn[4] * y + turn[5] * z + shift.y,
+                                          turn[6] * x + turn[7] * y + turn[8] * z + shift.z);
+            const float to_right = (place.x - other_x) * east_x, to_below = (other_y - place.y) * south_y;
             if (!(to_right >= 0.0f && to_right < other_columns - 1 && to_below >= 0.0f && to_below < other_rows - 1))
                 continue;
             const int west = to_right, north = to_below, at = north * other_columns + west;
             const float u = to_right - west, v = to_below - north;
-            float8 found = 0.0f;
-            for (int k = 0; k < 4; ++k) {
-                const int by_x = k & 1, by_y = k >> 1;
-                const float weight = (by_x ? u : 1.0f - u) * (by_y ? v : 1.0f - v);
-                const float8 record = vload8(at + by_y * other_columns + by_x, second);
-                const float half_of = 0.5f * weight / upright(record.s0, record.s1);
-                found += weight * record;
-                found.s3 -= half_of * (record.s0 * (u - by_x) * pose[21] - record.s1 * (v - by_y) * pose[22]);
-            }
+            const float left = 1.0f - u, above = 1.0f - v;
+            const float nw = left * above, ne = u * above, sw = left * v, se = u * v;
+            const float8 a_nw = vload8(at, second), a_ne = vload8(at + 1, second);
+            const float8 a_sw = vload8(at + other_columns, second), a_se = vload8(at + other_columns + 1, second);
+            const float8 found = nw * a_nw + ne * a_ne + sw * a_sw + se * a_se;
             if (found.s0 != found.s0) continue;
             const float share = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
-            const float3 n = (float3)(found.s0, found.s1, upright(found.s0, found.s1)), arm = place - vload3(4, pose);
+            const float3 n = (float3)(found.s0, found.s1, upright(found.s0, found.s1)), arm = place - centre;
+            const float bent_x = u * left * (above * (a_nw.s0 - a_ne.s0) + v * (a_sw.s0 - a_se.s0)) * wide;
+            const float bent_y = v * above * (left * (a_nw.s1 - a_sw.s1) + u * (a_ne.s1 - a_se.s1)) * high;
+            const float height = found.s3 - 0.5f * (bent_x - bent_y) / n.z;
             const float z_before = upright(mine.s0, mine.s1);
             const float3 turned = (float3)(turn[0] * mine.s0 + turn[1] * mine.s1 + turn[2] * z_before,
                                            turn[3] * mine.s0 + turn[4] * mine.s1 + turn[5] * z_before,
                                            turn[6] * mine.s0 + turn[7] * mine.s1 + turn[8] * z_before);
-            const float3 other = same_variances(n.x, n.y, n.z, found.s2, pose[24]);
-            const float3 both = variances(mine.s0, mine.s1, turn, mine.s2, pose[23]) + other;
+            const float3 other = same_variances(n.x, n.y, n.z, found.s2, other_least);
+            const float3 both = variances(mine.s0, mine.s1, turn, mine.s2, least) + other;
             const float area = both.x * both.z - both.y * both.y;
             const float low = inverse_root(both.x), told = both.x + both.z < VAGUE ? 1.0f : 0.0f;
             const float3 lower = (float3)(told * low, both.y * low, told * inverse_root(area) / low);
@@ -152,7 +155,7 @@ __kernel void pose_equations(
             float8 mine_rows[3];
             jacobian(n, (float3)(found.s5, found.s6, found.s7), arm, lower, sure, mine_rows);
             const float r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
-            const float r2 = sure * (place.z - found.s3);
+            const float r2 = sure * (place.z - height);
             const float8 a = mine_rows[0], b = mine_rows[1], c = mine_rows[2];
             right += a * r0 + b * r1 + c * r2;
             chi += r0 * r0 + r1 * r1 + r2 * r2;

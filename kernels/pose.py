@@ -139,8 +139,8 @@ def _upright(x: Doubles, y: Doubles) -> Doubles:
 def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
     """Return the records at places, (8, n), the squared weights' sums, and which places have four pixels.
 
-    Between pixels all numbers change linearly. To the height each pixel adds half of what its own slope
-    makes, so that a paraboloid remains one.
+    Between pixels all numbers change linearly. To the height each pixel adds half of what its own normal
+    makes of the distance, so that a paraboloid remains one.
     """
     rows, columns = second.shape[:2]
     x0, y0, step_x, step_y = grid
@@ -148,16 +148,16 @@ def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles,
     inside = (right >= 0) & (right < columns - 1) & (down >= 0) & (down < rows - 1)
     right, down = right[inside], down[inside]
     west, north = right.astype(np.intp), down.astype(np.intp)
-    found, share = np.zeros((8, len(west))), np.zeros(len(west))
+    found, share, bent = np.zeros((8, len(west))), np.zeros(len(west)), np.zeros(len(west))
     for below in (0, 1):
         for beside in (0, 1):
             from_x, from_y = right - west - beside, down - north - below
             weight = (1 - np.abs(from_x)) * (1 - np.abs(from_y))
             record = second[north + below, west + beside].T
-            n = _upright(record[0], record[1])
             found += weight * record
-            found[3] -= weight / 2 * (n[0] * from_x * step_x - n[1] * from_y * step_y) / n[2]
+            bent += weight / 2 * (record[0] * from_x * step_x - record[1] * from_y * step_y)
             share += weight**2
+    found[3] -= bent / np.sqrt(1 - found[0] ** 2 - found[1] ** 2)
     known = np.isfinite(found[0])
     inside[inside] = known
     return found[:, known], share[known], inside

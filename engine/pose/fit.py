@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,10 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.motion import STILL, Doubles, Motion, cross_matrix
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
-
-Doubles = NDArray[np.float64]
 
 _UPPER = np.triu_indices(6)
 _FLOOR = 1e-5  # of the mean information: what rounding and the pixels' size leave of none
@@ -34,26 +32,6 @@ _NONE = np.zeros((6, 0))
 _LONGEST = 0.35  # of the object's size: the longest step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """A rotation matrix and a translation."""
-
-    turn: Doubles
-    shift: Doubles
-
-    def apply(self, points: Doubles) -> Doubles:
-        """Move points, (..., 3)."""
-        return points @ self.turn.T + self.shift
-
-    def after(self, step: Doubles, centre: Doubles) -> Motion:
-        """Return the motion followed by a small one about a point."""
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        return Motion(turn @ self.turn, turn @ (self.shift - centre) + centre + step[3:])
-
-
-STILL = Motion(np.eye(3), np.zeros(3))
-
-
 class Equations:
     """Sums over the pixels that two maps share at some motion; lengths in units of the object's size.
 
@@ -61,22 +39,23 @@ class Equations:
     ----------
     pixels : float
     normal_matrix, unbiased : ndarray, (6, 6)
-        J'WJ, and J'WK, in which noise of the Jacobians averages out.
+        J'WJ, and J'WK, in which noise of the Jacobians averages out; J'WJ where K was not asked for.
     right : ndarray, (6,)
         J'Wr, and `scores`, (blocks, 6), of each block.
     chi_square : float
         For each degree of freedom, `compared` in all.
     """
 
-    def __init__(self, sums: NDArray[np.float32], size: float) -> None:
-        scale = np.array([1 / size] * 3 + [1.0] * 3)
+    def __init__(self, sums: NDArray[np.float32], size: float, beside: bool) -> None:
+        scale = np.repeat([1 / size, 1.0], 3)
         parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
         upper, scores, chi, expected, self.heights, self.normals, whole = parts
         self.normal_matrix = np.zeros((6, 6))
         self.normal_matrix[_UPPER] = upper.sum(axis=0)
         self.normal_matrix += np.triu(self.normal_matrix, 1).T
         self.normal_matrix *= np.outer(scale, scale)
-        self.unbiased = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
+        own = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
+        self.unbiased = own if beside else self.normal_matrix
         self.scores = scores * scale
         self.right = self.scores.sum(axis=0)
         self.pixels = max(float(self.normals.sum()), float(self.heights.sum()))
@@ -120,9 +99,6 @@ class PairFit:
 
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device
-        points = first.points()
-        self.middle = points.mean(axis=0)
-        self.size = float(np.sqrt(np.mean(np.sum((points - self.middle) ** 2, axis=1))))
 
     def equations(self, motion: Motion, beside: bool = False, step: int = 1) -> Equations:
         """Return the sums at a motion."""
@@ -133,7 +109,7 @@ class PairFit:
         pose = self.device.given(
             "pose",
             np.concatenate(
-                [motion.turn.ravel(), motion.shift, motion.apply(self.middle), first.grid, second.grid,
+                [motion.turn.ravel(), motion.shift, second.middle, first.grid, second.grid,
                  [first.least, second.least]]
             ),
         )  # fmt: skip
@@ -151,11 +127,14 @@ class PairFit:
             sums=sums,
             moved=32 * rows * columns // step**2,
         )
-        return Equations(sums.download(), self.size)
+        return Equations(sums.download(), second.size, beside)
 
-    def solve(self, start: Motion | None = None) -> tuple[Motion, Equations, Doubles]:
-        """Return the motion, its equations, and what they leave free, from a start, or from none and many."""
-        levels = self._levels()
+    def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
+        """Return the motion, its equations, and what they leave free, from a start, or from none and many.
+
+        One that is ``near`` needs no coarse maps.
+        """
+        levels = [self] if near else self._levels()
         found, chi_square = self._descend(levels, start or STILL)
         if start is None and not chi_square < _POOR:
             other = self._descend(levels, levels[-1].search())
@@ -178,7 +157,7 @@ class PairFit:
         levels = [self]
         while min(levels[-1].first.records.shape[:2]) >= 2 * _COARSEST:
             first, second = (one.halved(self.device) for one in (levels[-1].first, levels[-1].second))
-            if min(len(first.points()), len(second.points())) < _FEWEST:
+            if min(len(first.points), len(second.points)) < _FEWEST:
                 break
             levels.append(PairFit(first, second, self.device))
         return levels
@@ -198,7 +177,7 @@ class PairFit:
         found = []
         for start in self._starts():
             now = self.equations(start)
-            if now.pixels > _SHARED * len(self.first.points()):
+            if now.pixels > _SHARED * len(self.first.points):
                 matrix = now.normal_matrix + _FLOOR * np.trace(now.normal_matrix) / 6 * np.eye(6)
                 gain = now.right @ np.linalg.solve(matrix, now.right)
                 found.append((now.chi_square - gain / now.compared, start))
@@ -208,22 +187,21 @@ class PairFit:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
-                if now.pixels > _SHARED * len(self.first.points()) and now.chi_square < least:
+                if now.pixels > _SHARED * len(self.first.points) and now.chi_square < least:
                     best, least = motion, now.chi_square
         return best
 
     def _starts(self) -> Iterator[Motion]:
-        extent = np.ptp(self.first.points(), axis=0)
+        extent = np.ptp(self.first.points, axis=0)
         for angle in np.linspace(0, 2 * math.pi, _ANGLES, endpoint=False):
             turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
             for along in np.linspace(-_REACH, _REACH, _SHIFTS):
                 for up in np.linspace(-_REACH, _REACH, _SHIFTS):
                     shift = np.array([along, up, 0]) * extent
-                    yield Motion(turn, self.middle - turn @ self.middle + shift)
+                    yield Motion(turn, self.first.middle - turn @ self.first.middle + shift)
 
     def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
         """Return the motion from which no step but the free ones leads further; None without overlap."""
-        scale = np.array([1 / self.size] * 3 + [1.0] * 3)
         for _ in range(_STEPS):
             now = self.equations(motion, beside=not free.size)
             if now.pixels < _FEWEST:
@@ -231,12 +209,24 @@ class PairFit:
             ways = complement(free if free.size else now.free(_LIKELY[now.chi_square > _AWAY]))
             if not ways.size:
                 break
-            matrix = ways.T @ now.normal_matrix @ ways
-            matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-            step = -ways @ np.linalg.solve(matrix, ways.T @ now.right)
-            far = float(np.linalg.norm(step)) / (_LONGEST * self.size)
-            step /= max(far, 1.0)
-            motion = motion.after(step * scale, motion.apply(self.middle))
-            if step @ now.normal_matrix @ step < _STILL**2 * max(now.chi_square, 1.0):
+            motion, moved = self.step(motion, now, ways)
+            if moved < _STILL:
                 break
         return motion
+
+    def step(self, motion: Motion, now: Equations, ways: Doubles) -> tuple[Motion, float]:
+        """Return where the Gauss-Newton step in some directions leads, and its length in sigmas."""
+        matrix = ways.T @ now.normal_matrix @ ways
+        matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+        step = -ways @ np.linalg.solve(matrix, ways.T @ now.right)
+        step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.size), 1.0)
+        sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
+        scale = np.repeat([1 / self.second.size, 1.0], 3)
+        return motion.small_step(step * scale, self.second.middle), sigmas
+
+    def at_origin(self) -> Doubles:
+        """Return what makes of steps as these equations have them small motions about the origin, (6, 6)."""
+        moved = np.eye(6)
+        moved[3:, :3] = cross_matrix(self.second.middle)
+        moved[:, :3] /= self.second.size
+        return moved

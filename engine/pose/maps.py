@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -23,7 +24,7 @@ _UNTOLD = 1e6  # radians^2, of normals that are not compared
 _BORDER = np.ones((5, 5), np.uint8)  # pixels round edges and the border of contact that are left out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class PoseMap:
     """Records of a map, (H, W, 8), as `mirrorskin.kernels.pose` has them, and where they are.
 
@@ -76,12 +77,23 @@ class PoseMap:
         grid = x + step_x / 2, y - step_y / 2, 2 * step_x, 2 * step_y
         return PoseMap(records, grid, self.least, device.given("records", records))
 
+    @cached_property
     def points(self) -> NDArray[np.float64]:
-        """Return the points of the surface that can be used, (n, 3), mm."""
+        """The points of the surface that can be used, (n, 3), mm."""
         row, column = np.nonzero(np.isfinite(self.records[..., 0]))
         x, y, step_x, step_y = self.grid
         height = self.records[row, column, 3].astype(np.float64)
         return np.stack([x + column * step_x, y - row * step_y, height], axis=-1)
+
+    @cached_property
+    def middle(self) -> NDArray[np.float64]:
+        """Their mean."""
+        return np.asarray(self.points.mean(axis=0))
+
+    @cached_property
+    def size(self) -> float:
+        """Their root mean square distance from it."""
+        return float(np.sqrt(np.mean(np.sum((self.points - self.middle) ** 2, axis=1))))
 
 
 def _grid(result: Result, pixel_size: ArrayLike | None) -> tuple[float, float, float, float]:

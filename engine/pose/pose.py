@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.engine.pose.fit import Doubles, Equations, Motion, PairFit
+from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.motion import Doubles, Motion
 from mirrorskin.io import Result
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARE = 1e-3  # of a parameter in an undetermined direction, from which on it is undetermined itself
+_ALIKE = 0.01  # directions are the same that differ by less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +47,9 @@ class Pose:
     undetermined: Doubles
 
     @property
-    def matrix(self) -> Doubles:
-        """R, (3, 3)."""
-        return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix(), np.float64)
+    def motion(self) -> Motion:
+        """R and t."""
+        return Motion(np.asarray(Rotation.from_rotvec(self.rotation).as_matrix()), self.translation)
 
     @property
     def sigma(self) -> Doubles:
@@ -57,7 +59,32 @@ class Pose:
 
     def apply(self, points: ArrayLike) -> Doubles:
         """Move points, (..., 3), mm."""
-        return np.asarray(points, np.float64) @ self.matrix.T + self.translation
+        return self.motion.apply(np.asarray(points, np.float64))
+
+    def inverse(self) -> Pose:
+        """Return the motion back, with what its covariance becomes."""
+        back = self.motion.inverse()
+        change = back.adjoint()
+        return self._changed(back, change @ self.covariance @ change.T, self.undetermined @ change.T)
+
+    def then(self, other: Pose) -> Pose:
+        """Return this motion followed by another of independent errors.
+
+        What one of them leaves undetermined the whole does, too; chi square and pixels are the other's.
+        """
+        change = other.motion.adjoint()
+        covariance = change @ self.covariance @ change.T + other.covariance
+        free = np.concatenate([self.undetermined @ change.T, other.undetermined])
+        return other._changed(self.motion.then(other.motion), covariance, free)
+
+    def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
+        """Return a motion with its errors; its undetermined directions are orthonormalised."""
+        ways, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
+        vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
+        kept = ways[:, sizes > _ALIKE].T
+        return replace(
+            self, rotation=vector, translation=motion.shift, covariance=covariance, undetermined=kept
+        )
 
 
 def estimate_pose(
@@ -123,20 +150,12 @@ def estimate_pose(
     opened = open_device(device)
     maps = PoseMap.of(first, pixel_size, opened), PoseMap.of(second, pixel_size, opened)
     fit = PairFit(*maps, opened)
-    return pose_of(fit, *fit.solve(None if start is None else Motion(start.matrix, start.translation)))
+    return pose_of(fit, *fit.solve(None if start is None else start.motion))
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
     """Return a fit's motion about the picture's centre, and what its equations say of it."""
-    x, y, z = motion.apply(fit.middle)
-    moved = np.eye(6)
-    moved[3:, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    moved[:, :3] /= fit.size
-    return Pose(
-        np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64),
-        motion.shift,
-        moved @ now.covariance(free) @ moved.T,
-        now.chi_square,
-        int(now.pixels),
-        np.linalg.qr(moved @ free)[0].T,
-    )
+    moved = fit.at_origin()
+    covariance = moved @ now.covariance(free) @ moved.T
+    fitted = Pose(np.zeros(3), np.zeros(3), covariance, now.chi_square, int(now.pixels), np.zeros((0, 6)))
+    return fitted._changed(motion, covariance, (moved @ free).T)

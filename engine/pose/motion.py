@@ -1,0 +1,54 @@
+"""Rigid motions: to apply one, to join two, and what errors of one become after another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A rotation matrix, (3, 3), and a translation, (3,), mm: x' = R x + t."""
+
+    turn: Doubles
+    shift: Doubles
+
+    def apply(self, points: Doubles) -> Doubles:
+        """Move points, (..., 3)."""
+        return points @ self.turn.T + self.shift
+
+    def then(self, other: Motion) -> Motion:
+        """Return this motion followed by another."""
+        return Motion(other.turn @ self.turn, other.apply(self.shift))
+
+    def inverse(self) -> Motion:
+        """Return the motion back."""
+        return Motion(self.turn.T, -self.shift @ self.turn)
+
+    def small_step(self, step: Doubles, centre: Doubles) -> Motion:
+        """Return this motion followed by a small rotation about a point and a translation, (6,)."""
+        turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
+        moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
+        # Rounding would grow from motion to motion, as the transpose is taken for the inverse.
+        return Motion(np.asarray(Rotation.from_matrix(moved.turn).as_matrix()), moved.shift)
+
+    def adjoint(self) -> Doubles:
+        """Return the matrix, (6, 6), that makes small motions before this one such after it."""
+        both = np.zeros((6, 6))
+        both[:3, :3] = both[3:, 3:] = self.turn
+        both[3:, :3] = cross_matrix(self.shift) @ self.turn
+        return both
+
+
+STILL = Motion(np.eye(3), np.zeros(3))
+
+
+def cross_matrix(vector: Doubles) -> Doubles:
+    """Return the matrix, (3, 3), of the cross product with a vector on its left."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -1,0 +1,124 @@
+"""The motion of an object along a stream of results."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mirrorskin.engine.pose.fit import PairFit, complement
+from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
+from mirrorskin.engine.pose.pose import Pose, pose_of
+from mirrorskin.io import Result
+from mirrorskin.kernels.device import Device, open_device
+
+_SHARED = 0.6  # of the key's pixels: with fewer in common the next result becomes the key
+_COARSE, _STEPS, _STILL = 4, 8, 0.3  # every how many-th pixel at first; steps, and how many sigmas end them
+_FEWEST = 20  # pixels of a coarse comparison
+_LOST = 3.0  # times the key's first chi square, from which on the motion is looked for anew
+
+
+class PoseTracker:
+    """Finds where an object is in each of a stream of results, against where it was in the first.
+
+    Each result is compared with a key: the first one, and later the last before too few pixels were shared.
+    So errors grow with the keys, not with the results. A result is expected where a steady motion would have
+    brought the object; steps on every fourth pixel each way lead from there, and a last one takes all pixels.
+    What the key cannot tell is found with the first result after it, and is held still.
+
+    Parameters
+    ----------
+    pixel_size : float or (float, float), optional
+        mm; by default as the results say.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Attributes
+    ----------
+    keys : int
+        How many results became keys.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine, io
+    >>> def waves(at):
+    ...     x, y = np.meshgrid(np.arange(-30, 31) * 0.1, np.arange(20, -21, -1) * 0.1)
+    ...     p, q = 0.2 * np.cos(x - at) * np.cos(y), -0.2 * np.sin(x - at) * np.sin(y)
+    ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
+    ...     sure = np.full(x.shape, 0.01)
+    ...     height = 0.2 * np.sin(x - at) * np.cos(y)
+    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normal_sigma=sure)
+    >>> tracker = engine.PoseTracker(pixel_size=0.1)
+    >>> [float(tracker.push(waves(0.05 * number)).translation[0].round(2)) for number in range(3)]
+    [0.0, 0.05, 0.1]
+    """
+
+    def __init__(self, pixel_size: ArrayLike | None = None, *, device: str | Device | None = None) -> None:
+        self.keys = 0
+        self._pixel_size, self._device = pixel_size, open_device(device)
+        self._key: PoseMap | None = None
+        self._key_pose = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
+        self._free: Doubles | None = None
+        self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
+        self._back, self._way = STILL, STILL  # from the last result to the key, and from it to the one before
+
+    def push(self, result: Result) -> Pose:
+        """Take the next result, and return the motion from the first one to it.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            What `estimate_pose` refuses, or the result shares too few pixels with those before. It is left
+            out, and the next is expected where this one was.
+        """
+        if self._key is None:
+            self._take_key(result, self._key_pose)
+            return self._key_pose
+        if self._free is None:
+            return self._first_after_key(result)
+        fit = PairFit(self._map(result, curved=False), self._key, self._device)
+        ways, motion = complement(self._free), self._way.then(self._back)
+        for step in (_COARSE, 1):
+            for _ in range(_STEPS):
+                now = fit.equations(motion, step=step)
+                if now.pixels < _FEWEST:
+                    return self._look_for(result)
+                motion, moved = fit.step(motion, now, ways)
+                if moved < _STILL:
+                    break
+        if now.chi_square > self._worst:
+            return self._look_for(result)
+        pose = self._moved_to(motion, pose_of(fit, motion, now, self._free))
+        if now.pixels < self._fewest:
+            self._take_key(result, pose)
+        return pose
+
+    def _first_after_key(self, result: Result) -> Pose:
+        """Return the pose of a result that also tells what the key leaves undetermined."""
+        assert self._key is not None
+        fit = PairFit(self._map(result), self._key, self._device)
+        motion, now, self._free = fit.solve(self._way.then(self._back), near=True)
+        self._fewest, self._worst = _SHARED * now.pixels, _LOST * max(now.chi_square, 1.0)
+        return self._moved_to(motion, pose_of(fit, motion, now, self._free))
+
+    def _look_for(self, result: Result) -> Pose:
+        """Return the pose of a result that is not where it was expected."""
+        assert self._key is not None
+        fit = PairFit(self._map(result), self._key, self._device)
+        motion, now, free = fit.solve()
+        return self._moved_to(motion, pose_of(fit, motion, now, free))
+
+    def _moved_to(self, motion: Motion, found: Pose) -> Pose:
+        """Keep a motion back to the key, and return the pose that it makes."""
+        self._way = motion.then(self._back.inverse())
+        self._back = motion
+        return self._key_pose.then(found.inverse())
+
+    def _take_key(self, result: Result, pose: Pose) -> None:
+        self._key, self._key_pose, self._free = self._map(result), pose, None
+        self._back = STILL
+        self.keys += 1
+
+    def _map(self, result: Result, curved: bool = True) -> PoseMap:
+        return PoseMap.of(result, self._pixel_size, self._device, curved)
