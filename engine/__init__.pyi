@@ -22,6 +22,7 @@ from .rotation.normals import NormalEstimator, Normals, estimate_normals
 from .rotation.normals_pose import PoseEstimator, PoseNormals
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
+from .slip.search import Slip, SlipSearch
 from .tiling import free_memory
 
 __all__ = [
@@ -45,6 +46,8 @@ __all__ = [
     "PoseNormals",
     "PoseTracker",
     "Score",
+    "Slip",
+    "SlipSearch",
     "StrokeSearch",
     "Strokes",
     "Surface",

@@ -18,7 +18,7 @@ from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS, basis, i
 
 Doubles = NDArray[np.float64]
 
-ITERATIONS = 12
+ITERATIONS = 8
 """Times that a frame is fetched back at most; after a start from the frame before, 2 are needed."""
 GRADIENT_NOISE = 1.3923
 """Variance of a cubic spline's derivative at a sample, of samples with noise of variance 1."""
@@ -26,6 +26,7 @@ GRADIENT_NOISE = 1.3923
 _LEVELS = 4  # resolutions
 _ENOUGH = 0.5  # of the windows
 _LIKE = 0.5  # of the reference's contrast is in what is the same texture
+_MOST = 0.98  # of the nodes; windows with hardly any texture never settle
 _SETTLED = 0.03  # pixels: the linearisation is then wrong by less than a thousandth of one
 _FARTHEST = 1.5  # pixels in one iteration
 _KERNEL = (
@@ -116,7 +117,7 @@ class Tracker:
         for axis, place in enumerate(self._places(), 1):
             fine = _cubic(fine, place, axis)
         found = np.where(np.isfinite(fine), fine, linear).astype(np.float32)
-        return np.moveaxis(found, 0, -1).reshape(*level.shape, *values.shape[2:])
+        return np.asarray(np.moveaxis(found, 0, -1).reshape(*level.shape, *values.shape[2:]))
 
     def worst_at_pixels(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return at all pixels the largest code of the nodes around, (rows, columns)."""
@@ -124,6 +125,20 @@ class Tracker:
         both = [[place, np.minimum(place + 1, n - 1)] for place, n in zip(places, codes.shape, strict=True)]
         corners = [codes[np.ix_(rows, columns)] for rows in both[0] for columns in both[1]]
         return np.asarray(np.max(corners, axis=0))
+
+    def nearest(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return at all pixels the value of the nearest node, (rows, columns)."""
+        rows, columns = (np.rint(place).astype(int) for place in self._places())
+        return np.asarray(values[np.ix_(rows, columns)])
+
+    def at_nearest_pixels(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return at all nodes the value of about the nearest pixel, (H, W)."""
+        level = self.finest
+        rows, columns = (
+            np.clip(np.rint(level.start + level.step * np.arange(nodes)).astype(int), 0, size - 1)
+            for size, nodes in zip(level.shape, level.grid, strict=True)
+        )
+        return np.asarray(values[np.ix_(rows, columns)])
 
     def _places(self) -> list[Doubles]:
         """Return where rows and columns of pixels lie among the nodes."""
@@ -247,7 +262,7 @@ class _Level:
         for _ in range(ITERATIONS):
             answer = self._solve(field)
             last, field = field, self._next_field(field, answer[:AFFINE])
-            if np.abs(field - last).max() < _SETTLED:
+            if np.quantile(np.abs(field - last), _MOST) < _SETTLED:
                 break
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]

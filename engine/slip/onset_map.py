@@ -1,0 +1,155 @@
+"""When the skin breaks loose, node by node: the most likely map of onsets, of all frames at once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import splu
+
+Doubles = NDArray[np.float64]
+
+POWER = 1.5
+"""Of the way since the onset, by which a departure grows (Johnson, Contact Mechanics, 1985, eq. 7.45, of the
+contact of Cattaneo and Mindlin, near to what sticks)."""
+
+_CANDIDATES = 48  # onsets that a search begins with
+_EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's onset to begin with
+_ROUNDS = 20
+_SETTLED = 1e-3  # of the way, in a round
+_FARTHEST = 0.08  # of the way, by which an onset changes in a round
+_LEAST_GROWTH = 0.1  # of the usual one
+_APART = 9  # nodes, beyond which errors of onsets do not depend on each other
+_NEVER = 1.5  # of the way: an onset that has not come
+_FLOOR = 1e-6  # of an equation's weight, so that there is always a solution
+
+
+@dataclass(frozen=True, slots=True)
+class OnsetMap:
+    """Onsets of departure, and their standard deviations, (rows, columns), in the unit of the way.
+
+    An onset behind the end of the way has not come. One before its begin says that the departure was under
+    way from the first.
+    """
+
+    onset: Doubles
+    sigma: Doubles
+
+
+def fit_onsets(departure: Doubles, sigma: Doubles, way: Doubles, window: float, bend: float) -> OnsetMap:
+    """Fit ``growth (way - onset)^1.5``, zero before the onset, to departures as windows see them.
+
+    A window's answer is the mean over it. Where the onset changes by ``slope`` from node to node, that is the
+    mean over onsets within +- slope window / 2. Onset and growth are smooth maps: their second differences
+    have a standard deviation, known beforehand. Both are found together by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    departure : (T, rows, columns), mm, of the frames after the reference; NaN where there is none
+    sigma : (rows, columns), mm, of a departure; half of its variance is the reference's, common to all frames
+    way : (T,), of the body since the reference
+    window : nodes, over which a departure is a mean
+    bend : standard deviation of second differences between nodes, as a share of the way, and of the growth
+    """
+    known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
+    scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
+    data = _whitened(np.where(known, departure * scale, 0.0))
+    length, times = float(way[-1]), way[:, None, None]
+    plate = _bending(known.shape)
+    begin = _begin(data, scale, times, plate / (bend * length) ** 2)
+    if begin is None:
+        return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
+    onset, usual = begin
+    stiff = sparse.block_diag([plate / (bend * length) ** 2, plate / bend**2], format="csc")
+    floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
+    growth = np.ones_like(onset)
+    for number in range(_ROUNDS):
+        half = np.hypot(*np.gradient(onset)) * window / 2
+        half = np.maximum(half, length / len(way) * max(0.5, 2.0 - 0.5 * number))  # wider at first
+        shape, rate = (usual * _whitened(part * scale) for part in _blurred(times - onset, half))
+        columns = np.stack([-growth * rate, shape])
+        pull = np.sum(columns * (data - growth * shape), axis=1).ravel()
+        normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
+        blocks = [[sparse.diags(part) for part in row] for row in normal]
+        system = splu((sparse.bmat(blocks) + stiff + floor).tocsc())
+        step = system.solve(pull - stiff @ np.stack([onset, growth]).ravel()).reshape(2, *onset.shape)
+        change = np.clip(step[0], -_FARTHEST * length, _FARTHEST * length)
+        onset, growth = onset + change, np.maximum(growth + np.clip(step[1], -0.3, 0.3), _LEAST_GROWTH)
+        if number > 3 and np.abs(change).max() < _SETTLED * length:
+            break
+    return OnsetMap(onset, np.sqrt(_variances(system, onset.shape)))
+
+
+def _whitened(values: Doubles) -> Doubles:
+    """Return values without what a common offset, as uncertain as a frame's own part, would explain.
+
+    Of frames whose errors have the covariance (I + J) / 2, J being all ones: those of the outcome have I.
+    """
+    part = 1 - 1 / math.sqrt(len(values) + 1)
+    whitened: Doubles = math.sqrt(2) * (values - part * values.mean(axis=0))
+    return whitened
+
+
+def _blurred(since: Doubles, half: Doubles | float) -> tuple[Doubles, Doubles]:
+    """Return the mean of ``since^1.5``, 0 before 0, over +- half, and its derivative."""
+    ahead, behind = np.maximum(since + half, 0.0), np.maximum(since - half, 0.0)
+    ends = ahead**POWER, behind**POWER
+    mean = (ahead * ends[0] - behind * ends[1]) / (2 * half * (POWER + 1))
+    return mean, (ends[0] - ends[1]) / (2 * half)
+
+
+def _begin(data: Doubles, scale: Doubles, times: Doubles, stiff: Any) -> tuple[Doubles, float] | None:
+    """Return a first map of onsets, by trial at each node and its neighbours, and the usual growth.
+
+    None if no node departs.
+    """
+    length = float(times[-1, 0, 0])
+    best, onset = np.zeros_like(scale), np.full_like(scale, length)
+    for trial in np.linspace(-0.3 * length, length, _CANDIDATES, endpoint=False):
+        shape = _whitened(np.maximum(times - trial, 0.0) ** POWER * scale)
+        products, squares = np.sum(shape * data, axis=0), np.sum(shape**2, axis=0)
+        gain = np.maximum(products, 0.0) ** 2 / (2 * np.maximum(squares, np.finfo(float).tiny))
+        gain = gaussian_filter(gain, 1.0)
+        onset, best = np.where(gain > best, trial, onset), np.maximum(gain, best)
+    evident = best > _EVIDENCE
+    if not evident.any():
+        return None
+    trust = np.where(evident, (_CANDIDATES / length) ** 2, _FLOOR)
+    onset = splu((stiff + sparse.diags(trust.ravel())).tocsc()).solve((trust * onset).ravel())
+    onset = onset.reshape(scale.shape)
+    shape = _whitened(_blurred(times - onset, length / len(times))[0] * scale)
+    growth = np.sum(shape * data) / max(float(np.sum(shape**2)), np.finfo(float).tiny)
+    return (onset, float(growth)) if growth > 0 else None
+
+
+def _bending(shape: tuple[int, int]) -> Any:
+    """Return the matrix of a thin plate's energy: squares of the second differences of a map, summed."""
+    one = [sparse.identity(n, format="csr") for n in shape]
+    first, second = (
+        [sparse.csr_matrix(np.diff(np.eye(n), order, axis=0)) for n in shape] for order in (1, 2)
+    )
+    parts = [
+        sparse.kron(second[0], one[1]),
+        sparse.kron(one[0], second[1]),
+        math.sqrt(2) * sparse.kron(first[0], first[1]),
+    ]
+    return sum(part.T @ part for part in parts).tocsc()
+
+
+def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
+    """Return the diagonal of a system's inverse, of its first map, of nodes far apart at once."""
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
+    found = np.empty(shape)
+    for row in range(min(_APART, shape[0])):
+        for column in range(min(_APART, shape[1])):
+            here = np.s_[row::_APART, column::_APART]
+            right = np.zeros((2, *shape))
+            right[0][here] = signs[here]
+            answer = system.solve(right.ravel()).reshape(2, *shape)[0]
+            found[here] = (answer * signs)[here]
+    return np.maximum(found, 0.0)

@@ -1,0 +1,213 @@
+"""Slip from frames of a known course of stick and slip, of slides and of twists."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation, binary_erosion
+from speckle import Speckle
+
+from mirrorskin.engine import SlipSearch
+from mirrorskin.io import InputError
+
+SHAPE, PIXEL, NOISE = (128, 140), 0.05, 1.5
+CONTACT, FULL, GROWTH, STEP = 44.0, 11.0, 0.14, 0.35  # pixels; of the way, of its root
+SPECKLE = Speckle(5)
+ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+CENTRE = (SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2
+
+
+def radius(x, y):
+    return np.hypot(x - CENTRE[0], y - CENTRE[1])
+
+
+def onset(x, y):
+    """As under a ball (Cattaneo and Mindlin), pixels of the way."""
+    return FULL * (1 - (radius(x, y) / CONTACT) ** 2)
+
+
+def departure(x, y, way):
+    begin = onset(x, y)
+    since = np.maximum(way - begin, 0) ** 1.5 - np.maximum(-begin, 0) ** 1.5
+    return np.minimum(GROWTH * np.maximum(since, 0), way)
+
+
+@cache
+def slide(direction=(1.0, 0.0), count=20):
+    """Frames of a body that slides along a direction, y up, and the places where it was, mm."""
+    right, up = direction
+    frames = []
+    for k in range(count):
+        way = k * STEP
+
+        def lag(x, y, way=way):
+            return way - departure(x, y, way)
+
+        frames.append(
+            SPECKLE.frame(
+                SHAPE,
+                lambda x, y, lag=lag: -right * lag(x, y),
+                lambda x, y, lag=lag: up * lag(x, y),
+                NOISE,
+                k,
+            )
+        )
+    return np.stack(frames), np.arange(count)[:, None] * STEP * PIXEL * np.array(direction)
+
+
+INSIDE = radius(COLUMN, ROW) < CONTACT
+
+
+def search(**options):
+    return SlipSearch(SHAPE, np.float32, PIXEL, **({"contact": INSIDE} | options))
+
+
+@pytest.fixture(scope="module")
+def slid():
+    frames, places = slide()
+    estimator = search()
+    estimator.push(frames, displacement=places)
+    return estimator.result(), float(places[-1, 0])
+
+
+def test_slip_is_told_from_stick_within_a_pixel(slid):
+    found, way = slid
+    true = onset(COLUMN, ROW) * PIXEL < way
+    border = binary_dilation(true & INSIDE) & ~binary_erosion(true & INSIDE)
+    part = INSIDE & ~border & np.isin(found.status, [1, 2])
+    slipped = found.status == 1
+    assert part[INSIDE & ~border].mean() > 0.97
+    assert (slipped & true & part).sum() >= 0.98 * (true & part).sum()
+    assert (slipped & true & part).sum() >= 0.98 * (slipped & part).sum()
+    assert (found.status[~INSIDE] == 3).all()
+
+
+def test_the_moment_of_slip_is_known_within_a_frame_and_its_sigma_is_of_that_size(slid):
+    found, _ = slid
+    error = (found.slip_onset - onset(COLUMN, ROW) * PIXEL) / (STEP * PIXEL)
+    assert np.sqrt(np.nanmean(error**2)) < 1
+    sigma = found.slip_onset_sigma / (STEP * PIXEL)
+    assert 0.3 < np.nanmedian(np.abs(error) / sigma) / 0.6745 < 3
+    assert np.isnan(found.slip_onset[found.status == 2]).all()
+
+
+def test_the_stick_ratio_is_that_of_the_disc_that_sticks(slid):
+    found, _ = slid
+    ways = np.arange(20) * STEP
+    expected = np.sqrt(1 - ways / FULL)  # of the radii
+    np.testing.assert_allclose(np.sqrt(found.stick_ratio[3:]), expected[3:], rtol=0.03)
+    assert found.stick_ratio[0] == 1
+
+
+def test_the_displacement_is_that_of_the_skin(slid):
+    found, way = slid
+    lag = way / PIXEL - departure(COLUMN, ROW, way / PIXEL)
+    error = found.displacement - np.stack([-lag * PIXEL, 0 * lag], axis=-1)
+    sigma = found.displacement_sigma[..., None]
+    part = radius(COLUMN, ROW) < CONTACT / 2  # farther out the movement bends within a window
+    assert np.nanmean((error / sigma)[part] ** 2) == pytest.approx(1, abs=0.25)
+
+
+def test_the_direction_of_a_slide_does_not_matter(slid):
+    frames, places = slide((-0.6, 0.8))
+    estimator = search()
+    estimator.push(frames, displacement=places)
+    assert estimator.result().stick_ratio[-1] == pytest.approx(slid[0].stick_ratio[-1], rel=0.05)
+
+
+def test_contact_is_estimated_if_it_is_not_given(slid):
+    frames, places = slide()
+    estimator = search(contact=None)
+    estimator.push(frames, displacement=places)
+    found = estimator.result()
+    assert found.contact[INSIDE].mean() > 0.97
+    assert found.contact.sum() < 1.45 * INSIDE.sum()
+    stuck = [np.count_nonzero(one.status == 2) for one in (found, slid[0])]
+    assert stuck[0] == pytest.approx(stuck[1], rel=0.1)
+
+
+def test_blocks_make_no_difference_and_a_result_changes_nothing(slid):
+    frames, places = slide()
+    estimator = search(per_frame=True)
+    for part in np.split(np.arange(20), [1, 4, 11]):
+        estimator.push(frames[part], displacement=places[part])
+        if part[-1] == 10:
+            estimator.result()
+    found = estimator.result()
+    np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
+    np.testing.assert_array_equal(found.displacement[-1], slid[0].displacement)
+    assert found.displacement.shape == (20, *SHAPE, 2)
+    assert np.nanmax(np.abs(found.displacement[0])) == 0
+    estimator.reset()
+    estimator.push(frames, displacement=places)
+    np.testing.assert_array_equal(estimator.result().slip_onset, slid[0].slip_onset)
+
+
+def test_skin_that_sticks_does_so_to_the_end():
+    frames = np.stack([SPECKLE.frame(SHAPE, -0.4 * k, 0, NOISE, k) for k in range(8)])
+    estimator = search()
+    estimator.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
+    found = estimator.result()
+    assert (found.status[INSIDE] == 1).mean() < 0.01
+    assert (found.stick_ratio > 0.99).all()
+
+
+def test_a_body_that_turns_back_is_followed_until_then():
+    frames, places = slide()
+    way = np.r_[np.arange(20), np.arange(18, 14, -1)]
+    estimator = search()
+    estimator.push(frames[way], displacement=places[way])
+    found = estimator.result()
+    assert np.isfinite(found.stick_ratio[:20]).all()
+    assert np.isnan(found.stick_ratio[20:]).all()
+
+
+def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
+    about, steps = (6.0, -4.0), np.linspace(0, 0.12, 7)  # pixels right and up of the middle
+    x0, y0 = CENTRE[0] + about[0], CENTRE[1] - about[1]
+
+    def turned(angle):  # the body counter-clockwise, the skin clockwise in the picture
+        c, s = math.cos(angle) - 1, math.sin(angle)
+        return (lambda x, y: c * (x - x0) - s * (y - y0)), (lambda x, y: s * (x - x0) + c * (y - y0))
+
+    frames = np.stack([SPECKLE.frame(SHAPE, *turned(angle), NOISE, k) for k, angle in enumerate(steps)])
+    centre = (about[0] * PIXEL, about[1] * PIXEL)
+    estimator = search(motion="twist", centre=centre)
+    estimator.push(frames, twist=steps)
+    found = estimator.result()
+    assert found.angle == pytest.approx(-0.12, abs=2e-4)
+    assert found.centre == pytest.approx(centre, abs=0.1 * PIXEL)
+    assert (found.status[INSIDE] == 1).mean() < 0.01
+
+
+def test_a_clear_sheet_is_refused():
+    frames = np.random.default_rng(1).normal(100, NOISE, (4, *SHAPE)).astype(np.float32)
+    estimator = search()
+    estimator.push(frames, displacement=0.01 * np.arange(4)[:, None] * [1, 0])
+    with pytest.raises(InputError, match="no texture beyond the noise"):
+        estimator.result()
+
+
+def test_bad_input_is_one_line():
+    frames, places = slide()
+    for options, message in [
+        ({"motion": "axial"}, "motion 'axial' does not slip: horizontal and twist do"),
+        ({"contact": INSIDE[:-1]}, "contact has shape"),
+        ({"contact": 0 * INSIDE}, "contact is nowhere"),
+        ({"window": 4}, "window 4"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            search(**options)
+    estimator = search()
+    with pytest.raises(InputError, match="frames without displacement"):
+        estimator.push(frames, twist=np.arange(20.0))
+    with pytest.raises(InputError, match=r"displacement of shape \(20,\): finite numbers of shape"):
+        estimator.push(frames, displacement=places[:, 0])
+    with pytest.raises(InputError, match="0 frames tell no slip"):
+        estimator.result()
+    estimator.push(frames[:4], displacement=0 * places[:4])
+    with pytest.raises(InputError, match="the body does not move"):
+        estimator.result()
