@@ -101,7 +101,7 @@ class TravelAxis(Axis, frozen=True, kw_only=True):
 class CentredAxis(Axis, frozen=True, kw_only=True):
     """An axis that must be able to go to 0, where the body is before and after all else."""
 
-    _ZERO: ClassVar[str]
+    _ZERO: ClassVar[str] = "where the body is lowered"
 
     def __post_init__(self) -> None:
         Axis.__post_init__(self)
@@ -116,7 +116,6 @@ class CentredAxis(Axis, frozen=True, kw_only=True):
 class ShiftAxis(CentredAxis, frozen=True, kw_only=True):
     """An axis along the sheet, x or y; 0 is where the body is lowered."""
 
-    _ZERO = "where the body is lowered"
     zero: Annotated[float, Meta(description="a finite number of mm", examples=[0.0])] = 0.0
     unit: Literal["mm"] = "mm"
     limits: Annotated[
@@ -126,12 +125,17 @@ class ShiftAxis(CentredAxis, frozen=True, kw_only=True):
     speed: Annotated[float, Meta(gt=0, description="a speed above 0, in mm a second,", examples=[1.0])]
 
 
-class TwistAxis(CentredAxis, frozen=True, kw_only=True):
-    """The axis that turns the body about its own axis; 0 is where the body is lowered."""
+class AngleAxis(CentredAxis, frozen=True, kw_only=True):
+    """An axis that turns the body or leans it."""
 
-    _ZERO = "where the body is lowered"
     zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
     unit: Literal["deg"] = "deg"
+    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
+
+
+class TwistAxis(AngleAxis, frozen=True, kw_only=True):
+    """The axis that turns the body about its own axis; 0 is where the body is lowered."""
+
     limits: Annotated[
         tuple[
             Annotated[float, Meta(ge=-_ROUND, le=_ROUND)],
@@ -142,15 +146,12 @@ class TwistAxis(CentredAxis, frozen=True, kw_only=True):
             examples=[[-45.0, 45.0]],
         ),
     ]
-    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
 
 
-class TiltAxis(CentredAxis, frozen=True, kw_only=True):
+class TiltAxis(AngleAxis, frozen=True, kw_only=True):
     """An axis of the lean, pitch or roll; 0 is upright."""
 
     _ZERO = "upright"
-    zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
-    unit: Literal["deg"] = "deg"
     limits: Annotated[
         tuple[
             Annotated[float, Meta(gt=-_STEEPEST, lt=_STEEPEST)],
@@ -161,7 +162,6 @@ class TiltAxis(CentredAxis, frozen=True, kw_only=True):
             examples=[[-5.0, 5.0]],
         ),
     ]
-    speed: Annotated[float, Meta(gt=0, description="a speed above 0, in degrees a second,", examples=[20.0])]
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):

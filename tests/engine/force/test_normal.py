@@ -172,6 +172,5 @@ def test_a_force_comes_back_from_a_file(tmp_path):
     assert (found.force, found.force_sigma) == (0.5, 0.01)
     np.testing.assert_array_equal(found.pressure, 1)
     assert "force                         0.5 N" in repr(found)
-    pytest.importorskip("xarray")
     assert float(found.to_xarray().force) == 0.5
     assert found.to_xarray().force_sigma.units == "N"
