@@ -57,7 +57,7 @@ def check_travel(
     >>> check_travel([0, 1, 2], 3, "travel")
     array([0., 1., 2.])
     """
-    values = _known(travel, count, name)
+    values = check_strokes(travel, count, name)
     whole = np.concatenate([after, values])
     back = whole[1:] > whole[:-1] if falls else whole[1:] < whole[:-1]
     if np.any(back):
@@ -79,7 +79,9 @@ def check_strokes(
     >>> check_strokes([0, 1, 1, 0, 2], 5, "travel")
     array([0., 1., 1., 0., 2.])
     """
-    return _known(travel, count, name, within)
+    if travel is None:
+        raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
+    return check_finite(travel, count, name, within)
 
 
 def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np.intp]:
@@ -112,14 +114,6 @@ def check_phase(
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
     return check_finite(phase, count, name, within)
-
-
-def _known(
-    travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
-) -> NDArray[np.float64]:
-    if travel is None:
-        raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
-    return check_finite(travel, count, name, within)
 
 
 def check_finite(
