@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,12 +16,30 @@ from mirrorskin.cli.groups import Argument, Group, Option
 from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
+    from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.rig.check import Finding
     from mirrorskin.hw.rig_file import RigSettings
 
-app = Group(help="Look at a stage and a camera before they are used.", no_args_is_help=True)
+app = Group(
+    help="Look at a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
+)
 
+_SLOW = 0.1  # of an axis's speed, for moves by hand
 _COLOURS = {"ok": "green", "warning": "yellow", "failed": "red"}
+
+
+RigFile = Annotated[Path, Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")]
+
+
+class AxisName(StrEnum):
+    """The motions that a stage may have an axis for."""
+
+    travel = "travel"
+    pitch = "pitch"
+    roll = "roll"
+    x = "x"
+    y = "y"
+    twist = "twist"
 
 
 @app.add
@@ -43,7 +62,7 @@ def new(
 
 @app.add
 def check(
-    rig: Annotated[Path, Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")],
+    rig: RigFile,
     move: Annotated[bool, Option("--move", help="Home it, and move each axis a little.")] = False,
     as_json: options.Json = False,
 ) -> None:
@@ -67,6 +86,72 @@ def check(
         more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
         first = failed[0]
         raise HardwareError(f"{rig}: {first.part}, {first.what}: {first.found}: {first.remedy}{more}")
+
+
+@app.add
+def home(rig: RigFile) -> None:
+    """Find the switches of all axes; then the stage knows where it stands."""
+    with _opened(rig) as stage:
+        stage.home()
+
+
+@app.add
+def lift(rig: RigFile) -> None:
+    """Set the body upright, lift it to the end of its travel, and bring it to the middle."""
+    with _opened(rig) as stage:
+        for place in stage.limits.way_up(stage.report().position):
+            stage.move(place)
+            stage.wait()
+
+
+@app.add
+def jog(
+    rig: RigFile,
+    axis: Annotated[AxisName, Argument(help="What is moved.")],
+    by: Annotated[str, Option(metavar="LENGTH|ANGLE", help="How far from where it stands: 0.5mm, -1deg.")],
+) -> None:
+    """Move one axis a little, slowly and within its limits."""
+    from dataclasses import replace
+
+    from mirrorskin.cli.quantity import angle, length
+    from mirrorskin.hw.rig_file import load_rig
+    from mirrorskin.io import InputError
+
+    known = load_rig(rig).stage.axes.get(axis.value)
+    if known is None:
+        raise InputError(f"{rig} has no [stage.{axis.value}]: add it, or move another axis")
+    way = (length if known.unit == "mm" else angle)(by, "--by")
+    with _opened(rig) as stage:
+        here = stage.report().position
+        place = replace(here, **{axis.value: getattr(here, axis.value) + way})
+        stage.move(place, _SLOW * known.top_speed)
+        stage.wait()
+
+
+@app.add
+def unlock(rig: RigFile) -> None:
+    """End an alarm, a hold or an open door after a look at the machine, or stop what moves it.
+
+    Without switches its coordinates count from then on as they are; with switches it must be homed next.
+    """
+    with _opened(rig, unlock=True):
+        pass
+
+
+@contextmanager
+def _opened(rig: Path, unlock: bool = False) -> Iterator[GrblStage]:
+    """Open the stage alone; say in the end where it stands."""
+    from mirrorskin.hw.grbl.stage import GrblStage
+    from mirrorskin.hw.rig.check import in_words
+    from mirrorskin.hw.rig_file import load_rig
+
+    settings = load_rig(rig)
+    with GrblStage(settings.stage, unlock=unlock) as stage:
+        yield stage
+        report = stage.report()
+        where = in_words(report.position, settings.stage)
+        locked = "; locked: home it with 'mirrorskin rig home'" if report.state == "alarm" else ""
+        click.echo(f"{settings.name}: {where}{locked}")
 
 
 def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, as_json: bool) -> None:

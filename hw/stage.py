@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mirrorskin.io import InputError
 
 _ROUNDING = 1e-9  # by which a place may lie beyond a limit, mm and rad
+_UPRIGHT = 1e-4  # rad
 # Motions that need the body upright: their units in messages, and how many there are in one mm or rad.
 _SIDEWAYS = (("x", "mm", 1.0), ("y", "mm", 1.0), ("twist", "degrees", math.degrees(1.0)))
 
@@ -97,7 +98,7 @@ class Limits:
         if not low - _ROUNDING <= travel <= high + _ROUNDING:
             raise InputError(
                 f"{name}: a travel of {travel:.9g} mm is beyond the axis, which goes from {low:.9g} to "
-                f"{high:.9g} mm; stay within, or correct the rig file's limits"
+                f"{high:.9g} mm; stay within, or correct the rig file's limits, or $130 to $135"
             )
         if travel > self.press + _ROUNDING:
             raise InputError(
@@ -134,6 +135,12 @@ class Limits:
                 for motion, (least, greatest) in bounds.items()
             }
         )
+
+    def way_up(self, position: Position) -> list[Position]:
+        """Return where to go from a place: upright, straight up to the least travel, and to the middle."""
+        upright, high = self.nearest(position), self.travel[0]
+        ways = [upright] if position.tilt > _UPRIGHT else []
+        return list(dict.fromkeys([*ways, replace(upright, travel=high), Position(high)]))
 
     def _check_sideways(self, value: float, motion: str, unit: str, scale: float, name: str) -> None:
         """Refuse a move along x or y, mm, or a twist, degrees, beyond its limits."""

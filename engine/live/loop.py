@@ -149,10 +149,10 @@ class Loop:
         time = np.full(count, now) if block.time is None else block.time
         used = (now - time <= self._latency) | (np.arange(count) == count - 1)
         used &= (block.index + np.arange(count)) % self._estimator.every == 0
-        self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
         self._monitor.time(WAITED, *(now - time).tolist())
         self._times.extend(time.tolist())
         with self._guard():
+            self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
             for part in _runs(used):
                 push_block(self._estimator, block, part)
             if self._mark is not None:

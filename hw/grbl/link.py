@@ -69,20 +69,23 @@ def close_port(port: serial.Serial) -> None:
 
 
 HOLDING = 0.3
-"""Seconds that a stop waits for rest before it resets."""
+"""Seconds that a stop waits for rest before it resets, unless the axes take longer to slow down."""
 
 _RESETTING = 0.3  # seconds that a reset may take to be answered
-
-LONGEST = HOLDING + _RESETTING
-"""Seconds that a stop takes at most."""
 
 
 class Stopping:
     """Where a stop has got to; it needs no lock, so that anyone can begin it at any moment."""
 
     def __init__(self) -> None:
+        self.holding = HOLDING  # seconds that it waits for rest before it resets
         self.over = False
         self._began = self._reset = math.inf
+
+    @property
+    def longest(self) -> float:
+        """Seconds that a stop takes at most."""
+        return self.holding + _RESETTING
 
     @property
     def begun(self) -> bool:
@@ -103,7 +106,7 @@ class Stopping:
 
         `rested` is when the newest report was asked for, if that was of rest.
         """
-        if self.resetting or not (gone or rested > self._began or now - self._began > HOLDING):
+        if self.resetting or not (gone or rested > self._began or now - self._began > self.holding):
             return False
         self._reset = now
         return True
@@ -173,7 +176,7 @@ class Link:
         self._refused: Refusal | None = None
         self._active = False
         self._last_line = -math.inf  # when a line was last sent or answered
-        self._stopping = Stopping()
+        self.stopping = Stopping()
         self._deaf = False  # what comes is noise, and was reported as such
         self._closing = False
         self._threads = [
@@ -234,7 +237,7 @@ class Link:
     def restart(self, timeout: float) -> None:
         """Hold the machine, reset it, and forget what it said before."""
         self.send(HOLD)
-        time.sleep(HOLDING)
+        time.sleep(self.stopping.holding)
         self.banner = None
         self.send(RESET)
         self.until(lambda: self.banner, timeout, "start anew")
@@ -242,11 +245,11 @@ class Link:
 
     def halt(self, why: str) -> None:
         """Stop the machine at once, from any thread, without waiting for any; the reset follows."""
-        if not self._stopping.resetting:  # a hold after the reset would stay
+        if not self.stopping.resetting:  # a hold after the reset would stay
             self.send(HOLD)
         if self.error is None:
             self.error = HardwareError(f"{self._name}: {why}")
-        self._stopping.begin(time.monotonic())
+        self.stopping.begin(time.monotonic())
         if self.patience is not None:  # homing heeds nothing but a reset
             self.send(RESET)
 
@@ -261,11 +264,11 @@ class Link:
         """Stop the machine if it moves, end the threads, and let the port go, in a second or two at most."""
         if self._closing:
             return
-        if self._moving():
+        if self._active and self._moving():
             self.halt("the stage was closed in motion")
-        end = time.monotonic() + 2 * LONGEST
+        end = time.monotonic() + 2 * self.stopping.longest
         try:
-            while self._stopping.begun and not self._stopping.over and time.monotonic() < end:
+            while self.stopping.begun and not self.stopping.over and time.monotonic() < end:
                 time.sleep(_TICK)
         finally:  # also after another Ctrl-C
             self._closing = True
@@ -326,7 +329,7 @@ class Link:
                 if self._active and (homing or not self.locked):
                     self.halt(f"{reply}")
             case Banner():
-                if self._active and not self._stopping.begun:
+                if self._active and not self.stopping.begun:
                     self.halt("the controller was reset; it has lost its commands")
                 self.banner = reply
             case Setting() | Message():
@@ -334,7 +337,7 @@ class Link:
 
     def _report(self, status: Status, began: float) -> None:
         homed = not self.locked and self.patience is None
-        working = self._active and homed and not self._stopping.begun
+        working = self._active and homed and not self.stopping.begun
         self.seen = TimedStatus(status, self._times.answer(began), working)
         self._on_report(self.seen)
         if status.state != "idle":
@@ -373,24 +376,24 @@ class Link:
             now = time.monotonic()
             with self.lock:
                 self._check_answers(now)
-                if self._stopping.begun:
+                if self.stopping.begun:
                     self._advance_stop(now)
                 self._times.period = self._poll_period()
                 ask = self._times.due(now) and not self.gone
                 if ask:
                     self._times.ask(time.monotonic())
             if ask:
-                if self._stopping.begun and not self._stopping.resetting:  # lest one was lost, or undone
+                if self.stopping.begun and not self.stopping.resetting:  # lest one was lost, or undone
                     self.send(HOLD)
                 self.send(ASK)
             if not threading.main_thread().is_alive():  # the program ended and left us
-                if not self._stopping.begun:
+                if not self.stopping.begun:
                     self.halt("the program ended")
-                self._closing = self._stopping.over
+                self._closing = self.stopping.over
 
     def _check_answers(self, now: float) -> None:
         """Stop it when it has been silent for too long, or lost an answer."""
-        if not self._active or self._stopping.begun:
+        if not self._active or self.stopping.begun:
             return
         if self._times.silence(now) > self._limit() and not self._has_unread():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
@@ -413,7 +416,7 @@ class Link:
         """Return the seconds between two questions, as things stand."""
         if not self._active:
             return min(self._period, _OPENING_PERIOD)
-        return min(self._period, _MOVING_PERIOD) if self._moving() or self._stopping.begun else self._period
+        return min(self._period, _MOVING_PERIOD) if self._moving() or self.stopping.begun else self._period
 
     def _has_unread(self) -> bool:
         """Return whether there is something to be read that the reader did not get to."""
@@ -425,12 +428,12 @@ class Link:
     def _advance_stop(self, now: float) -> None:
         """Go on with a stop: reset once the machine is held, and wait until that is answered."""
         rested = self.seen.answer.asked if self.seen is not None and self.seen.status.rests else -math.inf
-        if self._stopping.reset(now, rested, self.gone):
+        if self.stopping.reset(now, rested, self.gone):
             self.window.clear()
             self.banner = None
             self.send(RESET)
-        elif self._stopping.resetting:
-            self._stopping.finish(now, self.gone or self.banner is not None)
+        elif self.stopping.resetting:
+            self.stopping.finish(now, self.gone or self.banner is not None)
         self.lock.notify_all()
 
     def _check(self) -> None:

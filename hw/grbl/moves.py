@@ -13,6 +13,9 @@ from mirrorskin.io import InputError
 SLOWEST = 1.0
 """Machine units a minute: GRBL goes no slower, whatever the feed."""
 
+SLOWEST_STEPS = 30.52
+"""Steps a second of the axis that makes most of them: the timer of an 8-bit controller counts no longer."""
+
 _STRAIGHT = "G53G1"  # in the machine's coordinates
 _PLANES = {("X", "Y"): "G17", ("Z", "X"): "G18", ("Y", "Z"): "G19"}
 _CENTRES = {"X": "I", "Y": "J", "Z": "K"}
@@ -37,6 +40,7 @@ class Axes:
         self._axes = settings.axes
         self._name = name
         self.speeds = {motion: axis.top_speed for motion, axis in self._axes.items()}
+        self._steps = dict.fromkeys(self.letters.values(), math.inf)
 
     @property
     def letters(self) -> dict[str, str]:
@@ -57,6 +61,10 @@ class Axes:
         """Lower the greatest speed of a motion to what the controller allows, machine units a second."""
         self.speeds[motion] = min(self.speeds[motion], rate / self._axes[motion].scale)
 
+    def limit_steps(self, motion: str, steps: float) -> None:
+        """Refuse speeds that are too low for a controller whose axis makes so many steps a machine unit."""
+        self._steps[self._axes[motion].letter] = steps
+
     def distance(self, one: Position, other: Position) -> float:
         """Return by how much two places differ in the axis where they differ most, machine units."""
         a, b = self.machine(one), self.machine(other)
@@ -73,7 +81,10 @@ class Axes:
         if length < 1e-6:
             return None
         duration = self._duration(start, place, speed)
-        return Command(f"{_STRAIGHT}{_words(after)}{self._feed(length / duration)}", duration)
+        feed = self._feed(length / duration)
+        steps = max(self._steps[letter] * abs(after[letter] - before[letter]) for letter in after)
+        self._check_steps(steps / duration, length / duration)
+        return Command(f"{_STRAIGHT}{_words(after)}{feed}", duration)
 
     def arcs(
         self, tilt: float, turns: float, rate: float, start: float, offset: Mapping[str, float]
@@ -86,7 +97,10 @@ class Axes:
         plane, sense = self._plane()
         self._check_rate(tilt, turns, rate)
         radius = tilt * self._axes["pitch"].scale
-        feed = self._feed(math.tau * rate * radius)
+        along = math.tau * rate * radius
+        feed = self._feed(along)
+        steps = min(self._steps[self._axes[motion].letter] for motion in ("pitch", "roll"))
+        self._check_steps(steps * along / math.sqrt(2), along)  # where both axes go alike
         count = max(1, math.ceil(2 * abs(turns) - _ROUNDING))
         step = math.tau * turns / count
         word = "G3" if step * sense > 0 else "G2"
@@ -167,6 +181,15 @@ class Axes:
                 f"{path / times[slowest]:.4g} {unit}"
             )
         return path / speed
+
+    def _check_steps(self, steps: float, speed: float) -> None:
+        """Refuse a move that would be faster than asked for: steps and machine units a second."""
+        if steps < SLOWEST_STEPS:
+            least = speed * SLOWEST_STEPS / steps
+            raise InputError(
+                f"{self._name}: {speed:.4g} mm/s (or degrees/s) are {steps:.3g} steps a second, and the"
+                f" controller makes no fewer than {SLOWEST_STEPS:g}; go {least:.3g} or faster, or in steps"
+            )
 
     def _feed(self, speed: float) -> str:
         """Return the feed word of a speed in machine units a second."""

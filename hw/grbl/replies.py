@@ -93,6 +93,7 @@ class Status:
     machine: Mapping[str, float] | None = None
     work: Mapping[str, float] | None = None
     offset: Mapping[str, float] | None = None  # how far the machine's are ahead of the work piece's
+    pins: str = ""  # switches that are pressed: axis letters, P probe, D door, H hold, R reset, S start
 
     @property
     def rests(self) -> bool:
@@ -159,8 +160,10 @@ def _status(text: str) -> Status | None:
     if state is None or state[1] not in _STATES:
         return None
     places: dict[str, Mapping[str, float] | None] = {}
+    pins = ""
     for field in fields:
         name, _, value = field.partition(":")
+        pins = value if name == "Pn" else pins
         if name in ("MPos", "WPos", "WCO"):
             places[name] = _coordinates(value)
             if places[name] is None:
@@ -168,7 +171,7 @@ def _status(text: str) -> Status | None:
     if ("MPos" in places) == ("WPos" in places):
         return None
     detail = int(state[2]) if state[2] else None
-    return Status(state[1].lower(), detail, places.get("MPos"), places.get("WPos"), places.get("WCO"))
+    return Status(state[1].lower(), detail, places.get("MPos"), places.get("WPos"), places.get("WCO"), pins)
 
 
 def _coordinates(text: str) -> Mapping[str, float] | None:

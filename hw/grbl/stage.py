@@ -12,8 +12,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.link import RESET, Link, TimedStatus, open_port
+from mirrorskin.hw.grbl.link import HOLDING, RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.replies import Message, Setting, Status
 from mirrorskin.hw.rig_file import StageSettings
@@ -34,7 +36,9 @@ _ARRIVED = (
 _RESTS = 3  # reports of rest elsewhere, until that is where it stays
 _MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
 _HOMING = 60.0  # seconds, where the settings do not say how long it takes
+_SLOWING = 1.25  # times the longest ramp, that a hold may take
 _LETTERS = "XYZABC"
+_UNLOCK = "release it with 'mirrorskin rig unlock'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +66,15 @@ class GrblStage(Closing):
         Where it is plugged in, its axes and limits.
     port : serial.Serial, optional
         What to speak through instead of opening ``settings.port``; it is closed with the stage.
+    unlock : bool
+        Whether to end an alarm, a hold or an open door that was there before, and to bear a pressed switch:
+        for a person who looked at the machine.
 
     Raises
     ------
     InputError
-        No such port, one in use, or one behind which there is no GRBL 1.1.
+        No such port, one in use, one behind which there is no GRBL 1.1, or a machine that another program
+        moves, that is locked though it is not homed, or that stands on a switch.
 
     Examples
     --------
@@ -77,11 +85,13 @@ class GrblStage(Closing):
     1.0
     """
 
-    def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:
+    def __init__(
+        self, settings: StageSettings, port: serial.Serial | None = None, *, unlock: bool = False
+    ) -> None:
         self.name = f"stage {settings.port}"
         self.limits = settings.limits
         self._settings = settings
-        self._axes = Axes(settings, self.name)
+        self.axes = Axes(settings, self.name)
         self._offset: Mapping[str, float] | None = None
         self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._latest: Report | None = None
@@ -93,7 +103,7 @@ class GrblStage(Closing):
         opened = open_port(settings.port, settings.baud, self.name) if port is None else port
         self._link = Link(opened, self.name, settings.timeout, 1 / settings.report_rate, self._on_report)
         try:
-            self._controller = self._open()
+            self._controller = self._open(unlock)
         except BaseException:
             self._link.close()
             raise
@@ -159,7 +169,7 @@ class GrblStage(Closing):
         for place in places:
             self.limits.check(place, self.name)
         ways = itertools.pairwise([self._destination(), *places])
-        commands = [line for way in ways if (line := self._axes.straight(*way, speed)) is not None]
+        commands = [line for way in ways if (line := self.axes.straight(*way, speed)) is not None]
         if commands:
             self._send(commands, places[-1], ramps=len(commands))
         else:
@@ -182,9 +192,9 @@ class GrblStage(Closing):
         before = self._destination()
         self.limits.check(Position(before.travel, tilt), self.name)
         assert self._offset is not None  # it is open only when this is known
-        commands = self._axes.arcs(tilt, turns, rate, start, self._offset)
+        commands = self.axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
-        if self._axes.distance(before, begin) > _ARRIVED:
+        if self.axes.distance(before, begin) > _ARRIVED:
             raise InputError(
                 f"{self.name}: a precession begins where the body leans by {math.degrees(tilt):.4g} degrees "
                 f"at the phase {math.degrees(start):.4g} degrees; move there first"
@@ -227,14 +237,13 @@ class GrblStage(Closing):
         """Stop the body if it moves, and let the port go."""
         self._link.close()
 
-    def _open(self) -> Controller:
+    def _open(self, unlock: bool) -> Controller:
         link, timeout = self._link, self._settings.timeout
         try:
-            controller = _greet(link, self.name, timeout)
+            controller = _greet(link, self.name, timeout, unlock)
             self._check(controller)
-            if self._in_state("alarm") and not self._settings.home:  # there are no switches to home against
-                link.ask("$X", timeout)
-                link.until(lambda: self._in_state("idle") or None, timeout, "unlock")
+            if not self._settings.home:  # there are no switches to home against
+                self._release(unlock)
             link.locked = self._in_state("alarm")
             self._await_offset()
             if not link.locked:
@@ -244,6 +253,26 @@ class GrblStage(Closing):
             raise InputError(str(error)) from error
         link.begin()
         return controller
+
+    def _release(self, unlock: bool) -> None:
+        """End an alarm if that was asked for; refuse it, and a switch that is pressed, otherwise."""
+        link, timeout = self._link, self._settings.timeout
+        pins = link.seen.status.pins if link.seen is not None else ""
+        pressed = sorted(set(pins) & set(self.axes.letters.values()))
+        if pressed and not unlock:
+            raise InputError(
+                f"{self.name}: a limit switch of {' and '.join(pressed)} is pressed: see where the machine "
+                f"stands, and {_UNLOCK}"
+            )
+        if not self._in_state("alarm"):
+            return
+        if not unlock:
+            raise InputError(
+                f"{self.name}: it is locked, since power came on or after an alarm, and may have lost its "
+                f"place: see where it stands, and {_UNLOCK}, or set home = true if it has switches"
+            )
+        link.ask("$X", timeout)
+        link.until(lambda: self._in_state("idle") or None, timeout, "unlock")
 
     def _in_state(self, state: str) -> bool:
         return self._link.seen is not None and self._link.seen.status.state == state
@@ -260,9 +289,9 @@ class GrblStage(Closing):
             ) from error
 
     def _check(self, controller: Controller) -> None:
-        """Refuse a controller that lacks an axis; go no faster than it does, and learn how soon."""
+        """Refuse a controller that lacks an axis; go no faster, slower or farther than it does."""
         known = (self._link.seen.status.machine or self._link.seen.status.work) if self._link.seen else None
-        for motion, letter in self._axes.letters.items():
+        for motion, letter in self.axes.letters.items():
             if known is not None and letter not in known:
                 raise InputError(f"{self.name}: the controller has no axis {letter}; correct the rig file")
             steps, rate, acceleration = (
@@ -271,10 +300,15 @@ class GrblStage(Closing):
             rate /= 60
             if steps > 0:
                 self._rounding = max(self._rounding, 0.5 / steps)
+                if not controller.firmware.lower().startswith("grblhal"):
+                    self.axes.limit_steps(motion, steps)
             if rate > 0:
-                self._axes.limit(motion, rate)
+                self.axes.limit(motion, rate)
             if acceleration > 0:
                 self._ramp = max(self._ramp, rate / acceleration)
+        self._link.stopping.holding = max(HOLDING, _SLOWING * self._ramp)
+        if controller.on(20):
+            self.limits = _within_soft_limits(self._settings, controller, self.name).limits
 
     def _on_report(self, seen: TimedStatus) -> None:
         """Take a report; the link's lock is held."""
@@ -300,7 +334,7 @@ class GrblStage(Closing):
         if machine is None and status.work is not None and self._offset is not None:
             machine = {letter: value + self._offset[letter] for letter, value in status.work.items()}
         try:
-            return None if machine is None else self._axes.place(machine)
+            return None if machine is None else self.axes.place(machine)
         except KeyError:  # fewer axes than asked for; refused when the stage is opened
             return None
 
@@ -344,7 +378,7 @@ class GrblStage(Closing):
             return None
         if self._target is None:
             return latest if link.rests > 1 else None
-        off = self._axes.distance(latest.position, self._target)
+        off = self.axes.distance(latest.position, self._target)
         if off <= _ARRIVED + self._rounding:
             return latest
         if link.rests >= _RESTS:
@@ -368,24 +402,50 @@ class GrblStage(Closing):
             raise
 
 
-def _greet(link: Link, name: str, timeout: float) -> Controller:
-    """Find out that GRBL 1.1 answers, bring it to rest, and read its settings."""
-    seen = _first(link, name, timeout)
+def _within_soft_limits(settings: StageSettings, controller: Controller, name: str) -> StageSettings:
+    """Return the settings with the limits of what the controller's soft limits leave of the axes."""
+    axes = {}
+    for motion, axis in settings.axes.items():
+        length = controller.settings.get(130 + _LETTERS.index(axis.letter), math.inf)
+        ends = sorted(axis.zero + axis.direction * value for value in axis.limits)
+        if ends[0] >= 0 and ends[1] <= length:  # homed at the other end, as some are built
+            continue
+        inside = sorted(axis.direction * (min(max(end, -length), 0.0) - axis.zero) for end in ends)
+        try:
+            axes[motion] = msgspec.structs.replace(axis, limits=(inside[0], inside[1]))
+        except ValueError as error:
+            raise InputError(
+                f"{name}: stage.{motion}.limits are {ends[0]:g} to {ends[1]:g} in the machine's coordinates, "
+                f"and its soft limits ($20) allow {-length:g} to 0: correct them, or zero"
+            ) from error
+    return msgspec.structs.replace(settings, **axes)
+
+
+def _greet(link: Link, name: str, timeout: float, unlock: bool) -> Controller:
+    """Find out that GRBL 1.1 answers and rests, and read its settings."""
+    seen = _first(link, name, timeout, unlock)
     if seen.status.state not in ("idle", "alarm"):  # left so by whoever spoke to it before
+        if not unlock:
+            raise InputError(
+                f"{name}: it is in the state {seen.status.state}, by another program or by hand: let that "
+                f"end, or {_UNLOCK}, which stops it"
+            )
         link.restart(timeout)
-        _first(link, name, timeout)
+        _first(link, name, timeout, unlock)
     controller = _identity(link, name, timeout)
     if controller.on(13):
         raise InputError(f"{name}: it reports in inches; set $13=0")
     return controller
 
 
-def _first(link: Link, name: str, timeout: float) -> TimedStatus:
+def _first(link: Link, name: str, timeout: float, unlock: bool) -> TimedStatus:
     """Wait for the first report; a controller that is locked hard answers only after a reset."""
     try:
         try:
             return link.until(lambda: link.seen, timeout / 2, "answer")
         except HardwareError:
+            if not unlock:
+                raise
             link.send(RESET)
             return link.until(lambda: link.seen, timeout / 2, "answer")
     except HardwareError as error:

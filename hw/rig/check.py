@@ -119,7 +119,8 @@ def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict 
     return Finding(part, what, found, verdict if remedy else "ok", remedy)
 
 
-def _in_words(position: Position, settings: StageSettings) -> str:
+def in_words(position: Position, settings: StageSettings) -> str:
+    """Return where the body stands, axis by axis, in their units."""
     return ", ".join(
         f"{name} {getattr(position, name) * axis.scale:.3f} {axis.unit}"
         for name, axis in settings.axes.items()
@@ -136,7 +137,7 @@ def _state(report: Report, settings: StageSettings) -> Finding:
 
 
 def _position(report: Report, stage: GrblStage, settings: StageSettings) -> Finding:
-    found = _in_words(report.position, settings)
+    found = in_words(report.position, settings)
     if settings.home:
         return Finding("stage", "position", f"{found} (before homing)")
     try:
@@ -293,7 +294,7 @@ def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     """
     if settings.home:
         stage.home()
-        yield Finding("move", "homing", f"done; now {_in_words(stage.report().position, settings)}")
+        yield Finding("move", "homing", f"done; now {in_words(stage.report().position, settings)}")
     home = stage.limits.nearest(stage.report().position)
     stage.move(home)
     stage.wait()

@@ -78,8 +78,8 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
     _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
     log = _FrameLog(rig, every)
-    there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed)))
-    back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed)))
+    there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed), timed=True))
+    back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed), timed=True))
     log.until(back.ended + _LONGEST_DELAY)
 
     path = Trapezoid.planned(way.length, speed)

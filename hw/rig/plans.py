@@ -608,20 +608,21 @@ def _check_steps(count: float, least: int) -> None:
         )
 
 
-def check_plan(plan: Plan, stage: StageSettings, name: str) -> None:
+def check_plan(plan: Plan, settings: StageSettings, name: str, stage: GrblStage | None = None) -> None:
     """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs.
 
     The body is lowered where x, y and twist are 0, and lifted straight up from where the scan ended: what
-    holds at both ends of the scan holds there, too.
+    holds at both ends of the scan holds there, too. A stage that is open knows its controller's bounds.
     """
     from mirrorskin.hw.grbl.moves import Axes
 
+    limits = settings.limits if stage is None else stage.limits
     ends = plan.ends if isinstance(plan, _Straight) else []
     for place in (plan.first, *ends):
-        stage.limits.check(place, name)
+        limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
-    axes = Axes(stage, name)
+    axes = Axes(settings, name) if stage is None else stage.axes
     if isinstance(plan, AxialPlan):
         # One turn is as possible as many, wherever the work coordinates begin.
         axes.arcs(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0, 0.0, axes.machine(Position()))

@@ -14,13 +14,13 @@ from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import RigSettings
 from mirrorskin.hw.stage import Position, Report
-from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
 if TYPE_CHECKING:
     from mirrorskin.hw.grbl.stage import GrblStage
 
 _TICK = 0.02  # seconds from one look of the guard to the next
+_PAUSE = 0.5  # seconds that the guard may be late: frames that come meanwhile have no time
 _STALL, _STALL_PERIODS = 0.1, 3  # seconds, and frame periods, without a frame that a move bears
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
@@ -28,10 +28,13 @@ _JOIN = 5.0
 
 
 class Move:
-    """A move of the stage that is under way, begun at a time; a thread waits for its end."""
+    """A move of the stage that is under way, begun at a time; a thread waits for its end.
 
-    def __init__(self, stage: GrblStage, began: float) -> None:
-        self._stage = stage
+    Of one that is `timed`, frames' arrivals tell where the body was.
+    """
+
+    def __init__(self, stage: GrblStage, began: float, timed: bool) -> None:
+        self._stage, self.timed = stage, timed
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
         self.error: Exception | None = None  # why it did not come to its end
         self.rest: Report | None = None  # where it came to rest
@@ -68,8 +71,9 @@ class Rig(Closing):
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
     the rig for anything gets the reason. Frames are missed after 0.1 s or three periods, whichever is longer;
-    a computer that is too busy to look that often gives the camera more time. Only moves that the rig begins
-    are guarded.
+    a computer that is too busy to look that often gives the camera more time. If it does not look for 0.5 s
+    in a timed move, when frames came is not known, and the move ends. Only moves that the rig begins are
+    guarded.
 
     Examples
     --------
@@ -83,6 +87,7 @@ class Rig(Closing):
         self._stall = _STALL
         self._move: Move | None = None
         self._fault: HardwareError | None = None
+        self._looked = -math.inf  # when the guard last did
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._watch, name=f"{self.name}: guard")
         self._guard.start()
@@ -115,20 +120,22 @@ class Rig(Closing):
         if self._fault is not None:
             raise self._fault
 
-    def begin(self, move: Callable[[], None]) -> Move:
-        """Tell the stage to move by calling `move`, and return while it does."""
+    def begin(self, move: Callable[[], None], timed: bool = False) -> Move:
+        """Tell the stage to move by calling `move`, and return while it does; see `Move`."""
         self.check()
         if self.camera.latest == -math.inf:
             self.take(1)  # a camera that is still starting is not missed later
         began = time.monotonic()
         move()
-        self._move = Move(self.stage, began)
+        self._move = Move(self.stage, began, timed)
         return self._move
 
     def end(self, move: Move) -> Report:
         """Wait until a move is over, and return where the body rests; HardwareError if the rig failed."""
         while not move.join(_SLICE):
             self.check()
+        while move.timed and self._looked < move.ended and self._guard.is_alive():
+            time.sleep(_TICK)
         self.check()
         if move.rest is None:
             raise HardwareError(f"{self.stage.name} did not say where it came to rest: look at its cable")
@@ -180,17 +187,20 @@ class Rig(Closing):
             # A guard that woke late means a busy machine, on which the camera's thread may be late as well.
             passed, last = time.monotonic() - last, time.monotonic()
             move, latest = self._move, self.camera.latest
-            if move is None or move.over:
+            paused = passed > _PAUSE and move is not None and move.timed and move.ended > last - passed
+            if move is None or (move.over and not paused):
+                self._looked = last
                 continue
             if move is not looked or latest != seen:
                 looked, seen, silence = move, latest, 0.0
             else:
                 silence += _TICK if passed < 2 * _TICK else _TICK / 2
-            fault = self._fault_after(silence)
+            fault = _paused(passed) if paused else self._fault_after(silence)
             if fault is not None:
                 self._fault = self._fault or fault  # first, or the stop would pass for the cause
                 self.stage.stop()
                 return
+            self._looked = last
 
     def _fault_after(self, silence: float) -> HardwareError | None:
         """Return what is wrong after so many seconds without a frame."""
@@ -205,12 +215,19 @@ class Rig(Closing):
         )
 
 
+def _paused(seconds: float) -> HardwareError:
+    return HardwareError(
+        f"this program stood still for {seconds:.2f} s while the stage moved, which was stopped: when frames"
+        " came is not known; let nothing pause it, and run less beside it"
+    )
+
+
 def open_rig(settings: RigSettings) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
-    A stage that has switches, and does not know where it is, is homed. One that the file says to have
-    switches, and that does not home, is refused: nobody would know where it is. InputError if one of them is
-    missing, busy, or not what the file says; HardwareError if no frame came.
+    A stage that the file says to have switches is homed, since a controller does not tell whether it was,
+    or was only unlocked. InputError if one of them is missing, busy, or not what the file says; HardwareError
+    if no frame came.
     """
     from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.video import VideoCamera
@@ -222,12 +239,6 @@ def open_rig(settings: RigSettings) -> Rig:
         stage = GrblStage(settings.stage)
         opening.callback(stage.close)
         if settings.stage.home:
-            if not stage.homes:
-                raise InputError(
-                    f"{stage.name}: the rig file asks for homing, and it is switched off; set $22=1, or "
-                    "home = false"
-                )
-            if stage.report().state == "alarm":
-                stage.home()
+            stage.home()
         opening.pop_all()
     return Rig(stage, camera, settings)

@@ -24,7 +24,6 @@ from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 _DARK_FRAMES = 16
 
 UNKNOWN_DELAY = 0.2  # seconds that a camera's frames are taken to be late at most, where it is not known
-_UPRIGHT = 1e-4  # rad
 
 
 class Scan(Closing):
@@ -45,7 +44,7 @@ class Scan(Closing):
         self._origin: float | None = None
         self._complete = False
         self._live: list[Floats] = []
-        check_plan(plan, rig.settings.stage, rig.stage.name)
+        check_plan(plan, rig.settings.stage, rig.stage.name, rig.stage)
 
     @property
     def expected(self) -> int:
@@ -106,10 +105,8 @@ class Scan(Closing):
 
     def lift(self) -> Report:
         """Bring the body upright, lift it straight up to the end of its travel, and go to the middle."""
-        here, limits = self.rig.stage.report().position, self.rig.stage.limits
-        upright, high = limits.nearest(here), limits.travel[0]
-        ways = [upright] if here.tilt > _UPRIGHT else []
-        return self._visit(*ways, replace(upright, travel=high), Position(high))
+        stage = self.rig.stage
+        return self._visit(*stage.limits.way_up(stage.report().position))
 
     def close(self) -> None:
         """Lift the body; stop the stage, if it is under way."""

@@ -134,7 +134,7 @@ class SweepScan(Scan):
         rests = stage.report().time + self.delay.seconds
         while (taken := self.rig.take(most)).time[-1] <= rests:
             pass
-        self._move = self.rig.begin(lambda: plan.begin(stage))
+        self._move = self.rig.begin(lambda: plan.begin(stage), timed=True)
         self._live_track = LiveTrack(self._path, self._move.began)
         self._reports = [(self._move.began, 0.0)]
         return taken, slice(int(np.searchsorted(taken.time, rests, side="right")), len(taken.time))

@@ -118,14 +118,72 @@ def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
     assert port.machine.position() == before
 
 
-def test_a_move_that_the_controller_refuses_ends_the_check(controller):
-    # Homed to -0.3 mm, it is sent up by 0.5 mm, and its soft limits refuse what lies above 0.
-    port = controller(home=True, changes=[("zero = -5.0", "zero = -3.0")], s20=1.0)
-    ended = run("rig", "check", "rig.toml", "--move", "--json")
-    assert ended.code == 1
-    assert json.loads(ended.out)["sound"] is False
-    assert re.fullmatch(r"mirrorskin: stage .*(error:15|ALARM:2) .*\n", ended.said)
-    assert not port.machine.moving()
+def test_what_soft_limits_do_not_allow_is_refused_before_anything_moves(controller):
+    port = controller(home=True, s20=1.0)
+    before = port.machine.position()
+    ended = run("rig", "check", "rig.toml", "--move")
+    assert ended.code == 2
+    assert re.fullmatch(
+        r"mirrorskin: stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*\n", ended.said
+    )
+    assert port.machine.position() == before
+
+
+def test_a_stage_is_moved_by_hand_within_its_limits(controller):
+    machine = controller().machine
+    ended = run("rig", "jog", "rig.toml", "travel", "--by", "0.5mm")
+    assert (ended.code, ended.said) == (0, "")
+    assert ended.out.startswith("rig: travel -4.500 mm, pitch 0.000 deg")
+    assert machine.position() == pytest.approx({"X": -1.0, "Y": -1.0, "Z": -1.5})
+    ended = run("rig", "jog", "rig.toml", "travel", "--by", "-1mm")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "beyond the axis" in ended.said
+    assert run("rig", "jog", "rig.toml", "twist", "--by", "1deg").said.startswith(
+        "mirrorskin: rig.toml has no [stage.twist]"
+    )
+
+
+def test_a_leaning_stage_is_lifted_upright(controller):
+    port = controller()
+    port.machine.receive(b"G53G1X2Y1Z-2F1800\n")
+    end = time.monotonic() + 10
+    while port.machine.position()["X"] != 1.0:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    ended = run("rig", "lift", "rig.toml")
+    assert (ended.code, ended.said) == (0, "")
+    assert ended.out.startswith("rig: travel -5.000 mm, pitch 0.000 deg, roll 0.000 deg")
+
+
+def test_an_alarm_is_ended_only_by_unlocking(controller):
+    port = controller()
+    port.alarm(9)
+    ended = run("rig", "lift", "rig.toml")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "locked" in ended.said
+    assert "'mirrorskin rig unlock'" in ended.said
+    assert port.machine.state == "Alarm"
+    assert run("rig", "unlock", "rig.toml").code == 0
+    assert port.machine.state == "Idle"
+
+
+def test_a_hold_of_someone_else_is_left_alone(controller):
+    port = controller()
+    port.machine.receive(b"G53G1Z-8F100\n")
+    time.sleep(0.05)
+    port.machine.receive(b"!")
+    time.sleep(0.2)
+    ended = run("rig", "check", "rig.toml")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "in the state hold" in ended.said
+    assert port.machine.state == "Hold:0"
+
+
+def test_a_stage_with_switches_is_homed_by_hand(controller):
+    machine = controller(home=True).machine
+    assert run("rig", "unlock", "rig.toml").out.endswith("locked: home it with 'mirrorskin rig home'\n")
+    assert run("rig", "home", "rig.toml").code == 0
+    assert machine.position() == pytest.approx({"X": -0.3, "Y": -0.3, "Z": -0.3})
 
 
 def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(controller):

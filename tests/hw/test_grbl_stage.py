@@ -10,10 +10,11 @@ from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig_file import TiltAxis
+from mirrorskin.hw.rig_file import TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
 
+DOWN = TravelAxis(letter="Z", direction=-1, zero=-5.0, limits=(-5.0, 3.0), speed=20.0)
 LEAN = math.radians(2.5)
 
 
@@ -22,9 +23,9 @@ def opened():
     """Open a stage on a scripted port, and close it in the end; no thread is left."""
     stages, before = [], threading.active_count()
 
-    def open_stage(port=None, **changes):
+    def open_stage(port=None, unlock=False, **changes):
         port = ScriptedGrbl() if port is None else port
-        stages.append(GrblStage(stage_settings(**changes), port))
+        stages.append(GrblStage(stage_settings(**changes), port, unlock=unlock))
         return stages[-1], port
 
     yield open_stage
@@ -106,6 +107,26 @@ def test_what_is_beyond_the_limits_is_refused_before_anything_is_sent(opened):
     assert stage.error is None
 
 
+def test_a_speed_below_the_firmwares_is_refused_before_anything_is_sent(opened):
+    stage, port = opened(ScriptedGrbl(settings={102: 250}))
+    sent = list(port.lines)
+    with pytest.raises(InputError, match=r"no fewer than 30\.5.*go 0\.122 or faster"):
+        stage.move(Position(1.0), 0.02)
+    assert port.lines == sent
+    stage.move(Position(0.1), 0.2)
+    stage.wait()
+
+
+def test_soft_limits_bound_the_axes(opened):
+    stage, _ = opened(ScriptedGrbl(settings={132: 6}, place=(30.0, 40.0, -1.0)), travel=DOWN)
+    assert stage.limits.travel == (-5.0, 1.0)
+
+
+def test_a_slow_axis_has_longer_for_its_hold(opened):
+    stage, _ = opened(ScriptedGrbl(settings={122: 10, 112: 600}))
+    assert stage._link.stopping.holding == pytest.approx(1.25)
+
+
 def test_reports_tell_of_the_time_when_they_were_so(opened):
     stage, _ = opened()
     begun = time.monotonic()
@@ -117,8 +138,12 @@ def test_reports_tell_of_the_time_when_they_were_so(opened):
     assert max(late) - min(late) < 0.1
 
 
-def test_a_locked_stage_without_switches_is_unlocked(opened):
-    stage, port = opened(ScriptedGrbl(state="Alarm"))
+def test_a_locked_stage_without_switches_is_refused_until_it_is_unlocked(opened):
+    port = ScriptedGrbl(state="Alarm")
+    with pytest.raises(InputError, match="rig unlock"):
+        opened(port)
+    assert "$X" not in port.lines
+    stage, port = opened(ScriptedGrbl(state="Alarm"), unlock=True)
     assert "$X" in port.lines
     stage.move(Position(0.1))
     stage.wait()
@@ -149,11 +174,20 @@ def test_homing_that_is_switched_off_is_refused(opened):
         stage.home()
 
 
-def test_a_stage_left_moving_by_others_is_held_and_reset(opened):
+def test_a_pressed_switch_is_refused_where_nothing_is_homed(opened):
+    with pytest.raises(InputError, match="limit switch of Z is pressed"):
+        opened(ScriptedGrbl(pins="ZP"))
+
+
+def test_what_moves_by_others_is_left_alone_unless_it_is_unlocked(opened):
     port = ScriptedGrbl()
     port._plan.append(([30.0, 40.0, 0.0], 60.0))
     port.state = "Run"
-    stage, _ = opened(port)
+    with pytest.raises(InputError, match="in the state run"):
+        opened(port)
+    assert not set(b"!\x18") & set(port.bytes)
+    port.closed = False
+    stage, _ = opened(port, unlock=True)
     assert stage.report().state == "idle"
     assert port.bytes.index(b"!") < port.bytes.index(b"\x18")
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from mirrorskin.hw.grbl.link import HOLDING, LONGEST, Stopping
+from mirrorskin.hw.grbl.link import HOLDING, Stopping
 from mirrorskin.hw.grbl.report_times import ReportTimes
 
 
@@ -104,9 +104,9 @@ def test_a_stop_waits_neither_for_a_rest_nor_for_an_answer_for_long():
     stopping.begin(5.0)
     assert not stopping.reset(5.0 + 0.9 * HOLDING, -math.inf, False)
     assert stopping.reset(5.0 + 1.1 * HOLDING, -math.inf, False)
-    stopping.finish(5.0 + LONGEST, False)
+    stopping.finish(5.0 + stopping.longest, False)
     assert not stopping.over
-    stopping.finish(5.0 + 1.1 * LONGEST, False)
+    stopping.finish(5.0 + 1.1 * stopping.longest, False)
     assert stopping.over
 
 

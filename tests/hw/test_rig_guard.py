@@ -159,3 +159,25 @@ def test_a_defect_while_the_stage_waits_is_not_hidden(rig):
     rig.stage.wait = lambda: 1 / 0
     with pytest.raises(ZeroDivisionError):
         rig.go(Position(0.0))
+
+
+def test_a_program_that_stood_still_in_a_timed_move_ends_it(rig, monkeypatch):
+    waited = rig._closing.wait
+
+    def paused(seconds):
+        monkeypatch.setattr(rig._closing, "wait", waited)
+        return waited(0.6)
+
+    move = rig.begin(lambda: rig.stage.move(Position(2.0), 5.0), timed=True)
+    monkeypatch.setattr(rig._closing, "wait", paused)
+    with pytest.raises(HardwareError, match=r"stood still for 0\.[67].* s while the stage moved"):
+        rig.end(move)
+    assert rig.stage.stops
+
+
+def test_a_program_that_stood_still_in_steps_goes_on(rig, monkeypatch):
+    waited = rig._closing.wait
+    move = rig.begin(lambda: rig.stage.move(Position(2.0), 5.0))
+    monkeypatch.setattr(rig._closing, "wait", lambda seconds: waited(0.6))
+    rig.end(move)
+    assert rig.stage.stops == []

@@ -13,6 +13,7 @@ import numpy as np
 
 from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.moves import Axes
 from mirrorskin.hw.rig.plans import Trapezoid
 from mirrorskin.hw.rig_file import (
     CameraSettings,
@@ -53,6 +54,7 @@ class FakeStage:
     """Goes along trapezoids, exactly; what it reports is rounded as GRBL does."""
 
     name = "fake stage"
+    axes = Axes(settings().stage, name)
 
     def __init__(self, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
         self.limits = limits

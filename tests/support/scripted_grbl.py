@@ -57,6 +57,7 @@ class ScriptedGrbl:
         self.size = behaviour.get("size", 128)
         self.answers = dict(behaviour.get("answers", {}))  # a line to what it is answered instead
         self.state = behaviour.get("state", "Idle")
+        self.pins = behaviour.get("pins", "")  # switches that are pressed
         self.lines, self.bytes, self.fill = [], bytearray(), 0
         self.silent = self.gone = self.closed = False
         self.on_move = None
@@ -144,6 +145,7 @@ class ScriptedGrbl:
     def _tell(self):
         at = [p - o for p, o in zip(self.place, self.offset, strict=True)] if self.work else self.place
         text = f"<{self.state}|{'WPos' if self.work else 'MPos'}:{_numbers(at)}|FS:0,0"
+        text += f"|Pn:{self.pins}" if self.pins else ""
         self._reports += 1
         if self._reports % 5 == 3:
             text += f"|WCO:{_numbers(self.offset)}"

@@ -17,6 +17,7 @@ from mirrorskin.hw.rig import rig as rigs
 def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
     """Let emulators be late, where other programs have the processors; that is no fault of the rig."""
     patch.setattr(rigs, "_STALL", seconds)
+    patch.setattr(rigs, "_PAUSE", seconds)
     patch.setattr(Link, "_limit", lambda link: link.patience or seconds)
 
 
