@@ -8,7 +8,7 @@ from typing import Annotated
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.demo import force, presses, rotation, shapes, vibration
+from mirrorskin.cli.demo import force, presses, rotation, shapes, slip, vibration
 from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json
 
@@ -35,8 +35,9 @@ def command(
     shaped = shapes.run(output, device)
     forces = force.run(force.EXPERIMENT, output, device)
     vibrated = vibration.run(vibration.EXPERIMENT, output, device)
+    slipped = slip.run(slip.EXPERIMENT, output, device)
     if as_json:
-        print_json({**pressed, **turned, **shaped, "force": forces, "vibration": vibrated})
+        print_json({**pressed, **turned, **shaped, "force": forces, "vibration": vibrated, "slip": slipped})
         return
     presses.print_outcomes(pressed)
     click.echo()
@@ -47,5 +48,7 @@ def command(
     force.print_outcomes(forces)
     click.echo()
     vibration.print_outcomes(vibrated)
+    click.echo()
+    slip.print_outcomes(slipped)
     first = presses.EXPERIMENTS[0].name
     click.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -11,15 +11,16 @@ import pytest
 from commands import run, small_experiments, small_rotations
 
 from mirrorskin import io, view
-from mirrorskin.cli.demo import force, presses, rotation, vibration
+from mirrorskin.cli.demo import force, presses, rotation, slip, vibration
 
 FULL, ROTATIONS = presses.EXPERIMENTS, rotation.EXPERIMENTS
 WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
-DRAWN = *MADE, "fig10a", "fig10b", "fused", "force", "vibration"
+DRAWN = *MADE, "fig10a", "fig10b", "fused", "force", "vibration", "slip"
 SHAKEN = vibration.Experiment(strokes=4, size=60)
+SLIPPED = slip.Experiment(frames=10, size=80)
 FORCES = force.Experiment(scale=(), found=(force.Press(6, 0.6),), size=48)
 
 # The table's rows.
@@ -54,6 +55,7 @@ def shown(tmp_path_factory):
         patch.setattr(rotation, "EXPERIMENTS", small_rotations())
         patch.setattr(force, "EXPERIMENT", FORCES)
         patch.setattr(vibration, "EXPERIMENT", SHAKEN)
+        patch.setattr(slip, "EXPERIMENT", SLIPPED)
         patch.setattr(view, "height_figure", watch)
         patch.setattr(view, "normal_figure", watch_normals)
         patch.setattr(view, "surface_figure", watch_surfaces)
@@ -152,6 +154,21 @@ def test_the_table_of_forces_tells_found_and_true_newtons(shown):
     assert "truth: the twin's" in " ".join(shown[0][start + 2 : -1])
 
 
+def test_the_table_of_slip_tells_what_was_found_beside_the_closed_forms(shown):
+    start = next(number for number, line in enumerate(shown[0]) if "closed form" in line)
+    head, *rows = (cells(line) for line in shown[0][start : start + 8])
+    told = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+    for way, tolerance in (("slide", 0.12), ("twist", 0.05)):
+        stuck = {name: float(one) for name, one in told[f"{way}, stick radius"].items() if one[0].isdigit()}
+        assert stuck["truth"] == pytest.approx(stuck["closed form"], abs=0.02)
+        assert stuck["found"] == pytest.approx(stuck["truth"], abs=tolerance)
+        assert float(told[f"{way}, displacement"]["found"]) < 8
+    assert float(told["twist, angle"]["found"]) == pytest.approx(
+        float(told["twist, angle"]["truth"]), rel=0.02
+    )
+    assert "stick radius: at the end" in " ".join(shown[0][start + 8 : -1])
+
+
 def cells(row):
     return [cell.strip() for cell in row.split("  ") if cell.strip()]
 
@@ -163,8 +180,9 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     monkeypatch.setattr(rotation, "EXPERIMENTS", small_rotations())
     monkeypatch.setattr(force, "EXPERIMENT", FORCES)
     monkeypatch.setattr(vibration, "EXPERIMENT", SHAKEN)
-    for figure in ("force_figure", "height_figure", "normal_figure", "surface_figure", "vibration_figure"):
-        monkeypatch.setattr(view, figure, lambda *given, **style: None)
+    monkeypatch.setattr(slip, "EXPERIMENT", SLIPPED)
+    for figure in ("force", "height", "normal", "slip", "surface", "vibration"):
+        monkeypatch.setattr(view, f"{figure}_figure", lambda *given, **style: None)
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
     assert {name: list(scores) for name, scores in told["fig6"].items()} == {
