@@ -8,7 +8,7 @@ from typing import Annotated
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.demo import force, presses, rotation, shapes, slip, vibration
+from mirrorskin.cli.demo import force, pose, presses, rotation, shapes, slip, vibration
 from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json
 
@@ -36,8 +36,10 @@ def command(
     forces = force.run(force.EXPERIMENT, output, device)
     vibrated = vibration.run(vibration.EXPERIMENT, output, device)
     slipped = slip.run(slip.EXPERIMENT, output, device)
+    followed = pose.run(pose.EXPERIMENT, output, device)
     if as_json:
-        print_json({**pressed, **turned, **shaped, "force": forces, "vibration": vibrated, "slip": slipped})
+        others = {"force": forces, "vibration": vibrated, "slip": slipped, "pose": followed}
+        print_json({**pressed, **turned, **shaped, **others})
         return
     presses.print_outcomes(pressed)
     click.echo()
@@ -50,5 +52,7 @@ def command(
     vibration.print_outcomes(vibrated)
     click.echo()
     slip.print_outcomes(slipped)
+    click.echo()
+    pose.print_outcomes(followed)
     first = presses.EXPERIMENTS[0].name
     click.echo(f"recordings, results and figures are in {output}: look at {output / first}.png")

@@ -11,16 +11,17 @@ import pytest
 from commands import run, small_experiments, small_rotations
 
 from mirrorskin import io, view
-from mirrorskin.cli.demo import force, presses, rotation, slip, vibration
+from mirrorskin.cli.demo import force, pose, presses, rotation, slip, vibration
 
 FULL, ROTATIONS = presses.EXPERIMENTS, rotation.EXPERIMENTS
 WAYS = "paper", "exact", "paper, registered", "exact, registered"
 PAPERS, SENSORS = "conform-ideal", ["conform-ideal", "conform-cylinder", "elastic-ideal", "elastic-cylinder"]
 MADE = {"fig5": SENSORS, "fig6": SENSORS[:2], "fig6-soft": SENSORS}
 
-DRAWN = *MADE, "fig10a", "fig10b", "fused", "force", "vibration", "slip"
+DRAWN = *MADE, "fig10a", "fig10b", "fused", "force", "vibration", "slip", "pose"
 SHAKEN = vibration.Experiment(strokes=4, size=60)
 SLIPPED = slip.Experiment(frames=10, size=80)
+FOLLOWED = pose.Experiment(touches=4, size=60)
 FORCES = force.Experiment(scale=(), found=(force.Press(6, 0.6),), size=48)
 
 # The table's rows.
@@ -56,6 +57,7 @@ def shown(tmp_path_factory):
         patch.setattr(force, "EXPERIMENT", FORCES)
         patch.setattr(vibration, "EXPERIMENT", SHAKEN)
         patch.setattr(slip, "EXPERIMENT", SLIPPED)
+        patch.setattr(pose, "EXPERIMENT", FOLLOWED)
         patch.setattr(view, "height_figure", watch)
         patch.setattr(view, "normal_figure", watch_normals)
         patch.setattr(view, "surface_figure", watch_surfaces)
@@ -70,6 +72,7 @@ def test_each_sensor_s_recording_and_result_and_each_figure_are_kept(shown):
              (".h5", "-result.h5")}  # fmt: skip
     files |= {"fig10a.h5"} | {f"fig10a-{way.replace(', ', '-')}-result.h5" for way in WAYS}
     files |= {f"vibration-{one}-result.h5" for one in ("strokes", "rocked", "dither")}
+    files |= {"pose-first-result.h5", "pose-last-result.h5"}
     files |= {"force-cal.h5", "force-0-result.h5", "fused-result.h5"} | {f"{name}.png" for name in DRAWN}
     assert {path.name for path in folder.iterdir()} == files
     for name in DRAWN:
@@ -169,6 +172,20 @@ def test_the_table_of_slip_tells_what_was_found_beside_the_closed_forms(shown):
     assert "stick radius: at the end" in " ".join(shown[0][start + 8 : -1])
 
 
+def test_the_table_of_motion_tells_where_the_object_was_found(shown):
+    start = next(number for number, line in enumerate(shown[0]) if line.startswith("motion "))
+    head, *rows = (cells(line) for line in shown[0][start : start + 7])
+    told = {row[0]: dict(zip(head[1:], map(float, row[1:]), strict=True)) for row in rows}
+    for axis in "xyz":
+        shift, turn = told[axis], told[f"turn about {axis}"]
+        assert shift["found"] == pytest.approx(shift["truth"], abs=0.015)  # a fifth of a pixel
+        assert turn["found"] == pytest.approx(turn["truth"], abs=0.25)
+        assert 0 < shift["sigma"] < 0.01
+        assert 0 < turn["sigma"] < 0.2
+    assert told["turn about z"]["truth"] == 40
+    assert "RMS on the way: " in " ".join(shown[0][start + 7 : -1])
+
+
 def cells(row):
     return [cell.strip() for cell in row.split("  ") if cell.strip()]
 
@@ -181,7 +198,8 @@ def test_json_tells_the_scores(tmp_path, monkeypatch):
     monkeypatch.setattr(force, "EXPERIMENT", FORCES)
     monkeypatch.setattr(vibration, "EXPERIMENT", SHAKEN)
     monkeypatch.setattr(slip, "EXPERIMENT", SLIPPED)
-    for figure in ("force", "height", "normal", "slip", "surface", "vibration"):
+    monkeypatch.setattr(pose, "EXPERIMENT", FOLLOWED)
+    for figure in ("force", "height", "normal", "pose", "slip", "surface", "vibration"):
         monkeypatch.setattr(view, f"{figure}_figure", lambda *given, **style: None)
     ended = run("demo", "-o", tmp_path, "--json")
     told = json.loads(ended.out)
