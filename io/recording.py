@@ -23,7 +23,7 @@ from mirrorskin.io.recorder import checksums
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.result import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
-from mirrorskin.io.stack import FrameSubset, Stack, open_stack
+from mirrorskin.io.stack import Stack
 from mirrorskin.io.types import (
     FRAME_DTYPES,
     UNDISTORTED,
@@ -114,8 +114,7 @@ class Recording(Closing):
         start = self._next
         if start >= self.shape[0]:
             return None
-        stop = self._stack.end(start, min(start + len(out), self.shape[0]))
-        frames = self._stack.read(start, stop, out)
+        frames = self._stack.read(start, out)
         return self._block(frames, lent=not np.may_share_memory(frames, out))
 
     def lend(self, most: int) -> Block | None:
@@ -124,8 +123,7 @@ class Recording(Closing):
         None at the end, and where frames have to be read. Their pages are the system's, which takes them back
         when it needs memory.
         """
-        start = self._next
-        frames = self._stack.lend(start, min(start + most, self.shape[0]))
+        frames = self._stack.lend(self._next, most) if self._next < self.shape[0] else None
         return None if frames is None else self._block(frames, lent=True)
 
     def _block(self, frames: NDArray[Any], lent: bool) -> Block:
@@ -269,16 +267,16 @@ def open_recording(
         cut = _cut(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size, override_motion)
-        state_of_part, truth = state.of(slice(*cut.frames)), layout.truth()
+        state, truth, numbers = state.of(slice(*cut.frames)), layout.truth(), np.arange(*cut.frames)
         if live:
-            chosen = _used(str(path), state_of_part, travel, phase)
-            state_of_part, positions = state_of_part.of(chosen), layout.live(header.motion, chosen)
+            chosen = _used(str(path), state, travel, phase)
+            state, positions = state.of(chosen), layout.live(header.motion, chosen)
+            numbers = numbers[chosen]
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, along(given, shape[0]))
-        opened = open_stack(stack, str(path), cut, memory_limit, threads, shape[0])
-        fetched = FrameSubset(opened, chosen) if live else opened
-        recording = Recording(file, stack, fetched, cut, header, positions, truth, state_of_part, live)
+        frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads)
+        recording = Recording(file, stack, frames_of, cut, header, positions, truth, state, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
@@ -117,36 +117,11 @@ def source_region(process: Mapping[str, object]) -> Region | None:
     return next((region for region in map(Region.read, texts) if region is not None), None)
 
 
-@dataclass(frozen=True, slots=True)
-class Selection:
+class Selection(NamedTuple):
     """What is wanted of a dataset: the frames, first and end, and the region of the picture."""
 
     frames: Span
     region: Region
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows and columns."""
-        return (self.frames[1] - self.frames[0], *self.region.shape)
-
-    @property
-    def spans(self) -> tuple[Span, Span, Span]:
-        """First and end of the frames, the rows and the columns."""
-        return self.frames, self.region.rows, self.region.columns
-
-    def overlap(self, other: Selection) -> Selection:
-        """Return what is in both; there must be something."""
-        frames, rows, columns = (
-            (max(a, c), min(b, d)) for (a, b), (c, d) in zip(self.spans, other.spans, strict=True)
-        )
-        return Selection(frames, Region(rows, columns))
-
-    def within(self, outer: Selection) -> tuple[slice, slice, slice]:
-        """Return what cuts this out of an array that holds another selection."""
-        frames, rows, columns = (
-            slice(a - c, b - c) for (a, b), (c, _) in zip(self.spans, outer.spans, strict=True)
-        )
-        return frames, rows, columns
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,8 @@ import hdf5plugin
 import numpy as np
 
 from mirrorskin import io
-from mirrorskin.io.chunked_stack import ChunkReader, Hdf5Reader
+from mirrorskin.io.chunks import Chunks
+from mirrorskin.io.stack import Hdf5Frames
 
 GIVEN = {"motion": "horizontal"}
 
@@ -89,18 +90,18 @@ def ours(path, room, **given):
 def count_unpacked(monkeypatch):
     """Count how often each chunk is unpacked, or asked of HDF5."""
     counts = Counter()
-    decode, fetch = ChunkReader._decode, Hdf5Reader.fetch
+    decode, fetch = Chunks._decode, Hdf5Frames.fetch
 
     def counted(self, position, out, room):
         counts[position] += 1
         decode(self, position, out, room)
 
-    def asked(self, cut, out):
-        spans = (cut.frames, cut.region.rows, cut.region.columns)
-        ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self.chunk, strict=True)]
+    def asked(self, frames, region, out):
+        spans, chunk = (frames, region.rows, region.columns), self._dataset.chunks or (1, *out.shape[1:])
+        ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, chunk, strict=True)]
         counts.update((i, j, k) for i in ranges[0] for j in ranges[1] for k in ranges[2])
-        fetch(self, cut, out)
+        fetch(self, frames, region, out)
 
-    monkeypatch.setattr(ChunkReader, "_decode", counted)
-    monkeypatch.setattr(Hdf5Reader, "fetch", asked)
+    monkeypatch.setattr(Chunks, "_decode", counted)
+    monkeypatch.setattr(Hdf5Frames, "fetch", asked)
     return counts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import os
 import subprocess
 import sys
 import zlib
@@ -17,7 +18,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mirrorskin import io
-from mirrorskin.io import chunked_stack
 from mirrorskin.io.selection import Region
 
 SHAPE = (11, 13, 17)
@@ -148,17 +148,17 @@ def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
 
 
 def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
-    from mirrorskin.io.chunked_stack import ChunkReader
+    from mirrorskin.io.chunks import Chunks
 
     path = write(tmp_path / "a.h5", compressible((30, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
-    decode = ChunkReader._decode
+    decode = Chunks._decode
 
     def interrupted(self, position, out, room):
         if position[0] == 20:
             raise KeyboardInterrupt
         decode(self, position, out, room)
 
-    monkeypatch.setattr(ChunkReader, "_decode", interrupted)
+    monkeypatch.setattr(Chunks, "_decode", interrupted)
     with io.open_recording(path, motion="horizontal", threads=3) as recording:
         out = np.zeros((30, 50, 70), "u2")
         with pytest.raises(KeyboardInterrupt):
@@ -224,7 +224,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
     def full(file, start, size):
         raise OSError(28, "full")
 
-    monkeypatch.setattr(chunked_stack.os, "posix_fallocate", full)
+    monkeypatch.setattr(os, "posix_fallocate", full)
     line = (
         r"a\.h5: /x is unpacked to disk, 1\.06e-05 GB: No space left on device; name a folder with more room"
     )
