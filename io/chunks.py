@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.codecs import Bytes, Codec, decode
+from mirrorskin.io.hdf5 import chunks_of
 from mirrorskin.io.selection import Place, Region, Span
 
 
@@ -49,8 +50,7 @@ def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -
     """
     if dataset.file.userblock_size:
         return "user block"  # HDF5's versions differ in what they count from
-    chunks: list[h5py.h5d.StoreInfo] = []
-    dataset.id.chunk_iter(chunks.append)
+    chunks = chunks_of(dataset)
     grid = tuple(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
     places = np.array([chunk.chunk_offset for chunk in chunks], np.int64) // dataset.chunks
     values = np.array([(chunk.byte_offset, chunk.size, chunk.filter_mask) for chunk in chunks], np.int64)

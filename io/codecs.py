@@ -96,19 +96,14 @@ def _lzf(_values: tuple[int, ...]) -> Codec:
 
 
 def _bitshuffle(values: tuple[int, ...]) -> Codec:
-    """Bitshuffle: blocks of which the bits are sorted by their place; LZ4, Zstandard or nothing packs them.
+    """Bitshuffle: blocks of which the bits are sorted by their place; LZ4 or Zstandard packs them.
 
-    Packed chunks begin with their unpacked size and that of a block; each block begins with its packed size.
+    Chunks begin with their unpacked size and that of a block; each block begins with its packed size.
     """
     itemsize, method = values[2], values[4] if len(values) > 4 else 0
-    name = {0: "bshuf_bitunshuffle", 2: "bshuf_decompress_lz4", 3: "bshuf_decompress_zstd"}[method]
+    name = {2: "bshuf_decompress_lz4", 3: "bshuf_decompress_zstd"}[method]
     function = _function(_plugin("bshuf"), name, ctypes.c_int64, _POINTER, _POINTER, _SIZE, _SIZE, _SIZE)
     default = _function(_plugin("bshuf"), "bshuf_default_block_size", _SIZE, _SIZE)(itemsize or 1)
-
-    def unshuffle(packed: Bytes, out: Bytes) -> None:
-        _check(packed.size, out.size)
-        block = values[3] if len(values) > 3 else 0
-        _check(function(packed.ctypes.data, out.ctypes.data, out.size // itemsize, itemsize, block), out.size)
 
     def decode(packed: Bytes, out: Bytes) -> None:
         if packed.size < _HEAD.size:
@@ -121,7 +116,7 @@ def _bitshuffle(values: tuple[int, ...]) -> Codec:
         used = function(packed.ctypes.data + _HEAD.size, out.ctypes.data, count, itemsize, block)
         _check(used, packed.size - _HEAD.size)
 
-    return decode if method else unshuffle
+    return decode
 
 
 def _check_blocks(packed: Bytes, size: int, block: int, itemsize: int) -> None:

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.hdf5 import Hdf5File, virtual_source
+from mirrorskin.io.hdf5 import Hdf5File, chunks_of, virtual_source
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
 
@@ -28,23 +28,12 @@ State = tuple[int, int, int, int]
 
 def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
     """Return the files that frames lie in, the recording itself first, each as it was when it was opened."""
-    found: dict[Path, State] = {}
-
-    def visit(part: h5py.Dataset) -> None:
-        if part.is_virtual:
-            for source in part.virtual_sources():
-                visit(virtual_source(file, part, source))
-        for name, _, _ in part.external or ():
-            raw = file.beside(part, name, f"the raw storage of {part.name}")
-            found[raw] = _state(raw.stat())
-        add(part.file)
-
-    def add(opened: h5py.File) -> None:
-        found.setdefault(Path(opened.filename), _state(os.fstat(opened.id.get_vfd_handle())))
-
     with as_input_error(f"{file.path}: {dataset.name}"):
-        add(file.root)
-        visit(dataset)
+        root = os.fstat(file.root.id.get_vfd_handle())
+        found = {Path(file.root.filename): _state(root)}
+        for path, part, _ in _parts(file, dataset):
+            opened = path.stat() if part is None else os.fstat(part.file.id.get_vfd_handle())
+            found.setdefault(path, _state(opened))
     return found
 
 
@@ -63,8 +52,8 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
             return _of_growing(file.root, dataset, frames)
     spans: dict[Path, list[Spans]] = {path: [] for path in origins}
     with as_input_error(f"{file.path}: {dataset.name}"):
-        for path, span in _stored(file, dataset):
-            spans[path].append(span)
+        for path, part, span in _parts(file, dataset):
+            spans[path].append(span if part is None else _stored(part))
     digest = hashlib.sha256()
     for path, parts in spans.items():
         with as_input_error(str(path)), path.open("rb", buffering=0) as opened:
@@ -101,10 +90,8 @@ def _of_growing(file: h5py.File, dataset: h5py.Dataset, frames: int) -> str:
             digest.update(value.tobytes() if value.dtype.kind != "O" else str(value).encode())
 
     file.visititems(add)
-    chunks: list[h5py.h5d.StoreInfo] = []
-    dataset.id.chunk_iter(chunks.append)
     before = 0
-    for chunk in sorted(chunks, key=lambda one: one.chunk_offset):
+    for chunk in sorted(chunks_of(dataset), key=lambda one: one.chunk_offset):
         if chunk.chunk_offset[0] < frames:
             stop = chunk.byte_offset + chunk.size
             for taken in range(chunk.byte_offset + -before % _EVERY, stop, _EVERY):
@@ -124,27 +111,25 @@ def _state(found: os.stat_result) -> State:
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def _stored(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, Spans]]:
-    """Yield where a dataset's samples lie: the files, and where each part begins and ends there."""
-    own = Path(dataset.file.filename)
-    if dataset.is_virtual:
-        for part in dataset.virtual_sources():
-            yield from _stored(file, virtual_source(file, dataset, part))
-    elif dataset.external:
-        for name, offset, size in dataset.external:
-            raw = file.beside(dataset, name, f"the raw storage of {dataset.name}")
-            end = min(offset + size, raw.stat().st_size)
-            yield raw, np.array([[offset, end]], np.int64)
-    elif dataset.chunks:
-        found: list[h5py.h5d.StoreInfo] = []
-        dataset.id.chunk_iter(found.append)
-        chunks = np.array([(chunk.byte_offset, chunk.size) for chunk in found], np.int64).reshape(-1, 2)
-        yield own, np.cumsum(chunks, axis=1)
-    elif dataset.id.get_offset() is not None:
-        start = dataset.id.get_offset()
-        yield own, np.array([[start, start + dataset.id.get_storage_size()]], np.int64)
-    else:  # in its header
-        yield own, np.empty((0, 2), np.int64)
+def _parts(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, h5py.Dataset | None, Spans]]:
+    """Yield where samples lie: the files, each with a dataset there, or a raw one's begin and end."""
+    for source in dataset.virtual_sources() if dataset.is_virtual else ():
+        yield from _parts(file, virtual_source(file, dataset, source))
+    for name, offset, size in dataset.external or ():
+        raw = file.beside(dataset, name, f"the raw storage of {dataset.name}")
+        yield raw, None, np.array([[offset, min(offset + size, raw.stat().st_size)]], np.int64)
+    yield Path(dataset.file.filename), dataset, np.empty((0, 2), np.int64)
+
+
+def _stored(dataset: h5py.Dataset) -> Spans:
+    """Return where the samples that a dataset's own file holds begin and end."""
+    start = dataset.id.get_offset()
+    if dataset.chunks and not dataset.is_virtual:
+        chunks = [(chunk.byte_offset, chunk.size) for chunk in chunks_of(dataset)]
+        return np.cumsum(np.array(chunks, np.int64).reshape(-1, 2), axis=1)
+    if start is None:  # in its header, or elsewhere
+        return np.empty((0, 2), np.int64)
+    return np.array([[start, start + dataset.id.get_storage_size()]], np.int64)
 
 
 def _joined(parts: list[Spans]) -> Spans:

@@ -104,10 +104,11 @@ class FrameSequence(Closing, ABC):
         frames = out[: stop - start]
         self._fill(start, frames)
         self._next = stop
-        time, travel, phase = (
-            v if v is None else v[start:stop] for v in (self._time, self.travel, self._phase)
-        )
-        return Block(frames, start, time, travel, phase, dropped=self._lost[start])
+        series = {"time": self._time, "travel": self.travel, "phase": self._phase}
+        known: dict[str, Any] = {
+            name: values[start:stop] for name, values in series.items() if values is not None
+        }
+        return Block(frames, start, **known, dropped=self._lost[start])
 
     def rewind(self) -> None:
         """Go back to the first frame."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import MAKE_ROOM, VERSIONS
-from mirrorskin.io.calibration.file import CARRIED, size_of, write_calibration
+from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import CHECKSUM, DROPPED, LIVE, POSITIONS, SERIES, STATE, UNDER_WAY, USED
 from mirrorskin.io.recorder import Compression, checksums, new_stack, packing, write_header, write_plot
@@ -112,9 +112,7 @@ class GrowingRecording(Closing):
             self._reserve.hold(room)
             self._file = opening.enter_context(_new_hdf5(self._descriptor, meta, self._frame))
             self._reserve.hold(room)  # once more: HDF5 has emptied the file
-            write_header(self._file, header)
-            if calibration is not None:
-                write_calibration(self._file, calibration, CARRIED)
+            write_header(self._file, header, calibration)
             known = {"time", POSITIONS[header.motion], *series}
             self._make(shape, dtype, compression, known)
             write_plot(self._file, header.motion, known)

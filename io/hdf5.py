@@ -325,7 +325,7 @@ def _bulk(file: h5py.File) -> list[tuple[int, int]]:
         if not isinstance(node, h5py.Dataset) or node.nbytes < _BULK or node.is_virtual or node.external:
             return
         if node.chunks:
-            node.id.chunk_iter(lambda one: places.append((one.byte_offset, one.byte_offset + one.size)))
+            places.extend((one.byte_offset, one.byte_offset + one.size) for one in chunks_of(node))
         elif (start := node.id.get_offset()) is not None:
             places.append((start, start + node.nbytes))
 
@@ -369,6 +369,13 @@ def describe_storage(dataset: h5py.Dataset) -> str:
         return "in raw files" if dataset.external else "in one piece"
     names = [name.split(";")[0].strip() or str(code) for code, name in _filters(dataset)]
     return f"chunks {dataset.chunks}, {', '.join(names) or 'raw'}"
+
+
+def chunks_of(dataset: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:
+    """Return the chunks that a dataset has: where each lies in the stack and in the file."""
+    found: list[h5py.h5d.StoreInfo] = []
+    dataset.id.chunk_iter(found.append)
+    return found
 
 
 def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.positions import check_finite, check_phase, check_strokes
+from mirrorskin.io.positions import check_finite
 from mirrorskin.io.selection import Selection
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
@@ -56,7 +56,6 @@ POSITIONS: dict[Motion, str] = {
 }
 """Which series says where the body was, of each motion."""
 
-_CHECKS = {"travel": check_strokes, "phase": check_phase}
 _REMEDIES = {"travel": "give --travel-step", "phase": "give --phase-step or --phases"}
 
 
@@ -153,17 +152,14 @@ class Layout:
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
         """Read when each frame was taken, and where the body was; travel or phase may be given; check it."""
         name, time = POSITIONS[motion], self._cut(self._series("time", (self._count,)))
-        if name not in _CHECKS:
+        if name not in _REMEDIES:
             return {"time": time, name: self._cut(self._series(name, (self._count, *_width(name))))}
-        where = f"{self._file.path}: {SERIES[name][0]}"
-        if given is not None:
-            where = f"{self._file.path}: the {name} given"
-        else:
-            given = self._series(name, (self._count,), _REMEDIES[name])
+        where = f"{self._file.path}: {SERIES[name][0] if given is None else f'the {name} given'}"
+        given = self._series(name, (self._count,), _REMEDIES[name]) if given is None else given
         if given is None:
             remedy = _REMEDIES[name]
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
-        found = {"time": time, name: _CHECKS[name](given, self._count, where, self._part.frames)}
+        found = {"time": time, name: check_finite(given, self._count, where, self._part.frames)}
         pressed = self._text(f"{STAGE}/motion") != "vertical"
         also = ("tilt", "travel") if motion == "axial" and pressed else ()
         return found | {one: self._each(one) for one in also}

@@ -67,12 +67,8 @@ def check_travel(
     return values
 
 
-def check_strokes(
-    travel: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
-) -> NDArray[np.float64]:
+def check_strokes(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
     """Return the travel of a vertical movement, mm, as float64: strokes down and up, as many as there are.
-
-    Only that of the frames from the first to the end of ``within`` is checked and returned, if it is given.
 
     Examples
     --------
@@ -81,7 +77,7 @@ def check_strokes(
     """
     if travel is None:
         raise InputError(f"{name} is missing: a vertical press needs the travel of each frame, in mm")
-    return check_finite(travel, count, name, within)
+    return check_finite(travel, count, name)
 
 
 def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np.intp]:
@@ -101,10 +97,8 @@ def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np
     return np.asarray(moving[turned] + 1, np.intp)
 
 
-def check_phase(
-    phase: ArrayLike | None, count: int, name: str, within: tuple[int, int] | None = None
-) -> NDArray[np.float64]:
-    """Return the phases of an axial rotation, radians, as float64; ``within`` as for ``check_strokes``.
+def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
+    """Return the phases of an axial rotation, radians, as float64.
 
     Examples
     --------
@@ -113,7 +107,7 @@ def check_phase(
     """
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
-    return check_finite(phase, count, name, within)
+    return check_finite(phase, count, name)
 
 
 def check_finite(
@@ -123,7 +117,9 @@ def check_finite(
     within: tuple[int, int] | None = None,
     width: tuple[int, ...] = (),
 ) -> NDArray[np.float64]:
-    """Return the positions of so many frames as float64, (T, *width); ``within`` as for ``check_strokes``.
+    """Return the positions of so many frames as float64, (T, *width).
+
+    Only those of the frames from the first to the end of ``within`` are checked and returned, if it is given.
 
     Examples
     --------

@@ -46,7 +46,7 @@ def packing(compression: Compression) -> dict[str, Any]:
     return {**hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE)}
 
 
-def write_header(file: h5py.File, header: Header) -> None:
+def write_header(file: h5py.File, header: Header, calibration: Calibration | None) -> None:
     """Write what holds for all frames, and the groups for what does not."""
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = new_group(file, "entry", "NXentry", default="data", **{MARK: 1})
@@ -69,6 +69,8 @@ def write_header(file: h5py.File, header: Header) -> None:
     put(stage, "pivot", "mm", header.pivot)
     if header.motion != "vertical":
         put(stage, "travel", "mm", header.press)
+    if calibration is not None:
+        write_calibration(file, calibration, CARRIED)
 
 
 def new_stack(file: h5py.File, shape: tuple[int, int, int], dtype: Any, **storage: Any) -> h5py.Dataset:
@@ -191,9 +193,7 @@ class Recorder(TeeSource[Source]):
             self._new = opening.enter_context(new_hdf5(self.path))
             opening.push(self._finish)
             opening.enter_context(self.source)
-            write_header(self._new.root, self.header)
-            if self._calibration is not None:
-                write_calibration(self._new.root, self._calibration, CARRIED)
+            write_header(self._new.root, self.header, self._calibration)
             chunks = None if self._compression == "raw" else (1, *self.shape[1:])
             storage = {"chunks": chunks, **packing(self._compression)}
             self._frames = new_stack(self._new.root, self.shape, self.dtype, **storage)

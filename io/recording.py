@@ -16,7 +16,7 @@ from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
-from mirrorskin.io.layout import CHECKSUM, MARK, STACK, Layout, RecordingState, read_state
+from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.recorder import checksums
@@ -87,11 +87,8 @@ class Recording(Closing):
         state: RecordingState,
         live: bool = False,
     ) -> None:
-        self.path = file.path
-        self.name = str(file.path)
-        self.dataset = str(dataset.name)
-        self.header = header
-        self.motion = header.motion
+        self.path, self.name, self.dataset = file.path, str(file.path), str(dataset.name)
+        self.header, self.motion, self.truth = header, header.motion, truth
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
         self.full_shape = (state.count, *_shape(dataset)[1:])
@@ -100,13 +97,9 @@ class Recording(Closing):
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.tilt = positions.get("tilt")
         self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
-        self.truth = truth
         self.storage = describe_storage(dataset)
-        self._file = file
-        self._dataset = dataset
-        self._origins = origins(file, dataset)
-        self._stack = stack
-        self._next = 0
+        self._file, self._dataset, self._origins = file, dataset, origins(file, dataset)
+        self._stack, self._next = stack, 0
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``."""
@@ -128,24 +121,11 @@ class Recording(Closing):
 
     def _block(self, frames: NDArray[Any], lent: bool) -> Block:
         """Go on behind the next frames, and return them."""
-        start = self._next
-        self._next = stop = start + len(frames)
-
-        def here(values: Floats | None) -> Floats | None:
-            return None if values is None else values[start:stop]
-
-        return Block(
-            frames,
-            start,
-            time=here(self.time),
-            travel=here(self.travel),
-            phase=here(self.phase),
-            displacement=here(self.displacement),
-            twist=here(self.twist),
-            tilt=here(self.tilt),
-            origin=self.origin,
-            lent=lent,
-        )
+        here = slice(self._next, self._next + len(frames))
+        self._next = here.stop
+        series = {name: getattr(self, name) for name in SERIES}
+        known = {name: values[here] for name, values in series.items() if values is not None}
+        return Block(frames, here.start, **known, origin=self.origin, lent=lent)
 
     def rewind(self) -> None:
         """Go back to the first frame."""

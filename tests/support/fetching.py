@@ -24,7 +24,6 @@ PACKINGS = {
     "bitshuffle": hdf5plugin.Bitshuffle(),
     "small blocks": hdf5plugin.Bitshuffle(nelems=64),
     "bitshuffle zstd": hdf5plugin.Bitshuffle(cname="zstd"),
-    "bitshuffle alone": hdf5plugin.Bitshuffle(cname="none"),
     "blosc": hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE),
     "blosc zstd": hdf5plugin.Blosc(cname="zstd"),
 }
@@ -34,6 +33,7 @@ ONLY_HDF5 = {
     "fletcher32": {"fletcher32": True},
     "checked gzip": {"compression": "gzip", "fletcher32": True},
     "shuffled zstd": {**hdf5plugin.Zstd(), "shuffle": True},
+    "bitshuffle alone": hdf5plugin.Bitshuffle(cname="none"),
     "lz4": hdf5plugin.LZ4(nbytes=512),
     "blosc2": hdf5plugin.Blosc2(),
     "bzip2": hdf5plugin.BZip2(),
