@@ -74,10 +74,8 @@ class Column:
 
     def _grow(self, count: int) -> None:
         if count > len(self._rows):
-            more = np.full(
-                (max(count - len(self._rows), len(self._rows)), *self._rows.shape[1:]), self._default
-            )
-            self._rows = np.concatenate([self._rows, more.astype(self._rows.dtype)])
+            more = max(count - len(self._rows), len(self._rows)), *self._rows.shape[1:]
+            self._rows = np.concatenate([self._rows, np.full(more, self._default, self._rows.dtype)])
 
 
 class GrowingRecording(Closing):
@@ -227,31 +225,26 @@ class Reserve:
 
     def __init__(self, path: Path, descriptor: int, step: int) -> None:
         self._path, self._descriptor, self._step = path, descriptor, step
-        self._end: float = 0
+        self._end, self._believed = 0, False
 
     def hold(self, end: int) -> None:
         """See that the file can be written up to some byte.
 
         A disk that cannot promise anything is believed to have room.
         """
-        if self._end < math.inf:
-            self._end = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
-        if end > self._end and not self._grow(end + self._step):
-            self._grow(end, last=True)
-
-    def _grow(self, end: int, last: bool = False) -> bool:
-        start = int(self._end)
-        try:
-            os.posix_fallocate(self._descriptor, start, end - start)
-        except OSError as error:
-            if error.errno in _UNABLE:
-                self._end = math.inf
-                return True
-            if error.errno not in _FULL:
-                raise
-            if last:
+        start = min(self._end, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
+        if self._believed or end <= start:
+            return
+        for reach in (end + self._step, end):
+            try:
+                os.posix_fallocate(self._descriptor, start, reach - start)
+                self._end = reach
+                return
+            except OSError as error:
+                self._believed = error.errno in _UNABLE
+                if self._believed:
+                    return
+                if error.errno not in _FULL:
+                    raise
                 why = os.strerror(error.errno)
-                raise InputError(f"{self._path}: the disk is full ({why}); {MAKE_ROOM}") from error
-            return False
-        self._end = end
-        return True
+        raise InputError(f"{self._path}: the disk is full ({why}); {MAKE_ROOM}")

@@ -10,7 +10,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,15 +39,17 @@ def read_picture(path: Path) -> NDArray[Any]:
     Colour becomes grey: where the channels are equal, their common value; else the luma of ITU-R BT.601,
     0.299 R + 0.587 G + 0.114 B, as OpenCV computes it. Opacity is ignored.
     """
-    contents = _contents(path)
-    encoded: bytes | mmap = contents
-    if contents[:8] == _PNG_MARK:
-        encoded = _essential_png(contents, path)
-    elif count_pages(path) != 1:
-        raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    if data[:8] != _PNG_MARK:
+        if count_pages(path) != 1:
+            raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
+        return next(read_pages(path, 0, 1))[1]
     with quiet_opencv() as cv2:
         try:
-            picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+            picture = cv2.imdecode(np.frombuffer(_essential_png(data, path), np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             picture = None
     if picture is None:
@@ -225,17 +226,7 @@ def _kind(picture: NDArray[Any]) -> str:
     return f"{columns} x {rows} {picture.dtype}"
 
 
-def _contents(path: Path) -> mmap:
-    try:
-        with path.open("rb") as file:
-            return mmap(file.fileno(), 0, access=ACCESS_READ)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"{path} is empty: copy it again") from error
-
-
-def _essential_png(data: mmap, path: Path) -> bytes:
+def _essential_png(data: bytes, path: Path) -> bytes:
     """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
     kept, at, kind = [data[:8]], 8, b""
     while kind != b"IEND":
