@@ -619,6 +619,20 @@ def integrate_live() -> Answer:
 
 
 @case(**SURFACE)
+def integrate_several() -> Answer:
+    shape = (36, 50)
+    slopes = [dome(shape, 0.2 + 0.05 * number)[1:] for number in range(3)]
+    random = np.random.default_rng(9)
+    along_x, along_y = (
+        np.stack(part) + random.normal(0, 0.01, (3, *shape)) for part in zip(*slopes, strict=True)
+    )
+    return named(
+        whole=surface_maps(engine.integrate(along_x, along_y, PIXEL)),
+        masked=surface_maps(engine.integrate(along_x, along_y, PIXEL, mask=disc(shape))),
+    )
+
+
+@case(**SURFACE)
 def fuse() -> Answer:
     shape = (40, 52)
     frames, gain, offset = turn("uint16", shape)

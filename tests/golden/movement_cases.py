@@ -1,0 +1,186 @@
+"""Cases of strokes, of poses, of forces, of a texture that moves, and of objects that move."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from golden import Answer, Tolerance, case
+from moved_surfaces import bumpy, rod, sampled
+from scenes import LEVELS, PIXEL, counted, dome, places
+from speckle import Speckle
+
+from mirrorskin import engine
+
+MOVED: Tolerance = (1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
+POSE: Tolerance = (1e-3, 2e-6)  # radians and mm
+FORCE: Tolerance = (1e-3, 1e-7)  # N and MPa: where conjugate gradients end
+HEIGHT: Tolerance = (1e-4, 1e-5)  # mm
+
+TEXTURE = Speckle(4)
+SHAPE = (64, 72)
+
+
+def strokes(dtype: str) -> tuple[Any, Any]:
+    """Return frames of a press that oscillates and lags behind on its way up, and its travel."""
+    random = np.random.default_rng(6)
+    travel = 0.5 * (1 - np.cos(0.41 * np.arange(48)))
+    lag = travel + 0.02 * (np.gradient(travel) < 0)
+    starts = np.clip(-dome((37, 53))[0] + 0.05, 0.01, 1.2)
+    share = np.clip((lag[:, None, None] - starts) / 0.05, 0, 1)
+    return counted(share + random.normal(0, 0.01, share.shape), dtype), travel
+
+
+@case(HEIGHT, sigma=HEIGHT)
+def stroke_search() -> Answer:
+    answers = {}
+    for dtype in ("uint8", "float32"):
+        frames, travel = strokes(dtype)
+        dark, bright = LEVELS[dtype]
+        search = engine.StrokeSearch(frames.shape[1:], frames.dtype, dark=dark, bright=bright)
+        for part in np.split(np.arange(len(frames)), [1, 17, 30]):
+            search.push(frames[part], travel=travel[part])
+        found = search.result()
+        answers[dtype] = {
+            "onset": found.onset.height,
+            "onset_sigma": found.onset.sigma,
+            "release": found.release.height,
+            "release_sigma": found.release.sigma,
+            "onsets": found.onsets,
+            "releases": found.releases,
+            "strokes": found.strokes,
+        }
+    return {f"{dtype}.{name}": value for dtype, each in answers.items() for name, value in each.items()}
+
+
+@case(FORCE)
+def find_force() -> Answer:
+    height = np.where(np.hypot(*places((40, 52))) < 1.1, dome((40, 52), 0.4)[0], np.nan)
+    found = engine.find_force(height, 0.2, PIXEL, 0.1, sigma=0.002, travel_sigma=0.005, modulus_sigma=0.001)
+    soft = engine.find_force(height, 0.2, PIXEL, 0.1, compliance=0.02)
+    return {
+        "pressure": found.pressure,
+        "contact": found.contact,
+        "numbers": np.array([found.force, found.sigma, soft.force]),
+    }
+
+
+@case(FORCE)
+def find_tangential_force() -> Answer:
+    x, y = places((40, 52))
+    contact = np.hypot(x - 0.1, y) < 0.7
+    shift = np.stack([0.05 - 0.02 * np.hypot(x, y) ** 2, 0.01 * x * y], axis=-1)
+    shift += np.random.default_rng(3).normal(0, 5e-4, shift.shape)
+    found = engine.find_tangential_force(
+        shift, PIXEL, 0.1, contact=contact, sigma=5e-4, window=4, modulus_sigma=0.001
+    )
+    return {"traction": found.traction, "force": found.force, "sigma": found.sigma}
+
+
+def leaning(direction: Any, tilt: Any, dtype: str = "uint16") -> tuple[Any, Any, float, float]:
+    """Return frames over the dome at leans towards directions, the axes, counts a radian, and at zenith 0."""
+    gain, offset = {"uint8": (220.0, 8.0), "uint16": (3400.0, 150.0)}[dtype]
+    axis = np.stack(
+        [np.sin(tilt) * np.cos(direction), np.sin(tilt) * np.sin(direction), np.cos(tilt)], axis=1
+    )
+    _, along_x, along_y = dome((37, 53))
+    upright = np.stack([-along_x, -along_y, np.ones_like(along_x)])
+    zenith = np.arccos(
+        np.clip(np.einsum("ka,ahw->khw", axis, upright / np.linalg.norm(upright, axis=0)), -1, 1)
+    )
+    noise = gain / 200 * np.random.default_rng(7).normal(size=zenith.shape)
+    return np.clip(np.rint(offset + gain * zenith + noise), 0, None).astype(dtype), axis, gain, offset
+
+
+@case((1e-4, 1e-5), azimuth=(1e-3, 1e-4))
+def normals_of_poses() -> Answer:
+    answers: dict[str, Any] = {}
+    turn = 0.7 * np.arange(20)
+    ways = {
+        "whole": (turn, 0.03 + 0.01 * np.cos(3 * turn)),
+        "rocked": (np.full(20, 0.6), 0.04 * np.sin(turn)),
+    }
+    for dtype in ("uint8", "uint16"):
+        for name, (direction, tilt) in ways.items():
+            frames, axis, gain, offset = leaning(direction, tilt, dtype)
+            options: dict[str, Any] = {"gain": gain, "offset": offset, "noise": gain / 200}
+            estimator = engine.PoseEstimator(frames.shape[1:], frames.dtype, **options)
+            for part in np.split(np.arange(20), [3, 11]):
+                estimator.push(frames[part], pose=axis[part])
+            found = estimator.result()
+            whole = {"vectors": found.vectors, "sigma": found.sigma} if name == "whole" else {}
+            rocked = {"slope": found.slope, "slope_sigma": found.slope_sigma, "direction": found.direction}
+            told = {"status": found.status, **whole, **rocked}
+            answers |= {f"{dtype}.{name}.{key}": value for key, value in told.items()}
+    return answers
+
+
+@case(MOVED)
+def estimate_frequency() -> Answer:
+    time = np.arange(120) / 30
+    wave = 100 + 20 * np.cos(math.tau * 3.21 * time)[:, None, None] * np.linspace(0.5, 1, 12).reshape(3, 4)
+    found = engine.estimate_frequency(wave + np.random.default_rng(1).normal(0, 1, wave.shape), time)
+    return {"numbers": np.array([found.hertz, found.sigma])}
+
+
+def drift(k: int, noise: float = 1.0) -> Any:
+    """Return a frame of a texture that has gone along, turned and stretched."""
+    angle = 0.01 * k
+    return TEXTURE.frame(
+        SHAPE,
+        lambda x, y: 0.3 * k + 0.004 * k * (x - 36) - angle * (y - 32),
+        lambda x, y: -0.2 * k + angle * (x - 36),
+        noise,
+        k,
+    )
+
+
+@case(MOVED)
+def find_displacement() -> Answer:
+    answers: dict[str, Any] = {}
+    for dtype in ("uint8", "float32"):
+        frames = np.stack([drift(k) for k in range(4)])
+        frames = frames if dtype == "float32" else np.clip(frames.round(), 0, 255).astype(dtype)
+        found = engine.find_displacement(frames[0], frames[1:], PIXEL, window=12, step=4)
+        answers |= {
+            f"{dtype}.displacement": found.displacement[:, ::3, ::3],
+            f"{dtype}.sigma": found.sigma[0, ::3, ::3],
+            f"{dtype}.status": found.status,
+            f"{dtype}.noise": found.noise,
+        }
+    return answers
+
+
+@case(POSE)
+def estimate_pose() -> Answer:
+    answers: dict[str, Any] = {}
+    for form in (bumpy, rod):
+        random = np.random.default_rng(1)
+        pair = [
+            sampled(form, *way, rng=random)
+            for way in (((0, 0, 0), (0, 0, 0)), ((0.02, -0.03, 0.1), (0.1, -0.05, 0.02)))
+        ]
+        pose = engine.estimate_pose(*pair)
+        answers |= {
+            f"{form.__name__}.rotation": pose.rotation,
+            f"{form.__name__}.translation": pose.translation,
+            f"{form.__name__}.sigma": pose.sigma,
+            f"{form.__name__}.chi_square": pose.chi_square,
+            f"{form.__name__}.free": len(pose.undetermined),
+        }
+    return answers
+
+
+@case(POSE)
+def pose_tracker() -> Answer:
+    random, tracker = np.random.default_rng(2), engine.PoseTracker()
+    found = [
+        tracker.push(sampled(bumpy, (0, 0, 0.03 * k), (0.15 * k, 0.03 * k, 0), rng=random)) for k in range(12)
+    ]
+    return {
+        "rotation": np.stack([pose.rotation for pose in found]),
+        "translation": np.stack([pose.translation for pose in found]),
+        "sigma": np.stack([pose.sigma for pose in found]),
+        "keys": tracker.keys,
+    }
