@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
+from mirrorskin.io.result import map_shape
 from mirrorskin.io.selection import source_region
 from mirrorskin.io.types import UNDISTORTED
 
@@ -106,8 +107,9 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     maps = result.maps()
     if not maps:
         raise InputError("there are no maps to undistort: reconstruct first")
-    name, values = next(iter(maps.items()))
-    *turns, rows, columns = values.shape[:-1] if name == "normals" else values.shape
+    *turns, rows, columns = map_shape(result)
+    if "displacement" in maps and maps["displacement"].ndim == 4:
+        raise InputError("displacements of each frame cannot be undistorted: leave per_frame out")
     region = source_region(result.process)
     row, column = (region.origin if region else (0, 0)) if origin is None else origin
     if min(row, column) < 0 or row + rows > lens.shape[0] or column + columns > lens.shape[1]:
@@ -145,6 +147,9 @@ def _resampled(maps: Maps, points: SamplePoints) -> Maps:
             made[name] = points.nearest_values(values, _NOTHING[name])
         elif name == "normals":
             made[name] = points.interpolate_vectors(values, touched)
+        elif name == "displacement":
+            parts = (points.interpolate(values[..., part], touched) for part in range(2))
+            made[name] = np.stack(list(parts), axis=-1)
         elif name == "azimuth":
             if "normals" not in maps:
                 made[name] = points.interpolate_angles(values, touched)

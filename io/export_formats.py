@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.os_errors import legible
-from mirrorskin.io.result import UNITS
+from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats, InputError, Result
 
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
@@ -130,10 +130,10 @@ def encode_npz(result: Result) -> Encoded:
 
     Nothing in it needs ``allow_pickle``.
     """
-    arrays: dict[str, Any] = dict(result.maps())
+    arrays: dict[str, Any] = {**result.maps(), **result.series()}
     more = {"x": result.x, "y": result.y, "offset_unknown": result.offset_unknown}
     arrays |= {name: values for name, values in more.items() if values is not None}
-    units = {name: unit for name, unit in {**UNITS, "x": "mm", "y": "mm"}.items() if name in arrays}
+    units = {name: unit for name in arrays if (unit := unit_of(name, result.process)) is not None}
     arrays |= {"units": json.dumps(units), "process": json.dumps(dict(result.process))}
     file = BytesIO()
     np.savez(file, **arrays)

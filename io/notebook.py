@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.result import UNITS, map_shape
+from mirrorskin.io.result import UNITS, map_shape, unit_of
 from mirrorskin.io.types import Result
 
 if TYPE_CHECKING:
@@ -30,8 +30,11 @@ def as_html(result: Result) -> str:
         "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
         for row in _rows(result)
     )
-    shown = next((name for name in ("height", "zenith", "modulation") if name in result.maps()), None)
-    picture = "" if shown is None else _picture(shown, result.maps()[shown])
+    shown = next(
+        (name for name in ("height", "zenith", "modulation", "slip_onset") if name in result.maps()), None
+    )
+    unit = "" if shown is None else unit_of(shown, result.process) or ""
+    picture = "" if shown is None else _picture(shown, result.maps()[shown], unit)
     title = f"<p><b>Result</b>{escape(_origin(result))}</p>"
     return f"{title}<div style='display:flex;gap:2em'>{picture}<table>{rows}</table></div>"
 
@@ -42,12 +45,14 @@ def as_xarray(result: Result) -> xarray.Dataset:
 
     maps = result.maps()
     lead = ("turn",) if len(map_shape(result)) == 3 else ()
-    dimensions = {
-        name: (*lead, "y", "x", "vector") if name == "normals" else (*lead, "y", "x") for name in maps
-    }
+    dimensions = dict.fromkeys(maps, (*lead, "y", "x")) | dict.fromkeys(result.series(), ("frame",))
+    dimensions["normals"] = (*lead, "y", "x", "vector")
+    each = ("frame",) if "displacement" in maps and maps["displacement"].ndim == 4 else ()
+    dimensions["displacement"] = (*each, "y", "x", "direction")
     data: dict[str, Any] = {
-        name: (dimensions[name], values, {"units": UNITS[name]} if name in UNITS else {})
-        for name, values in maps.items()
+        name: (dimensions[name], values, {} if unit is None else {"units": unit})
+        for name, values in {**maps, **result.series()}.items()
+        for unit in [unit_of(name, result.process)]
     }
     data |= {name: ((), value, {"units": UNITS[name]}) for name, value in result.numbers().items()}
     if result.offset_unknown is not None:
@@ -59,6 +64,8 @@ def as_xarray(result: Result) -> xarray.Dataset:
     }
     if "normals" in maps:
         coordinates["vector"] = ["x", "y", "z"]
+    if "displacement" in maps:
+        coordinates["direction"] = ["x", "y"]
     return xarray.Dataset(data, coordinates, attrs=dict(result.process))
 
 
@@ -70,7 +77,7 @@ def _rows(result: Result) -> list[tuple[str, str, str]]:
         known = values[np.isfinite(values)] if values.dtype.kind == "f" else values.ravel()
         span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
-        unit = f" {UNITS[name]}" if name in UNITS and known.size else ""
+        unit = f" {unit_of(name, result.process) or ''}".rstrip() if known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
     return rows + [(name, "", f"{value:.4g} {UNITS[name]}") for name, value in result.numbers().items()]
 
@@ -80,7 +87,7 @@ def _origin(result: Result) -> str:
     return f" of {source}" if source else ""
 
 
-def _picture(name: str, values: NDArray[Any]) -> str:
+def _picture(name: str, values: NDArray[Any], unit: str) -> str:
     """Return a map, or its last turn, in colours from dark (low) to light (high); unknown is clear."""
     import cv2
 
@@ -95,7 +102,6 @@ def _picture(name: str, values: NDArray[Any]) -> str:
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     picture = np.dstack([colours, 255 * known.astype(np.uint8)])
     data = base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
-    unit = f" {UNITS[name]}" if name in UNITS else ""
-    caption = f"{name}, {low:.4g} to {high:.4g}{unit}"
+    caption = f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip()
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
-from mirrorskin.io.types import NO_MAPS, SCALARS, InputError, ProcessValue, Result
+from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
 from mirrorskin.io.writing import Item, process_items, write_file
 
 MARK = "mirrorskin_result"
@@ -21,18 +21,29 @@ UNITS = (
     dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma", "slope_min", "slope_max"), "rad")
     | {"pressure": "MPa", "growth": "1/mm", "growth_sigma": "1/mm"}
+    | dict.fromkeys(("displacement", "displacement_sigma"), "mm")
     | dict.fromkeys(SCALARS, "N")
+    | dict.fromkeys(("x", "y"), "mm")
     | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
 )
 _DTYPES = (
     dict.fromkeys(("status", "edges", "filled", "contact", "offset_unknown"), np.uint8)
     | {"component": np.int32, "strokes": np.uint16}
-    | dict.fromkeys(("x", "y"), np.float64)
+    | dict.fromkeys(("x", "y", *SERIES), np.float64)
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
-_VECTORS, _OFFSETS = "normals", "offset_unknown"
+_VECTORS = {"normals": 3, "displacement": 2}  # and how many components they have
+_MOVED, _OFFSETS = "displacement", "offset_unknown"
+_ALONG_THE_WAY = ("slip_onset", "slip_onset_sigma", "way")
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 _AGAIN = "reconstruct it again"
+
+
+def unit_of(name: str, process: Mapping[str, ProcessValue]) -> str | None:
+    """Return the unit of a map, a number or a series of a result; the way of a twist is an angle."""
+    if name in _ALONG_THE_WAY:
+        return "rad" if process.get("motion") == "twist" else "mm"
+    return UNITS.get(name)
 
 
 def save_result(result: Result, path: str | Path) -> None:
@@ -74,15 +85,21 @@ def _items(result: Result) -> Iterator[Item]:
 def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Item]:
     """Yield the maps and a plot's axes: the turns, and where the pixels are."""
     for name, values in maps.items():
-        attributes = {} if name == _VECTORS else {"interpretation": "image"}
-        attributes |= {"units": UNITS[name]} if name in UNITS else {}
-        yield Item(f"{_RESULT}/{name}", values, attributes)
+        attributes = {} if name in _VECTORS else {"interpretation": "image"}
+        yield Item(f"{_RESULT}/{name}", values, attributes | _units(name, result))
     if result.offset_unknown is not None:
         yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
     for name, value in result.numbers().items():
         yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
+    for name, series in result.series().items():
+        yield Item(f"{_RESULT}/{name}", series, _units(name, result))
     for name, positions in _axes(result, maps).items():
-        yield Item(f"{_RESULT}/{name}", positions, {} if name == "turn" else {"units": "mm"})
+        yield Item(f"{_RESULT}/{name}", positions, _units(name, result))
+
+
+def _units(name: str, result: Result) -> dict[str, str]:
+    unit = unit_of(name, result.process)
+    return {} if unit is None else {"units": unit}
 
 
 def _axes(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -106,7 +123,7 @@ def _plot(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 def _plotted(maps: Mapping[str, NDArray[Any]]) -> list[str]:
     """Name the maps that are plotted together; NeXus has no picture of vectors."""
-    return [name for name in maps if name != _VECTORS]
+    return [name for name in maps if name not in _VECTORS]
 
 
 def open_result(path: str | Path) -> Result:
@@ -134,6 +151,10 @@ def open_result(path: str | Path) -> Result:
             for name, node in numbers.items()
             if node is not None
         }
+        for name in SERIES:
+            if (node := file.find(f"{_RESULT}/{name}")) is not None:
+                series = (getattr(node, "shape", None) or ())[:1]
+                maps[name] = file.read(node, series, remedy=_AGAIN).astype(np.float64, copy=False)
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
                 raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
@@ -169,7 +190,11 @@ def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
     size = _size_of(there)
     if size is None:
         raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
-    shapes = {"x": size[-1:], "y": size[-2:-1], _VECTORS: (*size, 3)}
+    shapes = {"x": size[-1:], "y": size[-2:-1]}
+    shapes |= {name: (*size, components) for name, components in _VECTORS.items()}
+    moved = getattr(there.get(_MOVED), "shape", None) or ()
+    if len(moved) == 4 and len(size) == 2:  # of each frame
+        shapes[_MOVED] = (moved[0], *shapes[_MOVED])
     return {name: (node, shapes.get(name, size)) for name, node in there.items()}
 
 
@@ -189,15 +214,20 @@ def _size_of(found: Mapping[str, Node]) -> Shape | None:
     for name in _MAPS:
         if name in found:
             shape: Shape = getattr(found[name], "shape", None) or ()
-            size = shape[:-1] if name == _VECTORS else shape
+            size = _size(name, shape)
             return size if len(size) in (2, 3) else None
     return None
 
 
+def _size(name: str, shape: Shape) -> Shape:
+    """Return the size of the result that has a map of a shape: (H, W), or (turns, H, W)."""
+    size = shape[:-1] if name in _VECTORS else shape
+    return size[-2:] if name == _MOVED else size
+
+
 def map_shape(result: Result) -> tuple[int, ...]:
     """Return the size of a result's maps: (H, W), or (turns, H, W)."""
-    sizes = (values.shape[: values.ndim - (name == "normals")] for name, values in result.maps().items())
-    return next(sizes, (0, 0))
+    return next((_size(name, values.shape) for name, values in result.maps().items()), (0, 0))
 
 
 def select_turn(result: Result, turn: int | None) -> Result:

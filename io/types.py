@@ -263,7 +263,8 @@ class Result:
     status : ndarray, (H, W), uint8
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
         2 dark at start, 3 light to the end. Of a body with a tilt of each frame: 1 normal, 2 none, 4 only the
-        slope along one direction.
+        slope along one direction. Of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no
+        texture.
     hysteresis, hysteresis_sigma : ndarray, (H, W), float32
         Millimetres by which the release is higher than the onset, and the standard deviation of that.
     strokes : ndarray, (H, W), uint16
@@ -288,7 +289,7 @@ class Result:
     filled : ndarray, (H, W), uint8
         1 where the height was not measured but filled from those around.
     contact : ndarray, (H, W), uint8
-        1 where the sheet was in contact in every frame.
+        1 where the sheet was in contact in every frame; of a slide or a twist in the first.
     component : ndarray, (H, W), int32
         Number of the connected piece that a height belongs to, from 0; -1 where there is no height.
     offset_unknown : ndarray, (components,), uint8
@@ -297,6 +298,17 @@ class Result:
         Radians: bounds of the sheet's zenith, by a wall with levels; NaN where there is none.
     pressure : ndarray, (H, W), float32
         MPa between sensor and object at the greatest travel; 0 where nothing touches.
+    displacement : ndarray, (H, W, 2) or (T, H, W, 2), float32
+        Millimetres along x and y that the skin has moved in the picture since the first frame of a slide or a
+        twist, in the last frame or in each: of the point that was seen at the pixel first.
+    displacement_sigma : ndarray, (H, W), float32
+        Millimetres: standard deviation of the displacement along either axis, the root of their mean square.
+    slip_onset, slip_onset_sigma : ndarray, (H, W), float32
+        The way of the body, mm or (of a twist) radians, after which the skin broke loose, and the standard
+        deviation; NaN where it did not.
+    way, stick_ratio : ndarray, (T,), float64
+        How far the body has slid or turned, mm or radians, and the share of the contact that sticks, in each
+        frame; NaN from where the body turns back.
     force, force_sigma : float
         Newtons at the greatest travel, normal to the sheet, and the standard deviation that is expected.
     x, y : ndarray, (W,) and (H,), float64
@@ -334,6 +346,12 @@ class Result:
     slope_min: NDArray[np.float32] | None = None
     slope_max: NDArray[np.float32] | None = None
     pressure: NDArray[np.float32] | None = None
+    displacement: NDArray[np.float32] | None = None
+    displacement_sigma: NDArray[np.float32] | None = None
+    slip_onset: NDArray[np.float32] | None = None
+    slip_onset_sigma: NDArray[np.float32] | None = None
+    way: Floats | None = None
+    stick_ratio: Floats | None = None
     force: float | None = None
     force_sigma: float | None = None
     x: Floats | None = None
@@ -349,6 +367,11 @@ class Result:
     def numbers(self) -> dict[str, float]:
         """Return the single numbers that were computed, by name."""
         values = {name: getattr(self, name) for name in SCALARS}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def series(self) -> dict[str, Floats]:
+        """Return what was computed frame by frame, by name."""
+        values = {name: getattr(self, name) for name in SERIES}
         return {name: value for name, value in values.items() if value is not None}
 
     def __repr__(self) -> str:
@@ -382,7 +405,10 @@ class Result:
 SCALARS = ("force", "force_sigma")
 """The single numbers that a result has."""
 
-NO_MAPS = ("offset_unknown", *SCALARS, "x", "y", "process", "calibration")
+SERIES = ("way", "stick_ratio")
+"""What a result has of each frame."""
+
+NO_MAPS = ("offset_unknown", *SCALARS, *SERIES, "x", "y", "process", "calibration")
 """What a result has besides maps."""
 
 UNDISTORTED = "undistorted"
