@@ -45,7 +45,9 @@ def command(
     ],
     settings: Annotated[
         Path | None,
-        Option(metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation]."),
+        Option(
+            metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation], [slip]."
+        ),
     ] = None,
     device: Annotated[
         list[str] | None,

@@ -36,6 +36,7 @@ class MethodName(StrEnum):
 _OWN = {
     MotionName.vertical: {
         *(
+            "method",
             "travel_step",
             "travel_start",
             "dark",
@@ -50,8 +51,20 @@ _OWN = {
         )
     },
     MotionName.axial: {
-        *("phase_step", "phases", "tilt", "zenith_gain", "zenith_offset", "robust", "per_turn", "heights")
+        *(
+            "method",
+            "phase_step",
+            "phases",
+            "tilt",
+            "zenith_gain",
+            "zenith_offset",
+            "robust",
+            "per_turn",
+            "heights",
+        )
     },
+    MotionName.horizontal: {"contact", "per_frame", "window", "step"},
+    MotionName.twist: {"contact", "per_frame", "window", "step"},
 }
 _ESTIMATE = "estimate"
 # What would bring a map that is missing: options.
@@ -142,14 +155,31 @@ def command(
             help="Rotation: heights (a result or a simulation) for registering the frames.",
         ),
     ] = None,
+    contact: Annotated[
+        Path | None,
+        Option(
+            metavar="RES.h5",
+            help="Slide, twist: a press's result, where the skin touches.",
+            show_default="estimated, too wide",
+        ),
+    ] = None,
+    per_frame: Annotated[
+        bool, Option("--per-frame", help="Slide, twist: the displacement in each frame, not in the last.")
+    ] = False,
+    window: Annotated[
+        int | None, Option(metavar="PIXELS", help="Slide, twist: side of a window.", show_default="8")
+    ] = None,
+    step: Annotated[
+        int | None, Option(metavar="PIXELS", help="Slide, twist: from window to window.", show_default="4")
+    ] = None,
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct heights from a press, or normals and heights from a rotation."""
+    """Reconstruct heights from a press, normals and heights from a rotation, slip from a slide or a twist."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import progress, report_missing_maps, save_and_report
+    from mirrorskin.cli.output import printable, progress, report_missing_maps, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle, pressure
     from mirrorskin.cli.stack import stack_options
@@ -170,7 +200,7 @@ def command(
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, recording, phases, heights, calibration)
+        io.check_output(target, recording, phases, heights, calibration, contact)
         calibrated = _calibrated(source, calibration, pixel_size)
         arguments: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if source.motion == MotionName.axial:
@@ -179,6 +209,9 @@ def command(
             given_tilt = None if calibrated is source else known.get("tilt")
             arguments["tilt"] = _ESTIMATE if tilt == _ESTIMATE else given_tilt
             arguments["heights"] = None if heights is None else io.open_heights(heights, source)
+        elif source.motion in (MotionName.horizontal, MotionName.twist):
+            arguments |= {"per_frame": per_frame, "window": window, "step": step}
+            arguments["contact"] = None if contact is None else io.open_result(contact)
         else:
             arguments |= {"event": event.value, "hold": hold, "subframe": subframe}
             arguments |= _levels(threshold, inclination)
@@ -193,6 +226,9 @@ def command(
                 progress=show,
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
+    if result.process.get("contact") == "estimated":
+        said = f"{recording}: the contact is estimated and too wide, and so is slip; give --contact, a press's result"
+        click.echo(printable(said), err=True)
     save_and_report(result, target, device, as_json)
 
 
@@ -223,9 +259,7 @@ def _refuse_foreign(context: click.Context, recording: Path, motion: str) -> Non
     """Refuse options that say nothing of the recording's motion, rather than ignore them."""
     from mirrorskin import io
 
-    if motion not in _OWN:
-        return  # the engine says that it has no method for it
-    foreign = {name for other, names in _OWN.items() if other != motion for name in names}
+    foreign = set[str]().union(*_OWN.values()) - _OWN[MotionName(motion)]
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
         if option.name in foreign and source is not None and source.name == "COMMANDLINE":

@@ -26,6 +26,7 @@ def _text(example: str) -> Meta:
 _Counts = Annotated[float, Meta(description="a number of counts", examples=[12.5])]
 _Share = Annotated[float, Meta(ge=0, le=1, description="a share from 0 (dark) to 1 (bright)", examples=[0.5])]
 _Frames = Annotated[int, Meta(ge=1, lt=2**31, description="a number of frames from 1 on", examples=[2])]
+_Pixels = Annotated[int, Meta(ge=1, lt=2**16, description="a number of pixels from 1 on", examples=[8])]
 _Sigma = Annotated[
     float, Meta(ge=0, description="a standard deviation in counts, not below 0,", examples=[1.5])
 ]
@@ -76,10 +77,18 @@ class _Rotation(Struct, frozen=True, rename="kebab"):
     robust: bool | None = None
 
 
+class _Slip(Struct, frozen=True, rename="kebab"):
+    per_frame: bool | None = None
+    window: _Pixels | None = None
+    step: _Pixels | None = None
+    noise: _SigmaAboveZero | None = None
+
+
 class _Settings(Struct, frozen=True):
     stack: _Stack = field(default_factory=_Stack)
     press: _Press = field(default_factory=_Press)
     rotation: _Rotation = field(default_factory=_Rotation)
+    slip: _Slip = field(default_factory=_Slip)
 
 
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
@@ -92,6 +101,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
         _press(_given(settings.press), f"{where}press."),
         _rotation(_given(settings.rotation), f"{where}rotation."),
         memory_limit,
+        _given(settings.slip),
     )
 
 

@@ -24,8 +24,8 @@ def command(
         Option(
             "--map",
             metavar="NAME",
-            help="Only height, section, normals, edges, status, sigma, histogram, slope, hysteresis, growth,"
-            " azimuth or modulation; may be given again.",
+            help="Only height, section, normals, edges, status, sigma, histogram, displacement, slip, slope,"
+            " hysteresis, growth, azimuth or modulation; may be given again.",
             show_default="all that the result has",
         ),
     ] = None,

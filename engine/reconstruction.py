@@ -25,13 +25,13 @@ def reconstruct(
         anything.
     **options
         Those of `mirrorskin.engine.press.press.reconstruct_press` for a vertical motion, of
-        `mirrorskin.engine.rotation.rotation.reconstruct_rotation` for an axial one.
+        `mirrorskin.engine.rotation.rotation.reconstruct_rotation` for an axial one, of
+        `mirrorskin.engine.slip.slip.reconstruct_slip` for a horizontal one or a twist.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The motion is not one that can be reconstructed, the calibration is of another camera, or the input
-        cannot be used.
+        The calibration is of another camera, or the input cannot be used.
 
     Examples
     --------
@@ -51,9 +51,9 @@ def reconstruct(
 
         result = reconstruct_rotation(known, **options)
     else:
-        raise io.InputError(
-            f"{source.name} is of {source.motion} motion: only vertical and axial ones can be reconstructed"
-        )
+        from mirrorskin.engine.slip.slip import reconstruct_slip
+
+        result = reconstruct_slip(known, **options)
     return undistorted(result, known)
 
 

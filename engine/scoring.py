@@ -9,7 +9,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from mirrorskin.engine.slip.status import SLIPPED, STICKS
 from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io.result import map_shape, unit_of
 from mirrorskin.io.types import UNDISTORTED
 
 Doubles = NDArray[np.float64]
@@ -145,6 +147,53 @@ class EdgeScore:
 
 
 @dataclass(frozen=True, slots=True)
+class SlipScore:
+    """How well displacement and slip were found in a slide or a twist.
+
+    Attributes
+    ----------
+    answered, touched : int
+        Pixels in contact of which it is said whether they slipped, and all in contact.
+    coverage : float
+        Share of these that were answered.
+    recall, precision : float
+        Share of the slipped pixels that were found, and of those found that slipped; pixels beside a border
+        of contact or slip are left out.
+    unit : str
+        Of onsets.
+    onset_rms, onset_chi_square : float
+        Of the onset's error where both found and truth slipped: its root mean square, and the mean of
+        (error / sigma)^2.
+    displacement_rms, displacement_chi_square : float
+        Of the displacement in the last frame, mm, and along either axis.
+    """
+
+    answered: int
+    touched: int
+    coverage: float
+    recall: float
+    precision: float
+    unit: str
+    onset_rms: float
+    onset_chi_square: float
+    displacement_rms: float
+    displacement_chi_square: float
+
+    def table(self) -> dict[str, str]:
+        """Return names and values to print."""
+        return {
+            "answered": f"{self.answered} pixels",
+            "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
+            "recall": f"{100 * self.recall:.2f} %",
+            "precision": f"{100 * self.precision:.2f} %",
+            "RMS error of the onset": f"{self.onset_rms:.4g} {self.unit}",
+            "onset's mean (error/sigma)^2": f"{self.onset_chi_square:.3f}",
+            "RMS error of the displacement": f"{self.displacement_rms:.4g} mm",
+            "displacement's mean (error/sigma)^2": f"{self.displacement_chi_square:.3f}",
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Score:
     """A result's errors; None of a map that it does not have.
 
@@ -161,6 +210,8 @@ class Score:
     edges : EdgeScore or None
         None of frames that were registered: what follows the object has another contact than what stays with
         the picture.
+    slip : SlipScore or None
+        Of a slide or a twist from its first frame to its last.
     """
 
     height: HeightScore | None = None
@@ -169,6 +220,7 @@ class Score:
     azimuth: AngleScore | None = None
     contact: ContactScore | None = None
     edges: EdgeScore | None = None
+    slip: SlipScore | None = None
 
     def parts(self) -> dict[str, Any]:
         """Return the scores that there are, by name."""
@@ -190,8 +242,8 @@ def score(result: Result, truth: Truth) -> Score:
     Parameters
     ----------
     result : Result
-        With at least one of ``height``, ``normals``, ``azimuth``, ``contact`` and ``edges``; of a result for
-        each turn, all turns are compared.
+        With at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges`` and slip; of a
+        result for each turn, all turns are compared.
     truth : Truth
         Of the same size.
 
@@ -216,15 +268,10 @@ def score(result: Result, truth: Truth) -> Score:
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
-    known = {name: getattr(result, name) for name in ("height", "azimuth", "normals", "contact", "edges")}
-    sizes = {
-        name: values.shape[:-1] if name == "normals" else values.shape
-        for name, values in known.items()
-        if values is not None
-    }
-    if not sizes:
+    known = ("height", "azimuth", "normals", "contact", "edges")
+    if all(getattr(result, name) is None for name in known):
         raise InputError("the result has no heights, normals, azimuths, contact or edges to score")
-    size = next(iter(sizes.values()))[-2:]
+    size = map_shape(result)[-2:]
     if size != truth.height.shape:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
@@ -240,6 +287,38 @@ def score(result: Result, truth: Truth) -> Score:
         azimuth=None if azimuth is None else _score_angles(_turned(azimuth, truth.azimuth), None, touched),
         contact=None if contact is None else _score_contact(result, touched),
         edges=None if edges is None else _score_edges(edges, _edges_of(truth)),
+        slip=_score_slip(result, truth, touched),
+    )
+
+
+def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore | None:
+    """Score what slides and twists tell, if the result has that, and the truth is of the same frames."""
+    onset, moved, true_onset = result.slip_onset, result.displacement, truth.slip_onset
+    if onset is None or moved is None or true_onset is None or truth.displacement is None:
+        return None
+    if result.status is None or result.way is None or len(result.way) != len(truth.displacement):
+        return None
+    answered = touched & np.isin(result.status, (SLIPPED, STICKS))
+    found, true = result.status == SLIPPED, np.isfinite(true_onset)
+    inside = answered & ~_around(~touched) & ~(_around(true) & _around(~true & touched))
+    both = answered & found & true
+    error = onset.astype(np.float64) - true_onset
+    last = moved if moved.ndim == 3 else moved[-1]
+    off = last.astype(np.float64) - truth.displacement[-1]
+    seen = touched & np.isfinite(off).all(axis=-1)
+    sigma = result.displacement_sigma
+    along = None if sigma is None else np.repeat(sigma[..., np.newaxis], 2, axis=-1)
+    return SlipScore(
+        answered=int(np.count_nonzero(answered)),
+        touched=int(np.count_nonzero(touched)),
+        coverage=_share(answered, touched),
+        recall=_share(found, inside & true),
+        precision=_share(true, inside & found),
+        unit=unit_of("slip_onset", result.process) or "",
+        onset_rms=_spread(np.abs(error[both]))["rms"],
+        onset_chi_square=_chi_square(error, result.slip_onset_sigma, both),
+        displacement_rms=_spread(np.abs(off[seen]))["rms"],
+        displacement_chi_square=_chi_square(off, along, np.repeat(seen[..., np.newaxis], 2, axis=-1)),
     )
 
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.slip.status import NO_CONTACT, SLIPPED, STICKS
 from mirrorskin.io import Result
+from mirrorskin.io.result import unit_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,10 +18,11 @@ class Summary:
 
     Attributes
     ----------
-    what : {"height", "slope", "normals", "azimuth"}
+    what : {"height", "slope", "normals", "azimuth", "slip"}
         The maps that count.
     pixels, answered : int
-        All, and those with an answer; in each turn, where each has maps of its own.
+        All (of slip those in contact), and those with an answer; in each turn, where each has maps of its
+        own.
     quantity, unit : str
         What ``lowest`` and ``highest`` are of.
     lowest, highest : float
@@ -32,6 +35,10 @@ class Summary:
         Of the pixels with a height, those that were filled, if holes were looked for.
     relief : (float, float) or None
         Lowest and highest of the heights that go with normals and are relative, mm.
+    slipped : int or None
+        Of the pixels that tell of slip, those that slipped.
+    stick_ratio : float or None
+        Share of the contact that sticks in the last frame for which that is known.
     force, force_sigma : float or None
         Of a press, and the standard deviation that is expected, N.
     """
@@ -47,11 +54,15 @@ class Summary:
     turns: int | None = None
     filled: int | None = None
     relief: tuple[float, float] | None = None
+    slipped: int | None = None
+    stick_ratio: float | None = None
     force: float | None = None
     force_sigma: float | None = None
 
     def __str__(self) -> str:
         turns = "" if self.turns is None else f" in {self.turns} turns"
+        if self.slipped is not None:
+            return self._slip()
         if self.answered == 0:
             return f"no {self.what} at any of {self.pixels} pixels{turns}"
         quantity = "" if self.quantity == self.what else f"{self.quantity} "
@@ -68,13 +79,26 @@ class Summary:
             parts.append(f"force {self.force:.4g} +- {self.force_sigma:.2g} N")
         return ", ".join(parts)
 
+    def _slip(self) -> str:
+        parts = [
+            f"slip known at {self.answered} of {self.pixels} pixels in contact",
+            f"{self.slipped} slipped",
+        ]
+        if self.slipped:
+            parts.append(f"from {self.lowest:.3f} to {self.highest:.3f} {self.unit} of the way")
+        if self.stick_ratio is not None:
+            parts.append(f"{100 * self.stick_ratio:.1f} % of the contact sticks")
+        return ", ".join(parts)
+
 
 def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have an answer, and find the range of the answers.
 
-    They are heights; slopes of a body that rocked; normals where there are some and all heights are relative;
-    else azimuths, whose modulation is given.
+    They are slip; heights; slopes of a body that rocked; normals where there are some and all heights are
+    relative; else azimuths, whose modulation is given.
     """
+    if result.slip_onset is not None:
+        return _summarise_slip(result)
     height = np.empty(0, np.float32) if result.height is None else result.height
     relative = result.offset_unknown is not None and bool(np.all(result.offset_unknown))
     answers, values, names = height, height, ("height", "height", "mm")
@@ -101,6 +125,25 @@ def summarise(result: Result) -> Summary:
         relief=_range(height) if relative else None,
         force=result.force,
         force_sigma=result.force_sigma,
+    )
+
+
+def _summarise_slip(result: Result) -> Summary:
+    assert result.slip_onset is not None
+    status = np.zeros(result.slip_onset.shape, np.uint8) if result.status is None else result.status
+    touched = status != NO_CONTACT if result.contact is None else result.contact != 0
+    ratio = np.empty(0) if result.stick_ratio is None else result.stick_ratio[np.isfinite(result.stick_ratio)]
+    lowest, highest = _range(result.slip_onset) or (np.nan, np.nan)
+    return Summary(
+        "slip",
+        int(np.count_nonzero(touched)),
+        int(np.count_nonzero(touched & np.isin(status, (SLIPPED, STICKS)))),
+        "slip onset",
+        unit_of("slip_onset", result.process) or "",
+        lowest,
+        highest,
+        slipped=int(np.count_nonzero(touched & (status == SLIPPED))),
+        stick_ratio=float(ratio[-1]) if ratio.size else None,
     )
 
 

@@ -192,7 +192,7 @@ def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
         raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
     shapes = {"x": size[-1:], "y": size[-2:-1]}
     shapes |= {name: (*size, components) for name, components in _VECTORS.items()}
-    moved = getattr(there.get(_MOVED), "shape", None) or ()
+    moved: Shape = getattr(there.get(_MOVED), "shape", None) or ()
     if len(moved) == 4 and len(size) == 2:  # of each frame
         shapes[_MOVED] = (moved[0], *shapes[_MOVED])
     return {name: (node, shapes.get(name, size)) for name, node in there.items()}

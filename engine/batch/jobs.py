@@ -19,6 +19,8 @@ import numpy as np
 from mirrorskin.engine.press.press import reconstruct_press
 from mirrorskin.engine.provenance import program_version
 from mirrorskin.engine.rotation.rotation import reconstruct_rotation
+from mirrorskin.engine.slip.search import MOTIONS as SLIP_MOTIONS
+from mirrorskin.engine.slip.slip import reconstruct_slip
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result
 
@@ -104,10 +106,11 @@ class Plan:
     press: Mapping[str, Any] = field(default_factory=dict)  # of `engine.reconstruct`, for vertical motion
     rotation: Mapping[str, Any] = field(default_factory=dict)  # and for axial motion
     memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames on the move, of each device
+    slip: Mapping[str, Any] = field(default_factory=dict)  # and for slides and twists
 
     def options(self, motion: Motion) -> Mapping[str, Any]:
         """Return the keywords of `mirrorskin.engine.reconstruct` for a motion."""
-        chosen = {"vertical": self.press, "axial": self.rotation}.get(motion, {})
+        chosen = {"vertical": self.press, "axial": self.rotation}.get(motion, self.slip)
         return {**chosen, "memory_limit": self.memory_limit}
 
     def key(self, motion: Motion) -> str:
@@ -125,6 +128,8 @@ class Plan:
             used["press"] = {**_defaults(reconstruct_press), **self.press}
         if motion == "axial":
             used["rotation"] = {**_defaults(reconstruct_rotation), **self.rotation}
+        if motion in SLIP_MOTIONS:
+            used["slip"] = {**_defaults(reconstruct_slip), **self.slip}
         return json.dumps(_as_json(used), sort_keys=True)
 
     def digest(self, motion: Motion) -> str:

@@ -23,6 +23,7 @@ from mirrorskin.engine.slip.displacement import (
     node_status,
 )
 from mirrorskin.engine.slip.onset_map import OnsetMap, fit_onsets
+from mirrorskin.engine.slip.status import CLEAR, NO_CONTACT, SLIPPED, STICKS, UNKNOWN
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, pixel_axes
@@ -34,9 +35,6 @@ MOTIONS: tuple[SlipMotion, ...] = get_args(SlipMotion)
 
 WINDOW = 8
 """Pixels: smaller than for displacement alone, as all frames together tell an onset."""
-
-UNKNOWN, SLIPPED, STICKS, NO_CONTACT, CLEAR = range(5)
-"""What the status says of a pixel."""
 
 _BEND = 16.0  # of the onset between nodes, as a share of the way, times the contact's area in nodes / pi
 _FOLLOWS = 0.5  # of the object's movement, from which on skin is taken to have touched it
@@ -62,6 +60,8 @@ class Slip:
         0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture.
     contact : ndarray, (H, W), uint8
         1 where the skin touches the object: given, or estimated.
+    way : ndarray, (T,), float64
+        How far the body has come along its path in each frame, mm or radians.
     stick_ratio : ndarray, (T,), float64
         Share of the contact that sticks, frame by frame; NaN from where the body first turns back.
     centre : (float, float) or None
@@ -79,6 +79,7 @@ class Slip:
     slip_onset_sigma: NDArray[np.float32]
     status: NDArray[np.uint8]
     contact: NDArray[np.uint8]
+    way: Doubles
     stick_ratio: Doubles
     centre: tuple[float, float] | None
     angle: float | None
@@ -151,7 +152,7 @@ class SlipSearch:
         self.device = open_device(device)
         self._shape, self._dtype, self._size = shape, check_dtype(dtype), check_pixel_size(pixel_size)
         self._contact = None if contact is None else _check_contact(contact, shape)
-        self._centre, self._window, self._step = centre, window, step
+        self._centre, self.window, self.step = centre, window, step
         self._noise, self._per_frame = noise, per_frame
         self._length = max(1, memory_limit // (2 * math.prod(shape) * self._dtype.itemsize))
         self.reset()
@@ -186,7 +187,7 @@ class SlipSearch:
         places = self._check_places(displacement if self.position == "displacement" else twist, len(frames))
         for frame, place in zip(frames, places, strict=True):
             if self._tracker is None:
-                self._tracker = Tracker(frame.copy(), self._window, self._step, self.device)
+                self._tracker = Tracker(frame.copy(), self.window, self.step, self.device)
             else:
                 self._fields.append(self._tracker.follow(frame, self._stride(place)))
             self._places.append(place)
@@ -253,6 +254,7 @@ class SlipSearch:
             slip_onset_sigma=np.where(slipped, tracker.to_pixels(onsets.sigma), np.float32(np.nan)),
             status=status,
             contact=contact.astype(np.uint8),
+            way=np.append(0.0, course.way),
             stick_ratio=course.stick_ratio(onset[(status == SLIPPED) | (status == STICKS)]),
             centre=centre,
             angle=angle,
@@ -312,13 +314,13 @@ class SlipSearch:
                 max(rows.min() - 2, 0) : rows.max() + 3, max(columns.min() - 2, 0) : columns.max() + 3
             ]
             # Windows overlap: what they say together is worth less.
-            overlap = max(1.0, self._window / self._step)
+            overlap = max(1.0, self.window / self.step)
             known = np.where(touched, overlap * sigma, np.nan)
             found = fit_onsets(
                 departure[: course.forward, *box],
                 known[box],
                 course.way[: course.forward],
-                self._window / self._step,
+                self.window / self.step,
                 _BEND * math.pi / touched.sum(),
             )
             onset[box], spread[box] = found.onset, found.sigma

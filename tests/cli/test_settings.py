@@ -45,6 +45,12 @@ zenith-offset = 10
 noise = 2
 per-turn = true
 robust = true
+
+[slip]
+per-frame = true
+window = 12
+step = 6
+noise = 1.5
 """
 
 
@@ -94,6 +100,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "per_turn": True,
         "robust": True,
     }
+    assert plan.slip == {"per_frame": True, "window": 12, "step": 6, "noise": 1.5}
     assert plan.memory_limit == 1000
 
 

@@ -40,6 +40,11 @@ PICTURES: Mapping[str, tuple[str, str]] = {
         "Growth: the share of full light that a pixel gains with the travel of a dithering press.",
         "Map of the growth of the light, per millimetre",
     ),
+    "displacement": (
+        "Displacement of the skin since the first frame, in the last one; arrows point along it.",
+        "Map of the skin's displacement in micrometres, with arrows",
+    ),
+    "slip": ("How far the body had come when the skin broke loose.", "Map of the onset of slip"),
     "histogram": ("How often each height occurs.", "Histogram of the heights"),
 }
 """Caption and alternative text of each picture."""
@@ -50,7 +55,8 @@ MAPS: Mapping[str, tuple[str, str]] = {
     "status": (
         "",
         "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
-        "2 dark at start, 3 light to the end; of a tilt of each frame: 1 normal, 2 none, 4 only a slope",
+        "2 dark at start, 3 light to the end; of a tilt of each frame: 1 normal, 2 none, 4 only a slope; "
+        "of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture",
     ),
     "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
     "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),
@@ -78,6 +84,10 @@ MAPS: Mapping[str, tuple[str, str]] = {
     ),
     "slope_min": ("rad", "least inclination of the sheet, by the highest level of light that it passes"),
     "slope_max": ("rad", "greatest inclination of the sheet, by the lowest level that it does not pass"),
+    "displacement": ("mm", "how far the skin has moved along x and y since the first frame"),
+    "displacement_sigma": ("mm", "the standard deviation that is expected of that along either axis"),
+    "slip_onset": ("mm, of a twist rad", "the way of the body after which the skin broke loose"),
+    "slip_onset_sigma": ("mm, of a twist rad", "the standard deviation that is expected of the onset"),
     "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
 }
 """Of each map its unit in the file, and what it says."""
@@ -111,7 +121,8 @@ _FIRST = (
 """Entries of a process that are provenance; the others are parameters."""
 
 _UNITS = {
-    "tilt": "rad",
+    **dict.fromkeys(("tilt", "angle"), "rad"),
+    **dict.fromkeys(("centre_x", "centre_y"), "mm"),
     "slope_direction": "rad",
     **dict.fromkeys(("travel", "travel_amplitude"), "mm"),
     **dict.fromkeys(("area_growth", "area_growth_sigma"), "mm^2/mm"),

@@ -16,6 +16,7 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.view.canvas import encode_figure, new_figure
 from mirrorskin.view.result.maps import (
     draw_azimuth,
+    draw_displacement,
     draw_edges,
     draw_height,
     draw_height_sigma,
@@ -23,6 +24,7 @@ from mirrorskin.view.result.maps import (
     draw_normal_sigma,
     draw_normals,
     draw_signed,
+    draw_slip_onset,
     draw_status,
 )
 from mirrorskin.view.result.section import draw_histogram, draw_section
@@ -38,7 +40,7 @@ Ends = tuple[tuple[float, float], tuple[float, float]]
 """Where a section begins and ends, x and y, mm."""
 
 MAPS = (
-    *("height", "section", "normals", "edges", "status", "sigma", "histogram"),
+    *("height", "section", "normals", "edges", "status", "sigma", "histogram", "displacement", "slip"),
     *("slope", "hysteresis", "growth", "azimuth", "modulation"),
 )
 """What can be drawn, where a result has it."""
@@ -137,6 +139,8 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
         ("sigma", result.height_sigma, draw_height_sigma),
         ("sigma", result.normal_sigma, draw_normal_sigma),
         ("histogram", result.height, draw_histogram),
+        ("displacement", result.displacement, draw_displacement),
+        ("slip", result.slip_onset, draw_slip_onset),
     ):
         if values is not None:
             yield _Panel(name, partial(draw, sheet=sheet))

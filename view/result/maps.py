@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
 from mirrorskin.view.colours import MISSING, MISSING_RGB, Colours, normal_colours, span
@@ -206,6 +207,7 @@ def _draw_key(axes: Axes) -> None:
     key.text(0, -1.2, "a ball's colours", ha="center", va="top", fontsize=SMALL)
 
 
+_ARROWS = 12  # along a side
 _MICROMETRES = 1e3  # in a millimetre
 _SHOWN = 1, 99  # percentiles at the ends of the colour scale
 _DECADES = 30.0  # times between these, from which on colours are of the logarithm
@@ -239,6 +241,30 @@ def draw_modulation(axes: Axes, sheet: Sheet) -> None:
         "counts",
         "viridis",
     )
+
+
+def draw_slip_onset(axes: Axes, sheet: Sheet) -> None:
+    """Draw how far the body had come when the skin broke loose, in micrometres or degrees."""
+    onset = sheet.result.slip_onset
+    assert onset is not None
+    turned = unit_of("slip_onset", sheet.result.process) == "rad"
+    unit, scale = ("deg", np.degrees(1.0)) if turned else ("\N{MICRO SIGN}m", _MICROMETRES)
+    draw_map(axes, sheet, scale * onset.astype(np.float64), f"way of the body ({unit})", cmap="viridis")
+    entitle(axes, "Onset of slip", "blue: no slip, or no answer")
+
+
+def draw_displacement(axes: Axes, sheet: Sheet) -> None:
+    """Draw how far the skin has moved in the last frame, with arrows along its way."""
+    moved = sheet.result.displacement
+    assert moved is not None
+    last = _MICROMETRES * (moved if moved.ndim == 3 else moved[-1]).astype(np.float64)
+    length = np.sqrt(np.sum(last**2, axis=-1))
+    draw_map(axes, sheet, length, "length (\N{MICRO SIGN}m)", cmap="viridis")
+    rows, columns = (slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in length.shape))
+    x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
+    arrows = last[rows, columns]
+    axes.quiver(x, y, arrows[..., 0], arrows[..., 1], color="white", edgecolor="black", linewidth=0.3)
+    entitle(axes, "Displacement of the skin", "since the first frame")
 
 
 def draw_signed(axes: Axes, sheet: Sheet, name: str) -> None:
@@ -283,9 +309,11 @@ def _draw_positive(
 _ONSET = "invalid input", "onset", "never light", "light at start"
 _RELEASE = "invalid input", "release", "dark at start", "light to the end"
 _POSES = "invalid input", "normal", "none", "", "slope only"
+_SLIP = "unknown", "slipped", "sticks", "no contact", "no texture"
 _UNKNOWN = "unknown number"
 _STATUS_COLOURS = "#d55e00", "#009e73", "0.25", "#f0e442", "white"
 _POSE_COLOURS = *_STATUS_COLOURS[:4], "#56b4e9", "white"
+_SLIP_COLOURS = "#f0e442", "#d55e00", "#009e73", "0.85", "#56b4e9", "white"
 _SIGNED = {  # what colours say, in a unit of so many
     "slope": ("slope along the rocking", "slope", 1.0),
     "hysteresis": ("hysteresis", "release less onset (µm)", 1e3),
@@ -313,9 +341,14 @@ def draw_status(axes: Axes, sheet: Sheet) -> None:
     status = sheet.result.status
     assert status is not None
     released = sheet.result.process.get("event") == "release"
-    names = *(_POSES if sheet.result.zenith is not None else _RELEASE if released else _ONSET), _UNKNOWN
-    classes = np.minimum(status, names.index(_UNKNOWN)).astype(np.uint8)
-    _draw_shares(axes, sheet, classes, _POSE_COLOURS if names[:-1] == _POSES else _STATUS_COLOURS, names)
+    names: tuple[str, ...] = _RELEASE if released else _ONSET
+    colours: tuple[str, ...] = _STATUS_COLOURS
+    if sheet.result.slip_onset is not None:
+        names, colours = _SLIP, _SLIP_COLOURS
+    elif sheet.result.zenith is not None:
+        names, colours = _POSES, _POSE_COLOURS
+    classes = np.minimum(status, len(names)).astype(np.uint8)
+    _draw_shares(axes, sheet, classes, colours, (*names, _UNKNOWN))
     entitle(axes, "Status")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes, select_turn
+from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import Extent, draw_image, extent
 
@@ -71,8 +72,8 @@ def sheet_of(result: Result) -> Sheet:
     result = select_turn(result, None)
     if result.x is not None and result.y is not None:
         return Sheet(result, result.x, result.y, "mm")
-    shape = next(iter(result.maps().values())).shape
-    return Sheet(result, *pixel_axes((shape[0], shape[1]), (1.0, 1.0)), "px")
+    rows, columns = map_shape(result)
+    return Sheet(result, *pixel_axes((rows, columns), (1.0, 1.0)), "px")
 
 
 def draw_map(axes: Axes, sheet: Sheet, values: NDArray[Any], label: str = "", **colours: Any) -> AxesImage:

@@ -1,0 +1,163 @@
+"""What a slide or a twist tells: where the skin sticks, where and when it slips, and how far it moves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin import io
+from mirrorskin.engine.provenance import attach_provenance
+from mirrorskin.engine.slip.displacement import STEP
+from mirrorskin.engine.slip.search import MOTIONS, WINDOW, Slip, SlipSearch
+from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.types import UNDISTORTED
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
+    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.kernels.device import Device
+
+
+def reconstruct_slip(
+    source: Source,
+    *,
+    contact: Result | ArrayLike | None = None,
+    per_frame: bool = False,
+    window: int = WINDOW,
+    step: int = STEP,
+    noise: float | None = None,
+    memory_limit: int = MEMORY_LIMIT,
+    device: str | Device | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Reconstruct displacement and slip from a slide or a twist, by `SlipSearch`.
+
+    Parameters
+    ----------
+    source : Source
+        Of horizontal motion or a twist, with a known pixel size. It is rewound first, if it can be.
+    contact : Result or array_like, (H, W), optional
+        Where the skin touches the object in the first frame: a press's result, or a map that is not 0 there.
+        Heights alone tell where light is, which runs ahead of an elastic contact; a pressure tells contact.
+        Without it, contact is estimated, and comes out too wide.
+    per_frame : bool
+        Whether the displacement is that of each frame, and not of the last alone.
+    window, step, noise
+        As for `mirrorskin.engine.find_displacement`.
+    memory_limit : int
+        Bytes of host memory for frames on the move.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+    progress : callable, optional
+        Called with the number of frames so far.
+
+    Returns
+    -------
+    Result
+        ``displacement``, ``displacement_sigma``, ``slip_onset``, ``slip_onset_sigma``, ``status``,
+        ``contact``, ``way`` and ``stick_ratio``; of a twist the process has ``angle``, ``centre_x`` and
+        ``centre_y`` of the skin that sticks.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The input cannot be used: no pixel size, a body that does not move, a sheet without texture, or a
+        contact of another size.
+    """
+    search = slip_search(
+        source,
+        contact=contact,
+        per_frame=per_frame,
+        window=window,
+        step=step,
+        noise=noise,
+        memory_limit=memory_limit,
+        device=device,
+    )
+    feed(source, search, range(source.shape[0]), progress)
+    return slip_result(search.result(), source, search, contact_given=contact is not None)
+
+
+def slip_search(
+    source: Source,
+    *,
+    contact: Result | ArrayLike | None,
+    per_frame: bool,
+    window: int,
+    step: int,
+    noise: float | None,
+    memory_limit: int,
+    device: str | Device | None,
+) -> SlipSearch:
+    """Make the estimator for a source; see `reconstruct_slip`."""
+    if source.motion not in MOTIONS:
+        raise InputError(f"{source.name} is of {source.motion} motion: slip is of {' and '.join(MOTIONS)}")
+    if source.header.pixel_size is None:
+        raise InputError(f"{source.name} has no pixel size, which slip takes: give it")
+    right, up = _off_centre(source)
+    return SlipSearch(
+        (source.shape[1], source.shape[2]),
+        source.dtype,
+        source.header.pixel_size,
+        motion="twist" if source.motion == "twist" else "horizontal",
+        contact=_contact_map(contact) if isinstance(contact, Result) else contact,
+        centre=(-right, -up),
+        window=window,
+        step=step,
+        noise=noise,
+        per_frame=per_frame,
+        memory_limit=memory_limit,
+        device=device,
+    )
+
+
+def slip_result(found: Slip, source: Source, search: SlipSearch, *, contact_given: bool) -> Result:
+    """Return the maps as a result, with how they came about."""
+    process: dict[str, ProcessValue] = {
+        "motion": source.motion,
+        "frames": len(found.way),
+        "window": search.window,
+        "step": search.step,
+        "noise": found.noise,
+        "contact": "given" if contact_given else "estimated",
+    }
+    if found.centre is not None and found.angle is not None:
+        (right, up), (x, y) = _off_centre(source), found.centre
+        process |= {"angle": found.angle, "centre_x": x + right, "centre_y": y + up}
+    result = Result(
+        displacement=found.displacement,
+        displacement_sigma=found.displacement_sigma,
+        slip_onset=found.slip_onset,
+        slip_onset_sigma=found.slip_onset_sigma,
+        status=found.status,
+        contact=found.contact,
+        way=found.way,
+        stick_ratio=found.stick_ratio,
+    )
+    return attach_provenance(result, source, search.device, process)
+
+
+def _off_centre(source: Source) -> tuple[float, float]:
+    """Return where the middle of the frames is, mm from the whole picture's centre."""
+    own = source.source if isinstance(source, io.Calibrated) else source
+    if not isinstance(own, io.Recording) or source.header.pixel_size is None:
+        return 0.0, 0.0
+    _, rows, columns = own.full_shape
+    return own.region.centre((rows, columns), source.header.pixel_size)
+
+
+def _contact_map(press: Result) -> NDArray[Any]:
+    """Return where a press touched: by its pressure, its map of contact, or its heights."""
+    if press.process.get(UNDISTORTED):
+        raise InputError("the contact is undistorted, and the frames are not: make it without a lens")
+    if press.pressure is not None:
+        return press.pressure > 0
+    if press.contact is not None:
+        return press.contact
+    if press.height is None:
+        raise InputError("the contact's result has neither contact nor heights: give that of a press")
+    return np.isfinite(press.height)

@@ -1,0 +1,152 @@
+"""Slides and twists on the command line: simulated, reconstructed, scored and looked at."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from commands import run
+
+from mirrorskin import engine, io
+
+SCENE = "--contact elastic --texture flakes --size 64x64 --pixel-size 0.05mm --press 0.5mm --friction 0.6"
+
+
+def simulate(motion, folder, *more):
+    path = folder / f"{motion}.h5"
+    assert run("simulate", motion, *SCENE.split(), *more, "-o", path).code == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("slide")
+    return simulate("horizontal", folder, "--frames", 12, "--displacement-step", "0.02mm,0mm")
+
+
+@pytest.fixture(scope="module")
+def contact(slide):
+    """A result that tells where the skin touches, from the simulation."""
+    with io.open_recording(slide) as recording:
+        touched = recording.truth.contact
+    path = slide.with_name("press-result.h5")
+    io.save_result(io.Result(contact=touched), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(slide, contact):
+    ended = run("reconstruct", slide, "--contact", contact, "--per-frame", "-o", slide.with_name("found.h5"))
+    assert (ended.code, ended.said) == (0, "")
+    assert "slipped, from" in ended.out
+    return io.open_result(slide.with_name("found.h5"))
+
+
+def test_a_slide_is_told_as_the_search_finds_it_in_its_frames(slide, contact, found):
+    touched = io.open_result(contact).contact
+    with io.open_recording(slide) as recording:
+        block = recording.read(np.empty(recording.shape, recording.dtype))
+        search = engine.SlipSearch((64, 64), recording.dtype, 0.05, contact=touched, per_frame=True)
+        search.push(block.frames, displacement=block.displacement)
+    told = search.result()
+    for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(told, name), err_msg=name)
+    np.testing.assert_allclose(found.way, np.arange(12) * 0.02, atol=1e-12)
+    np.testing.assert_array_equal(found.stick_ratio, told.stick_ratio)
+
+
+def test_a_slide_agrees_with_the_truth(slide, found):
+    with io.open_recording(slide) as recording:
+        score = engine.score(found, recording.truth).slip
+    assert score.coverage > 0.9
+    assert score.recall > 0.9
+    assert score.precision > 0.9
+    assert score.onset_rms < 0.03
+    assert score.displacement_rms < 0.01
+    ended = run("score", slide.with_name("found.h5"), "--truth", slide, "--json")
+    assert json.loads(ended.out)["slip"]["unit"] == "mm"
+
+
+def test_a_score_without_slip_in_the_truth_lacks_it(slide, found):
+    with io.open_recording(slide) as recording:
+        truth = recording.truth
+    bare = io.Truth(truth.height, truth.zenith, truth.azimuth, truth.contact)
+    assert engine.score(found, bare).slip is None
+
+
+def test_only_the_last_displacement_is_told_unless_all_are_wanted(slide, contact, found):
+    target = slide.with_name("last.h5")
+    assert run("reconstruct", slide, "--contact", contact, "-o", target).code == 0
+    np.testing.assert_array_equal(io.open_result(target).displacement, found.displacement[-1])
+
+
+def test_a_part_of_a_twist_turns_about_the_whole_pictures_centre(tmp_path):
+    path = simulate("twist", tmp_path, "--frames", 6, "--twist-step", "0.5deg", "--friction", "5")
+    with io.open_recording(path, region=io.Region.read("8,4,52x56")) as recording:
+        io.save_result(io.Result(contact=recording.truth.contact), tmp_path / "press.h5")
+    words = "--region", "8,4,52x56", "--contact", tmp_path / "press.h5", "-o", tmp_path / "found.h5"
+    assert run("reconstruct", path, *words).code == 0
+    found = io.open_result(tmp_path / "found.h5")
+    assert found.process["angle"] == pytest.approx(-math.radians(2.5), rel=0.05)
+    assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.06)
+    assert found.to_xarray()["way"].attrs["units"] == "rad"
+    assert found.way[-1] == pytest.approx(math.radians(2.5))
+
+
+def test_pictures_and_tables_know_slip(slide, found, tmp_path):
+    result = slide.with_name("found.h5")
+    assert run("view", result, "-o", tmp_path / "pictures").code == 0
+    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {"status", "displacement", "slip"}
+    assert run("report", result, "-o", tmp_path / "page.html").code == 0
+    assert run("export", result, "-o", tmp_path / "maps.npz").code == 0
+    with np.load(tmp_path / "maps.npz") as arrays:
+        assert json.loads(str(arrays["units"]))["slip_onset"] == "mm"
+        np.testing.assert_array_equal(arrays["stick_ratio"], found.stick_ratio)
+    described = found.to_xarray()
+    assert described["displacement"].dims == ("frame", "y", "x", "direction")
+
+
+def test_a_batch_takes_slides(slide, tmp_path):
+    (tmp_path / "batch.toml").write_text("[slip]\nper-frame = true\n")
+    assert run("batch", slide, "-o", tmp_path, "--settings", tmp_path / "batch.toml").code == 0
+    assert io.open_result(tmp_path / "horizontal-result.h5").displacement.shape == (12, 64, 64, 2)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--hold", 3], "of which --hold says nothing"),
+        (["--method", "paper"], "of which --method says nothing"),
+        (["--window", 200], "window"),
+        (["--frames", "0:2"], "at least 3"),
+    ],
+)
+def test_what_says_nothing_of_a_slide_is_refused_in_a_line(slide, words, told):
+    ended = run("reconstruct", slide, *words)
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert told in ended.said
+
+
+def test_a_contact_that_is_only_estimated_is_told(slide, tmp_path):
+    ended = run("reconstruct", slide, "-o", tmp_path / "found.h5")
+    assert ended.code == 0
+    assert "contact is estimated" in ended.said
+    assert "--contact" in ended.said
+
+
+def test_a_contact_of_another_size_is_refused_in_a_line(slide, tmp_path):
+    io.save_result(io.Result(contact=np.ones((3, 4), np.uint8)), tmp_path / "other.h5")
+    ended = run("reconstruct", slide, "--contact", tmp_path / "other.h5")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "(3, 4)" in ended.said
+
+
+def test_a_press_that_knows_its_pressure_tells_contact_by_that(slide):
+    touched = np.zeros((64, 64), bool)
+    touched[20:40, 20:40] = True
+    press = io.Result(height=np.zeros((64, 64), np.float32), pressure=touched.astype(np.float32))
+    with io.open_recording(slide) as recording:
+        found = engine.reconstruct(recording, contact=press)
+    np.testing.assert_array_equal(found.contact, touched)
