@@ -29,7 +29,7 @@ PURPOSES = {
     "import": "Make a recording of a video or pictures.",
     "capture": "Move the stage, and record what the camera sees.",
     "live": "Reconstruct while the stage moves.",
-    "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, slip from a slide or a twist.",
+    "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",
     "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
     "fuse": "Make one surface of a press and a rotation.",
     "batch": "Reconstruct many recordings.",

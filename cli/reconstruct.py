@@ -177,7 +177,7 @@ def command(
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct heights from a press, normals and heights from a rotation, slip from a slide or a twist."""
+    """Reconstruct heights from a press, normals and heights from a rotation, or slip."""
     from mirrorskin import engine, io
     from mirrorskin.cli.output import printable, progress, report_missing_maps, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
@@ -227,7 +227,10 @@ def command(
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
     if result.process.get("contact") == "estimated":
-        said = f"{recording}: the contact is estimated and too wide, and so is slip; give --contact, a press's result"
+        said = (
+            f"{recording}: the contact is estimated and too wide, and so is slip; "
+            "give --contact, a press's result"
+        )
         click.echo(printable(said), err=True)
     save_and_report(result, target, device, as_json)
 
