@@ -513,18 +513,9 @@ def test_frames_are_packed_as_asked(packing):
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_what_has_no_method_yet_is_recorded_and_told(motion):
+def test_slides_and_twists_tell_their_motion_and_press(motion):
     assert run("simulate", motion, *SMALL, "--frames", "3", *EXACT, "-o", "a.h5").code == 0
     facts = run("info", "a.h5")
     assert facts.code == 0
     assert re.search(rf"motion +{motion}\n", facts.out)
     assert re.search(r"press +1 mm\n", facts.out)
-    code, out, said = run("reconstruct", "a.h5")
-    assert (code, out, said.count("\n")) == (2, "", 1)
-    assert "a.h5" in said
-    assert motion in said
-    assert {path.name for path in Path().iterdir()} == {"a.h5"}
-    io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "r.h5")
-    code, out, said = run("score", "r.h5", "--truth", "a.h5")
-    assert (code, out, said.count("\n")) == (2, "", 1)
-    assert "not of one stack" in said
