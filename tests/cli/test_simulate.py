@@ -519,3 +519,7 @@ def test_slides_and_twists_tell_their_motion_and_press(motion):
     assert facts.code == 0
     assert re.search(rf"motion +{motion}\n", facts.out)
     assert re.search(r"press +1 mm\n", facts.out)
+    io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "r.h5")
+    code, out, said = run("score", "r.h5", "--truth", "a.h5")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert "not of one stack" in said

@@ -84,11 +84,11 @@ MAPS: Mapping[str, tuple[str, str]] = {
     ),
     "slope_min": ("rad", "least inclination of the sheet, by the highest level of light that it passes"),
     "slope_max": ("rad", "greatest inclination of the sheet, by the lowest level that it does not pass"),
+    "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
     "displacement": ("mm", "how far the skin has moved along x and y since the first frame"),
     "displacement_sigma": ("mm", "the standard deviation that is expected of that along either axis"),
     "slip_onset": ("mm, of a twist rad", "the way of the body after which the skin broke loose"),
     "slip_onset_sigma": ("mm, of a twist rad", "the standard deviation that is expected of the onset"),
-    "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
 }
 """Of each map its unit in the file, and what it says."""
 
