@@ -97,7 +97,7 @@ def slip_search(
     if source.motion not in MOTIONS:
         raise InputError(f"{source.name} is of {source.motion} motion: slip is of {' and '.join(MOTIONS)}")
     if source.header.pixel_size is None:
-        raise InputError(f"{source.name} has no pixel size, which slip takes: give it")
+        raise InputError(f"{source.name} has no pixel size, which slip takes: give --pixel-size")
     right, up = _off_centre(source)
     return SlipSearch(
         (source.shape[1], source.shape[2]),
