@@ -17,7 +17,7 @@ from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
-    from mirrorskin.engine.live import LivePress, LiveRotation, Loop
+    from mirrorskin.engine.live import LivePress, LiveRotation, LiveSlip, Loop
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource
@@ -35,7 +35,7 @@ _REMEDIES = {
 
 def command(
     context: click.Context,
-    motion: scans.LiveMotion,
+    motion: scans.Motion,
     rig_file: scans.RigFile,
     record: Annotated[
         Path | None, Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
@@ -75,12 +75,17 @@ def command(
     step: scans.Step = None,
     speed: scans.Speed = None,
     press: scans.Press = None,
+    distance: scans.Distance = None,
+    direction: scans.Direction = None,
+    angle: scans.Angle = None,
+    wait: scans.Wait = None,
     tilt: scans.Tilt = None,
     turns: scans.Turns = None,
     phase_step: scans.PhaseStep = None,
     rate: scans.Rate = None,
     settle: scans.Settle = None,
     frames: scans.StepFrames = None,
+    contact: options.Contact = None,
     calibration: options.Calibration = None,
     device: options.Device = None,
 ) -> None:
@@ -93,7 +98,7 @@ def command(
     plan = scans.make_plan(context.params, settings)  # from the options above
     for path, others in ((record, ()), (output, (record,))):
         if path is not None:
-            io.check_output(path, rig_file, calibration, *others)
+            io.check_output(path, rig_file, calibration, contact, *others)
     known = scans.open_calibration(calibration, settings)
     _Live(settings, plan, {**context.params, "latency": duration(latency, "--latency")}, known).run()
 
@@ -104,10 +109,14 @@ class _Live:
     def __init__(
         self, settings: RigSettings, plan: Plan, given: Mapping[str, Any], calibration: Calibration | None
     ) -> None:
+        from mirrorskin.io import open_result
+
         self._settings, self._plan, self._given = settings, plan, given
         self._calibration = calibration
+        contact = given["contact"]
+        self._contact = None if contact is None else open_result(contact)
         self._loop: Loop | None = None
-        self._estimator: LivePress | LiveRotation | None = None
+        self._estimator: LivePress | LiveRotation | LiveSlip | None = None
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
@@ -171,16 +180,18 @@ class _Live:
             finally:
                 gc.unfreeze()
 
-    def _make_estimator(self, source: LiveSource, rate: float) -> LivePress | LiveRotation:
+    def _make_estimator(self, source: LiveSource, rate: float) -> LivePress | LiveRotation | LiveSlip:
         """Make what estimates the maps; the source has its references."""
-        from mirrorskin.engine.live import LivePress, LiveRotation, choose_window
-        from mirrorskin.hw.rig.plans import AxialPlan
+        from mirrorskin.engine.live import LivePress, LiveRotation, LiveSlip, choose_window
+        from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, TwistPlan
 
         given, plan = self._given, self._plan
         known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
         if isinstance(plan, AxialPlan):
             window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
             return LiveRotation(source, window=window, every=every, **known)
+        if isinstance(plan, HorizontalPlan | TwistPlan):
+            return LiveSlip(source, contact=self._contact, **known)
         threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
         hold = _HOLD if given["hold"] is None else given["hold"]
         return LivePress(source, threshold=threshold, hold=hold, **known)

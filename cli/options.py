@@ -85,3 +85,11 @@ LearnedCalibration = Annotated[
     Path, Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
 ]
 Ball = Annotated[str, Option(metavar="LENGTH", help="Diameter of the ball: 4mm.")]
+Contact = Annotated[
+    Path | None,
+    Option(
+        metavar="RES.h5",
+        help="Slide, twist: a press's result, where the skin touches.",
+        show_default="estimated, too wide",
+    ),
+]

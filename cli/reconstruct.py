@@ -155,14 +155,7 @@ def command(
             help="Rotation: heights (a result or a simulation) for registering the frames.",
         ),
     ] = None,
-    contact: Annotated[
-        Path | None,
-        Option(
-            metavar="RES.h5",
-            help="Slide, twist: a press's result, where the skin touches.",
-            show_default="estimated, too wide",
-        ),
-    ] = None,
+    contact: options.Contact = None,
     per_frame: Annotated[
         bool, Option("--per-frame", help="Slide, twist: the displacement in each frame, not in the last.")
     ] = False,

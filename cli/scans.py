@@ -39,19 +39,11 @@ class ScanName(StrEnum):
     twist = "twist"
 
 
-class LiveName(StrEnum):
-    """Motions that are reconstructed while a rig does them."""
-
-    vertical = "vertical"
-    axial = "axial"
-
-
 def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
     return Option(metavar=metavar, help=text, show_default=False if default is None else str(default))
 
 
 Motion = Annotated[ScanName, Argument(help="How the body moves.")]
-LiveMotion = Annotated[LiveName, Argument(help="How the body moves.")]
 RigFile = Annotated[Path, Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
 Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
 Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
@@ -98,7 +90,7 @@ _OF: Mapping[str, str] = {
     "press": "axial rock horizontal twist",
     **dict.fromkeys(("distance", "direction"), "horizontal"),
     "angle": "twist",
-    "wait": "horizontal twist",
+    **dict.fromkeys(("wait", "contact"), "horizontal twist"),
 }
 
 

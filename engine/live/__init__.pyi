@@ -1,6 +1,7 @@
 from .loop import LATENCY, LiveEstimator, Loop
 from .press import LivePress
 from .rotation import LiveRotation, choose_window
+from .slip import LiveSlip
 from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "LiveEstimator",
     "LivePress",
     "LiveRotation",
+    "LiveSlip",
     "Loop",
     "Maps",
     "Status",

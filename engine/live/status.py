@@ -33,6 +33,7 @@ class Maps(TypedDict, total=False):
     contact_area: float | None
     height_lag: int
     offset_unknown: bool
+    displacement: NDArray[np.float32] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +49,10 @@ class Update:
         That were used so far.
     time : float
         Of the newest of them, seconds on the scale of ``Block.time``; NaN where the source has none.
-    motion : {"vertical", "axial"}
+    motion : {"vertical", "axial", "horizontal", "twist"}
     position : float
-        Of the body in the newest frame: travel, mm, or phase, radians.
+        Of the body in the newest frame: travel, mm; phase or twist, radians; of a slide the length of its
+        displacement, mm.
     picture : ndarray, (H, W), uint8, uint16 or float32
         The newest frame, raw counts.
     height : ndarray, (H, W), float32
@@ -67,6 +69,8 @@ class Update:
         Square millimetres.
     offset_unknown : bool
         Whether heights are relative, the mean of each connected piece being 0.
+    displacement : ndarray, (H, W, 2), float32
+        Millimetres along x and y that the skin has moved since the first frame.
     """
 
     frames: int
@@ -81,6 +85,7 @@ class Update:
     contact_area: float | None = None
     height_lag: int = 0
     offset_unknown: bool = False
+    displacement: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True)

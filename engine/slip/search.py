@@ -211,6 +211,19 @@ class SlipSearch:
         square = float(before @ before)
         return float(np.clip((place - self._places[-1]) @ before / square, -4, 4)) if square > 0 else 0.0
 
+    def newest(self) -> NDArray[np.float32] | None:
+        """Return the displacement in the newest frame, (H, W, 2), mm; None before the second."""
+        if self._tracker is None or not self._fields:
+            return None
+        field = self._fields[-1]
+        moved = np.where(field.found, field.moved, np.nan)
+        return self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale)
+
+    @property
+    def _scale(self) -> Doubles:
+        """Millimetres along x and y that pixels to the right and down are."""
+        return np.array([self._size[0], -self._size[1]])
+
     def result(self) -> Slip:
         """Return the maps of the frames so far; more may follow.
 
@@ -263,15 +276,13 @@ class SlipSearch:
 
     def _in_mm(self, tracker: Tracker, fields: list[NodeField], texture: Texture) -> Doubles:
         """Return the displacement of the nodes, (T - 1, rows, columns, 2), mm; NaN where it was not found."""
-        scale = np.array([self._size[0], -self._size[1]])
         found = [(node_status(field, texture) == FOUND)[..., None] for field in fields]
-        moved = [np.moveaxis(field.moved, 0, -1) * scale for field in fields]
+        moved = [np.moveaxis(field.moved, 0, -1) * self._scale for field in fields]
         return np.where(np.stack(found), np.stack(moved), np.nan)
 
     def _covariance(self, texture: Texture) -> Doubles:
         """Return the covariance of a displacement, (rows, columns, 2, 2), mm^2 along x and y."""
-        scale = np.array([self._size[0], -self._size[1]])
-        return np.asarray(texture.covariance * scale[:, None] * scale)
+        return np.asarray(texture.covariance * self._scale[:, None] * self._scale)
 
     def _each(self, tracker: Tracker, moved: Doubles) -> NDArray[np.float32]:
         rest = np.where(np.isfinite(moved[:1]).any(axis=0), 0.0, np.nan)

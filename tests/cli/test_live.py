@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
+from speckle import Speckle
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.cli import live
 from mirrorskin.cli.groups import make_command
 from mirrorskin.cli.status import Board, Newest, summary
@@ -20,8 +21,9 @@ from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import rig
+from mirrorskin.hw.stage import Position
 
-SHAPE = (24, 32)
+SHAPE, SHAPED = (24, 32), (48, 56)
 OFFSET, GAIN = 20.0, 200.0
 PRESS = ["vertical", "--stop", "1mm", "--speed", "2mm/s"]
 TURN = ["axial", "--press", "1mm", "--tilt", "2.5deg", "--rate", "2.5", "--turns", "2"]
@@ -62,7 +64,9 @@ def fake(monkeypatch, tmp_path):
 
     made = Fake()
     made.path.touch()
-    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **made.camera_settings))
+    monkeypatch.setattr(
+        file, "load_rig", lambda path: settings(made.picture(Position()).shape, **made.camera_settings)
+    )
     monkeypatch.setattr(rig, "open_rig", made.open)
     return made
 
@@ -277,3 +281,26 @@ def test_ctrl_c_while_frames_are_pushed_comes_after_them():
         push()
     assert pushed == [1]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
+    texture = Speckle(4)
+
+    def picture(place):
+        noise = np.random.default_rng(int(1e6 * abs(place.x))).normal(0, 1.0, SHAPED)
+        return np.clip(np.rint(texture.frame(SHAPED, -place.x / 0.05, 0.0) + noise), 0, 255).astype(np.uint8)
+
+    fake.picture = picture
+    record, output, press = (tmp_path / name for name in ("rec.h5", "res.h5", "press.h5"))
+    io.save_result(io.Result(contact=np.ones(SHAPED, np.uint8)), press)
+    words = ["horizontal", "--press", "1mm", "--distance", "0.3mm", "--speed", "0.3mm/s", "--wait", "0s"]
+    words += ["--contact", str(press), "--latency", "5s"]
+    done = fake.run(*words, "--record", str(record), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    result = io.open_result(output)
+    assert result.process["frames"] == counted(done.output)[1] > 10
+    assert np.nanmedian(result.displacement[..., 0]) == pytest.approx(-0.3, abs=0.02)
+    with io.open_recording(record, live=True) as recording:
+        again = engine.reconstruct(recording, contact=np.ones(SHAPED, np.uint8))
+    np.testing.assert_array_equal(again.displacement, result.displacement)
+    np.testing.assert_array_equal(again.slip_onset, result.slip_onset)

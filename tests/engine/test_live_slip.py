@@ -1,0 +1,70 @@
+"""Displacement and slip while a body slides are those that are found afterwards."""
+
+import numpy as np
+import pytest
+from speckle import Speckle
+from stacks import MadeUp
+
+from mirrorskin.engine.live import LiveSlip, Loop
+from mirrorskin.engine.slip.slip import reconstruct_slip
+from mirrorskin.io import Header, InputError
+
+SHAPE, PIXEL, COUNT = (64, 72), 0.05, 8
+PLACES = np.arange(COUNT)[:, None] * [0.02, 0.01]  # mm; the skin sticks, and stays behind
+FRAMES = np.stack([Speckle(3).frame(SHAPE, -x / PIXEL, y / PIXEL, 1.0, k) for k, (x, y) in enumerate(PLACES)])
+CONTACT = np.ones(SHAPE)
+
+
+def source(motion="horizontal", **changes):
+    known = {"pixel_size": (PIXEL, PIXEL)} | changes
+    return MadeUp(FRAMES, Header(motion, **known), displacement=PLACES, time=0.01 * np.arange(COUNT))
+
+
+class Timed(MadeUp):
+    """A source whose frames are never late."""
+
+    def now(self):
+        return 0.01 * self.frames_read
+
+
+def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
+    live = LiveSlip(source(), contact=CONTACT)
+    live.warm()
+    for part in np.split(np.arange(COUNT), [1, 2, 5]):
+        live.push(FRAMES[part], displacement=PLACES[part])
+        live.maps()
+    found, offline = live.result(), reconstruct_slip(source(), contact=CONTACT)
+    for name in ("displacement", "slip_onset", "status", "stick_ratio", "way"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(offline, name), err_msg=name)
+    assert (found.status == 2).mean() > 0.5
+    assert found.process["live"] is True
+
+
+def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
+    live = LiveSlip(source(), contact=CONTACT)
+    for number in range(COUNT):
+        live.push(FRAMES[number : number + 1], displacement=PLACES[number : number + 1])
+        maps = live.maps()
+        assert bool(maps) == (number > 0)
+        if maps:
+            middle = maps["displacement"][16:48, 16:56]
+            np.testing.assert_allclose(middle, np.broadcast_to(-PLACES[number], middle.shape), atol=0.005)
+
+
+def test_a_whole_run_shows_how_far_the_body_has_come():
+    given = source()
+    timed = Timed(FRAMES, given.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
+    updates = []
+    live = LiveSlip(timed, contact=CONTACT)
+    status = Loop(timed, live, updates=1e6, on_update=lambda update, _: updates.append(update)).run()
+    assert status.used == COUNT
+    assert updates[-1].position == pytest.approx(np.hypot(0.14, 0.07))
+    assert updates[-1].displacement is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [(source("vertical"), "slip is of"), (source(pixel_size=None), "pixel size")]
+)
+def test_what_tells_no_slip_is_refused(given, told):
+    with pytest.raises(InputError, match=told):
+        LiveSlip(given)
