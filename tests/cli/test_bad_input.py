@@ -136,7 +136,7 @@ DETECTOR, STAGE = "instrument/detector", "instrument/stage"
 NAMED = [*GIVEN, "--dataset", "x"]
 CASES = {
     "axial, of no known tilt": (other_motion("axial", zenith_gain=np.array(50.0)), [], "tilt"),
-    "horizontal": (other_motion("horizontal"), [], "horizontal"),
+    "horizontal": (other_motion("horizontal"), [], "pixel size"),
     "a result": (a_result, [], "is a result: give the recording that it was made from"),
     "no data": (change(f"{DETECTOR}/data"), [], "name the stack with --dataset"),
     "dangling travel": (
