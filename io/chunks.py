@@ -28,17 +28,10 @@ class ChunkIndex(NamedTuple):
     sizes: NDArray[np.int64]  # bytes, as they are stored
     filter_masks: NDArray[np.int64]  # a bit for each filter that a chunk did not go through
 
-    def frame_by_frame(self, itemsize: int) -> ChunkIndex:
-        """Return the index of raw chunks as if each were of one frame: parts of them can be read."""
-        size = math.prod(self.shape[1:]) * itemsize
-        steps = size * np.arange(self.shape[0])[:, None, None]
-        offsets = (self.offsets[:, None] + steps).reshape(-1, *self.offsets.shape[1:])
-        return ChunkIndex((1, *self.shape[1:]), offsets, np.full_like(offsets, size), np.zeros_like(offsets))
-
     def contiguous_offset(self, shape: tuple[int, int, int]) -> int | None:
-        """Return where raw chunks of one frame begin, if each begins where the one before ends."""
-        offsets, sizes = self.offsets.ravel()[: shape[0]], self.sizes.ravel()[: shape[0] - 1]
-        if self.shape != (1, *shape[1:]) or np.any(np.diff(offsets) != sizes):
+        """Return where raw chunks of whole frames begin, if each begins where the one before ends."""
+        offsets, sizes = self.offsets.ravel(), self.sizes.ravel()
+        if self.shape[1:] != shape[1:] or np.any(np.diff(offsets) != sizes[:-1]):
             return None
         return int(offsets[0])
 

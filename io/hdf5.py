@@ -77,9 +77,7 @@ class Hdf5File(Closing):
 
     def marked(self, mark: str, group: str = "/entry") -> bool:
         """Tell whether a file is one of ours: whether its entry, or that group, has a certain attribute."""
-        entry = self.find(group)
-        with as_input_error(f"{self.path}: {group}"):
-            return isinstance(entry, h5py.Group) and h5py.h5a.exists(entry.id, mark.encode())
+        return self.attribute(group, mark) is not None
 
     def check_layout(self, mark: str, known: int = 1) -> None:
         """Raise InputError if a file of ours is laid out as nobody knew when this was written."""

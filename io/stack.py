@@ -190,7 +190,6 @@ def _open(
             if isinstance(index, str):
                 return Hdf5Frames(dataset, place, index)
             if not codecs:
-                index = index.frame_by_frame(dtype.itemsize)
                 offset = index.contiguous_offset(shape)
             if offset is None:
                 # So many threads that a quarter of the memory is enough for them.
