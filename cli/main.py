@@ -32,6 +32,7 @@ PURPOSES = {
     "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",
     "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
     "fuse": "Make one surface of a press and a rotation.",
+    "stitch": "Make one larger surface of several touches.",
     "batch": "Reconstruct many recordings.",
     "view": "Show heights, a section, normals, edges, status, expected errors.",
     "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",

@@ -8,6 +8,7 @@ from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
 from .pose.pose import Pose, estimate_pose
+from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
 from .press.changepoint import ChangePointSearch, find_change_point
 from .press.growth import Growth, find_growth
@@ -48,6 +49,7 @@ __all__ = [
     "Score",
     "Slip",
     "SlipSearch",
+    "Stitch",
     "StrokeSearch",
     "Strokes",
     "Surface",
@@ -71,4 +73,5 @@ __all__ = [
     "measure",
     "reconstruct",
     "score",
+    "stitch",
 ]

@@ -1,0 +1,31 @@
+"""``mirrorskin stitch``: results of several touches become one larger surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
+
+
+def command(
+    results: Annotated[
+        list[Path],
+        Argument(metavar="RES.h5...", help="Results of touches that overlap; x and y are the first one's."),
+    ],
+    output: Annotated[Path, Option("--output", "-o", metavar="RES.h5", help="Result to write.")],
+    pixel_size: options.PixelSize = None,
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Make one larger surface of several touches."""
+    from mirrorskin import engine, io
+    from mirrorskin.cli.output import save_and_report
+    from mirrorskin.cli.stack import stack_options
+
+    size = stack_options(pixel_size=pixel_size).get("pixel_size")
+    io.check_output(output, *results)
+    touches = [io.open_result(path) for path in results]
+    whole = engine.stitch(touches, size, names=[str(path) for path in results], device=device)
+    save_and_report(whole.result, output, device, as_json)

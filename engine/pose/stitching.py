@@ -1,0 +1,397 @@
+"""Results of several touches become one larger surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from mirrorskin.engine.pose.fit import PairFit
+from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
+from mirrorskin.engine.pose.pose import Pose, pose_of
+from mirrorskin.engine.provenance import signature
+from mirrorskin.engine.resample import SamplePoints
+from mirrorskin.io import InputError, Result, select_turn
+from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.device import Device, open_device
+
+AGREES, DISAGREES = 1, 2
+"""What the status says of a height that touches make together."""
+
+_SHARED = 0.2  # of the smaller map's pixels, from which on two touches are compared
+_ALIKE = 4.0  # of chi square, that two touches which are compared may have for a link
+_ROUNDS, _NEWTON = 5, 8  # steps of the poses, and of a height along z
+_APART = 4.0  # sigmas between a touch and the mean, from which on they disagree
+_LARGEST = 1 << 28  # pixels of the whole
+_UNFIT = 1e-9  # of the largest information, below which a direction has none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stitch:
+    """One surface of several touches.
+
+    Attributes
+    ----------
+    result : Result
+        Height, its standard deviation, status (0 no height, 1 one touch or touches that agree, 2 touches that
+        differ by more than 4 of their sigmas), contact and, where all touches have them, normals; x and y as
+        in the first touch. The standard deviation includes that of the poses.
+    poses : tuple of Pose
+        The motion of the object from the first touch to each, the first being none.
+    links : int
+        Pairs of touches that were compared.
+    """
+
+    result: Result
+    poses: tuple[Pose, ...]
+    links: int
+
+
+def stitch(
+    results: Sequence[Result],
+    pixel_size: ArrayLike | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    device: str | Device | None = None,
+) -> Stitch:
+    """Put the maps of several touches of one object together into one larger surface.
+
+    The motion from each touch to the next is found as by `mirrorskin.engine.estimate_pose`, then those
+    between all others that share a fifth of their pixels. A least-squares fit of all motions, weighted by
+    their covariances, makes the poses (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights of
+    all touches are then brought to the pixels of the first, and merged by their inverse variances.
+
+    Parameters
+    ----------
+    results : sequence of Result
+        Two or more, each with heights and what `estimate_pose` needs, and sharing a part with one before it.
+        Of touches whose height's offset is unknown, it is made to agree with those before.
+    pixel_size : float or (float, float), optional
+        mm; by default as the results say.
+    names : sequence of str, optional
+        What messages call the results.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Fewer than two results, one that shares nothing with those before it, or what `estimate_pose` refuses.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine, io
+    >>> def waves(at):
+    ...     x, y = np.meshgrid(np.arange(-30, 31) * 0.1, np.arange(20, -21, -1) * 0.1)
+    ...     p, q = 0.2 * np.cos(x - at) * np.cos(y), -0.2 * np.sin(x - at) * np.sin(y)
+    ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
+    ...     sure = np.full(x.shape, 0.01)
+    ...     height = 0.2 * np.sin(x - at) * np.cos(y)
+    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normal_sigma=sure)
+    >>> whole = engine.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
+    >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
+    ((41, 71), [-1.0, 0.0, 0.0])
+    """
+    if len(results) < 2:
+        raise InputError(f"{len(results)} results make no larger surface: give two or more")
+    names = [f"result {number}" for number in range(len(results))] if names is None else names
+    touches = [select_turn(result, None) for result in results]
+    opened = open_device(device)
+    maps = []
+    for touch, name in zip(touches, names, strict=True):
+        try:
+            maps.append(PoseMap.of(touch, pixel_size, opened))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    graph = _Graph(maps, names, opened)
+    poses = graph.solve()
+    return Stitch(_merged(touches, maps, poses, names), tuple(poses), len(graph.links))
+
+
+class _Graph:
+    """Touches, and the motions that were found between pairs of them."""
+
+    def __init__(self, maps: Sequence[PoseMap], names: Sequence[str], device: Device) -> None:
+        self._maps, self._device = maps, device
+        self.links: dict[tuple[int, int], Pose] = {}
+        self._motions = [STILL]
+        for new in range(1, len(maps)):
+            self._join(new, names)
+        for first in range(len(maps)):
+            for second in range(first + 1, len(maps)):
+                if (first, second) not in self.links:
+                    self._compare(first, second)
+
+    def _join(self, new: int, names: Sequence[str]) -> None:
+        """Link a touch to the one before it, or to the latest that it shares enough with."""
+        for old in range(new - 1, -1, -1):
+            fit = PairFit(self._maps[old], self._maps[new], self._device)
+            try:
+                pose = pose_of(fit, *fit.solve())
+            except InputError:
+                continue
+            if self._is_link(pose, old, new):
+                self.links[old, new] = pose
+                self._motions.append(self._motions[old].then(pose.motion))
+                return
+        raise InputError(f"{names[new]} shares too little with those before it: give results that overlap")
+
+    def _compare(self, first: int, second: int) -> None:
+        """Link two touches that lie over each other, as far as is known, if they are alike there."""
+        start = self._motions[first].inverse().then(self._motions[second])
+        fit = PairFit(self._maps[first], self._maps[second], self._device)
+        if fit.equations(start).pixels < _SHARED * self._smaller(first, second):
+            return
+        try:
+            pose = pose_of(fit, *fit.solve(start, near=True))
+        except InputError:
+            return
+        if self._is_link(pose, first, second):
+            self.links[first, second] = pose
+
+    def _smaller(self, *numbers: int) -> int:
+        return min(len(self._maps[number].points) for number in numbers)
+
+    def _is_link(self, pose: Pose, first: int, second: int) -> bool:
+        return pose.chi_square < _ALIKE and pose.pixels >= _SHARED * self._smaller(first, second)
+
+    def solve(self) -> list[Pose]:
+        """Return the motion from the first touch to each, by least squares over all links."""
+        count, motions = 6 * (len(self._maps) - 1), self._motions
+        for _ in range(_ROUNDS):
+            normal, right = np.zeros((count, count)), np.zeros(count)
+            for (first, second), link in self.links.items():
+                between = motions[first].inverse().then(motions[second])
+                rest = _small(link.motion.inverse().then(between))
+                weight = _information(link)
+                parts = {first: -between.adjoint(), second: np.eye(6)}
+                for one, left in parts.items():
+                    for other, beside in parts.items():
+                        if one and other:
+                            normal[_part(one), _part(other)] += left.T @ weight @ beside
+                    if one:
+                        right[_part(one)] -= left.T @ weight @ rest
+            covariance = np.linalg.pinv(normal, _UNFIT, hermitian=True)
+            step = (covariance @ right).reshape(-1, 6)
+            motions = [
+                STILL,
+                *(one.small_step(d, np.zeros(3)) for one, d in zip(motions[1:], step, strict=True)),
+            ]
+        nothing = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
+        poses = [nothing]
+        for number, motion in enumerate(motions[1:], 1):
+            own = np.asarray(covariance[_part(number), _part(number)], np.float64)
+            link = next(pose for (_, second), pose in self.links.items() if second == number)
+            poses.append(
+                replace(
+                    link,
+                    rotation=np.asarray(Rotation.from_matrix(motion.turn).as_rotvec()),
+                    translation=motion.shift,
+                    covariance=own,
+                )
+            )
+        return poses
+
+
+def _part(number: int) -> slice:
+    return slice(6 * number - 6, 6 * number)
+
+
+def _information(pose: Pose) -> Doubles:
+    """Return the inverse of a pose's covariance, 0 along what is undetermined."""
+    lengths = np.sqrt(np.maximum(np.diag(pose.covariance), np.finfo(float).tiny))
+    scaled = pose.covariance / np.outer(lengths, lengths)
+    return np.asarray(np.linalg.pinv(scaled, _UNFIT, hermitian=True) / np.outer(lengths, lengths))
+
+
+def _small(motion: Motion) -> Doubles:
+    """Return a small motion as a rotation vector and a translation, (6,)."""
+    return np.concatenate([Rotation.from_matrix(motion.turn).as_rotvec(), motion.shift])
+
+
+def _merged(
+    touches: Sequence[Result], maps: Sequence[PoseMap], poses: Sequence[Pose], names: Sequence[str]
+) -> Result:
+    """Bring all touches to the pixels of the first, and merge them by their inverse variances."""
+    x, y = _axes(maps, poses)
+    shape = len(y), len(x)
+    if shape[0] * shape[1] > _LARGEST:
+        raise InputError(f"the whole would have {shape[1]} x {shape[0]} pixels: give results that overlap")
+    sums = _Sums(shape)
+    with_normals = all(touch.normals is not None and touch.normal_sigma is not None for touch in touches)
+    unknown = touches[0].offset_unknown is not None and bool(np.any(touches[0].offset_unknown))
+    placed: list[_Moved] = []
+    for touch, known, pose in zip(touches, maps, poses, strict=True):
+        moved = _Moved.of(touch, known, pose, x, y, with_normals)
+        if touch.offset_unknown is not None and touch.offset_unknown.any() and placed:
+            moved = sums.levelled(moved)
+        sums.add(moved)
+        placed.append(moved)
+    return sums.result(placed, x, y, poses, names, unknown)
+
+
+def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doubles]:
+    """Return x and y of pixels, as those of the first map, that hold all of them, mm."""
+    x, y, step_x, step_y = maps[0].grid
+    corners = []
+    for one, pose in zip(maps, poses, strict=True):
+        corners.append(pose.inverse().apply(one.points)[:, :2])
+    every = np.concatenate(corners)
+    (left, low), (right, high) = every.min(axis=0), every.max(axis=0)
+    columns = np.arange(np.round((left - x) / step_x), np.round((right - x) / step_x) + 1)
+    rows = np.arange(np.round((y - high) / step_y), np.round((y - low) / step_y) + 1)
+    return x + columns * step_x, y - rows * step_y
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moved:
+    """A touch where the first one has its pixels: (H, W), NaN where it has nothing."""
+
+    height: Doubles
+    variance: Doubles  # with the pose's
+    contact: NDArray[np.bool_]
+    normals: Doubles | None
+    normal_variance: Doubles | None
+
+    @classmethod
+    def of(
+        cls, touch: Result, known: PoseMap, pose: Pose, x: Doubles, y: Doubles, with_normals: bool
+    ) -> _Moved:
+        assert touch.height is not None
+        left, top, step_x, step_y = known.grid
+        height = np.asarray(touch.height, np.float32).copy()
+        if touch.filled is not None:
+            height[touch.filled != 0] = np.nan
+        across, up = (part.ravel() for part in np.meshgrid(x, y))
+        motion, size = pose.motion, (len(y), len(x))
+        down, right = np.gradient(height)
+        slopes = right / step_x, -down / step_y
+        above = np.full(across.shape, float(np.nanmedian(pose.inverse().apply(known.points)[:, 2])))
+        for _ in range(_NEWTON):
+            place = motion.apply(np.stack([across, up, above], axis=-1))
+            points = SamplePoints.at(
+                (place[:, 0] - left) / step_x, (top - place[:, 1]) / step_y, height.shape
+            )
+            found = points.interpolate(height).astype(np.float64)
+            here = np.nan_to_num(found - place[:, 2])
+            above = above + here / motion.turn[2, 2]
+        p, q = (np.nan_to_num(points.interpolate(np.asarray(one, np.float32))) for one in slopes)
+        upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
+        steep = upright @ motion.turn[:, 2]  # how much faster the surface comes nearer than z
+        lever = np.concatenate([np.cross(place, upright), upright], axis=-1)
+        own = _variance_of(touch, height.shape)
+        variance = points.interpolate(own.astype(np.float32)).astype(np.float64)
+        variance = (variance + np.einsum("ni,ij,nj->n", lever, pose.covariance, lever)) / steep**2
+        answered = np.isfinite(found) & np.isfinite(variance)
+        touched = np.isfinite(touch.height) if touch.contact is None else touch.contact != 0
+        contact = points.nearest_values(touched, False) & points.inside
+        normals = square = None
+        if with_normals:
+            assert touch.normals is not None
+            assert touch.normal_sigma is not None
+            normals = points.interpolate_vectors(np.asarray(touch.normals, np.float32)) @ motion.turn
+            square = points.interpolate(np.asarray(touch.normal_sigma, np.float32)).astype(np.float64) ** 2
+            normals, square = normals.reshape(*size, 3), square.reshape(size)
+        return cls(
+            np.where(answered, above, np.nan).reshape(size),
+            np.where(answered, variance, np.nan).reshape(size),
+            contact.reshape(size),
+            normals,
+            square,
+        )
+
+
+def _variance_of(touch: Result, shape: tuple[int, ...]) -> Doubles:
+    """Return the variance of a touch's heights, (H, W); alike for all where it is not known."""
+    if touch.height_sigma is None:
+        return np.ones(shape)
+    sigma = np.asarray(touch.height_sigma, np.float64)
+    return np.where(sigma > 0, sigma, np.nan) ** 2
+
+
+class _Sums:
+    """Sums over touches, pixel by pixel."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._weight, self._height = np.zeros(shape), np.zeros(shape)
+        self._normal_weight, self._normals = np.zeros(shape), np.zeros((*shape, 3))
+        self._contact = np.zeros(shape, bool)
+
+    def add(self, moved: _Moved) -> None:
+        known = np.isfinite(moved.height)
+        weight = np.where(known, 1 / moved.variance, 0.0)
+        self._weight += weight
+        self._height += weight * np.nan_to_num(moved.height)
+        self._contact |= moved.contact
+        if moved.normals is not None and moved.normal_variance is not None:
+            told = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
+            weight = np.where(told, 1 / np.where(told, moved.normal_variance, 1.0), 0.0)
+            self._normal_weight += weight
+            self._normals += weight[..., np.newaxis] * np.nan_to_num(moved.normals)
+
+    def mean(self) -> Doubles:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self._height / self._weight)
+
+    def levelled(self, moved: _Moved) -> _Moved:
+        """Return a touch of unknown offset at the height of those before, where they share pixels."""
+        off = self.mean() - moved.height
+        shared = np.isfinite(off)
+        if not shared.any():
+            return replace(moved, height=np.full_like(off, np.nan), variance=np.full_like(off, np.nan))
+        weight = 1 / (moved.variance[shared] + 1 / self._weight[shared])
+        return replace(moved, height=moved.height + np.average(off[shared], weights=weight))
+
+    def result(
+        self,
+        placed: Sequence[_Moved],
+        x: Doubles,
+        y: Doubles,
+        poses: Sequence[Pose],
+        names: Sequence[str],
+        unknown: bool,
+    ) -> Result:
+        height = self.mean()
+        with np.errstate(divide="ignore"):
+            sigma = 1 / np.sqrt(self._weight)
+        apart, spread = np.zeros(height.shape), np.zeros(height.shape)
+        for moved in placed:
+            off = np.nan_to_num(moved.height - height)
+            apart = np.fmax(apart, off**2 / np.where(np.isfinite(moved.variance), moved.variance, 1.0))
+            spread += np.where(np.isfinite(moved.variance), off**2 / moved.variance, 0.0)
+        known = self._weight > 0
+        differs = known & (apart > _APART**2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sigma = np.where(differs, np.maximum(sigma, np.sqrt(spread / self._weight)), sigma)
+        status = np.where(differs, DISAGREES, np.where(known, AGREES, 0)).astype(np.uint8)
+        maps: dict[str, Any] = {}
+        if self._normal_weight.any():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                normals = self._normals / np.linalg.norm(self._normals, axis=-1, keepdims=True)
+                spread = 1 / np.sqrt(self._normal_weight)
+            told = self._normal_weight > 0
+            maps["normals"] = normals.astype(np.float32)
+            maps["normal_sigma"] = np.where(told, spread, np.nan).astype(np.float32)
+        if unknown:
+            maps["component"] = np.where(known, 0, -1).astype(np.int32)
+            maps["offset_unknown"] = np.ones(1, np.uint8)
+        process: dict[str, ProcessValue] = {**signature(), "method": "stitch", "touches": len(placed)}
+        for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
+            process[f"touch_{number}"] = str(name)
+            parts = ", ".join(f"{part:.6g}" for part in (*pose.rotation, *pose.translation))
+            process[f"pose_{number}"] = f"{parts} (rad, mm)"
+        return Result(
+            height=np.where(known, height, np.nan).astype(np.float32),
+            height_sigma=np.where(known, sigma, np.nan).astype(np.float32),
+            status=status,
+            contact=self._contact.astype(np.uint8),
+            x=x,
+            y=y,
+            process=process,
+            **maps,
+        )

@@ -1,0 +1,112 @@
+"""Touches of one surface are put together where they belong, as well as their errors say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from moved_surfaces import bumpy, sampled
+
+from mirrorskin import engine, io
+
+MOVES = (
+    ((0, 0, 0), (0, 0, 0)),
+    ((0.02, -0.01, 0.05), (-1.5, 0.2, 0.02)),
+    ((-0.02, 0.02, -0.03), (-2.6, -0.8, -0.03)),
+)
+
+
+def touches(seed=0, moves=MOVES, **known):
+    rng = np.random.default_rng(seed)
+    return [sampled(bumpy, np.array(turn), np.array(shift), rng=rng, **known) for turn, shift in moves]
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return engine.stitch(touches())
+
+
+def errors(result):
+    x, y = np.meshgrid(result.x, result.y)
+    return result.height - bumpy(x, y)[0]
+
+
+def test_the_surface_is_larger_and_right_to_its_sigma(whole):
+    found = whole.result
+    known = np.isfinite(found.height)
+    assert known.sum() > 1.5 * 60 * 80
+    error = errors(found)[known]
+    assert np.sqrt(np.mean(error**2)) < 1.2e-3
+    # Interpolation takes noise away, of which the standard deviations say nothing.
+    assert 0.5 < np.mean((error / found.height_sigma[known]) ** 2) < 1.2
+    assert (found.status == 2).sum() < 5
+
+
+def test_what_several_touches_saw_is_known_better(whole):
+    found = whole.result
+    once, more = np.nanmax(found.height_sigma), np.nanmin(found.height_sigma)
+    assert more < 0.75 * once
+
+
+def test_poses_are_those_that_the_touches_were_moved_by(whole):
+    for (turn, shift), pose in zip(MOVES[1:], whole.poses[1:], strict=True):
+        np.testing.assert_allclose(pose.rotation, turn, atol=4e-3)
+        np.testing.assert_allclose(pose.translation, shift, atol=5e-3)
+    assert whole.links == 3
+
+
+def test_normals_are_turned_and_merged(whole):
+    found = whole.result
+    x, y = np.meshgrid(found.x, found.y)
+    _, across, up = bumpy(x, y)
+    upright = np.dstack([-across, -up, np.ones_like(x)])
+    upright /= np.linalg.norm(upright, axis=-1, keepdims=True)
+    known = np.isfinite(found.normals).all(axis=-1)
+    angle = np.linalg.norm(found.normals - upright, axis=-1)[known]
+    assert np.sqrt(np.mean(angle**2)) < 0.011
+
+
+def test_a_touch_of_unknown_offset_takes_that_of_the_others():
+    first, second = touches(moves=MOVES[:2])
+    shape = second.height.shape
+    relative = {"component": np.zeros(shape, np.int32), "offset_unknown": np.ones(1, np.uint8)}
+    shifted = io.Result(
+        height=second.height + np.float32(0.4),
+        height_sigma=second.height_sigma,
+        normals=second.normals,
+        normal_sigma=second.normal_sigma,
+        x=second.x,
+        y=second.y,
+        **relative,
+    )
+    found = engine.stitch([first, shifted]).result
+    assert np.sqrt(np.nanmean(errors(found) ** 2)) < 2e-3
+    assert found.offset_unknown is None
+
+
+def test_touches_that_differ_say_so():
+    first, second = touches(moves=MOVES[:1] * 2)
+    dented = np.array(second.height)
+    dented[20:30, 30:40] -= 0.02
+    other = io.Result(
+        height=dented,
+        height_sigma=second.height_sigma,
+        normals=second.normals,
+        normal_sigma=second.normal_sigma,
+        x=second.x,
+        y=second.y,
+    )
+    found = engine.stitch([first, other]).result
+    assert (found.status[21:29, 31:39] == 2).all()
+    assert (found.height_sigma[21:29, 31:39] > 0.005).all()
+    assert (found.status == 2).sum() < 130
+
+
+def test_what_shares_nothing_is_refused_by_name():
+    far = sampled(lambda x, y: bumpy(x + 40.0, 3 * y), rng=np.random.default_rng(1))
+    with pytest.raises(io.InputError, match=r"other\.h5 shares too little"):
+        engine.stitch([touches()[0], far], names=["one.h5", "other.h5"])
+
+
+def test_a_single_result_is_refused():
+    with pytest.raises(io.InputError, match="two or more"):
+        engine.stitch(touches(moves=MOVES[:1]))
