@@ -84,9 +84,17 @@ class SheetTexture:
             if not holds:
                 raise InputError(f"{name} {getattr(self, name)} of the texture cannot be: give {range_}")
 
-    def reflectance(self, places: Floats) -> Floats:
-        """Return the share of the light that the sheet's points reflect, by their x and y, (2, ...), mm."""
-        share = self._flakes(places) if self.kind == "flakes" else self._dots(places)
+    def reflectance(self, places: Floats, pixel_size: tuple[float, float] = (0.0, 0.0)) -> Floats:
+        """Return the share of the light that the sheet reflects around points, by x and y, (2, ...), mm.
+
+        Dots have rims, and are averaged over four points of a pixel of that size, mm; flakes are smooth.
+        """
+        if self.kind == "flakes":
+            return 1 - self.contrast * self._flakes(places)
+        across, up = (size / 4 for size in pixel_size)
+        x, y = places
+        quarters = [np.stack([x + i * across, y + j * up]) for j in (-1, 1) for i in (-1, 1)]
+        share: Floats = np.mean([self._dots(part) for part in quarters], axis=0)
         return 1 - self.contrast * share
 
     def shown(self, reflectance: Floats, light: Light) -> Light:
@@ -138,7 +146,7 @@ class Coat:
                 f" make it {_PIXELS_MIN:g} pixels or more"
             )
         self.texture, self.optics, self._view = texture, optics, view
-        self.rest = texture.reflectance(np.stack([view.x, view.y]))
+        self.rest = texture.reflectance(np.stack([view.x, view.y]), view.pixel_size)
 
     def levels(self, dark: ArrayLike, bright: ArrayLike) -> tuple[Floats, Floats]:
         """Return what pixels count with no light from the mirror and with all, by the camera's own levels."""
@@ -160,7 +168,7 @@ class Coat:
         seen = np.stack([view.x + height * view.slope_x, view.y + height * view.slope_y])
         if history is not None:
             seen = history.material(frame, seen)
-        return self.texture.shown(self.texture.reflectance(seen), light)
+        return self.texture.shown(self.texture.reflectance(seen, view.pixel_size), light)
 
 
 class DraggedCoat:

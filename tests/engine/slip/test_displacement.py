@@ -9,6 +9,7 @@ import pytest
 from speckle import Speckle
 
 from mirrorskin.engine import find_displacement
+from mirrorskin.hw.twin import SheetTexture
 from mirrorskin.io import InputError
 
 SHAPE, NOISE, PIXEL = (96, 128), 2.0, (0.1, 0.05)
@@ -46,6 +47,25 @@ def test_errors_are_at_the_bound_and_sigma_is_honest(device, window):
         bound.append(found.sigma[INSIDE].astype(float) ** 2)
     assert np.sqrt(np.mean(squares) / np.mean(bound)) == pytest.approx(1, abs=0.07)
     assert np.mean(np.array(squares) / np.array(bound)) == pytest.approx(1, abs=0.12)
+
+
+@pytest.mark.parametrize(("kind", "size"), [("dots", 3.0), ("random-dots", 4.0), ("flakes", 4.0)])
+def test_errors_on_a_sheet_s_own_texture_are_at_the_bound(kind, size):
+    column, row = np.meshgrid(np.arange(128.0), np.arange(96.0))
+    squares, bound = [], []
+    for seed in range(1, 5):
+        sheet, random = SheetTexture(kind, size=size, seed=seed), np.random.default_rng(seed)
+        right, down = 0.3 * seed, -0.17 * seed
+        reference, frame = (
+            (20 + 100 * sheet.reflectance(np.stack([column - x, row - y]), (1.0, 1.0))
+             + random.normal(0, NOISE, SHAPE)).astype(np.float32)
+            for x, y in ((0, 0), (right, down))
+        )  # fmt: skip
+        found = find_displacement(reference, frame[None], PIXEL, step=1)
+        assert (found.status[INSIDE[:-1]] == 1).mean() > 0.99
+        squares.append((found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE] ** 2)
+        bound.append((found.sigma[INSIDE] * NOISE / found.noise) ** 2)
+    assert np.sqrt(np.nanmean(squares) / np.nanmean(bound)) == pytest.approx(1, abs=0.1)
 
 
 def test_the_noise_is_estimated_from_what_the_fit_leaves():
