@@ -63,8 +63,8 @@ _OWN = {
             "heights",
         )
     },
-    MotionName.horizontal: {"contact", "per_frame", "window", "step"},
-    MotionName.twist: {"contact", "per_frame", "window", "step"},
+    MotionName.horizontal: {"contact", "per_frame", "window", "step", "modulus"},
+    MotionName.twist: {"contact", "per_frame", "window", "step", "modulus"},
 }
 _ESTIMATE = "estimate"
 # What would bring a map that is missing: options.
@@ -138,7 +138,7 @@ def command(
         str | None,
         Option(
             metavar="PRESSURE",
-            help="Press: Young's, for force and pressure: 0.1MPa.",
+            help="All but rotation: Young's, for force, pressure and traction: 0.1MPa.",
             show_default="the calibration's",
         ),
     ] = None,
@@ -196,6 +196,8 @@ def command(
         io.check_output(target, recording, phases, heights, calibration, contact)
         calibrated = _calibrated(source, calibration, pixel_size)
         arguments: dict[str, Any] = {"method": method and method.value, "noise": noise}
+        if modulus is not None:
+            arguments["modulus"] = pressure(modulus, "--modulus")
         if source.motion == MotionName.axial:
             arguments |= {"gain": gain, "offset": zenith_offset, "per_turn": per_turn, "robust": robust}
             # A tilt that is given is believed, whatever the calibration says.
@@ -209,7 +211,6 @@ def command(
             arguments |= {"event": event.value, "hold": hold, "subframe": subframe}
             arguments |= _levels(threshold, inclination)
             arguments |= {"dark": dark, "bright": bright, "fill": fill}
-            arguments["modulus"] = None if modulus is None else pressure(modulus, "--modulus")
         with progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(
                 calibrated,

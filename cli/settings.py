@@ -82,6 +82,7 @@ class _Slip(Struct, frozen=True, rename="kebab"):
     window: _Pixels | None = None
     step: _Pixels | None = None
     noise: _SigmaAboveZero | None = None
+    modulus: Annotated[str, _text("0.1MPa")] | None = None
 
 
 class _Settings(Struct, frozen=True):
@@ -101,7 +102,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
         _press(_given(settings.press), f"{where}press."),
         _rotation(_given(settings.rotation), f"{where}rotation."),
         memory_limit,
-        _given(settings.slip),
+        _slip(_given(settings.slip), f"{where}slip."),
     )
 
 
@@ -122,13 +123,18 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     return {**dataset, **options}
 
 
+def _slip(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Convert [slip] to keywords of ``reconstruct``."""
+    if "modulus" in values:
+        values["modulus"] = pressure(values["modulus"], f"{where}modulus")
+    return values
+
+
 def _press(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [press] to keywords of ``reconstruct``."""
     if "inclination" in values:
         values["inclinations"] = [angle(text, f"{where}inclination") for text in values.pop("inclination")]
-    if "modulus" in values:
-        values["modulus"] = pressure(values["modulus"], f"{where}modulus")
-    return values
+    return _slip(values, where)
 
 
 def _rotation(values: dict[str, Any], where: str) -> dict[str, Any]:

@@ -39,6 +39,8 @@ class Summary:
         Of the pixels that tell of slip, those that slipped.
     stick_ratio : float or None
         Share of the contact that sticks in the last frame for which that is known.
+    force_x, force_y : float or None
+        Along the sheet, N.
     force, force_sigma : float or None
         Of a press, and the standard deviation that is expected, N.
     """
@@ -58,6 +60,8 @@ class Summary:
     stick_ratio: float | None = None
     force: float | None = None
     force_sigma: float | None = None
+    force_x: float | None = None
+    force_y: float | None = None
 
     def __str__(self) -> str:
         turns = "" if self.turns is None else f" in {self.turns} turns"
@@ -88,6 +92,8 @@ class Summary:
             parts.append(f"from {self.lowest:.3f} to {self.highest:.3f} {self.unit} of the way")
         if self.stick_ratio is not None:
             parts.append(f"{100 * self.stick_ratio:.1f} % of the contact sticks")
+        if self.force_x is not None and self.force_y is not None:
+            parts.append(f"force along the sheet {self.force_x:.4g}, {self.force_y:.4g} N")
         return ", ".join(parts)
 
 
@@ -144,6 +150,8 @@ def _summarise_slip(result: Result) -> Summary:
         highest,
         slipped=int(np.count_nonzero(touched & (status == SLIPPED))),
         stick_ratio=float(ratio[-1]) if ratio.size else None,
+        force_x=result.force_x,
+        force_y=result.force_y,
     )
 
 

@@ -147,7 +147,7 @@ def _resampled(maps: Maps, points: SamplePoints) -> Maps:
             made[name] = points.nearest_values(values, _NOTHING[name])
         elif name == "normals":
             made[name] = points.interpolate_vectors(values, touched)
-        elif name == "displacement":
+        elif name in ("displacement", "traction"):
             parts = (points.interpolate(values[..., part], touched) for part in range(2))
             made[name] = np.stack(list(parts), axis=-1)
         elif name == "azimuth":

@@ -49,6 +49,7 @@ def as_xarray(result: Result) -> xarray.Dataset:
     dimensions["normals"] = (*lead, "y", "x", "vector")
     each = ("frame",) if "displacement" in maps and maps["displacement"].ndim == 4 else ()
     dimensions["displacement"] = (*each, "y", "x", "direction")
+    dimensions["traction"] = ("y", "x", "direction")
     data: dict[str, Any] = {
         name: (dimensions[name], values, {} if unit is None else {"units": unit})
         for name, values in {**maps, **result.series()}.items()

@@ -20,7 +20,7 @@ MARK = "mirrorskin_result"
 UNITS = (
     dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
     | dict.fromkeys(("zenith", "azimuth", "normal_sigma", "slope_min", "slope_max"), "rad")
-    | {"pressure": "MPa", "growth": "1/mm", "growth_sigma": "1/mm"}
+    | {"pressure": "MPa", "traction": "MPa", "growth": "1/mm", "growth_sigma": "1/mm"}
     | dict.fromkeys(("displacement", "displacement_sigma"), "mm")
     | dict.fromkeys(SCALARS, "N")
     | dict.fromkeys(("x", "y"), "mm")
@@ -32,7 +32,7 @@ _DTYPES = (
     | dict.fromkeys(("x", "y", *SERIES), np.float64)
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
-_VECTORS = {"normals": 3, "displacement": 2}  # and how many components they have
+_VECTORS = {"normals": 3, "displacement": 2, "traction": 2}  # and how many components they have
 _MOVED, _OFFSETS = "displacement", "offset_unknown"
 _ALONG_THE_WAY = ("slip_onset", "slip_onset_sigma", "way")
 _RESULT, _PROCESS = "/entry/result", "/entry/process"

@@ -309,6 +309,12 @@ class Result:
     way, stick_ratio : ndarray, (T,), float64
         How far the body has slid or turned, mm or radians, and the share of the contact that sticks, in each
         frame; NaN from where the body turns back.
+    traction : ndarray, (H, W, 2), float32
+        MPa along x and y that the object exerts on the sensor at the end of a slide or a twist; 0 outside the
+        contact.
+    force_x, force_x_sigma, force_y, force_y_sigma : float
+        Newtons along the sheet that the object exerts on the sensor then, and the standard deviations that
+        are expected.
     force, force_sigma : float
         Newtons at the greatest travel, normal to the sheet, and the standard deviation that is expected.
     x, y : ndarray, (W,) and (H,), float64
@@ -350,10 +356,15 @@ class Result:
     displacement_sigma: NDArray[np.float32] | None = None
     slip_onset: NDArray[np.float32] | None = None
     slip_onset_sigma: NDArray[np.float32] | None = None
+    traction: NDArray[np.float32] | None = None
     way: Floats | None = None
     stick_ratio: Floats | None = None
     force: float | None = None
     force_sigma: float | None = None
+    force_x: float | None = None
+    force_x_sigma: float | None = None
+    force_y: float | None = None
+    force_y_sigma: float | None = None
     x: Floats | None = None
     y: Floats | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
@@ -402,7 +413,7 @@ class Result:
         return as_xarray(self)
 
 
-SCALARS = ("force", "force_sigma")
+SCALARS = ("force", "force_sigma", "force_x", "force_x_sigma", "force_y", "force_y_sigma")
 """The single numbers that a result has."""
 
 SERIES = ("way", "stick_ratio")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin import io
+from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.provenance import attach_provenance
 from mirrorskin.engine.slip.displacement import STEP
 from mirrorskin.engine.slip.search import MOTIONS, WINDOW, Slip, SlipSearch
@@ -30,6 +33,7 @@ def reconstruct_slip(
     window: int = WINDOW,
     step: int = STEP,
     noise: float | None = None,
+    modulus: float | None = None,
     memory_limit: int = MEMORY_LIMIT,
     device: str | Device | None = None,
     progress: Progress | None = None,
@@ -48,6 +52,8 @@ def reconstruct_slip(
         Whether the displacement is that of each frame, and not of the last alone.
     window, step, noise
         As for `mirrorskin.engine.find_displacement`.
+    modulus : float, optional
+        Young's, MPa, for ``traction`` and the force along the sheet; by default that of the calibration.
     memory_limit : int
         Bytes of host memory for frames on the move.
     device : str or Device, optional
@@ -59,8 +65,9 @@ def reconstruct_slip(
     -------
     Result
         ``displacement``, ``displacement_sigma``, ``slip_onset``, ``slip_onset_sigma``, ``status``,
-        ``contact``, ``way`` and ``stick_ratio``; of a twist the process has ``angle``, ``centre_x`` and
-        ``centre_y`` of the skin that sticks.
+        ``contact``, ``way`` and ``stick_ratio``; with a modulus ``traction``, ``force_x`` and ``force_y``, if
+        the frames begin before any load along the sheet; of a twist the process has ``angle``, ``centre_x``
+        and ``centre_y`` of the skin that sticks.
 
     Raises
     ------
@@ -79,7 +86,7 @@ def reconstruct_slip(
         device=device,
     )
     feed(source, search, range(source.shape[0]), progress)
-    return slip_result(search.result(), source, search, contact_given=contact is not None)
+    return slip_result(search.result(), source, search, contact_given=contact is not None, modulus=modulus)
 
 
 def slip_search(
@@ -115,7 +122,9 @@ def slip_search(
     )
 
 
-def slip_result(found: Slip, source: Source, search: SlipSearch, *, contact_given: bool) -> Result:
+def slip_result(
+    found: Slip, source: Source, search: SlipSearch, *, contact_given: bool, modulus: float | None = None
+) -> Result:
     """Return the maps as a result, with how they came about."""
     process: dict[str, ProcessValue] = {
         "motion": source.motion,
@@ -138,7 +147,45 @@ def slip_result(found: Slip, source: Source, search: SlipSearch, *, contact_give
         way=found.way,
         stick_ratio=found.stick_ratio,
     )
-    return attach_provenance(result, source, search.device, process)
+    result, said = _with_force(result, source, search, modulus)
+    return attach_provenance(result, source, search.device, process | said)
+
+
+def _with_force(
+    result: Result, source: Source, search: SlipSearch, modulus: float | None
+) -> tuple[Result, dict[str, ProcessValue]]:
+    """Add traction and force, where the modulus is known; what was done is for the process."""
+    known = source.calibration.stiffness if isinstance(source, io.Calibrated) and modulus is None else None
+    young = known.modulus if known is not None else modulus
+    if young is None:
+        return result, {}
+    from mirrorskin.engine.force.tangential import find_tangential_force
+
+    assert result.displacement is not None
+    assert source.header.pixel_size is not None
+    moved = result.displacement
+    try:
+        found = find_tangential_force(
+            moved if moved.ndim == 3 else moved[-1],
+            source.header.pixel_size,
+            young,
+            contact=result.contact,
+            sigma=result.displacement_sigma,  # type: ignore[arg-type]
+            window=search.window,
+            modulus_sigma=0.0 if known is None else math.sqrt(known.covariance[0, 0]),
+        )
+    except (InputError, NotConverged) as error:
+        return result, {"force": f"none: {error}"}
+    result = replace(
+        result,
+        traction=found.traction,
+        force_x=float(found.force[0]),
+        force_x_sigma=float(found.sigma[0]),
+        force_y=float(found.force[1]),
+        force_y_sigma=float(found.sigma[1]),
+    )
+    whose = "given" if known is None else "of the calibration"
+    return result, {"modulus": f"{young:.4g} MPa, {whose}"}
 
 
 def _off_centre(source: Source) -> tuple[float, float]:

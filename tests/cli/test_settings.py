@@ -51,6 +51,7 @@ per-frame = true
 window = 12
 step = 6
 noise = 1.5
+modulus = "0.2MPa"
 """
 
 
@@ -100,7 +101,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "per_turn": True,
         "robust": True,
     }
-    assert plan.slip == {"per_frame": True, "window": 12, "step": 6, "noise": 1.5}
+    assert plan.slip == {"per_frame": True, "window": 12, "step": 6, "noise": 1.5, "modulus": 0.2}
     assert plan.memory_limit == 1000
 
 

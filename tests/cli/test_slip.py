@@ -150,3 +150,16 @@ def test_a_press_that_knows_its_pressure_tells_contact_by_that(slide):
     with io.open_recording(slide) as recording:
         found = engine.reconstruct(recording, contact=press)
     np.testing.assert_array_equal(found.contact, touched)
+
+
+def test_a_modulus_gives_the_force_along_the_sheet(slide, contact, tmp_path):
+    target = tmp_path / "force.h5"
+    assert run("reconstruct", slide, "--contact", contact, "--modulus", "1MPa", "-o", target).code == 0
+    found = io.open_result(target)
+    with io.open_recording(slide) as recording:
+        true = recording.truth.force[-1]
+    # The simulation's modulus is 1 MPa, too.
+    assert found.force_x == pytest.approx(true[0], rel=0.06)
+    assert found.force_y == pytest.approx(true[1], abs=4 * found.force_y_sigma + 0.01 * abs(true[0]))
+    assert found.traction.shape == (64, 64, 2)
+    assert found.traction[..., 0].sum() * 0.05**2 == pytest.approx(found.force_x, rel=0.05)

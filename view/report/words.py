@@ -89,6 +89,7 @@ MAPS: Mapping[str, tuple[str, str]] = {
     "displacement_sigma": ("mm", "the standard deviation that is expected of that along either axis"),
     "slip_onset": ("mm, of a twist rad", "the way of the body after which the skin broke loose"),
     "slip_onset_sigma": ("mm, of a twist rad", "the standard deviation that is expected of the onset"),
+    "traction": ("MPa", "what the object exerts on the sensor along x and y at the end"),
 }
 """Of each map its unit in the file, and what it says."""
 
