@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping
-from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -102,8 +101,6 @@ def check_export(result: Result, path: str | Path) -> None:
     if suffix not in known:
         wrong = f"{suffix} is no format" if suffix else "its name does not say a format"
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
-    if suffix == ".png" and find_spec("PIL") is None:
-        raise InputError(f"{path} needs Pillow: pip install 'mirrorskin[export]'")
     if suffix == _ARRAYS:
         return
     remedy = f"or export its maps as {_ARRAYS}"

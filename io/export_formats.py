@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io import pictures
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.os_errors import legible
 from mirrorskin.io.result import unit_of
@@ -25,7 +26,7 @@ _FLAT = 1e-6  # mm a count, where all heights are one
 _PLY_TYPES = {"f4": "float", "u1": "uchar"}
 _STL_HEAD = 80  # bytes of free text, which must not begin with "solid": that would be STL as text
 _PNG_KEYWORDS = {_SOURCE: "Title", _DATE: "Creation Time", _SOFTWARE: "Software"}
-_INCH, _CENTIMETRE = 25.4, 10.0  # mm
+_CENTIMETRE = 10.0  # mm
 _METRE = 1e-3  # m a mm
 _NO_DATA = 42113  # the tag by which GDAL names the value of holes
 
@@ -88,16 +89,10 @@ def encode_png(result: Result) -> Encoded:
     Its resolution is pixels a metre, and texts tell the scale of heights: for people, in numbers, and under
     the keys that Gwyddion documents for pictures of 16 bits.
     """
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
-    counts, notes, texts = _counts(result), notes_of(result), PngInfo()
-    for name, note in (*_texts(counts, notes), *_gwyddion(counts, notes.get(_SOURCE, "height"))):
-        texts.add_text(name, note)
+    counts, notes = _counts(result), notes_of(result)
     width, height = counts.pixel_size
-    file = BytesIO()
-    Image.fromarray(counts.values).save(file, "png", pnginfo=texts, dpi=(_INCH / width, _INCH / height))
-    return Encoded([file.getvalue()], str(counts))
+    texts = (*_texts(counts, notes), *_gwyddion(counts, notes.get(_SOURCE, "height")))
+    return Encoded(pictures.encode_png(counts.values, (width * _METRE, height * _METRE), texts), str(counts))
 
 
 def encode_tiff(result: Result) -> Encoded:

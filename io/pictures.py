@@ -7,7 +7,7 @@ import re
 import struct
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -107,13 +107,31 @@ def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray
 
 def save_print(picture: NDArray[np.uint8], path: str | Path, dots_per_inch: float) -> None:
     """Write a grey picture (H, W) as a PNG that says how large its pixels are, whole or not at all."""
-    per_metre = round(dots_per_inch / _INCH)
+    size = _INCH / dots_per_inch
+    write_new(Path(path), encode_png(picture, (size, size)))
+
+
+def encode_png(
+    picture: NDArray[Any], pixel_size: tuple[float, float], texts: Iterable[tuple[str, str]] = ()
+) -> list[bytes]:
+    """Encode a grey picture (H, W) as a PNG with the width and height of its pixels, m, and named texts."""
     with quiet_opencv() as cv2:
-        _, encoded = cv2.imencode(".png", picture)
+        _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     png = encoded.tobytes()
-    size = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
-    chunk = struct.pack(">I", len(size) - 4) + size + struct.pack(">I", zlib.crc32(size))
-    write_new(Path(path), [png[:_PNG_HEAD], chunk, png[_PNG_HEAD:]])
+    x, y = (round(1 / size) for size in pixel_size)
+    chunks = [_png_chunk(b"pHYs", struct.pack(">IIB", x, y, 1)), *(_png_text(*text) for text in texts)]
+    return [png[:_PNG_HEAD], *chunks, png[_PNG_HEAD:]]
+
+
+def _png_text(name: str, text: str) -> bytes:
+    try:
+        return _png_chunk(b"tEXt", f"{name}\0{text}".encode("latin-1"))
+    except UnicodeEncodeError:
+        return _png_chunk(b"iTXt", f"{name}\0\0\0\0\0{text}".encode())
+
+
+def _png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 class Pictures(FrameSequence):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import sys
 from dataclasses import replace
 from io import BytesIO
 
@@ -59,12 +58,6 @@ def test_a_single_row_is_no_surface(tmp_path, name, shape):
     line = refused(row, tmp_path / name)
     assert line == ": no three known heights are neighbours, so there is no surface: export points, .xyz"
     assert not list(tmp_path.iterdir())
-
-
-def test_a_package_that_is_missing_is_named(slope, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    assert refused(slope, tmp_path / "out.png") == " needs Pillow: pip install 'mirrorskin[export]'"
-    assert io.export_result(slope, tmp_path / "out.ply")
 
 
 @pytest.mark.parametrize("name", ["ply", "csv"])
