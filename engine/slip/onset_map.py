@@ -14,10 +14,6 @@ from scipy.sparse.linalg import splu
 
 Doubles = NDArray[np.float64]
 
-POWER = 1.5
-"""Of the way since the onset, by which a departure grows (Johnson, Contact Mechanics, 1985, eq. 7.45, of the
-contact of Cattaneo and Mindlin, near to what sticks)."""
-
 _CANDIDATES = 48  # onsets that a search begins with
 _EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's onset to begin with
 _ROUNDS = 20
@@ -41,8 +37,10 @@ class OnsetMap:
     sigma: Doubles
 
 
-def fit_onsets(departure: Doubles, sigma: Doubles, way: Doubles, window: float, bend: float) -> OnsetMap:
-    """Fit ``growth (way - onset)^1.5``, zero before the onset, to departures as windows see them.
+def fit_onsets(
+    departure: Doubles, sigma: Doubles, way: Doubles, window: float, bend: float, power: float
+) -> OnsetMap:
+    """Fit ``growth (way - onset)^power``, zero before the onset, to departures as windows see them.
 
     A window's answer is the mean over it. Where the onset changes by ``slope`` from node to node, that is the
     mean over onsets within +- slope window / 2. Onset and growth are smooth maps: their second differences
@@ -61,7 +59,7 @@ def fit_onsets(departure: Doubles, sigma: Doubles, way: Doubles, window: float, 
     data = _whitened(np.where(known, departure * scale, 0.0))
     length, times = float(way[-1]), way[:, None, None]
     plate = _bending(known.shape)
-    begin = _begin(data, scale, times, plate / (bend * length) ** 2)
+    begin = _begin(data, scale, times, plate / (bend * length) ** 2, power)
     if begin is None:
         return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
     onset, usual = begin
@@ -71,7 +69,7 @@ def fit_onsets(departure: Doubles, sigma: Doubles, way: Doubles, window: float, 
     for number in range(_ROUNDS):
         half = np.hypot(*np.gradient(onset)) * window / 2
         half = np.maximum(half, length / len(way) * max(0.5, 2.0 - 0.5 * number))  # wider at first
-        shape, rate = (usual * _whitened(part * scale) for part in _blurred(times - onset, half))
+        shape, rate = (usual * _whitened(part * scale) for part in _blurred(times - onset, half, power))
         columns = np.stack([-growth * rate, shape])
         pull = np.sum(columns * (data - growth * shape), axis=1).ravel()
         normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
@@ -95,15 +93,17 @@ def _whitened(values: Doubles) -> Doubles:
     return whitened
 
 
-def _blurred(since: Doubles, half: Doubles | float) -> tuple[Doubles, Doubles]:
-    """Return the mean of ``since^1.5``, 0 before 0, over +- half, and its derivative."""
+def _blurred(since: Doubles, half: Doubles | float, power: float) -> tuple[Doubles, Doubles]:
+    """Return the mean of ``since^power``, 0 before 0, over +- half, and its derivative."""
     ahead, behind = np.maximum(since + half, 0.0), np.maximum(since - half, 0.0)
-    ends = ahead**POWER, behind**POWER
-    mean = (ahead * ends[0] - behind * ends[1]) / (2 * half * (POWER + 1))
+    ends = ahead**power, behind**power
+    mean = (ahead * ends[0] - behind * ends[1]) / (2 * half * (power + 1))
     return mean, (ends[0] - ends[1]) / (2 * half)
 
 
-def _begin(data: Doubles, scale: Doubles, times: Doubles, stiff: Any) -> tuple[Doubles, float] | None:
+def _begin(
+    data: Doubles, scale: Doubles, times: Doubles, stiff: Any, power: float
+) -> tuple[Doubles, float] | None:
     """Return a first map of onsets, by trial at each node and its neighbours, and the usual growth.
 
     None if no node departs.
@@ -111,7 +111,7 @@ def _begin(data: Doubles, scale: Doubles, times: Doubles, stiff: Any) -> tuple[D
     length = float(times[-1, 0, 0])
     best, onset = np.zeros_like(scale), np.full_like(scale, length)
     for trial in np.linspace(-0.3 * length, length, _CANDIDATES, endpoint=False):
-        shape = _whitened(np.maximum(times - trial, 0.0) ** POWER * scale)
+        shape = _whitened(np.maximum(times - trial, 0.0) ** power * scale)
         products, squares = np.sum(shape * data, axis=0), np.sum(shape**2, axis=0)
         gain = np.maximum(products, 0.0) ** 2 / (2 * np.maximum(squares, np.finfo(float).tiny))
         gain = gaussian_filter(gain, 1.0)
@@ -122,7 +122,7 @@ def _begin(data: Doubles, scale: Doubles, times: Doubles, stiff: Any) -> tuple[D
     trust = np.where(evident, (_CANDIDATES / length) ** 2, _FLOOR)
     onset = splu((stiff + sparse.diags(trust.ravel())).tocsc()).solve((trust * onset).ravel())
     onset = onset.reshape(scale.shape)
-    shape = _whitened(_blurred(times - onset, length / len(times))[0] * scale)
+    shape = _whitened(_blurred(times - onset, length / len(times), power)[0] * scale)
     growth = np.sum(shape * data) / max(float(np.sum(shape**2)), np.finfo(float).tiny)
     return (onset, float(growth)) if growth > 0 else None
 

@@ -37,6 +37,7 @@ WINDOW = 8
 """Pixels: smaller than for displacement alone, as all frames together tell an onset."""
 
 _BEND = 16.0  # of the onset between nodes, as a share of the way, times the contact's area in nodes / pi
+_POWERS = {"displacement": 1.6, "twist": 1.4}  # of departure; see docs/method/slip.md
 _FOLLOWS = 0.5  # of the object's movement, from which on skin is taken to have touched it
 _LEAST_STUCK = 4  # nodes that a twist's centre and angle are made of
 _STILL = 1e-9  # of the way, by which nobody moves
@@ -333,6 +334,7 @@ class SlipSearch:
                 course.way[: course.forward],
                 self.window / self.step,
                 _BEND * math.pi / touched.sum(),
+                _POWERS[self.position],
             )
             onset[box], spread[box] = found.onset, found.sigma
         return OnsetMap(onset, spread)
