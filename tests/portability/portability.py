@@ -44,7 +44,10 @@ VECTORS = "normals or axial"
 # It does not know what LLVM writes where it inlines a function that returns a structure.
 UNOPTIMISED = {"OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable -Dalways_inline=noinline"}
 # Tests on few pixels that still reach all kernels and types.
-SMALL = "odd_sizes or references_of_each_pixel or used_again or is_light or touch_only or (reading and 127)"
+SMALL = (
+    "odd_sizes or references_of_each_pixel or used_again or is_light or touch_only or (reading and 127)"
+    " or kernels_do_as_the_reference or sums_agree_with or gradients_agree_with"
+)
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,8 @@ CHECKS = (
             "tests/kernels/test_multigrid.py",
             "tests/kernels/test_links.py",
             "tests/kernels/test_edges.py",
+            "tests/kernels/test_displacement.py",
+            "tests/kernels/test_pose.py",
         ),
         faults=RACES,
         told={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
@@ -98,7 +103,7 @@ CHECKS = (
         OCLGRIND,
         tests=f"({VECTORS}) and not ({STATISTICS})",
         folders=KERNELS,
-        part=("tests/kernels/test_normals_wall.py",),
+        part=("tests/kernels/test_normals_wall.py", "tests/kernels/test_normals_pose.py"),
         faults=RACES,
         told={"OCLGRIND_DATA_RACES": "1", **UNOPTIMISED, **LITTLE_MEMORY},
     ),
