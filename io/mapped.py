@@ -8,6 +8,8 @@ import math
 import mmap
 import os
 import signal
+import sys
+from contextlib import suppress
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -99,44 +101,52 @@ def _machine_memory() -> int:
 # may do so between the check of a block and its end. Such pages are replaced by empty ones; that the file is
 # not as it was is told by the check of the next block, or by that of the source's fingerprint at the end.
 
-_maps: WeakKeyDictionary[mmap.mmap, list[int]] = WeakKeyDictionary()
-"""Pages of files: their address, where they begin in the file, and how many bytes are left of that."""
+_maps: WeakKeyDictionary[mmap.mmap, tuple[int, int]] = WeakKeyDictionary()
+"""Pages of files: their address, and where they begin in the file."""
 
-_FIXED = 0x10  # MAP_FIXED
-_libc = ctypes.CDLL(None)
-_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
-_libc.mmap.restype = _libc.signal.restype = ctypes.c_void_p
-_libc.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
+_FIXED, _WITH_ADDRESS = 0x10, 4  # MAP_FIXED, SA_SIGINFO
+_FAULT = 16  # bytes from the begin of a siginfo_t to the address that was touched
+_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t)
+
+
+class _Action(ctypes.Structure):
+    """A struct sigaction of Linux's C libraries."""
+
+    _fields_ = (
+        ("handler", ctypes.c_void_p),
+        ("mask", ctypes.c_char * 128),
+        ("flags", ctypes.c_int),
+        ("restorer", ctypes.c_void_p),
+    )
 
 
 def _map(file: int, base: int, length: int) -> mmap.mmap:
-    _survive_lost_pages()
+    if sys.platform == "linux":
+        _survive_lost_pages()
     pages = mmap.mmap(file, length, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ, offset=base)
-    _maps[pages] = [np.frombuffer(pages, np.uint8).ctypes.data, base, length]
+    _maps[pages] = np.frombuffer(pages, np.uint8).ctypes.data, base
     return pages
 
 
 @functools.cache
 def _survive_lost_pages() -> Any:
-    """Replace lost pages whenever one is touched; any other SIGBUS is left to who had it before."""
+    """Replace lost pages when one is touched; any other SIGBUS is left to who had it before."""
+    libc, before = ctypes.CDLL(None), _Action()
+    libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    libc.mmap.restype = ctypes.c_void_p
 
-    def replace(number: int) -> None:
-        replaced = [_replace_lost(pages, place) for pages, place in list(_maps.items())]
-        if not any(replaced):
-            _libc.signal(number, before)
+    def replace(number: int, info: int, _: int) -> None:
+        touched = ctypes.c_size_t.from_address(info + _FAULT).value
+        with suppress(OSError):  # a file that does not even tell its size
+            for pages, (address, base) in list(_maps.items()):
+                kept = max(0, -(-(pages.size() - base) // mmap.PAGESIZE)) * mmap.PAGESIZE
+                if address + kept <= touched < address + -(-len(pages) // mmap.PAGESIZE) * mmap.PAGESIZE:
+                    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _FIXED
+                    libc.mmap(address + kept, len(pages) - kept, mmap.PROT_READ, flags, -1, 0)
+                    return
+        libc.sigaction(number, ctypes.byref(before), None)
 
-    handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(replace)
-    before = _libc.signal(signal.SIGBUS, ctypes.cast(handler, ctypes.c_void_p))
+    handler = _HANDLER(replace)
+    action = _Action(ctypes.cast(handler, ctypes.c_void_p).value, flags=_WITH_ADDRESS)
+    libc.sigaction(signal.SIGBUS, ctypes.byref(action), ctypes.byref(before))
     return handler  # kept, since the system calls it
-
-
-def _replace_lost(pages: mmap.mmap, place: list[int]) -> bool:
-    """Put empty pages where a file has no longer any; tell whether there were such."""
-    address, base, left = place
-    kept = max(0, -(-(pages.size() - base) // mmap.PAGESIZE)) * mmap.PAGESIZE
-    if kept >= left:
-        return False
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _FIXED
-    _libc.mmap(address + kept, left - kept, mmap.PROT_READ, flags, -1, 0)
-    place[2] = kept
-    return True
