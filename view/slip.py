@@ -32,8 +32,6 @@ class Slipped:
         With displacement and slip_onset.
     contact : ndarray, (H, W), bool
         Where the skin touched the object before it moved.
-    way : ndarray, (T,)
-        The way of the body, mm or radians.
     closed : ndarray, (T,)
         Share of the contact that sticks, by a closed form.
     x, y : ndarray, (W,) and (H,)
@@ -43,7 +41,6 @@ class Slipped:
     found: Slip
     truth: Truth
     contact: NDArray[np.bool_]
-    way: Floats
     closed: Floats
     x: Floats
     y: Floats
@@ -75,7 +72,7 @@ class Slipped:
     def true_ratio(self) -> Floats:
         """Share of the contact that truly sticks, (T,)."""
         onset = self.onset[self.contact]
-        return np.array([1 - np.mean(onset <= way) for way in self.way])
+        return np.array([1 - np.mean(onset <= way) for way in self.found.way])
 
 
 def slip_figure(slid: Slipped, twisted: Slipped, title: str, path: Path) -> None:
@@ -148,7 +145,7 @@ def _outline(axes: Axes, slid: Slipped) -> None:
 
 
 def _draw_stick_ratio(axes: Axes, slid: Slipped, scale: float, label: str, theory: str) -> None:
-    way = scale * slid.way
+    way = scale * slid.found.way
     axes.plot(way, slid.closed, color="0.6", lw=3, label=theory)
     axes.plot(way, slid.true_ratio, color="tab:red", lw=1, label="truth of the twin")
     axes.plot(way, slid.found.stick_ratio, "o", ms=4, label="found")

@@ -103,9 +103,8 @@ def _search(
     )
     places: Any = {search.position: movement.path}
     search.push(frames, **places)
-    way = np.linalg.norm(movement.path.reshape(len(frames), -1), axis=1)
     x, y = io.pixel_axes((twin.shape[1], twin.shape[2]), (pixel, pixel))
-    return view.Slipped(search.result(), twin.truth, contact, way, closed, x, y)
+    return view.Slipped(search.result(), twin.truth, contact, closed, x, y)
 
 
 def _outcomes(name: str, slid: view.Slipped, scale: float) -> dict[str, dict[str, float]]:
