@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, median_filter
 from scipy.sparse.linalg import splu
 
 Doubles = NDArray[np.float64]
@@ -19,7 +19,9 @@ _EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's
 _ROUNDS = 20
 _SETTLED = 1e-3  # of the way, in a round
 _FARTHEST = 0.08  # of the way, by which an onset changes in a round
-_LEAST_GROWTH = 0.1  # of the usual one
+_ONSET_BEND = 64.0  # third difference of onsets, as a share of the way, over the radius of the contact
+_GROWTH_BEND = 32.0  # second difference of the growth's logarithm over that radius
+_POWER_SIGMA = 0.1  # those of slides and twists differ by twice that
 _APART = 9  # nodes, beyond which errors of onsets do not depend on each other
 _NEVER = 1.5  # of the way: an onset that has not come
 _FLOOR = 1e-6  # of an equation's weight, so that there is always a solution
@@ -38,13 +40,14 @@ class OnsetMap:
 
 
 def fit_onsets(
-    departure: Doubles, sigma: Doubles, way: Doubles, window: float, bend: float, power: float
+    departure: Doubles, sigma: Doubles, way: Doubles, window: float, radius: float, power: float
 ) -> OnsetMap:
     """Fit ``growth (way - onset)^power``, zero before the onset, to departures as windows see them.
 
     A window's answer is the mean over it. Where the onset changes by ``slope`` from node to node, that is the
-    mean over onsets within +- slope window / 2. Onset and growth are smooth maps: their second differences
-    have a standard deviation, known beforehand. Both are found together by Gauss-Newton steps.
+    mean over onsets within +- slope window / 2. The map of growth is smooth, with small second differences,
+    and that of onsets with small third ones: under a ball it is a paraboloid. Both are found together by
+    Gauss-Newton steps. To what noise makes uncertain, sigma adds by how much another power changes the onset.
 
     Parameters
     ----------
@@ -52,35 +55,40 @@ def fit_onsets(
     sigma : (rows, columns), mm, of a departure; half of its variance is the reference's, common to all frames
     way : (T,), of the body since the reference
     window : nodes, over which a departure is a mean
-    bend : standard deviation of second differences between nodes, as a share of the way, and of the growth
+    radius : nodes, of a disc as large as the contact
+    power : by which a departure grows, known to +- 0.1
     """
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
     data = _whitened(np.where(known, departure * scale, 0.0))
-    length, times = float(way[-1]), way[:, None, None]
-    plate = _bending(known.shape)
-    begin = _begin(data, scale, times, plate / (bend * length) ** 2, power)
+    length, times = float(way[-1]), (way / way[-1])[:, None, None]
+    second, third = (_bending(known.shape, order) for order in (2, 3))
+    onset_stiff = third * (radius**3 / _ONSET_BEND) ** 2
+    begin = _begin(data, scale, times, onset_stiff, power)
     if begin is None:
         return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
     onset, usual = begin
-    stiff = sparse.block_diag([plate / (bend * length) ** 2, plate / bend**2], format="csc")
+    stiff = sparse.block_diag([onset_stiff, second * (radius**2 / _GROWTH_BEND) ** 2], format="csc")
     floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
-    growth = np.ones_like(onset)
+    log_growth = np.zeros_like(onset)
     for number in range(_ROUNDS):
         half = np.hypot(*np.gradient(onset)) * window / 2
-        half = np.maximum(half, length / len(way) * max(0.5, 2.0 - 0.5 * number))  # wider at first
-        shape, rate = (usual * _whitened(part * scale) for part in _blurred(times - onset, half, power))
-        columns = np.stack([-growth * rate, shape])
-        pull = np.sum(columns * (data - growth * shape), axis=1).ravel()
+        half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(way))  # wider at first
+        growth = usual * np.exp(log_growth) * scale
+        shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
+        columns = np.stack([-rate, shape])
         normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
         blocks = [[sparse.diags(part) for part in row] for row in normal]
         system = splu((sparse.bmat(blocks) + stiff + floor).tocsc())
-        step = system.solve(pull - stiff @ np.stack([onset, growth]).ravel()).reshape(2, *onset.shape)
-        change = np.clip(step[0], -_FARTHEST * length, _FARTHEST * length)
-        onset, growth = onset + change, np.maximum(growth + np.clip(step[1], -0.3, 0.3), _LEAST_GROWTH)
-        if number > 3 and np.abs(change).max() < _SETTLED * length:
+        pull = np.sum(columns * (data - shape), axis=1).ravel()
+        step = system.solve(pull - stiff @ np.stack([onset, log_growth]).ravel()).reshape(2, *onset.shape)
+        change = np.clip(step[0], -_FARTHEST, _FARTHEST)
+        onset, log_growth = onset + change, log_growth + np.clip(step[1], -0.3, 0.3)
+        if number > 3 and np.abs(change).max() < _SETTLED:
             break
-    return OnsetMap(onset, np.sqrt(_variances(system, onset.shape)))
+    other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
+    shift = system.solve(np.sum(columns * (other - shape), axis=1).ravel()).reshape(2, *onset.shape)[0]
+    return OnsetMap(length * onset, length * np.sqrt(_variances(system, onset.shape) + shift**2))
 
 
 def _whitened(values: Doubles) -> Doubles:
@@ -127,16 +135,13 @@ def _begin(
     return (onset, float(growth)) if growth > 0 else None
 
 
-def _bending(shape: tuple[int, int]) -> Any:
-    """Return the matrix of a thin plate's energy: squares of the second differences of a map, summed."""
-    one = [sparse.identity(n, format="csr") for n in shape]
-    first, second = (
-        [sparse.csr_matrix(np.diff(np.eye(n), order, axis=0)) for n in shape] for order in (1, 2)
+def _bending(shape: tuple[int, int], order: int) -> Any:
+    """Return the matrix of a smooth map's energy: squares of the differences of an order, summed."""
+    rows, columns = (
+        [sparse.csr_matrix(np.diff(np.eye(n), k, axis=0)) for k in range(order + 1)] for n in shape
     )
     parts = [
-        sparse.kron(second[0], one[1]),
-        sparse.kron(one[0], second[1]),
-        math.sqrt(2) * sparse.kron(first[0], first[1]),
+        math.sqrt(math.comb(order, k)) * sparse.kron(rows[order - k], columns[k]) for k in range(order + 1)
     ]
     return sum(part.T @ part for part in parts).tocsc()
 
@@ -152,4 +157,4 @@ def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
             right[0][here] = signs[here]
             answer = system.solve(right.ravel()).reshape(2, *shape)[0]
             found[here] = (answer * signs)[here]
-    return np.maximum(found, 0.0)
+    return np.maximum(median_filter(found, 3), 0.0)  # neighbours in common make single ones wrong

@@ -36,7 +36,6 @@ MOTIONS: tuple[SlipMotion, ...] = get_args(SlipMotion)
 WINDOW = 8
 """Pixels: smaller than for displacement alone, as all frames together tell an onset."""
 
-_BEND = 16.0  # of the onset between nodes, as a share of the way, times the contact's area in nodes / pi
 _POWERS = {"displacement": 1.6, "twist": 1.4}  # of departure; see docs/method/slip.md
 _FOLLOWS = 0.5  # of the object's movement, from which on skin is taken to have touched it
 _LEAST_STUCK = 4  # nodes that a twist's centre and angle are made of
@@ -265,7 +264,9 @@ class SlipSearch:
             displacement=self._each(tracker, moved) if self._per_frame else last,
             displacement_sigma=np.where(np.isfinite(last[..., 0]), spread, np.float32(np.nan)),
             slip_onset=np.where(slipped, np.maximum(onset, 0), np.float32(np.nan)),
-            slip_onset_sigma=np.where(slipped, tracker.to_pixels(onsets.sigma), np.float32(np.nan)),
+            slip_onset_sigma=np.where(
+                slipped, np.exp(tracker.to_pixels(np.log(onsets.sigma))), np.float32(np.nan)
+            ),
             status=status,
             contact=contact.astype(np.uint8),
             way=np.append(0.0, course.way),
@@ -333,7 +334,7 @@ class SlipSearch:
                 known[box],
                 course.way[: course.forward],
                 self.window / self.step,
-                _BEND * math.pi / touched.sum(),
+                math.sqrt(touched.sum() / math.pi),
                 _POWERS[self.position],
             )
             onset[box], spread[box] = found.onset, found.sigma
