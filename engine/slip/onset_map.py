@@ -157,4 +157,4 @@ def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
             right[0][here] = signs[here]
             answer = system.solve(right.ravel()).reshape(2, *shape)[0]
             found[here] = (answer * signs)[here]
-    return np.maximum(median_filter(found, 3), 0.0)  # neighbours in common make single ones wrong
+    return np.maximum(np.asarray(median_filter(found, 3), np.float64), 0.0)  # of a few neighbours, too
