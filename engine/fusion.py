@@ -23,6 +23,7 @@ from mirrorskin.engine.rotation.rotation import Rotation, at_poses, estimate_rot
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source
+from mirrorskin.io.arguments import check_has, checked
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
@@ -33,6 +34,7 @@ _PASSES = 3  # over the axial frames, at most
 _STILL = 0.02  # of a pixel, by which points may move between passes
 
 
+@checked
 def fuse(
     onset: Onset,
     normals: Normals,
@@ -90,6 +92,8 @@ def fuse(
     >>> fuse(onset, normals, 0.1).height.tolist()
     [[1.0, 1.0]]
     """
+    check_has("onset", onset, "height", "sigma")
+    check_has("normals", normals, "vectors", "sigma", "contact")
     wanted = _check_shapes(onset, normals, mask)
     slopes = find_slopes(
         normals.vectors,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.slip.status import SLIPPED, STICKS
 from mirrorskin.io import InputError, Result, Truth
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.result import map_shape, unit_of
 from mirrorskin.io.types import UNDISTORTED
 
@@ -236,6 +237,7 @@ class Score:
         }
 
 
+@checked
 def score(result: Result, truth: Truth) -> Score:
     """Compare the maps of a result with the truth.
 

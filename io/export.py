@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import write_new
 from mirrorskin.io.export_formats import (
     Encoded,
@@ -38,6 +39,7 @@ _FORMATS: dict[str, Callable[[Result], Encoded]] = {
 _SECTION, _ARRAYS = ".csv", ".npz"
 
 
+@checked
 def export_result(
     result: Result,
     path: str | Path,

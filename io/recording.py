@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
@@ -179,6 +180,7 @@ class Recording(Closing):
         self._file.close()
 
 
+@checked
 def open_recording(
     path: str | Path,
     *,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
@@ -46,6 +47,7 @@ def unit_of(name: str, process: Mapping[str, ProcessValue]) -> str | None:
     return UNITS.get(name)
 
 
+@checked
 def save_result(result: Result, path: str | Path) -> None:
     """Write a result; the file exists whole or not at all (``docs/formats.md``).
 
@@ -126,6 +128,7 @@ def _plotted(maps: Mapping[str, NDArray[Any]]) -> list[str]:
     return [name for name in maps if name not in _VECTORS]
 
 
+@checked
 def open_result(path: str | Path) -> Result:
     """Read a result.
 

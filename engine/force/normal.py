@@ -13,6 +13,7 @@ from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
@@ -41,6 +42,7 @@ class Force:
     sigma: float
 
 
+@checked
 def find_force(
     height: ArrayLike,
     travel: float,
@@ -119,7 +121,7 @@ def find_force(
 
 def check_modulus(modulus: float) -> float:
     """Return Young's modulus, or raise InputError where it cannot be."""
-    if not (math.isfinite(modulus) and modulus > 0):
+    if not 1e-9 < modulus < 1e9:
         raise InputError(
             f"a modulus of {modulus:g} MPa cannot be: give Young's modulus, above 0, as in 0.1 MPa"
         )

@@ -16,6 +16,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -45,6 +46,7 @@ class TangentialForce:
     sigma: Doubles
 
 
+@checked
 def find_tangential_force(
     displacement: ArrayLike,
     pixel_size: ArrayLike,

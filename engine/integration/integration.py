@@ -23,6 +23,7 @@ from mirrorskin.engine.integration.validation import (
     logarithm,
 )
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
 # The memory of the last call, some 100 bytes a pixel, stays with the device for the next one: making it takes
@@ -30,6 +31,7 @@ from mirrorskin.kernels.device import Device, open_device
 _KEPT = 2**23
 
 
+@checked
 def integrate(
     dz_dx: ArrayLike | None = None,
     dz_dy: ArrayLike | None = None,

@@ -12,6 +12,7 @@ from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import check_above_zero
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 Doubles = NDArray[np.float64]
 
 
+@checked
 def invert_laplacian(
     right: ArrayLike,
     down: ArrayLike,

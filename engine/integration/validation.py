@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.integration.camera import Camera, Slopes, find_slopes
 from mirrorskin.engine.integration.crop import Box, Mask, find_box
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import as_array
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -228,9 +229,12 @@ def logarithm(name: str, depths: NDArray[Any]) -> NDArray[np.float64]:
 
 def check_pixel_size(pixel_size: ArrayLike | None) -> tuple[float, float]:
     """Return width and height of a pixel, mm, of one number or both."""
-    size = np.asarray(pixel_size, np.float64)
-    if size.shape not in ((), (2,)) or not np.all((size > 0) & (size < np.inf)):
-        raise InputError(f"pixel size {pixel_size!r}: one length in mm above 0, or (x, y), is needed")
+    size = as_array("pixel_size", pixel_size)
+    told = size.tolist() if isinstance(pixel_size, np.ndarray) else pixel_size
+    if size.shape not in ((), (2,)):
+        raise InputError(f"pixel size {told}: one length in mm, or (x, y), is needed")
+    if not np.all((size > 1e-9) & (size < 1e6)):
+        raise InputError(f"pixel size {told}: a length from 1e-9 to 1e6 mm is needed")
     width, height = np.broadcast_to(size, 2).tolist()
     return width, height
 

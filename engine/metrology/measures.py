@@ -17,6 +17,7 @@ from mirrorskin.engine.metrology.sections import Point, along, step_height
 from mirrorskin.engine.metrology.sections import section as cut
 from mirrorskin.engine.metrology.texture import roughness
 from mirrorskin.io import InputError, Region, Result
+from mirrorskin.io.arguments import checked
 
 FormName = Literal["plane", "sphere", "none"]
 
@@ -46,6 +47,7 @@ class Measures:
     notes: list[str]
 
 
+@checked
 def measure(
     result: Result,
     *,

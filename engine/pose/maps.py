@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
@@ -102,10 +103,7 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> tuple[float, float, f
         raise InputError("a motion needs heights, (H, W): integrate the normals, or choose one turn")
     x, y = result.x, result.y
     if pixel_size is not None:
-        size = np.broadcast_to(np.asarray(pixel_size, np.float64), 2)
-        if not (np.isfinite(size) & (size > 0)).all():
-            raise InputError(f"pixel_size must be above 0 mm, not {pixel_size}")
-        x, y = pixel_axes(height.shape, (float(size[0]), float(size[1])))
+        x, y = pixel_axes(height.shape, check_pixel_size(pixel_size))
     if x is None or y is None or min(len(x), len(y)) < 2:
         raise InputError(
             "the result does not say where its pixels are, or has one row of them: give pixel_size"

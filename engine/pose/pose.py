@@ -12,6 +12,7 @@ from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Doubles, Motion
 from mirrorskin.io import Result
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARE = 1e-3  # of a parameter in an undetermined direction, from which on it is undetermined itself
@@ -87,6 +88,7 @@ class Pose:
         )
 
 
+@checked
 def estimate_pose(
     first: Result,
     second: Result,

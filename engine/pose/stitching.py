@@ -97,6 +97,8 @@ def stitch(
     >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
     """
+    if not isinstance(results, Sequence) or not all(isinstance(one, Result) for one in results):
+        raise InputError("the touches are no sequence of results: give a list of mirrorskin.io.Result")
     if len(results) < 2:
         raise InputError(f"{len(results)} results make no larger surface: give two or more")
     names = [f"result {number}" for number in range(len(results))] if names is None else names

@@ -12,6 +12,7 @@ from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference
 from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
@@ -21,6 +22,7 @@ _EVIDENCE = 12.0  # log of how much likelier the samples must be with a change t
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
 
 
+@checked
 def find_change_point(
     frames: NDArray[Any],
     travel: ArrayLike,

@@ -14,6 +14,7 @@ from mirrorskin.engine.rotation.correlation import Correlation, correlate
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.engine.rotation.frequency import estimate_frequency
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_strokes
 
 _SINUSOID = 0.9  # share of the travel's variance that its first harmonic has at least
@@ -85,6 +86,7 @@ class Growth:
         )
 
 
+@checked
 def find_growth(
     frames: NDArray[Any],
     travel: ArrayLike,
@@ -128,6 +130,8 @@ def find_growth(
     >>> round(float(find_growth(frames, travel, dark=0, bright=200).growth[0, 0]), 3)
     1.5
     """
+    if frames.ndim != 3:
+        raise InputError(f"frames of shape {frames.shape}: (T, H, W) is needed")
     wave = travel_wave(travel, len(frames))
     fit = correlate(frames, wave.phase, device=device)
     return Growth.of(fit, wave, dark, bright, frames.dtype, pixel_size)

@@ -14,6 +14,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -44,6 +45,7 @@ _WORK = 40.0  # small surfaces in all: the smallest of very many holes get membr
 _EXACT = 0.01  # pixel sizes: half-width of a height that claims to be exact
 
 
+@checked
 def fill_holes(
     height: ArrayLike,
     sigma: ArrayLike,

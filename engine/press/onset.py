@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_maps
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
@@ -51,6 +52,7 @@ class Onset:
     noise: float
 
 
+@checked
 def find_onset(
     frames: NDArray[Any],
     travel: ArrayLike,

@@ -20,6 +20,7 @@ from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
@@ -72,6 +73,7 @@ class Correlation:
         return phase
 
 
+@checked
 def correlate(
     frames: NDArray[Any],
     phase: ArrayLike,

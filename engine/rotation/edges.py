@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
@@ -27,6 +28,7 @@ LIMITS = Limits(
 _SHORTER = 4  # by how much other kernels are shorter than the longest one
 
 
+@checked
 def find_edges(
     vectors: NDArray[np.float32],
     sigma: NDArray[np.float32],

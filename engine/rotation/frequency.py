@@ -11,6 +11,7 @@ from scipy import optimize
 
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError, Source
+from mirrorskin.io.arguments import checked
 
 _FEWEST = 8  # frames
 _PIXELS, _SAMPLES = 4096, 2**22  # pixels that are looked at, and samples, at most
@@ -32,6 +33,7 @@ class Frequency(NamedTuple):
     sigma: float
 
 
+@checked
 def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     """Estimate the frequency that all pixels share, by any amplitude and phase of each.
 
@@ -63,6 +65,8 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     (3.21, True)
     """
     seconds = np.asarray(time, np.float64)
+    if not samples.ndim:
+        raise InputError("samples are one number: (T, ...) is needed")
     if len(samples) < _FEWEST or seconds.shape != (len(samples),):
         raise InputError(f"{len(samples)} frames with {seconds.size} times: at least {_FEWEST} are needed")
     if not np.all(np.diff(seconds) > 0):

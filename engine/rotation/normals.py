@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Unpack, cast
+from typing import Any, Literal, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -31,6 +31,7 @@ from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows,
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.device import Device
 
@@ -103,11 +104,12 @@ class Normals:
         return np.hypot(self.cosine, self.sine)
 
 
+@checked
 def estimate_normals(
     frames: NDArray[Any],
     phase: ArrayLike | None = None,
     *,
-    tilt: ArrayLike | None = None,
+    tilt: ArrayLike | Literal["estimate"] | None = None,
     axis: ArrayLike | None = None,
     travel: ArrayLike | None = None,
     gain: ArrayLike | None = None,

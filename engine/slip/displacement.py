@@ -12,6 +12,7 @@ from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -47,6 +48,7 @@ class Displacement:
     noise: float
 
 
+@checked
 def find_displacement(
     reference: NDArray[Any],
     frames: NDArray[Any],
@@ -104,6 +106,8 @@ def find_displacement(
         raise InputError(f"{shapes}: (H, W) and (T, H, W) are needed")
     dtype = check_dtype(np.asarray(reference).dtype)
     check_frames(frames, dtype, np.shape(reference))
+    if not np.isfinite(reference).all():
+        raise InputError("the reference has samples that are no numbers: leave out a part that has none")
     size = check_pixel_size(pixel_size)
     check_windows(np.shape(reference), window, step)
     check_noise(noise)
@@ -203,5 +207,5 @@ def check_windows(shape: tuple[int, ...], window: int, step: int) -> None:
 
 def check_noise(noise: float | None) -> None:
     """Raise InputError unless noise is a standard deviation, or not given."""
-    if noise is not None and not 0 < noise < np.inf:
+    if noise is not None and not 0 < noise < 1e9:
         raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")

@@ -115,7 +115,7 @@ BAD = {
     "normals: shape (4, 5)": {"normals": FLAT, "camera": CAMERA},
     "normals: shape (0, 5, 3)": {"normals": NORMALS[:0], "camera": CAMERA},
     "pixel_size 0.1: a camera": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
-    "pixel size None": {"normals": NORMALS},
+    "pixel_size is None": {"normals": NORMALS},
     "nothing to integrate": {"normals": -NORMALS, "camera": CAMERA},
     "known_heights: some are not above 0": {"normals": NORMALS, "camera": CAMERA, "known_heights": FLAT},
     "initial_heights: some are not": {"normals": NORMALS, "camera": CAMERA, "initial_heights": FLAT},

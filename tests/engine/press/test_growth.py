@@ -109,7 +109,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
         (np.linspace(0, 1, 40), "travel does not dither about a mean"),
         (np.ones(40), "travel does not dither about a mean"),
         (np.ones(5), "travel does not dither about a mean: 5 frames"),
-        (None, "travel is missing"),
+        (None, "travel is None"),
     ],
 )
 def test_a_travel_that_is_no_dither_is_one_line(travel, line):

@@ -172,12 +172,6 @@ def test_frames_of_all_types_go_the_same_way():
     np.testing.assert_allclose(heights[0], heights[2], atol=1e-6)
 
 
-def test_a_motion_without_a_method_is_refused():
-    other = MadeUp(np.zeros((4, 3, 5), np.uint8), io.Header("twist"))
-    with pytest.raises(io.InputError, match=r"made up is of twist motion"):
-        engine.reconstruct(other)
-
-
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     ("dtype", "compression"), [("uint8", "raw"), ("uint16", "bitshuffle"), ("float32", "gzip")]

@@ -151,7 +151,7 @@ def test_a_texture_that_is_not_found_again_has_no_answer():
         ({"window": 97}, "window 97: 6 to 96 pixels"),
         ({"step": 0}, "step 0: 1 to 64 pixels"),
         ({"noise": 0.0}, "noise 0.0: a standard deviation"),
-        ({"pixel_size": -1}, "pixel size -1: one length"),
+        ({"pixel_size": -1}, "pixel size -1: a length"),
         ({"frames": REFERENCE}, r"frames \(96, 128\): \(H, W\) and \(T, H, W\) are needed"),
         ({"frames": REFERENCE[None, :-1]}, "expected float32"),
         ({"reference": REFERENCE.astype(float)}, "frames of type float64"),

@@ -1,0 +1,139 @@
+"""Calls of every public function with one argument replaced by something that it is not.
+
+``CALLS`` has a sound call of each; ``odd_values`` makes what may be given in an argument's place. A call may
+answer or refuse in one line, and nothing else.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import SimpleNamespace as Maps
+from typing import Any
+
+import numpy as np
+
+from mirrorskin import engine, io
+from mirrorskin.kernels.errors import DeviceError
+
+REFUSALS = (io.InputError, engine.NotConverged, DeviceError)
+SHAPE = (16, 20)
+_COUNTS = "mean", "cosine", "sine", "residual"  # of a pixel's samples, which may be infinite themselves
+ELSEWHERE = {"reconstruct", "free_memory"}
+"""Public functions that take no arrays of numbers: sources and nothing, which other tests see to."""
+
+_ROW, _COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+_FAR = np.hypot(_ROW - 7.5, _COLUMN - 9.5)
+
+
+def _texture() -> np.ndarray:
+    waves = sum(np.sin(a * _ROW + b * _COLUMN + a * b) for a, b in ((0.9, 0.2), (-0.4, 1.1), (0.3, -0.8)))
+    return (100 + 20 * waves).astype(np.float32)
+
+
+def _press(frames: int = 8) -> np.ndarray:
+    travel = np.linspace(0, 1, frames)[:, None, None]
+    return np.where(travel > _FAR / 15, 200, 10).astype(np.uint8)
+
+
+def _rotation(phases: np.ndarray) -> np.ndarray:
+    return np.rint(100 + 12 * np.cos(phases[:, None, None] - _COLUMN / 9)).astype(np.uint8)
+
+
+@cache
+def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
+    """Return the functions by their names, each with arguments that it answers to."""
+    phases, sure = np.arange(8) * math.pi / 4, np.full(SHAPE, 0.01, np.float32)
+    height = (-0.002 * _FAR**2).astype(np.float32)
+    normals = np.dstack([0.004 * (_COLUMN - 9.5), -0.004 * (_ROW - 7.5), np.ones(SHAPE)])
+    normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
+    flat, contact = np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.uint8)
+    places = {"x": 0.1 * (np.arange(20) - 9.5), "y": 0.1 * (7.5 - np.arange(16))}
+    result = io.Result(height=height, height_sigma=sure, normals=normals, normal_sigma=sure, **places)
+    wave = 0.5 + 0.1 * np.sin(np.arange(64) * 0.8)
+    dither = (100 + 40 * (wave[:, None, None] - 0.5) + 0 * _FAR).astype(np.float32)
+    onset, turned = Maps(height=height, sigma=sure), Maps(vectors=normals, sigma=sure, contact=contact)
+    disc = _FAR < 5
+    made: dict[str, dict[str, Any]] = {
+        "find_onset": {"frames": _press(), "travel": np.linspace(0, 1, 8), "noise": 1.0},
+        "find_change_point": {"frames": _press(), "travel": np.linspace(0, 1, 8)},
+        "estimate_normals": {"frames": _rotation(phases), "phase": phases, "tilt": 0.04, "gain": 300.0},
+        "correlate": {"frames": _rotation(phases), "phase": phases},
+        "integrate": {"normals": normals, "pixel_size": 0.1},
+        "invert_laplacian": {"right": np.ones((16, 19)), "down": np.ones((15, 20))},
+        "fill_holes": {"height": height, "sigma": sure, "pixel_size": 0.1},
+        "find_edges": {"vectors": normals, "sigma": sure, "contact": contact},
+        "find_displacement": {
+            "reference": _texture(), "frames": _texture()[None], "pixel_size": 0.1, "noise": 1.0,
+        },
+        "find_force": {"height": height, "travel": 0.2, "pixel_size": 0.1, "modulus": 0.1},
+        "find_tangential_force": {
+            "displacement": np.full((*SHAPE, 2), 0.01), "pixel_size": 0.1, "modulus": 0.1, "contact": disc,
+        },
+        "find_growth": {"frames": dither, "travel": wave, "dark": 0.0, "bright": 255.0},
+        "estimate_frequency": {"samples": wave, "time": 0.01 * np.arange(64)},
+        "estimate_pose": {"first": result, "second": result, "pixel_size": 0.1},
+        "stitch": {"results": [result, result], "pixel_size": 0.1},
+        "measure": {"result": result},
+        "score": {"result": result, "truth": io.Truth(height, flat, flat, contact)},
+        "fuse": {"onset": onset, "normals": turned, "pixel_size": 0.1},
+    }  # fmt: skip
+    return {name: (getattr(engine, name), arguments) for name, arguments in made.items()}
+
+
+def public_functions() -> set[str]:
+    """Return the names of the engine's public functions."""
+    return {name for name in engine.__all__ if inspect.isfunction(getattr(engine, name))}
+
+
+def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:
+    """Yield what may be given in place of a sound argument."""
+    array = np.asarray(sound, float) if isinstance(sound, np.ndarray | float | int) else None
+    yield from (("text", "abc"), ("none", None), ("table", {"a": 1}), ("object", object()))
+    yield from (
+        ("complex", 1j),
+        ("huge", 1e308),
+        ("tiny", 1e-320),
+        ("below 0", -1.0),
+        ("not a number", math.nan),
+    )
+    yield from (("empty", np.empty(0)), ("five axes", np.zeros((1, 2, 3, 4, 5))), ("ragged", [[1], [1, 2]]))
+    if array is None or not array.ndim:
+        return
+    yield "list", np.asarray(sound).tolist()
+    yield "masked", np.ma.masked_array(sound, np.arange(array.size).reshape(array.shape) % 5 == 0)
+    for name, value in (("infinite", math.inf), ("unknown", math.nan)):
+        part = array.copy()
+        part.flat[3] = value
+        yield f"{name} in part", part.astype(np.float32)
+    yield "transposed", np.asarray(sound).T
+    yield "one too few", np.asarray(sound)[:-1]
+    yield "complex array", array * 1j
+    yield "objects", array.astype(object)
+    yield "texts", array.astype(str)
+    yield "dates", array.astype("M8[s]") if np.isfinite(array).all() else None
+    yield "infinite", np.full(array.shape, math.inf)
+
+
+def trial(name: str, argument: str, value: Any) -> str | None:
+    """Call a function with one argument replaced; return what is wrong with how it ended, None if nothing."""
+    function, arguments = calls()[name]
+    try:
+        answer = function(**{**arguments, argument: value})
+    except REFUSALS as refusal:
+        return "refuses in more than a line" if "\n" in str(refusal) else None
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    infinite = [part for part, values in _arrays(answer) if np.isinf(values).any()]
+    return f"infinite {', '.join(infinite)}" if infinite else None
+
+
+def _arrays(answer: Any) -> Iterator[tuple[str, np.ndarray]]:
+    for name in getattr(answer, "__dataclass_fields__", ()):
+        if name in _COUNTS:
+            continue
+        values = getattr(answer, name)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+            yield name, values

@@ -1,0 +1,72 @@
+"""Public functions answer, or refuse in a line, whatever they are given."""
+
+import math
+
+import numpy as np
+import pytest
+from calls import ELSEWHERE, SHAPE, calls, odd_values, public_functions, trial
+
+from mirrorskin import engine
+from mirrorskin.io import InputError
+
+
+def test_every_public_function_is_tried():
+    assert public_functions() == set(calls()) | ELSEWHERE
+
+
+@pytest.mark.parametrize("name", calls())
+@pytest.mark.filterwarnings("ignore")
+def test_an_odd_argument_is_answered_or_refused_in_a_line(name):
+    function, arguments = calls()[name]
+    function(**arguments)
+    wrong = {
+        f"{argument} {kind}": said
+        for argument, sound in arguments.items()
+        for kind, value in odd_values(sound)
+        if (said := trial(name, argument, value)) is not None
+    }
+    assert wrong == {}
+
+
+def test_lists_are_taken_as_arrays():
+    function, known = calls()["find_onset"]
+    listed = {name: value.tolist() for name, value in known.items() if isinstance(value, np.ndarray)}
+    listed["frames"] = known["frames"]
+    np.testing.assert_array_equal(function(**known).height, function(**{**known, **listed}).height)
+
+
+def test_a_masked_sample_is_not_known():
+    function, known = calls()["find_onset"]
+    mask = np.zeros(known["frames"].shape, bool)
+    mask[:, 3, 4] = True
+    frames = np.ma.masked_array(known["frames"], mask)
+    found = function(**{**known, "frames": frames, "dark": 0.0, "bright": 255.0})
+    whole = function(**{**known, "dark": 0.0, "bright": 255.0})
+    assert math.isnan(found.height[3, 4])
+    there = ~mask[0]
+    np.testing.assert_allclose(found.height[there], whole.height[there], equal_nan=True)
+
+
+def test_a_masked_height_is_a_hole():
+    function, known = calls()["fill_holes"]
+    mask = np.zeros(SHAPE, bool)
+    mask[7:9, 9:11] = True
+    height, filled = function(**{**known, "height": np.ma.masked_array(known["height"], mask)})
+    np.testing.assert_array_equal(filled, mask)
+    np.testing.assert_allclose(height[mask], known["height"][mask], atol=5e-3)
+
+
+def test_masked_contact_is_none():
+    function, known = calls()["find_tangential_force"]
+    touches = known["contact"]
+    mask = np.zeros(SHAPE, bool)
+    mask[:7] = True
+    masked = function(**{**known, "contact": np.ma.masked_array(touches, mask)})
+    np.testing.assert_array_equal(masked.force, function(**{**known, "contact": touches & ~mask}).force)
+
+
+def test_the_argument_is_named():
+    with pytest.raises(InputError, match="travel is 'abc': numbers are needed"):
+        engine.find_onset(calls()["find_onset"][1]["frames"], "abc")
+    with pytest.raises(InputError, match=r"result is a dict: a mirrorskin.io.Result is needed"):
+        engine.measure({})
