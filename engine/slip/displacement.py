@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
@@ -24,6 +26,8 @@ INVALID, FOUND, NOT_FOUND, NO_TEXTURE = range(4)
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # of a status among those of the nodes around a pixel
 _CODES = np.argsort(_RANK).astype(np.uint8)
 _MOST_STEP = 64  # pixels from node to node
+_ALIKE = 4  # samples
+_LAPLACIAN_NOISE = 4 * 20 / 24**2  # of a variance: two standard deviations
 _LEAST_TEXTURED = 0.1  # of the windows; there are as many on a clear sheet where light and dark meet
 
 
@@ -116,7 +120,7 @@ def find_displacement(
     texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
     texture.refuse_clear("the frames")
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
-    maps = [_maps(tracker, field, texture, sigma, size) for field in fields]
+    maps = [_maps(tracker, field, texture, window, sigma, size) for field in fields]
     displacement, sigmas, status = (np.stack(part) for part in zip(*maps, strict=True))
     return Displacement(displacement, sigmas, status, texture.noise)
 
@@ -133,13 +137,16 @@ class Texture:
         Whether the texture's derivatives have at least the variance of those of noise, in every direction.
     usable : ndarray, (rows, columns), bool
         Whether the window has enough samples.
+    variance : ndarray, (rows, columns), float64
+        Of a sample, counts^2.
     noise : float
-        Of a sample, counts: the median.
+        The median's root.
     """
 
     covariance: Doubles
     there: NDArray[np.bool_]
     usable: NDArray[np.bool_]
+    variance: Doubles
     noise: float
 
     @classmethod
@@ -160,7 +167,7 @@ class Texture:
         there = least >= np.maximum(alone[..., 0, 0], np.finfo(float).tiny)
         covariance = np.full(own.shape, np.nan)
         covariance[there] = 2 * variance[there][:, None, None] * np.linalg.inv(level.information[there])
-        return cls(covariance, there, level.usable, float(np.sqrt(usual)))
+        return cls(covariance, there, level.usable, variance, float(np.sqrt(usual)))
 
     def refuse_clear(self, name: str) -> None:
         """Raise InputError if hardly any window has texture."""
@@ -173,17 +180,56 @@ class Texture:
 
 
 def _maps(
-    tracker: Tracker, field: NodeField, texture: Texture, sigma: Doubles, size: tuple[float, float]
+    tracker: Tracker,
+    field: NodeField,
+    texture: Texture,
+    window: int,
+    sigma: Doubles,
+    size: tuple[float, float],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return a frame's displacement, sigma, mm, and status, of all pixels."""
     status = node_status(field, texture)
     known = (status == FOUND)[..., None]
     displacement = np.where(known, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
+    noisy = (sigma * misfit(field, texture, window)) ** 2
+    sigma = np.sqrt(noisy + bending_variance(displacement, sigma**2, tracker.finest.step, window))
     return (
         tracker.to_pixels(displacement),
-        tracker.to_pixels(np.where(known, sigma, np.nan)),
+        tracker.positive_to_pixels(np.where(known, sigma, np.nan)),
         _CODES[tracker.worst_at_pixels(_RANK[status])],
     )
+
+
+def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
+    """Return by what a frame's misfit, beyond noise, raises sigma, as a factor, (rows, columns, 1).
+
+    What light that changes leaves is alike over some samples, and counts as many times.
+    """
+    chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
+    more = np.fmax(field.variance / texture.variance - chance, 0)
+    return np.asarray(np.sqrt(1 + _ALIKE * more)[..., None])
+
+
+def bending_variance(displacement: Doubles, variance: Doubles, step: int, window: int) -> Doubles:
+    """Return about how much a displacement that bends is off in the middle of its windows, squared.
+
+    Of nodes, (rows, columns, 2), and the variance by noise. An affine field misses the mean of the
+    second-order terms, window^2 / 24 times the Laplacian. That is made of displacements a window apart; what
+    noise makes of it is left out.
+    """
+    apart = max(1, round(window / step))
+    laplacian = np.zeros(displacement.shape)
+    for axis in (0, 1):
+        if displacement.shape[axis] > 2 * apart:
+            n = displacement.shape[axis]
+            before, here, after = (
+                displacement.take(np.arange(k, n - 2 * apart + k), axis) for k in (0, apart, 2 * apart)
+            )
+            inside = [(apart, apart) if k == axis else (0, 0) for k in range(3)]
+            laplacian += np.pad(before - 2 * here + after, inside, mode="edge")
+    filled = [fill_with_nearest(part) for part in np.moveaxis(laplacian, -1, 0)]
+    bias = np.stack(filled, axis=-1) * (window / (apart * step)) ** 2 / 24
+    return np.asarray(np.fmax(bias**2 - _LAPLACIAN_NOISE * variance, 0))
 
 
 def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:

@@ -18,8 +18,10 @@ from mirrorskin.engine.slip.displacement import (
     NO_TEXTURE,
     STEP,
     Texture,
+    bending_variance,
     check_noise,
     check_windows,
+    misfit,
     node_status,
 )
 from mirrorskin.engine.slip.onset_map import OnsetMap, fit_onsets
@@ -253,7 +255,10 @@ class SlipSearch:
             )
         status, onset = self._pixels(tracker, codes, onsets, contact, course.end)
         slipped = status == SLIPPED
-        spread = tracker.to_pixels(np.sqrt(np.trace(self._covariance(texture), axis1=2, axis2=3) / 2))
+        noisy = np.einsum("yxii->yxi", self._covariance(texture))
+        bent = bending_variance(moved[-1], noisy, self.step, self.window)
+        noisy = noisy * misfit(fields[-1], texture, self.window) ** 2
+        spread = tracker.positive_to_pixels(np.sqrt(np.mean(noisy + bent, axis=-1)))
         centre, angle = (
             (None, None)
             if self.position == "displacement"
@@ -264,9 +269,7 @@ class SlipSearch:
             displacement=self._each(tracker, moved) if self._per_frame else last,
             displacement_sigma=np.where(np.isfinite(last[..., 0]), spread, np.float32(np.nan)),
             slip_onset=np.where(slipped, np.maximum(onset, 0), np.float32(np.nan)),
-            slip_onset_sigma=np.where(
-                slipped, np.exp(tracker.to_pixels(np.log(onsets.sigma))), np.float32(np.nan)
-            ),
+            slip_onset_sigma=np.where(slipped, tracker.positive_to_pixels(onsets.sigma), np.float32(np.nan)),
             status=status,
             contact=contact.astype(np.uint8),
             way=np.append(0.0, course.way),

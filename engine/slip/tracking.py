@@ -119,6 +119,10 @@ class Tracker:
         found = np.where(np.isfinite(fine), fine, linear).astype(np.float32)
         return np.asarray(np.moveaxis(found, 0, -1).reshape(*level.shape, *values.shape[2:]))
 
+    def positive_to_pixels(self, values: Doubles) -> NDArray[np.float32]:
+        """Return values above 0 at all pixels, by their logarithms: a cubic may fall below 0."""
+        return np.asarray(np.exp(self.to_pixels(np.log(values))))
+
     def worst_at_pixels(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return at all pixels the largest code of the nodes around, (rows, columns)."""
         places = [np.floor(place).astype(int) for place in self._places()]

@@ -84,6 +84,17 @@ def test_a_turn_is_followed_frame_by_frame(angle):
     assert np.mean((error / found.sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
 
 
+def test_sigma_counts_that_the_movement_bends_inside_windows():
+    def right(x, y):
+        return 0.003 * (x - 64) ** 2 + 0 * y
+
+    frames = np.stack([SPECKLE.frame(SHAPE, right, 0, NOISE, k) for k in range(4)])
+    found = find_displacement(REFERENCE, frames, PIXEL, window=16)
+    part = np.s_[:, 24:-24, 40:88, 0]
+    error = (found.displacement - grid(right, lambda x, y: 0 * x))[part]
+    assert np.mean((error / found.sigma[part]) ** 2) == pytest.approx(1, abs=0.4)
+
+
 @pytest.mark.parametrize("far", [6.0, 40.0])
 def test_a_long_way_in_one_step_is_found(far):
     frame = SPECKLE.frame(SHAPE, far, 0, NOISE, 1)[None]
