@@ -717,19 +717,19 @@ __kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VALUES parts
     const int from = get_global_id(0) % pieces * TILE, upto = LESSER(columns, from + TILE);                \
     if (row >= rows) return;
 #if LANES == 1
-__kernel void multigrid_admit(const int rows, const int columns, const int stride, MAP map, OUT level)
+__kernel void multigrid_admit(LEVEL_ARGS, const int columns, MAP map, OUT level)
 {
     PICTURE_ITEMS
     for (int c = from; c < upto; ++c) {
-        level[(row + 1) * stride + c] = map[row * columns + c];
+        level[base + (row + 1) * stride + c] = map[row * columns + c];
     }
 }
 
-__kernel void multigrid_release(const int rows, const int columns, const int stride, MAP level, OUT map)
+__kernel void multigrid_release(LEVEL_ARGS, const int columns, MAP level, OUT map)
 {
     PICTURE_ITEMS
     for (int c = from; c < upto; ++c) {
-        map[row * columns + c] = level[(row + 1) * stride + c];
+        map[row * columns + c] = level[base + (row + 1) * stride + c];
     }
 }
 #else
@@ -737,7 +737,7 @@ __kernel void multigrid_release(const int rows, const int columns, const int str
 // where caches keep few of them at once.
 #define PIECE LESSER(TILE, 64)
 __kernel void multigrid_admit(
-    const int rows, const int columns, const int stride, const int first, const int count, MAP map, OUT level)
+    LEVEL_ARGS, const int columns, const int first, const int count, MAP map, OUT level)
 {
     PICTURE_ITEMS
     float some[LANES][PIECE];
@@ -748,19 +748,19 @@ __kernel void multigrid_admit(
                 some[lane][k] = lane < count ? map[((long)(first + lane) * rows + row) * columns + c + k] : 0;
         for (int k = 0; k < width; ++k)
             for (int lane = 0; lane < LANES; ++lane)
-                level[((long)(row + 1) * stride + c + k) * LANES + lane] = some[lane][k];
+                level[(base + (long)(row + 1) * stride + c + k) * LANES + lane] = some[lane][k];
     }
 }
 
 __kernel void multigrid_release(
-    const int rows, const int columns, const int stride, const int first, const int count, MAP level, OUT map)
+    LEVEL_ARGS, const int columns, const int first, const int count, MAP level, OUT map)
 {
     PICTURE_ITEMS
     for (int c = from; c < upto; c += PIECE) {
         const int width = LESSER(PIECE, upto - c);
         for (int lane = 0; lane < count; ++lane)
             for (int k = 0; k < width; ++k)
-                map[((long)(first + lane) * rows + row) * columns + c + k] = level[((long)(row + 1) * stride + c + k) * LANES + lane];
+                map[((long)(first + lane) * rows + row) * columns + c + k] = level[(base + (long)(row + 1) * stride + c + k) * LANES + lane];
     }
 }
 #endif
@@ -838,12 +838,12 @@ __kernel void multigrid_local(
 // Standard deviations: the roots of variances, of which each has its least share of one over the diagonal; no number
 // where no flag of `wanted` is.
 __kernel void multigrid_deviation(
-    const int rows, const int columns, const int stride, const float least, const int wanted,
+    LEVEL_ARGS, const int columns, const float least, const int wanted,
     BYTES flags, MAP inverse, MAP level, OUT map)
 {
     PICTURE_ITEMS
     for (int c = from; c < upto; ++c) {
-        const int i = (row + 1) * stride + c;
+        const int i = base + (row + 1) * stride + c;
         const float found = GREATER(level[i], least * inverse[i]);
         map[row * columns + c] = flags[row * columns + c] & wanted ? sqrt(found) : NAN;
     }

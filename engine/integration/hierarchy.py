@@ -23,6 +23,8 @@ LANES = 16, 8, 4
 
 _ROUNDS = 4  # an even number, in which parts of blocks find another aggregate
 _VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
+_BEFORE = _VECTOR  # nodes before the first level, which vectors to the left of its margin read
+_ROOM_OF_WIDE_TILES = 45056  # bytes of a group's memory; OpenCL grants no more than 32768
 _BEYOND = 64  # nodes behind the last level, which vectors may read
 
 
@@ -63,7 +65,7 @@ class Level:
 
 def cut_levels(shape: tuple[int, int]) -> list[Level]:
     """Return a picture's levels, the finest first; the last one has one node."""
-    levels = [Level.at(0, *shape)]
+    levels = [Level.at(_BEFORE, *shape)]
     while levels[-1].rows * levels[-1].columns > 1:
         fine = levels[-1]
         levels.append(Level.at(fine.end, -(-fine.rows // 2), -(-fine.columns // 2)))
@@ -213,7 +215,7 @@ class Hierarchy:
     def copy_picture(self, name: str, level: Array, map_: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Copy a map of pixels to ("admit") the finest level, or back ("release")."""
         finest = self.levels[0]
-        sizes = {"rows": finest.rows, "columns": finest.columns, "stride": finest.stride}
+        sizes = {**finest.place, "columns": finest.columns}
         items = finest.rows * -(-finest.columns // self.device.layout.tile)
         kernel = self.kernel(name, 4, lanes)
         kernel(items, **sizes, level=level, map=map_, **arguments, moved=8 * lanes * finest.nodes)
@@ -237,7 +239,10 @@ def place_of_coarse(coarse: Level) -> dict[str, int]:
 
 def tile_columns(device: Device, lanes: int) -> int:
     """Return the columns of the tiles that a group takes in half a cycle."""
-    return 32 if device.layout.tile == 1 else 128 if lanes == 1 else 64
+    if device.layout.tile == 1:
+        return 32
+    room = device.context.devices[0].local_mem_size
+    return 128 if lanes == 1 and room >= _ROOM_OF_WIDE_TILES else 64
 
 
 def tile_rows(device: Device, lanes: int) -> int:
