@@ -16,6 +16,7 @@ from mirrorskin.bench import (
     normals,
     onset,
     paths,
+    pose,
     robust,
     sweep,
     twin,
@@ -36,6 +37,7 @@ _RUNS: Cases = {
     **paths.CASES,
     **batch.CASES,
     **live.CASES,
+    **pose.CASES,
     **accuracy.CASES,
 }
 NAMES = tuple(_RUNS)
