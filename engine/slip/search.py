@@ -107,7 +107,7 @@ class SlipSearch:
     contact : array_like, (H, W), optional
         Not 0 where the skin touches the object in the first frame, as a press tells. Without it, contact is
         where the skin went along by half of the way or more: free skin round the contact does so, too, so
-        that the contact comes out some 20 % too wide.
+        that the contact comes out 2 to 9 % too wide.
     centre : (float, float)
         Of a twist: where the body's axis is, mm from the picture's centre.
     window, step, noise, device
