@@ -47,6 +47,7 @@ _NOUN: dict[Kind, str] = {
     "force": "a force",
     "pressure": "a pressure",
 }
+_ANGLES = ("radian", "degree", "arcminute", "arcsecond", "grade", "turn")
 _LONGEST = 40  # letters of a unit in a file
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given single names only
 
@@ -95,7 +96,9 @@ def _pint_factor(symbol: str, kind: Kind) -> float:
     base = registry.Unit(BASE[kind])
     # A pixel of a style sheet is a length, but nobody here means that one.
     same = registry.get_root_units(unit)[1] == registry.get_root_units(base)[1]
-    if not same or unit == registry.Unit("css_pixel"):
+    # Angles have no dimension, and neither have decibels, percents and counts.
+    other = kind == "angle" and not str(unit).endswith(_ANGLES)
+    if not same or other or unit == registry.Unit("css_pixel"):
         raise ValueError(f"{unit}s are not {_NOUN[kind]}")
     return float(registry.convert(1.0, unit, base))
 

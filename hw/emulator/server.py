@@ -69,6 +69,9 @@ class FrameServer(Closing):
                 line, _ = self._door.accept()
             except TimeoutError:
                 continue
+            except OSError:  # of too many open files, which may be closed
+                time.sleep(_LOOK)
+                continue
             line.settimeout(None)
             line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._change:

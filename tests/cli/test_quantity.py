@@ -177,6 +177,7 @@ def test_frame_sizes_that_are_none(text):
         (angle, "45", "--o 45: a unit is needed; write e.g. 2.5deg"),
         (angle, "0.1mm", "--o 0.1mm: millimeters are not an angle; write e.g. 2.5deg"),
         (angle, "5percent", "--o 5percent: percents are not an angle; write e.g. 2.5deg"),
+        (angle, "5dB", "--o 5dB: decibels are not an angle; write e.g. 2.5deg"),
         (angle, "5byte", "--o 5byte: bytes are not an angle; write e.g. 2.5deg"),
         (angle, "3pi", "--o 3pi: pis are not an angle; write e.g. 2.5deg"),
         (memory, "512", "--o 512: a unit is needed; write e.g. 512MB"),

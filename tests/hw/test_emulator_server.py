@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import threading
 import time
@@ -185,3 +186,18 @@ def test_what_cannot_be_streamed_is_refused() -> None:
             FrameServer(tape, 30.0)
     finally:
         tape.close()
+
+
+def test_running_out_of_descriptors_for_a_while_ends_nothing() -> None:
+    with streaming() as (_, server):
+        door, refused = server._door, threading.Event()
+
+        class Full:
+            def accept(self) -> Any:
+                refused.set()
+                raise OSError(errno.EMFILE, "Too many open files")
+
+        server._door = Full()  # type: ignore[assignment]
+        assert refused.wait(PATIENCE)
+        server._door = door
+        assert len(watch(server.url, 2)) == 2
