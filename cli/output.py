@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 _NO_GEL = "none: the calibration has no gel"
+_OF_SLIP = ("slipped", "stick_ratio")  # in a summary
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
@@ -31,8 +32,8 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records()
-        told = dataclasses.asdict(summary)
-        told = {name: value for name, value in told.items() if value is not None or name not in SCALARS}
+        told, some = dataclasses.asdict(summary), (*SCALARS, *_OF_SLIP)
+        told = {name: value for name, value in told.items() if value is not None or name not in some}
         facts = {"summary": told | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:

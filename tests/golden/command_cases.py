@@ -186,7 +186,7 @@ def reconstruct_a_recorded_release() -> Answer:
     )
 
 
-@case(**RESULT)
+@case(fragile=True, **RESULT)
 def reconstruct_a_recorded_rotation() -> Answer:
     return named(
         exact=result("reconstruct", "turn.h5"),
@@ -217,7 +217,7 @@ def correlate_recordings() -> Answer:
     )
 
 
-@case(**RESULT)
+@case(fragile=True, **RESULT)
 def fuse_recordings() -> Answer:
     return named(
         plain=result("fuse", "press.h5", "turn.h5"),
@@ -226,7 +226,7 @@ def fuse_recordings() -> Answer:
     )
 
 
-@case((1e-3, 1e-6))
+@case((1e-3, 1e-6), fragile=True)
 def score_results() -> Answer:
     return {
         "press": told("score", "press-result.h5", "--truth", "press.h5"),
@@ -236,13 +236,13 @@ def score_results() -> Answer:
     }
 
 
-@case((1e-3, 1e-6))
+@case((1e-3, 1e-6), fragile=True)
 def info_of_files() -> Answer:
     names = ("press.h5", "turn.h5", "press-result.h5", "turn-result.h5", "fused.h5", "gel-cal.h5")
     return {name: told("info", name) for name in names}
 
 
-@case((1e-3, 1e-6))
+@case((1e-3, 1e-6), fragile=True)
 def measure_results() -> Answer:
     return {
         "fused": told("measure", "fused.h5"),
@@ -252,7 +252,7 @@ def measure_results() -> Answer:
     }
 
 
-@case((1e-5, 1e-4), picture=(0.0, 0.0))
+@case((1e-5, 1e-4), picture=(0.0, 0.0), fragile=True)
 def export_results() -> Answer:
     names = [f"fused.{kind}" for kind in ("ply", "stl", "xyz", "png", "tif", "csv", "npz")]
     command("export", "fused.h5", *(word for name in names for word in ("-o", f"./{name}")))

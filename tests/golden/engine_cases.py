@@ -649,7 +649,7 @@ def fuse() -> Answer:
     )
 
 
-@case(FITTED, **RECONSTRUCTED)
+@case(FITTED, **{**RECONSTRUCTED, "normals": (1e-3, 1e-5)})
 def fuse_sources() -> Answer:
     shape, travel = (40, 52), np.arange(0.0, 1.0, 0.05)
     starts = -dome(shape)[0]
