@@ -106,6 +106,8 @@ def stitch(
     opened = open_device(device)
     maps = []
     for touch, name in zip(touches, names, strict=True):
+        if touch.height_sigma is None:
+            raise InputError(f"{name} has no height_sigma, by which heights are merged: reconstruct it again")
         try:
             maps.append(PoseMap.of(touch, pixel_size, opened))
         except InputError as error:
@@ -286,7 +288,7 @@ class _Moved:
         upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
         steep = upright @ motion.turn[:, 2]  # how much faster the surface comes nearer than z
         lever = np.concatenate([np.cross(place, upright), upright], axis=-1)
-        own = _variance_of(touch, height.shape)
+        own = _variance_of(touch)
         variance = points.interpolate(own.astype(np.float32)).astype(np.float64)
         variance = (variance + np.einsum("ni,ij,nj->n", lever, pose.covariance, lever)) / steep**2
         answered = np.isfinite(found) & np.isfinite(variance)
@@ -308,10 +310,8 @@ class _Moved:
         )
 
 
-def _variance_of(touch: Result, shape: tuple[int, ...]) -> Doubles:
-    """Return the variance of a touch's heights, (H, W); alike for all where it is not known."""
-    if touch.height_sigma is None:
-        return np.ones(shape)
+def _variance_of(touch: Result) -> Doubles:
+    """Return the variance of a touch's heights, (H, W); NaN where it is not known."""
     sigma = np.asarray(touch.height_sigma, np.float64)
     return np.where(sigma > 0, sigma, np.nan) ** 2
 

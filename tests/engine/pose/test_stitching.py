@@ -110,3 +110,12 @@ def test_what_shares_nothing_is_refused_by_name():
 def test_a_single_result_is_refused():
     with pytest.raises(io.InputError, match="two or more"):
         engine.stitch(touches(moves=MOVES[:1]))
+
+
+def test_heights_without_sigma_are_refused_by_name():
+    first, second = touches(moves=MOVES[:2])
+    bare = io.Result(
+        height=second.height, normals=second.normals, normal_sigma=second.normal_sigma, x=second.x, y=second.y
+    )
+    with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
+        engine.stitch([first, bare], names=["one.h5", "two.h5"])
