@@ -23,10 +23,12 @@ test: lint
 	$(PYTEST) -m 'not slow'
 	wait $$types
 
-# What 'make test' leaves out: the second work shape of every device, statistics over many draws, recordings
-# of full size, batches that are killed, the documentation, and reports in a real browser.
+# What 'make test' leaves out: captures that go by the clock, with nothing beside them; the second work shape of
+# every device, statistics over many draws, recordings of full size, batches that are killed, the documentation,
+# and reports in a real browser.
 test-all: $(READY)
-	@$(PYTEST) -m slow
+	@$(BIN)/python -m pytest --ignore tests/browser -m 'slow and real_time'
+	$(PYTEST) -m 'slow and not real_time'
 	$(MAKE) --no-print-directory docs test-browser
 
 # Pages in a real browser, which the system brings: Debian's package chromium.

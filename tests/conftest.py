@@ -33,6 +33,7 @@ WAYS = [
 def pytest_configure(config):
     config.addinivalue_line("markers", "device: runs on each OpenCL device")
     config.addinivalue_line("markers", "slow: only 'make test-all' runs it")
+    config.addinivalue_line("markers", "real_time: it goes by the clock, so 'make test-all' runs it alone")
 
 
 def pytest_collection_modifyitems(items):

@@ -16,7 +16,7 @@ from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
 
-pytestmark = pytest.mark.slow  # it runs in real time
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 SOON = 1.0  # seconds; it is 0.2 on a machine that has nothing else to do
 LATE = 5.0

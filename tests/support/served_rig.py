@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.link import Link
+from mirrorskin.hw.grbl import link as links
 from mirrorskin.hw.rig import rig as rigs
 
 
@@ -18,7 +18,8 @@ def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
     """Let emulators be late, where other programs have the processors; that is no fault of the rig."""
     patch.setattr(rigs, "_STALL", seconds)
     patch.setattr(rigs, "_PAUSE", seconds)
-    patch.setattr(Link, "_limit", lambda link: link.patience or seconds)
+    patch.setattr(links, "_WRITE", seconds)
+    patch.setattr(links.Link, "_limit", lambda link: link.patience or seconds)
 
 
 @contextmanager
