@@ -16,7 +16,10 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Compare a result with a simulation's truth."""
+    import click
+
     from mirrorskin import engine, io
+    from mirrorskin.cli.output import printable
     from mirrorskin.io.selection import source_region
 
     found = io.open_result(result)
@@ -28,6 +31,8 @@ def command(
         if recording.truth is None:
             raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
         score = engine.score(found, recording.truth)
+    if score.slip_left_out is not None:
+        click.echo(printable(f"{result}: slip is left out: {score.slip_left_out}"), err=True)
     if as_json:
         print_json(score.parts())
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -160,6 +161,9 @@ class SlipScore:
     recall, precision : float
         Share of the slipped pixels that were found, and of those found that slipped; pixels beside a border
         of contact or slip are left out.
+    stick_radius, true_stick_radius : float
+        At the end, as shares of the contact's radius: square roots of the share of the answered pixels that
+        stick, found and true.
     unit : str
         Of onsets.
     onset_rms, onset_chi_square : float
@@ -174,6 +178,8 @@ class SlipScore:
     coverage: float
     recall: float
     precision: float
+    stick_radius: float
+    true_stick_radius: float
     unit: str
     onset_rms: float
     onset_chi_square: float
@@ -187,11 +193,17 @@ class SlipScore:
             "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
             "recall": f"{100 * self.recall:.2f} %",
             "precision": f"{100 * self.precision:.2f} %",
+            "stick radius": self._stick_radius(),
             "RMS error of the onset": f"{self.onset_rms:.4g} {self.unit}",
             "onset's mean (error/sigma)^2": f"{self.onset_chi_square:.3f}",
             "RMS error of the displacement": f"{self.displacement_rms:.4g} mm",
             "displacement's mean (error/sigma)^2": f"{self.displacement_chi_square:.3f}",
         }
+
+    def _stick_radius(self) -> str:
+        found, true = self.stick_radius, self.true_stick_radius
+        error = f" ({100 * (found / true - 1):+.1f} %)" if true else ""
+        return f"{100 * found:.2f} % of the contact's, in truth {100 * true:.2f} %{error}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +224,9 @@ class Score:
         None of frames that were registered: what follows the object has another contact than what stays with
         the picture.
     slip : SlipScore or None
-        Of a slide or a twist from its first frame to its last.
+        Of a slide or a twist from its first frame on.
+    slip_left_out : str or None
+        Why slip that the result has is not scored.
     """
 
     height: HeightScore | None = None
@@ -222,10 +236,12 @@ class Score:
     contact: ContactScore | None = None
     edges: EdgeScore | None = None
     slip: SlipScore | None = None
+    slip_left_out: str | None = None
 
     def parts(self) -> dict[str, Any]:
         """Return the scores that there are, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
+        del values["slip_left_out"]
         return {name: value for name, value in values.items() if value is not None}
 
     def table(self) -> dict[str, str]:
@@ -244,8 +260,8 @@ def score(result: Result, truth: Truth) -> Score:
     Parameters
     ----------
     result : Result
-        With at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges`` and slip; of a
-        result for each turn, all turns are compared.
+        With at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges``, ``slip_onset`` and
+        ``displacement``; of a result for each turn, all turns are compared.
     truth : Truth
         Of the same size.
 
@@ -270,9 +286,9 @@ def score(result: Result, truth: Truth) -> Score:
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
-    known = ("height", "azimuth", "normals", "contact", "edges")
+    known = ("height", "azimuth", "normals", "contact", "edges", "slip_onset", "displacement")
     if all(getattr(result, name) is None for name in known):
-        raise InputError("the result has no heights, normals, azimuths, contact or edges to score")
+        raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
     size = map_shape(result)[-2:]
     if size != truth.height.shape:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
@@ -282,31 +298,62 @@ def score(result: Result, truth: Truth) -> Score:
     follows = bool(result.process.get("registered", result.process.get("heights", "none") != "none"))
     contact, edges = (None, None) if follows else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
-    return Score(
+    left_out = _why_slip_is_left_out(result, truth)
+    found = Score(
         height=height,
         filled=filled,
         normal=None if result.normals is None else _score_normals(result, truth, touched),
         azimuth=None if azimuth is None else _score_angles(_turned(azimuth, truth.azimuth), None, touched),
         contact=None if contact is None else _score_contact(result, touched),
         edges=None if edges is None else _score_edges(edges, _edges_of(truth)),
-        slip=_score_slip(result, truth, touched),
+        slip=None if left_out or result.slip_onset is None else _score_slip(result, truth, touched),
+        slip_left_out=left_out,
     )
+    if not found.parts() and left_out is not None:
+        raise InputError(f"slip, all that the result has, cannot be scored: {left_out}")
+    return found
 
 
-def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore | None:
-    """Score what slides and twists tell, if the result has that, and the truth is of the same frames."""
-    onset, moved, true_onset = result.slip_onset, result.displacement, truth.slip_onset
-    if onset is None or moved is None or true_onset is None or truth.displacement is None:
+_SLIP_MAPS = ("displacement", "slip_onset", "status", "way")
+
+
+def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
+    """Say why slip that a result has cannot be compared with the truth; None if it can, or there is none."""
+    if result.slip_onset is None and result.displacement is None:
         return None
-    if result.status is None or result.way is None or len(result.way) != len(truth.displacement):
-        return None
+    missing = [name for name in _SLIP_MAPS if getattr(result, name) is None]
+    if missing:
+        return f"the result lacks {' and '.join(missing)}; reconstruct it again"
+    if truth.slip_onset is None or truth.displacement is None:
+        return "the truth has none; simulate a slide or a twist with --contact elastic"
+    assert result.way is not None
+    count, whole = len(result.way), len(truth.displacement)
+    frames = str(result.process.get("source_frames", f"0:{whole}"))
+    if frames.partition(",")[0] != f"0:{count}" or count > whole:
+        return (
+            f"the result is of {count} frames ({frames}), the truth of {whole} from frame 0 on;"
+            " reconstruct all from frame 0 to any other"
+        )
+    return None
+
+
+def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore:
+    """Score what slides and twists tell in the frames of the result, which are the truth's first."""
+    onset, moved, way = result.slip_onset, result.displacement, result.way
+    assert onset is not None
+    assert moved is not None
+    assert way is not None
+    assert result.status is not None
+    assert truth.displacement is not None
+    assert truth.slip_onset is not None
+    true_onset = np.where(truth.slip_onset <= way[-1], truth.slip_onset, np.nan)
     answered = touched & np.isin(result.status, (SLIPPED, STICKS))
     found, true = result.status == SLIPPED, np.isfinite(true_onset)
     inside = answered & ~_around(~touched) & ~(_around(true) & _around(~true & touched))
     both = answered & found & true
     error = onset.astype(np.float64) - true_onset
     last = moved if moved.ndim == 3 else moved[-1]
-    off = last.astype(np.float64) - truth.displacement[-1]
+    off = last.astype(np.float64) - truth.displacement[len(way) - 1]
     seen = touched & np.isfinite(off).all(axis=-1)
     sigma = result.displacement_sigma
     along = None if sigma is None else np.repeat(sigma[..., np.newaxis], 2, axis=-1)
@@ -316,6 +363,8 @@ def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore | None
         coverage=_share(answered, touched),
         recall=_share(found, inside & true),
         precision=_share(true, inside & found),
+        stick_radius=math.sqrt(_share(~found, answered)),
+        true_stick_radius=math.sqrt(_share(~true, answered)),
         unit=unit_of("slip_onset", result.process) or "",
         onset_rms=_spread(np.abs(error[both]))["rms"],
         onset_chi_square=_chi_square(error, result.slip_onset_sigma, both),

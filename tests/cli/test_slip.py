@@ -69,11 +69,64 @@ def test_a_slide_agrees_with_the_truth(slide, found):
     assert json.loads(ended.out)["slip"]["unit"] == "mm"
 
 
-def test_a_score_without_slip_in_the_truth_lacks_it(slide, found):
+def test_slip_in_the_first_frames_is_scored_by_the_truth_of_these(slide, contact, found, tmp_path):
+    target = tmp_path / "part.h5"
+    assert run("reconstruct", slide, "--frames", "0:10", "--contact", contact, "-o", target).code == 0
+    ended = run("score", target, "--truth", slide, "--json")
+    assert (ended.code, ended.said) == (0, "")
+    slip = json.loads(ended.out)["slip"]
+    assert slip["recall"] > 0.9
+    assert slip["precision"] > 0.9
+    assert slip["displacement_rms"] < 0.01
+    # Cattaneo and Mindlin: less sticks at the end of the slide than on the way.
+    with io.open_recording(slide) as recording:
+        whole = engine.score(found, recording.truth).slip
+    assert slip["true_stick_radius"] > whole.true_stick_radius + 0.03
+
+
+def test_slip_that_begins_later_than_the_truth_is_left_out_with_the_reason(slide, contact, tmp_path):
+    target = tmp_path / "part.h5"
+    assert run("reconstruct", slide, "--frames", "3:12", "--contact", contact, "-o", target).code == 0
+    ended = run("score", target, "--truth", slide, "--json")
+    assert (ended.code, ended.said.count("\n")) == (0, 1)
+    assert "slip is left out: the result is of 9 frames (3:12)" in ended.said
+    assert "slip" not in json.loads(ended.out)
+
+
+def stuck_within(radius, truth):
+    """Return a result of slip that says so much of the contact's radius sticks, and nothing else."""
+    x, y = np.meshgrid(*2 * [np.arange(64) - 31.5])
+    touched = truth.contact != 0
+    slipped = touched & (np.hypot(x, y) > radius * np.sqrt(touched.sum() / np.pi))
+    return io.Result(
+        displacement=truth.displacement[-1],
+        slip_onset=np.where(slipped, 0.0, np.nan).astype(np.float32),
+        status=np.where(touched, np.where(slipped, 1, 2), 3).astype(np.uint8),
+        way=np.arange(12) * 0.02,
+    )
+
+
+def test_a_score_tells_the_radius_of_what_sticks_found_and_true(slide):
+    with io.open_recording(slide) as recording:
+        truth = recording.truth
+    score = engine.score(stuck_within(0.7, truth), truth)
+    assert score.slip.stick_radius == pytest.approx(0.7, abs=0.03)
+    touched = truth.contact != 0
+    sticks = touched & ~np.isfinite(truth.slip_onset)
+    assert score.slip.true_stick_radius == pytest.approx(math.sqrt(sticks.sum() / touched.sum()))
+    error = 100 * (score.slip.stick_radius / score.slip.true_stick_radius - 1)
+    assert score.table()["slip stick radius"].endswith(f"({error:+.1f} %)")
+
+
+def test_slip_without_a_truth_of_it_is_left_out_or_refused_where_there_is_nothing_else(slide, found):
     with io.open_recording(slide) as recording:
         truth = recording.truth
     bare = io.Truth(truth.height, truth.zenith, truth.azimuth, truth.contact)
-    assert engine.score(found, bare).slip is None
+    score = engine.score(found, bare)
+    assert score.slip is None
+    assert "the truth has none" in score.slip_left_out
+    with pytest.raises(io.InputError, match="the truth has none"):
+        engine.score(stuck_within(0.5, truth), bare)
 
 
 def test_only_the_last_displacement_is_told_unless_all_are_wanted(slide, contact, found):

@@ -57,7 +57,7 @@ def test_no_answer_at_all_is_scored_too():
 def test_what_cannot_be_compared_is_refused():
     truth = truth_of(np.zeros((2, 2), np.float32))
     for nothing in (io.Result(), io.Result(mean=np.zeros((2, 2), np.float32))):
-        with pytest.raises(io.InputError, match="no heights, normals, azimuths, contact or edges to score"):
+        with pytest.raises(io.InputError, match="no heights, normals, azimuths, contact, edges or slip"):
             engine.score(nothing, truth)
     flat = np.zeros((2, 3), np.float32)
     maps = {"height": flat, "azimuth": flat, "normals": flat[..., np.newaxis] * np.ones(3), "contact": flat}
