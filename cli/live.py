@@ -113,8 +113,8 @@ class _Live:
 
         self._settings, self._plan, self._given = settings, plan, given
         self._calibration = calibration
-        contact = given["contact"]
-        self._contact = None if contact is None else open_result(contact)
+        if given["contact"] is not None:
+            open_result(given["contact"])  # refused before anything moves
         self._loop: Loop | None = None
         self._estimator: LivePress | LiveRotation | LiveSlip | None = None
 
@@ -191,7 +191,7 @@ class _Live:
             window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
             return LiveRotation(source, window=window, every=every, **known)
         if isinstance(plan, HorizontalPlan | TwistPlan):
-            return LiveSlip(source, contact=self._contact, **known)
+            return LiveSlip(source, contact=self._given["contact"], **known)
         threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
         hold = _HOLD if given["hold"] is None else given["hold"]
         return LivePress(source, threshold=threshold, hold=hold, **known)
@@ -201,11 +201,12 @@ class _Live:
         output = self._given["output"]
         if output is None:
             return
-        from mirrorskin.cli.output import report_missing_maps, save_and_report
+        from mirrorskin.cli.output import report_contact, report_missing_maps, save_and_report
 
         assert self._estimator is not None
         result = self._estimator.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
+        report_contact(self._settings.name, result.process)
         save_and_report(result, output, self._given["device"], as_json=False)
 
 

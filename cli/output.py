@@ -116,6 +116,19 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
         click.echo(printable(f"{name}: heights {what}"), err=True)
 
 
+def report_contact(name: str, process: Mapping[str, object]) -> None:
+    """Say where the contact of a slide or a twist is wider than the skin's."""
+    widened = {
+        "estimated": "the contact is estimated and too wide, and so is slip;"
+        " give --contact, a press's result",
+        "given, by light": "the contact given is where a press saw light, which runs ahead of the skin;"
+        " reconstruct that press with the calibration of a gel and --modulus",
+    }
+    said = widened.get(str(process.get("contact")))
+    if said is not None:
+        click.echo(printable(f"{name}: {said}"), err=True)
+
+
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on a terminal, none in a pipe; yields a function that takes how much is done."""

@@ -172,7 +172,7 @@ def command(
 ) -> None:
     """Reconstruct heights from a press, normals and heights from a rotation, or slip."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import printable, progress, report_missing_maps, save_and_report
+    from mirrorskin.cli.output import progress, report_contact, report_missing_maps, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle, pressure
     from mirrorskin.cli.stack import stack_options
@@ -206,7 +206,7 @@ def command(
             arguments["heights"] = None if heights is None else io.open_heights(heights, source)
         elif source.motion in (MotionName.horizontal, MotionName.twist):
             arguments |= {"per_frame": per_frame, "window": window, "step": step}
-            arguments["contact"] = None if contact is None else io.open_result(contact)
+            arguments["contact"] = contact
         else:
             arguments |= {"event": event.value, "hold": hold, "subframe": subframe}
             arguments |= _levels(threshold, inclination)
@@ -220,12 +220,7 @@ def command(
                 progress=show,
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
-    if result.process.get("contact") == "estimated":
-        said = (
-            f"{recording}: the contact is estimated and too wide, and so is slip; "
-            "give --contact, a press's result"
-        )
-        click.echo(printable(said), err=True)
+    report_contact(str(recording), result.process)
     save_and_report(result, target, device, as_json)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ class LiveSlip:
     ----------
     source : LiveSource
         Of horizontal motion or a twist, with a pixel size.
-    contact : Result or array_like, (H, W), optional
+    contact : Result, path or array_like, (H, W), optional
         Where the skin touches the object in the first frame; see ``reconstruct_slip``.
     window, step, noise, device
         As for `mirrorskin.engine.find_displacement`.
@@ -48,14 +49,14 @@ class LiveSlip:
         self,
         source: LiveSource,
         *,
-        contact: Result | ArrayLike | None = None,
+        contact: Result | str | Path | ArrayLike | None = None,
         window: int = WINDOW,
         step: int = STEP,
         noise: float | None = None,
         device: str | Device | None = None,
     ) -> None:
-        self._source, self._given = source, contact is not None
-        self._search = slip_search(
+        self._source = source
+        self._search, self._contact = slip_search(
             source,
             contact=contact,
             per_frame=False,
@@ -108,5 +109,5 @@ class LiveSlip:
         mirrorskin.io.InputError
             See `SlipSearch.result`.
         """
-        found = slip_result(self._search.result(), self._source, self._search, contact_given=self._given)
+        found = slip_result(self._source, self._search, contact=self._contact)
         return undistorted(replace(found, process={**found.process, "live": True}), self._source)

@@ -153,7 +153,7 @@ class SlipSearch:
         self.position = "displacement" if motion == "horizontal" else "twist"
         self.device = open_device(device)
         self._shape, self._dtype, self._size = shape, check_dtype(dtype), check_pixel_size(pixel_size)
-        self._contact = None if contact is None else _check_contact(contact, shape)
+        self._contact = None if contact is None else check_contact(contact, shape)
         self._centre, self.window, self.step = centre, window, step
         self._noise, self._per_frame = noise, per_frame
         self._length = max(1, memory_limit // (2 * math.prod(shape) * self._dtype.itemsize))
@@ -245,7 +245,7 @@ class SlipSearch:
         course = _Course(np.array(self._places), *self._node_places(tracker), self._centre)
         departure, sigma = course.departures(moved, self._covariance(texture))
         if course.way[course.forward - 1] <= 0:
-            raise InputError("the body does not move: slip needs frames along a slide or a twist")
+            raise InputError("the body does not move in these frames: take some along a slide or a twist")
         touched = self._touched(tracker, course, departure)
         onsets = self._fit(tracker, course, departure, sigma, touched)
         contact = self._contact
@@ -432,11 +432,14 @@ class _Course:
         return ratio
 
 
-def _check_contact(contact: ArrayLike, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def check_contact(contact: ArrayLike, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return where a map is not 0; raise InputError unless it is so somewhere in a picture of this shape."""
     given = np.asarray(contact)
     if given.shape != shape:
         size = f"{shape[0]} x {shape[1]}"
-        raise InputError(f"contact has shape {given.shape}, the frames are {size}: give a map of their size")
+        raise InputError(
+            f"contact has shape {given.shape}, the frames are {size}: give that of the same camera and region"
+        )
     if not np.nan_to_num(given).any():
         raise InputError("contact is nowhere: give a map that is not 0 where the skin touches the object")
     return np.asarray(np.nan_to_num(given) != 0)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.provenance import attach_provenance
+from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.slip.displacement import STEP
-from mirrorskin.engine.slip.search import MOTIONS, WINDOW, Slip, SlipSearch
+from mirrorskin.engine.slip.search import MOTIONS, WINDOW, SlipSearch, check_contact
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 def reconstruct_slip(
     source: Source,
     *,
-    contact: Result | ArrayLike | None = None,
+    contact: Result | str | Path | ArrayLike | None = None,
     per_frame: bool = False,
     window: int = WINDOW,
     step: int = STEP,
@@ -44,10 +45,10 @@ def reconstruct_slip(
     ----------
     source : Source
         Of horizontal motion or a twist, with a known pixel size. It is rewound first, if it can be.
-    contact : Result or array_like, (H, W), optional
-        Where the skin touches the object in the first frame: a press's result, or a map that is not 0 there.
-        Heights alone tell where light is, which runs ahead of an elastic contact; a pressure tells contact.
-        Without it, contact is estimated, and comes out too wide.
+    contact : Result, path or array_like, (H, W), optional
+        Where the skin touches the object in the first frame: a press's result, its file, or a map that is not
+        0 there. Heights alone tell where light is, which runs ahead of an elastic contact (the process says
+        so); a pressure tells contact. Without it, contact is estimated, and comes out too wide.
     per_frame : bool
         Whether the displacement is that of each frame, and not of the last alone.
     window, step, noise
@@ -75,7 +76,7 @@ def reconstruct_slip(
         The input cannot be used: no pixel size, a body that does not move, a sheet without texture, or a
         contact of another size.
     """
-    search = slip_search(
+    search, told = slip_search(
         source,
         contact=contact,
         per_frame=per_frame,
@@ -86,32 +87,33 @@ def reconstruct_slip(
         device=device,
     )
     feed(source, search, range(source.shape[0]), progress)
-    return slip_result(search.result(), source, search, contact_given=contact is not None, modulus=modulus)
+    return slip_result(source, search, contact=told, modulus=modulus)
 
 
 def slip_search(
     source: Source,
     *,
-    contact: Result | ArrayLike | None,
+    contact: Result | str | Path | ArrayLike | None,
     per_frame: bool,
     window: int,
     step: int,
     noise: float | None,
     memory_limit: int,
     device: str | Device | None,
-) -> SlipSearch:
-    """Make the estimator for a source; see `reconstruct_slip`."""
+) -> tuple[SlipSearch, str]:
+    """Make the estimator for a source, and say where its contact is from; see `reconstruct_slip`."""
     if source.motion not in MOTIONS:
         raise InputError(f"{source.name} is of {source.motion} motion: slip is of {' and '.join(MOTIONS)}")
     if source.header.pixel_size is None:
         raise InputError(f"{source.name} has no pixel size, which slip takes: give --pixel-size")
     right, up = _off_centre(source)
-    return SlipSearch(
+    there, told = _read_contact(contact, (source.shape[1], source.shape[2]))
+    search = SlipSearch(
         (source.shape[1], source.shape[2]),
         source.dtype,
         source.header.pixel_size,
         motion="twist" if source.motion == "twist" else "horizontal",
-        contact=_contact_map(contact) if isinstance(contact, Result) else contact,
+        contact=there,
         centre=(-right, -up),
         window=window,
         step=step,
@@ -120,19 +122,20 @@ def slip_search(
         memory_limit=memory_limit,
         device=device,
     )
+    return search, told
 
 
-def slip_result(
-    found: Slip, source: Source, search: SlipSearch, *, contact_given: bool, modulus: float | None = None
-) -> Result:
-    """Return the maps as a result, with how they came about."""
+def slip_result(source: Source, search: SlipSearch, *, contact: str, modulus: float | None = None) -> Result:
+    """Return the maps as a result, with how they came about, and where the contact is from."""
+    with naming(source):
+        found = search.result()
     process: dict[str, ProcessValue] = {
         "motion": source.motion,
         "frames": len(found.way),
         "window": search.window,
         "step": search.step,
         "noise": found.noise,
-        "contact": "given" if contact_given else "estimated",
+        "contact": contact,
     }
     if found.centre is not None and found.angle is not None:
         (right, up), (x, y) = _off_centre(source), found.centre
@@ -197,14 +200,25 @@ def _off_centre(source: Source) -> tuple[float, float]:
     return own.region.centre((rows, columns), source.header.pixel_size)
 
 
-def _contact_map(press: Result) -> NDArray[Any]:
-    """Return where a press touched: by its pressure, its map of contact, or its heights."""
-    if press.process.get(UNDISTORTED):
+def _read_contact(
+    contact: Result | str | Path | ArrayLike | None, shape: tuple[int, int]
+) -> tuple[NDArray[np.bool_] | None, str]:
+    """Return where the skin touches, if that is given, and what the process says of it."""
+    if contact is None:
+        return None, "estimated"
+    if isinstance(contact, str | Path):
+        try:
+            return _read_contact(io.open_result(contact), shape)
+        except InputError as error:
+            raise (error if str(contact) in str(error) else InputError(f"{contact}: {error}")) from error
+    if not isinstance(contact, Result):
+        return check_contact(contact, shape), "given"
+    if contact.process.get(UNDISTORTED):
         raise InputError("the contact is undistorted, and the frames are not: make it without a lens")
-    if press.pressure is not None:
-        return press.pressure > 0
-    if press.contact is not None:
-        return press.contact
-    if press.height is None:
+    if contact.pressure is not None:
+        return check_contact(contact.pressure > 0, shape), "given"
+    if contact.contact is not None:
+        return check_contact(contact.contact, shape), "given"
+    if contact.height is None:
         raise InputError("the contact's result has neither contact nor heights: give that of a press")
-    return np.isfinite(press.height)
+    return check_contact(np.isfinite(contact.height), shape), "given, by light"

@@ -189,11 +189,47 @@ def test_a_contact_that_is_only_estimated_is_told(slide, tmp_path):
     assert "--contact" in ended.said
 
 
-def test_a_contact_of_another_size_is_refused_in_a_line(slide, tmp_path):
-    io.save_result(io.Result(contact=np.ones((3, 4), np.uint8)), tmp_path / "other.h5")
+def test_a_contact_by_the_light_of_a_press_is_told(slide, tmp_path):
+    height = np.full((64, 64), np.nan, np.float32)
+    height[20:40, 20:40] = 0
+    io.save_result(io.Result(height=height), tmp_path / "press.h5")
+    words = "--contact", tmp_path / "press.h5", "-o", tmp_path / "found.h5"
+    ended = run("reconstruct", slide, *words)
+    assert (ended.code, ended.said.count("\n")) == (0, 1)
+    assert "where a press saw light" in ended.said
+    assert "--modulus" in ended.said
+    np.testing.assert_array_equal(io.open_result(tmp_path / "found.h5").contact, np.isfinite(height))
+
+
+@pytest.mark.parametrize(
+    ("maps", "told"),
+    [
+        ({"contact": np.ones((3, 4), np.uint8)}, "(3, 4), the frames are 64 x 64: give that of the same"),
+        ({"contact": np.zeros((64, 64), np.uint8)}, "contact is nowhere: give"),
+        ({"mean": np.zeros((64, 64), np.float32)}, "neither contact nor heights: give"),
+    ],
+)
+def test_a_contact_of_no_use_is_refused_by_the_name_of_its_file(slide, tmp_path, maps, told):
+    io.save_result(io.Result(**maps), tmp_path / "other.h5")
     ended = run("reconstruct", slide, "--contact", tmp_path / "other.h5")
     assert (ended.code, ended.said.count("\n")) == (2, 1)
-    assert "(3, 4)" in ended.said
+    assert "other.h5" in ended.said
+    assert told in ended.said
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--texture", "none", "--press", "0.05mm"], "speckled or printed sheet"),
+        (["--displacement-step", "0mm,0mm"], "the body does not move in these frames: take some"),
+    ],
+)
+def test_frames_that_tell_no_slip_are_refused_by_the_name_of_their_file(tmp_path, words, told):
+    path = simulate("horizontal", tmp_path, "--frames", 4, *words)
+    ended = run("reconstruct", path)
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert f"{path}: " in ended.said
+    assert told in ended.said
 
 
 def test_a_press_that_knows_its_pressure_tells_contact_by_that(slide):
