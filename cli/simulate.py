@@ -69,6 +69,9 @@ def command(
             " heights in NPY, PNG or TIFF, or a mesh in STL, PLY or OBJ.",
         ),
     ] = "sphere",
+    object_shift: Annotated[
+        str, Option(metavar="X,Y", help="Where the object's centre lies, from the picture's.")
+    ] = "0mm,0mm",
     size: sensor.Size = "480x480",
     pixel_size: sensor.PixelSize = "0.025mm",
     frames: Annotated[
@@ -172,15 +175,17 @@ def command(
 
     from mirrorskin import hw, io
     from mirrorskin.cli.output import progress
-    from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths
+    from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths, vector
     from mirrorskin.hw.twin import Body, Camera
 
     for source in map(Path, (thing, pattern)):
         io.check_output(output, source if source.suffix else None)  # a name is no file to keep
     given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
     columns, rows = frame_size(size, "--size")
+    along = vector(object_shift, 2, "--object-shift")
     twin = hw.Twin(
         object=thing,
+        object_shift=(along[0], along[1]),
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
         movement=make_movement(motion, frames, release, given, strokes, rock, spiral),

@@ -73,7 +73,8 @@ def check_fits(thing: Object, body_radius: float) -> None:
     if thing.radius > body_radius:
         raise InputError(
             f"{thing.name} is larger than the sensor: it needs a circle of {2 * thing.radius:.4g} mm,"
-            f" the sensor is {2 * body_radius:.4g} mm across; take a smaller object"
+            f" the sensor is {2 * body_radius:.4g} mm across;"
+            " take a smaller object, or one nearer to the middle"
         )
 
 

@@ -34,6 +34,39 @@ class Object(Protocol):
         """Return dz/dx and dz/dy, float64, shaped as x and y broadcast; NaN where there is no object."""
 
 
+@dataclass(frozen=True, slots=True)
+class Shifted:
+    """An object that lies elsewhere under the sheet.
+
+    Attributes
+    ----------
+    thing : Object
+    shift : (float, float)
+        Millimetres along x and y from the picture's centre to where the object's centre lies.
+    """
+
+    thing: Object
+    shift: tuple[float, float]
+
+    @property
+    def name(self) -> str:
+        """That of the object."""
+        return self.thing.name
+
+    @property
+    def radius(self) -> float:
+        """Radius of a circle about the picture's centre that holds the object, mm."""
+        return self.thing.radius + math.hypot(*self.shift)
+
+    def height(self, x: Floats, y: Floats, /) -> Floats:
+        """Return the object's z, mm; NaN where there is no object."""
+        return self.thing.height(x - self.shift[0], y - self.shift[1])
+
+    def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
+        """Return the object's dz/dx and dz/dy; NaN where there is no object."""
+        return self.thing.slope(x - self.shift[0], y - self.shift[1])
+
+
 def difference_slope(
     height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, step: tuple[float, float]
 ) -> tuple[Floats, Floats]:

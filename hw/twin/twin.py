@@ -15,7 +15,7 @@ from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.hw.twin.catalogue import check_fits, make_object
 from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
-from mirrorskin.hw.twin.objects import Object
+from mirrorskin.hw.twin.objects import Object, Shifted
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
 from mirrorskin.hw.twin.scene import CachedScene, Imprint, PoseScene, Press, Scene
@@ -49,6 +49,9 @@ class Twin(Closing):
     ----------
     object : Object, str or Path
         What to press on; a name or a path goes through `make_object`.
+    object_shift : (float, float)
+        Where the object's centre lies, mm along x and y from the picture's centre; it keeps its height, so
+        that its highest point need not be in the picture.
     shape : (int, int)
         Rows and columns of a frame.
     pixel_size : float or (float, float)
@@ -100,6 +103,7 @@ class Twin(Closing):
         shape: tuple[int, int],
         pixel_size: float | tuple[float, float],
         movement: Movement,
+        object_shift: tuple[float, float] = (0.0, 0.0),
         contact: ContactName = "conform",
         optics: OpticsName = "ideal",
         pattern: str | Path = "uniform",
@@ -118,6 +122,10 @@ class Twin(Closing):
         self._camera = camera or Camera()
         self._names, self._references, self._texture = (contact, optics), references, texture
         self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
+        if any(object_shift):
+            if not np.isfinite(object_shift).all():
+                raise InputError(f"object shift {object_shift} cannot be: give two finite numbers of mm")
+            self._thing = Shifted(self._thing, object_shift)
 
         self.name = f"twin: {self._thing.name}"
         self.movement = movement

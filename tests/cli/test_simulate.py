@@ -100,6 +100,20 @@ def test_a_body_rocks_or_spirals_as_it_is_told():
 
 
 @pytest.mark.parametrize("contact", ["conform", "elastic"])
+def test_an_object_lies_where_it_is_shifted_to(contact):
+    words = ["--frames", "2", "--press", "1mm", "--contact", contact, *EXACT]
+    centred, shifted = (
+        simulate("horizontal", *words, *more)[1].truth for more in ([], ["--object-shift=1.2mm,-0.8mm"])
+    )
+    right, down = 3, 2  # pixels
+    for name in ("height", "zenith", "azimuth", "contact"):
+        moved = getattr(shifted, name)[down:, right:]
+        np.testing.assert_allclose(moved, getattr(centred, name)[:-down, :-right], atol=1e-5, err_msg=name)
+    assert_refused(["vertical", "--object-shift", "1mm", "-o", "a.h5"], "2 lengths are needed")
+    assert_refused(["vertical", "--object-shift", "50mm,0mm", "-o", "a.h5"], "larger than the sensor")
+
+
+@pytest.mark.parametrize("contact", ["conform", "elastic"])
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_each_motion_is_recorded_as_it_is_given(motion, contact):
     words = [*GIVEN[motion], "--frames", "5", "--contact", contact, *EXACT]

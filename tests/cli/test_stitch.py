@@ -26,6 +26,37 @@ def test_touches_become_a_result_that_is_wider(names):
     assert whole.process["touch_1"] == "touch-1.h5"
 
 
+def hills(x, y):
+    """Steep nearly everywhere, as the sensor sees no level ground; mm."""
+    waves = 0.12 * np.sin(2 * x + 0.3) * np.cos(1.7 * y) + 0.08 * np.sin(2.1 * y + 1.3 * x)
+    return waves - 0.02 * x * x - 0.05 * y * y - 0.1
+
+
+def test_presses_of_an_object_wider_than_the_field_become_all_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    x, y = np.meshgrid(*(np.arange(-reach, reach + 1) * 0.05 for reach in (70, 45)))
+    np.save("wide.npy", hills(x, -y))  # from the upper edge on
+    field = "--size 64x48 --pixel-size 0.05mm --frames 30 --travel-step 0.03mm --references exact"
+    for number, along in enumerate((0.0, 1.13, -1.06)):
+        shift = f"--object-shift={along}mm,0.07mm"
+        words = "--object", "wide.npy", *field.split(), shift, "-o", f"{number}.h5"
+        assert run("simulate", "vertical", *words).code == 0
+        assert run("reconstruct", f"{number}.h5").code == 0
+    ended = run("stitch", *(f"{number}-result.h5" for number in range(3)), "-o", "whole.h5")
+    assert ended.code == 0
+    whole = io.open_result("whole.h5")
+    # The first press has the object's middle at y 0.07 mm; its highest point is at height 0.
+    error = whole.height - (hills(*np.meshgrid(whole.x, whole.y - 0.07)) - hills(x, y).max())
+    known = np.isfinite(error)
+    across = whole.x[known.any(axis=0)]
+    assert across[-1] - across[0] > 1.5 * 64 * 0.05
+    measured = io.open_result("0-result.h5").filled == 0
+    assert known.sum() > 1.4 * measured.sum()
+    assert np.median(np.abs(error[known])) < 0.01  # steps of 0.03 mm
+    agree = whole.status == 1
+    assert 0.8 < np.mean((error[agree] / whole.height_sigma[agree]) ** 2) < 1.4
+
+
 def test_a_single_touch_is_refused_in_a_line(names):
     ended = run("stitch", names[0], "-o", "whole.h5")
     assert (ended.code, ended.said.count("\n")) == (2, 1)
