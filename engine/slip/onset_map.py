@@ -19,12 +19,34 @@ _EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's
 _ROUNDS = 20
 _SETTLED = 1e-3  # of the way, in a round
 _FARTHEST = 0.08  # of the way, by which an onset changes in a round
-_ONSET_BEND = 64.0  # third difference of onsets, as a share of the way, over the radius of the contact
-_GROWTH_BEND = 32.0  # second difference of the growth's logarithm over that radius
 _POWER_SIGMA = 0.1  # those of slides and twists differ by twice that
 _APART = 9  # nodes, beyond which errors of onsets do not depend on each other
 _NEVER = 1.5  # of the way: an onset that has not come
 _FLOOR = 1e-6  # of an equation's weight, so that there is always a solution
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What departures of a motion are like.
+
+    Attributes
+    ----------
+    power : float
+        By which a departure grows, known to +- 0.1.
+    onset_bend : float
+        Standard deviation of the third difference of onsets over the radius of the contact, as a share of
+        the way.
+    growth_bend : float
+        That of the second difference of the growth's logarithm.
+    rim : float
+        Of the radius of a contact that is estimated, how much is left out: it is too wide, and free skin does
+        not break loose.
+    """
+
+    power: float
+    onset_bend: float
+    growth_bend: float
+    rim: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +62,7 @@ class OnsetMap:
 
 
 def fit_onsets(
-    departure: Doubles, sigma: Doubles, way: Doubles, window: float, radius: float, power: float
+    departure: Doubles, sigma: Doubles, way: Doubles, window: float, radius: float, expected: Expected
 ) -> OnsetMap:
     """Fit ``growth (way - onset)^power``, zero before the onset, to departures as windows see them.
 
@@ -56,19 +78,20 @@ def fit_onsets(
     way : (T,), of the body since the reference
     window : nodes, over which a departure is a mean
     radius : nodes, of a disc as large as the contact
-    power : by which a departure grows, known to +- 0.1
+    expected : of the motion
     """
+    power = expected.power
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
     data = _whitened(np.where(known, departure * scale, 0.0))
     length, times = float(way[-1]), (way / way[-1])[:, None, None]
     second, third = (_bending(known.shape, order) for order in (2, 3))
-    onset_stiff = third * (radius**3 / _ONSET_BEND) ** 2
+    onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
     begin = _begin(data, scale, times, onset_stiff, power)
     if begin is None:
         return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
     onset, usual = begin
-    stiff = sparse.block_diag([onset_stiff, second * (radius**2 / _GROWTH_BEND) ** 2], format="csc")
+    stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
     floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
     log_growth = np.zeros_like(onset)
     for number in range(_ROUNDS):

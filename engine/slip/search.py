@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy.ndimage import distance_transform_edt
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
@@ -24,7 +25,7 @@ from mirrorskin.engine.slip.displacement import (
     misfit,
     node_status,
 )
-from mirrorskin.engine.slip.onset_map import OnsetMap, fit_onsets
+from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.status import CLEAR, NO_CONTACT, SLIPPED, STICKS, UNKNOWN
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.engine.tiling import MEMORY_LIMIT
@@ -38,7 +39,10 @@ MOTIONS: tuple[SlipMotion, ...] = get_args(SlipMotion)
 WINDOW = 8
 """Pixels: smaller than for displacement alone, as all frames together tell an onset."""
 
-_POWERS = {"displacement": 1.6, "twist": 1.4}  # of departure; see docs/method/slip.md
+_EXPECTED = {  # see docs/method/slip.md
+    "displacement": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0, rim=0.2),
+    "twist": Expected(power=1.4, onset_bend=24.0, growth_bend=4.0, rim=0.0),
+}
 _FOLLOWS = 0.5  # of the object's movement, from which on skin is taken to have touched it
 _LEAST_STUCK = 4  # nodes that a twist's centre and angle are made of
 _STILL = 1e-9  # of the way, by which nobody moves
@@ -331,14 +335,18 @@ class SlipSearch:
             ]
             # Windows overlap: what they say together is worth less.
             overlap = max(1.0, self.window / self.step)
-            known = np.where(touched, overlap * sigma, np.nan)
+            expected, radius = _EXPECTED[self.position], math.sqrt(touched.sum() / math.pi)
+            inside = touched
+            if self._contact is None:
+                inside = distance_transform_edt(np.pad(touched, 1))[1:-1, 1:-1] > expected.rim * radius
+            known = np.where(inside, overlap * sigma, np.nan)
             found = fit_onsets(
                 departure[: course.forward, *box],
                 known[box],
                 course.way[: course.forward],
                 self.window / self.step,
-                math.sqrt(touched.sum() / math.pi),
-                _POWERS[self.position],
+                radius,
+                expected,
             )
             onset[box], spread[box] = found.onset, found.sigma
         return OnsetMap(onset, spread)
