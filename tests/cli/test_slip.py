@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 from commands import run
@@ -67,6 +68,25 @@ def test_a_slide_agrees_with_the_truth(slide, found):
     assert score.displacement_rms < 0.01
     ended = run("score", slide.with_name("found.h5"), "--truth", slide, "--json")
     assert json.loads(ended.out)["slip"]["unit"] == "mm"
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [("horizontal", "--friction 0.5"), ("twist", "--friction 0.8")],
+)
+def test_skin_at_coarse_pixels_is_not_told_to_slip_before_it_does(motion, words, tmp_path):
+    path = tmp_path / "coarse.h5"
+    scene = SCENE.replace("64x64", "96x96").replace("--friction 0.6", words).split()
+    assert run("simulate", motion, *scene, "-o", path).code == 0
+    with io.open_recording(path) as recording:
+        truth = recording.truth
+        found = engine.reconstruct(recording, contact=truth.contact)
+    slipped = np.isfinite(truth.slip_onset).astype(np.uint8)
+    around = np.ones((3, 3), np.uint8)
+    inside = cv2.dilate(slipped, around) == cv2.erode(slipped, around)
+    told, known = (found.status == 1) & inside, np.isin(found.status, (1, 2)) & inside
+    assert np.mean(slipped[told]) > 0.98
+    assert np.mean(told[known & (slipped != 0)]) > 0.98
 
 
 def test_slip_in_the_first_frames_is_scored_by_the_truth_of_these(slide, contact, found, tmp_path):

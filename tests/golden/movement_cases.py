@@ -152,6 +152,52 @@ def find_displacement() -> Answer:
     return answers
 
 
+@case(MOVED, stick_ratio=(0, 5e-3), slip_onset=(1e-2, 1e-4), slip_onset_sigma=(3e-2, 1e-4))
+def slip_search() -> Answer:
+    answers: dict[str, Any] = {}
+    x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)
+    contact = np.hypot(x, y) < 26
+    for motion, position in (("horizontal", "displacement"), ("twist", "twist")):
+        search = engine.SlipSearch(SHAPE, np.float32, PIXEL, motion=motion, contact=contact)
+        for k in range(12):
+            search.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
+        found = search.result()
+        told = {
+            "displacement": found.displacement[::3, ::3],
+            "sigma": found.displacement_sigma[::3, ::3],
+            "stick_ratio": found.stick_ratio,
+            # Not each pixel: whether one that is about to slip has slipped, last bits decide.
+            "slip_onset": np.nanpercentile(found.slip_onset, (10, 30, 50, 70)),
+            "slip_onset_sigma": np.nanpercentile(found.slip_onset_sigma, (10, 30, 50, 70)),
+        }
+        answers |= {f"{motion}.{name}": value for name, value in told.items()}
+    return answers
+
+
+def places_of(motion: str, k: int) -> Any:
+    return [[0.3 * PIXEL[0] * k, 0.0]] if motion == "horizontal" else [0.01 * k]
+
+
+def slipping(motion: str, k: int) -> Any:
+    """Return a frame of skin that sticks within a circle, which shrinks as the body goes on."""
+
+    def share(x: Any, y: Any) -> Any:
+        """How much of the body's way the skin stays behind the body."""
+        square = ((x - 36) ** 2 + (y - 32) ** 2) / 26**2
+        return 1 - 0.5 * np.clip(k / 16 - (1 - square), 0, None) ** 1.5 * 16 / max(k, 1)
+
+    if motion == "horizontal":
+        return TEXTURE.frame(SHAPE, lambda x, y: -0.3 * k * share(x, y), lambda x, y: 0 * x, 1.0, k)
+    angle = 0.01 * k
+    return TEXTURE.frame(
+        SHAPE,
+        lambda x, y: angle * share(x, y) * -(y - 32),
+        lambda x, y: angle * share(x, y) * (x - 36),
+        1.0,
+        k,
+    )
+
+
 @case(POSE)
 def estimate_pose() -> Answer:
     answers: dict[str, Any] = {}
