@@ -184,7 +184,7 @@ def slipping(motion: str, k: int) -> Any:
     def share(x: Any, y: Any) -> Any:
         """How much of the body's way the skin stays behind the body."""
         square = ((x - 36) ** 2 + (y - 32) ** 2) / 26**2
-        return 1 - 0.5 * np.clip(k / 16 - (1 - square), 0, None) ** 1.5 * 16 / max(k, 1)
+        return 1 - 0.5 * np.clip(k / 16 - (1 - square), 0, 0.6) ** 1.5 * 16 / max(k, 1)
 
     if motion == "horizontal":
         return TEXTURE.frame(SHAPE, lambda x, y: -0.3 * k * share(x, y), lambda x, y: 0 * x, 1.0, k)
