@@ -21,6 +21,7 @@ from mirrorskin.cli.groups import LazyGroup, Option, make_command
 
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
+_LESS = "take a smaller region or fewer frames, or end other programs"
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
@@ -83,14 +84,17 @@ class _OneLine:
         if isinstance(error, KeyboardInterrupt | click.Abort):
             sys.exit(_INTERRUPTED)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
-        code = getattr(error, "exit_code", None)
+        no_memory = isinstance(error, MemoryError)
+        code = 1 if no_memory else getattr(error, "exit_code", None)
         usage = getattr(error, "format_message", None)
-        ours = kind is not None and kind.__module__.startswith("mirrorskin.")
+        ours = no_memory or (kind is not None and kind.__module__.startswith("mirrorskin."))
         if not isinstance(code, int) or not (ours or usage):
             return
         if self.debug:
             traceback.print_exception(error)
         message = usage() if usage else str(error)
+        if no_memory:
+            message = f"not enough memory{message and f' ({message})'}: {_LESS}"
         if kind is not None and kind.__name__ == _HELP:
             sys.stderr.write(f"{message}\n")
         else:

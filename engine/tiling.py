@@ -241,7 +241,7 @@ def cut_into_bands(
             return [Band(device, slice(start, stop), shape[1], dtype, maps, length, least)]
         except DeviceMemoryError as error:
             if stop - start == 1:
-                message = f"one row of {shape[1]} pixels does not fit: {error}; use another device"
+                message = f"one row of {shape[1]} pixels does not fit: {error}"
                 raise DeviceError(message) from error
         middle, bands = (start + stop) // 2, []
         for half in ((start, middle), (middle, stop)):

@@ -118,7 +118,7 @@ def new_file(path: Path) -> Iterator[int]:
             part.replace(target)
     finally:
         part.unlink(missing_ok=True)
-        if descriptor >= 0:
+        with suppress(OSError):
             os.close(descriptor)  # it was locked until it had its name
 
 

@@ -21,11 +21,11 @@ class as_input_error(AbstractContextManager[None]):  # noqa: N801  # as contextl
     A class, because files are opened with many of these and a generator takes several times as long.
     """
 
-    def __init__(self, what: str | Callable[[], str], remedy: str = "") -> None:
-        self._what, self._remedy = what, remedy
+    def __init__(self, what: str | Callable[[], str], remedy: str = "", kinds: Any = _ERRORS) -> None:
+        self._what, self._remedy, self._kinds = what, remedy, kinds
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any, /) -> None:
-        if isinstance(error, _ERRORS) and not isinstance(error, InputError):
+        if isinstance(error, self._kinds) and not isinstance(error, InputError):
             what = self._what if isinstance(self._what, str) else self._what()
             remedy = self._remedy and f"; {self._remedy}"
             raise InputError(f"{what}: {reason(error)}{remedy}") from error

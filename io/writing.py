@@ -69,10 +69,9 @@ def write_file(path: Path, items: Iterable[Item]) -> None:
     arrays = [np.asarray(item.values, order="C") for item in items if isinstance(item.values, np.ndarray)]
     likeness = repr([(name, _likeness(values), attributes) for name, values, attributes in items])
     layout = _layouts.get(likeness)
-    with new_file(path) as descriptor:
+    with new_file(path) as descriptor, as_input_error(f"{path} could not be written", MAKE_ROOM, OSError):
         if layout is not None:
-            with as_input_error(f"{path} could not be written", MAKE_ROOM):
-                layout.write(descriptor, arrays)
+            layout.write(descriptor, arrays)
             return
         with hdf5_in(path, descriptor) as new:
             places = [write_item(new.root, item) for item in items]

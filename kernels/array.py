@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cached_property, wraps
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from mirrorskin.kernels import memory
-from mirrorskin.kernels.errors import DeviceMemoryError
+from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
@@ -29,6 +29,29 @@ _NO_ROOM = {
     cl.status_code.OUT_OF_RESOURCES,
     cl.status_code.INVALID_BUFFER_SIZE,
 }
+
+_Given = ParamSpec("_Given")
+_Made = TypeVar("_Made")
+
+
+def failed(device: Device, what: str, error: cl.Error) -> DeviceError:
+    """Return an error that says what a device could not do, why, and what to do."""
+    return DeviceError(
+        f"{device.info.title} cannot {what}: {error}; if that goes on, choose another ('mirrorskin devices')"
+    )
+
+
+def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatenate[Any, _Given], _Made]:
+    """Let a method of an array name device and array where OpenCL fails."""
+
+    @wraps(work)
+    def told(array: Array | BorrowedBuffer, /, *given: _Given.args, **named: _Given.kwargs) -> _Made:
+        try:
+            return work(array, *given, **named)
+        except cl.Error as error:
+            raise failed(array._device, f"hold or copy {array.name}", error) from error
+
+    return told
 
 
 class Array:
@@ -83,10 +106,12 @@ class Array:
         return memory.take(self.nbytes + SLACK, self._zeroed)
 
     def __del__(self) -> None:
-        # A kernel may still be at work in this memory, which others have next.
-        if self._shared and self.last_use is not None:
-            self.last_use.wait()
+        # A kernel may still be at work in this memory, which others have next; on a lost device none is.
+        with suppress(cl.Error):
+            if self._shared and self.last_use is not None:
+                self.last_use.wait()
 
+    @_told
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
         if self._shared and self._mapped is None and self._buffer is not None:
@@ -94,6 +119,7 @@ class Array:
                 self.last_use.wait()
             self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
 
+    @_told
     def upload(self, rows: int | None = None) -> None:
         """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
         if not self._shared:
@@ -102,6 +128,7 @@ class Array:
             event = cl.enqueue_copy(self._device.queue, self.buffer, part)
             self._device.profile.wait("upload", self.name, event, part.nbytes)
 
+    @_told
     def put(self, row: int, values: NDArray[Any]) -> None:
         """Write one row where the device holds it; the others stay as they are."""
         if self._shared:
@@ -113,6 +140,7 @@ class Array:
             event = cl.enqueue_copy(self._device.queue, self.buffer, part, dst_offset=place)
             self._device.profile.wait("upload", self.name, event, part.nbytes)
 
+    @_told
     def upload_async(self, values: NDArray[Any]) -> None:
         """Begin to copy values from elsewhere on the host; kernels that take this array wait for it.
 
@@ -127,12 +155,14 @@ class Array:
         )
         self._device.copies.flush()
 
+    @_told
     def wait(self) -> None:
         """Wait until a copy under way has arrived."""
         if self.arrived is not None:
             self._device.profile.wait("upload", self.name, self.arrived, self._arriving)
             self.arrived = None
 
+    @_told
     def download(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote, in the host's array."""
         if self._shared:
@@ -143,6 +173,7 @@ class Array:
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
         return self.host
 
+    @_told
     def snapshot(self, kernel: cl.Event | None) -> NDArray[Any]:
         """Wait for one kernel, while others that only read may run, and return a copy of what it wrote."""
         queue, after = self._device.copies, [] if kernel is None else [kernel]
@@ -156,6 +187,7 @@ class Array:
         view.base.release(queue)
         return copied
 
+    @_told
     def detach(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote, without a copy; the array is no longer of use."""
         host = self.download()
@@ -174,18 +206,21 @@ class Array:
             self.download()
             self.discard()
 
+    @_told
     def discard(self) -> None:
         """Make room on the device, and forget what the device held."""
         if not self._shared and self._buffer is not None:
             self._buffer.release()
             self._buffer = None
 
+    @_told
     def reserve(self) -> None:
         """Have room on the device, which holds anything if there was none."""
         if self._buffer is None:
             self._allocate()
 
     @property
+    @_told
     def buffer(self) -> cl.Buffer:
         """The device's side, for kernels; the host must not write while they run."""
         if self._buffer is None:
@@ -221,15 +256,18 @@ class BorrowedBuffer:
     arrived = None
 
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
-        self.name, self.host = name, values
+        self._device, self.name, self.host = device, name, values
         self.last_use: cl.Event | None = None
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
-        self.buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
+        with _naming(device, name, values.nbytes):
+            self.buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
 
     def __del__(self) -> None:
-        self.wait()
+        with suppress(DeviceError):
+            self.wait()
 
+    @_told
     def wait(self) -> None:
         """Wait until no kernel reads it."""
         if self.last_use is not None:
@@ -284,12 +322,12 @@ def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
         yield
     except cl.Error as error:
         if error.code not in _NO_ROOM:
-            raise
+            raise failed(device, f"hold {name}", error) from error
         raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
 
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:
     return (
         f"{device.info.title} has no room for {name} ({nbytes} bytes; "
-        f"one buffer holds at most {device.max_allocation})"
+        f"one buffer holds at most {device.max_allocation}): take a smaller region, or another device"
     )

@@ -22,7 +22,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import embedded, memory
-from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, pinned
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed, pinned
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -162,8 +162,11 @@ class Device:
         self.profile = Profile()
         self.max_allocation = self.info.max_allocation
         self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
-        self.context = cl.Context([device])
-        self.queue, self.copies = _queues(self.context)
+        try:
+            self.context = cl.Context([device])
+            self.queue, self.copies = _queues(self.context)
+        except cl.Error as error:
+            raise failed(self, "be used", error) from error
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._kernels = _ThreadKernels()
@@ -229,7 +232,7 @@ class Device:
             return None
         try:
             return BorrowedBuffer(self, name, values)
-        except cl.Error as error:
+        except DeviceError as error:
             _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
             return None
 
@@ -293,7 +296,10 @@ class Device:
 
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
-        self.queue.finish()
+        try:
+            self.queue.finish()
+        except cl.Error as error:
+            raise failed(self, "finish its work", error) from error
 
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
@@ -307,6 +313,8 @@ class Device:
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
+        except cl.Error as error:
+            raise failed(self, f"compile {name}", error) from error
 
     def _program(
         self, file: str | Path, options: tuple[str, ...], more: str = ""
@@ -416,11 +424,11 @@ class Kernel:
             event = self._kernel(
                 self._device.queue, (size,), (group,), *values, global_offset=(first_item,), wait_for=copies
             )
+            for array in arrays:
+                array.last_use = event
+            self._device.profile.watch("kernel", self.name, event, moved)
         except cl.Error as error:
-            raise DeviceError(f"{self._device.info.title} cannot run {self.name}: {error}") from error
-        for array in arrays:
-            array.last_use = event
-        self._device.profile.watch("kernel", self.name, event, moved)
+            raise failed(self._device, f"run {self.name}", error) from error
 
     def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
         """Return arguments in the source's order, numbers in its types."""

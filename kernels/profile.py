@@ -68,9 +68,9 @@ class Profile:
             self._records.clear()
 
     def _read_pending(self) -> None:
-        for kind, name, event, nbytes in self._pending:
+        pending, self._pending = self._pending, []  # one that failed is not waited for again
+        for kind, name, event, nbytes in pending:
             self._finish(kind, name, event, nbytes)
-        self._pending.clear()
 
     def _finish(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         event.wait()

@@ -56,6 +56,10 @@ def run_job(
             outcome = _done(outcome, source, plan, device, progress)
     except (InputError, NotConverged, DeviceError) as error:
         outcome = replace(outcome, message=str(error))
+    except MemoryError as error:
+        outcome = replace(
+            outcome, message=f"not enough memory ({error}): take a smaller region or fewer frames"
+        )
     except Exception as error:
         outcome = replace(outcome, message=f"unexpected {type(error).__name__}: {error}")
     return replace(outcome, seconds=time.perf_counter() - start)

@@ -129,7 +129,7 @@ def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, sa
         (NotConverged("it did not"), "it did not"),
         (DeviceMemoryError("no room"), "no room"),
         (ZeroDivisionError("by zero"), "unexpected ZeroDivisionError: by zero"),
-        (MemoryError(), "unexpected MemoryError: "),
+        (MemoryError("none"), "not enough memory (none): take a smaller region or fewer frames"),
     ],
 )
 def test_what_the_engine_raises_is_told(job, monkeypatch, error, said):
