@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import functools
 import os
 import secrets
 import tempfile
@@ -101,10 +102,12 @@ class NewHdf5:
 def new_file(path: Path) -> Iterator[int]:
     """Make a file under a temporary name beside ``path``, and rename it when all went well.
 
-    It is on the disk before it has its name. Where ``path`` is a link, what the link leads to is replaced.
+    It is on the disk before it has its name. What killed programs left half-written in that folder is
+    removed, once per process. Where ``path`` is a link, what the link leads to is replaced.
     """
     check_output(path)
     target = Path(os.path.realpath(path))
+    _tidy(target.parent)
     # Its name is known before there is a file: whenever the program is ended, it is removed.
     part, descriptor = target.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
@@ -152,6 +155,9 @@ def remove_leftovers(folder: Path) -> list[Path]:
             part.unlink()
             removed.append(part)
     return removed
+
+
+_tidy = functools.cache(remove_leftovers)
 
 
 def _make(part: Path) -> int:

@@ -52,6 +52,21 @@ def test_only_what_a_killed_program_wrote_is_removed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["other.part"]
 
 
+def test_the_next_file_in_a_folder_takes_the_place_of_what_was_killed(tmp_path):
+    command = [sys.executable, "-c", BEGIN, str(tmp_path / "a.h5")]
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as killed,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as alive,
+    ):
+        assert [one.stdout.readline() for one in (killed, alive)] == [b"begun\n"] * 2
+        killed.kill()
+        killed.wait()
+        write_new(tmp_path / "b.h5", [b"new"])
+        assert len(parts(tmp_path)) == 1
+        alive.communicate()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
+
+
 def test_a_file_that_was_taken_for_a_leftover_is_begun_again(tmp_path, monkeypatch):
     lock, locked = atomic.fcntl.flock, []
 
