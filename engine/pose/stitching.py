@@ -26,6 +26,7 @@ AGREES, DISAGREES = 1, 2
 _SHARED = 0.2  # of the smaller map's pixels, from which on two touches are compared
 _ALIKE = 4.0  # of chi square, that two touches which are compared may have for a link
 _ROUNDS, _NEWTON = 5, 8  # steps of the poses, and of a height along z
+_LEVELLINGS = 3  # of a touch of unknown offset: how high it lies says where its pixels are
 _APART = 4.0  # sigmas between a touch and the mean, from which on they disagree
 _LARGEST = 1 << 28  # pixels of the whole
 _UNFIT = 1e-9  # of the largest information, below which a direction has none
@@ -208,7 +209,8 @@ def _part(number: int) -> slice:
 
 def _information(pose: Pose) -> Doubles:
     """Return the inverse of a pose's covariance, 0 along what is undetermined."""
-    lengths = np.sqrt(np.maximum(np.diag(pose.covariance), np.finfo(float).tiny))
+    variance = np.diag(pose.covariance)
+    lengths = np.sqrt(np.where(variance > _UNFIT**2 * variance.max(), variance, 1.0))
     scaled = pose.covariance / np.outer(lengths, lengths)
     return np.asarray(np.linalg.pinv(scaled, _UNFIT, hermitian=True) / np.outer(lengths, lengths))
 
@@ -231,9 +233,9 @@ def _merged(
     unknown = touches[0].offset_unknown is not None and bool(np.any(touches[0].offset_unknown))
     placed: list[_Moved] = []
     for touch, known, pose in zip(touches, maps, poses, strict=True):
-        moved = _Moved.of(touch, known, pose, x, y, with_normals)
-        if touch.offset_unknown is not None and touch.offset_unknown.any() and placed:
-            moved = sums.levelled(moved)
+        relative = unknown or (touch.offset_unknown is not None and bool(touch.offset_unknown.any()))
+        before = sums if relative and placed else None
+        moved = _Moved.of(touch, known, pose, x, y, with_normals, before)
         sums.add(moved)
         placed.append(moved)
     return sums.result(placed, x, y, poses, names, unknown)
@@ -257,15 +259,24 @@ class _Moved:
     """A touch where the first one has its pixels: (H, W), NaN where it has nothing."""
 
     height: Doubles
-    variance: Doubles  # with the pose's
+    variance: Doubles  # with the pose's and, where it was levelled, the offset's
+    common: Doubles  # of that, what all pixels share: the pose's and the offset's
     contact: NDArray[np.bool_]
     normals: Doubles | None
     normal_variance: Doubles | None
 
     @classmethod
     def of(
-        cls, touch: Result, known: PoseMap, pose: Pose, x: Doubles, y: Doubles, with_normals: bool
+        cls,
+        touch: Result,
+        known: PoseMap,
+        pose: Pose,
+        x: Doubles,
+        y: Doubles,
+        with_normals: bool,
+        before: _Sums | None,
     ) -> _Moved:
+        """Move a touch; one of unknown offset goes to the height of those before."""
         assert touch.height is not None
         left, top, step_x, step_y = known.grid
         height = np.asarray(touch.height, np.float32).copy()
@@ -276,21 +287,30 @@ class _Moved:
         down, right = np.gradient(height)
         slopes = right / step_x, -down / step_y
         above = np.full(across.shape, float(np.nanmedian(pose.inverse().apply(known.points)[:, 2])))
-        for _ in range(_NEWTON):
-            place = motion.apply(np.stack([across, up, above], axis=-1))
-            points = SamplePoints.at(
-                (place[:, 0] - left) / step_x, (top - place[:, 1]) / step_y, height.shape
-            )
-            found = points.interpolate(height).astype(np.float64)
-            here = np.nan_to_num(found - place[:, 2])
-            above = above + here / motion.turn[2, 2]
-        p, q = (np.nan_to_num(points.interpolate(np.asarray(one, np.float32))) for one in slopes)
-        upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
-        steep = upright @ motion.turn[:, 2]  # how much faster the surface comes nearer than z
-        lever = np.concatenate([np.cross(place, upright), upright], axis=-1)
-        own = _variance_of(touch)
-        variance = points.interpolate(own.astype(np.float32)).astype(np.float64)
-        variance = (variance + np.einsum("ni,ij,nj->n", lever, pose.covariance, lever)) / steep**2
+        level, middle, of_level = 0.0, np.zeros(6), 0.0
+        for _ in range(1 if before is None else _LEVELLINGS):
+            motion = Motion(motion.turn, motion.shift - [0.0, 0.0, level * motion.turn[2, 2]])
+            for _ in range(_NEWTON):
+                place = motion.apply(np.stack([across, up, above], axis=-1))
+                points = SamplePoints.at(
+                    (place[:, 0] - left) / step_x, (top - place[:, 1]) / step_y, height.shape
+                )
+                found = points.interpolate(height).astype(np.float64)
+                here = np.nan_to_num(found - place[:, 2])
+                above = above + here / motion.turn[2, 2]
+            p, q = (np.nan_to_num(points.interpolate(np.asarray(one, np.float32))) for one in slopes)
+            upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
+            steep = upright @ motion.turn[:, 2]  # how much faster the surface comes nearer than z
+            lever = np.concatenate([np.cross(place, upright), upright], axis=-1) / steep[:, np.newaxis]
+            own = points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
+            if before is not None:
+                heights = np.where(np.isfinite(found), above, np.nan)
+                level, middle, of_level = before.level(heights, own, lever)
+            if not np.isfinite(level):
+                break
+        lever -= middle  # what the pose's error does there is levelled out
+        common = np.einsum("ni,ij,nj->n", lever, pose.covariance, lever) + of_level
+        above, variance = above + level, own + common
         answered = np.isfinite(found) & np.isfinite(variance)
         touched = np.isfinite(touch.height) if touch.contact is None else touch.contact != 0
         contact = points.nearest_values(touched, False) & points.inside
@@ -304,6 +324,7 @@ class _Moved:
         return cls(
             np.where(answered, above, np.nan).reshape(size),
             np.where(answered, variance, np.nan).reshape(size),
+            np.where(answered, common, np.nan).reshape(size),
             contact.reshape(size),
             normals,
             square,
@@ -320,7 +341,7 @@ class _Sums:
     """Sums over touches, pixel by pixel."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self._weight, self._height = np.zeros(shape), np.zeros(shape)
+        self._weight, self._height, self._common = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self._normal_weight, self._normals = np.zeros(shape), np.zeros((*shape, 3))
         self._contact = np.zeros(shape, bool)
 
@@ -329,6 +350,7 @@ class _Sums:
         weight = np.where(known, 1 / moved.variance, 0.0)
         self._weight += weight
         self._height += weight * np.nan_to_num(moved.height)
+        self._common += weight * np.nan_to_num(moved.common)
         self._contact |= moved.contact
         if moved.normals is not None and moved.normal_variance is not None:
             told = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
@@ -340,14 +362,22 @@ class _Sums:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self._height / self._weight)
 
-    def levelled(self, moved: _Moved) -> _Moved:
-        """Return a touch of unknown offset at the height of those before, where they share pixels."""
-        off = self.mean() - moved.height
-        shared = np.isfinite(off)
+    def level(self, height: Doubles, variance: Doubles, lever: Doubles) -> tuple[float, Doubles, float]:
+        """Return what brings heights, (n,), to those so far, its mean lever, and its variance.
+
+        Pixels' own errors are independent. What pixels share by their poses no mean takes away; of several
+        touches their weighted mean is the most that it can be. All is NaN where no pixel is shared.
+        """
+        off = self.mean().ravel() - height
+        shared = np.isfinite(off) & np.isfinite(variance)
         if not shared.any():
-            return replace(moved, height=np.full_like(off, np.nan), variance=np.full_like(off, np.nan))
-        weight = 1 / (moved.variance[shared] + 1 / self._weight[shared])
-        return replace(moved, height=moved.height + np.average(off[shared], weights=weight))
+            return np.nan, np.zeros(6), np.nan
+        before = self._weight.ravel()[shared]
+        weight = 1 / (variance[shared] + 1 / before)
+        total = float(weight.sum())
+        common = float(weight @ (self._common.ravel()[shared] / before)) / total
+        middle = np.asarray(weight @ lever[shared] / total)
+        return float(weight @ off[shared]) / total, middle, 1 / total + common
 
     def result(
         self,
