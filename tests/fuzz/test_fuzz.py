@@ -1,11 +1,43 @@
 """Damaged files, a few thousand of them; ``make fuzz`` goes on for an hour."""
 
 import time
+from pathlib import Path
 
 import fuzz
 import pytest
 
 SECONDS = 40
+LAYOUTS = Path(__file__).parents[1] / "io" / "layouts"
+STRUCTURES = (b"OHDR", b"OCHK", b"GCOL", b"TREE", b"HEAP", b"SNOD", b"FRHP", b"FADB", b"FAHD", b"EAHD")
+"""What HDF5 begins its structures with."""
+
+
+def test_a_file_that_is_cut_short_is_refused(tmp_path):
+    reader, mutant = fuzz.Reader(), tmp_path / "mutant.h5"
+    outcomes = {}
+    for path in sorted(LAYOUTS.glob("*.h5")):
+        whole = path.read_bytes()
+        for length in (0, 7, 100, len(whole) // 2, len(whole) - 1):
+            mutant.write_bytes(whole[:length])
+            outcomes[path.name, length] = reader.read(mutant)
+    reader.close()
+    assert len(outcomes) >= 40
+    assert set(outcomes.values()) == {"refused"}, outcomes
+
+
+def test_a_structure_that_lies_is_read_or_refused_in_one_line(tmp_path):
+    reader, mutant = fuzz.Reader(), tmp_path / "mutant.h5"
+    outcomes = {}
+    for path in sorted(LAYOUTS.glob("*.h5")):
+        whole = path.read_bytes()
+        for mark in STRUCTURES:
+            at = whole.find(mark)
+            for wrong in (b"\x00", b"\xff") if at >= 0 else ():
+                mutant.write_bytes(whole[: at + 8] + 8 * wrong + whole[at + 16 :])
+                outcomes[path.name, mark, wrong] = reader.read(mutant)
+    reader.close()
+    assert len(outcomes) >= 30
+    assert set(outcomes.values()) <= {"read", "refused"}, outcomes
 
 
 @pytest.mark.slow
