@@ -9,6 +9,8 @@ import time
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from faults import failing
+from mishaps import state_of
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
 from speckle import Speckle
 
@@ -22,6 +24,7 @@ from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import rig
 from mirrorskin.hw.stage import Position
+from mirrorskin.kernels.errors import DeviceError
 
 SHAPE, SHAPED = (24, 32), (48, 56)
 OFFSET, GAIN = 20.0, 200.0
@@ -174,6 +177,27 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
     assert fake.stage.stops
     assert "cut short" in done.output
     assert output.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["device lost", "no resources", "allocation", "read"])
+def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_path, kind):
+    words = [*PRESS, "--record"]
+    with failing(kind) as calls:
+        assert fake.run(*words, str(tmp_path / "rec.h5"), "-o", str(tmp_path / "res.h5")).exit_code == 0
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9):
+        record, output = tmp_path / f"rec-{share}.h5", tmp_path / f"res-{share}.h5"
+        with failing(kind, int(share * calls.count)):
+            done = fake.run(*words, str(record), "-o", str(output))
+        if done.exit_code:
+            known = (DeviceError, MemoryError, io.InputError, HardwareError)
+            assert isinstance(done.exception, known), (share, done.exception)
+        assert fake.stage.closed
+        assert not fake.stage.moving()
+        if output.exists():
+            io.open_result(output)
+        assert re.fullmatch("complete|cut short: .*", state_of(record) or "complete")
+        assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
