@@ -38,15 +38,11 @@ class Expected:
         the way.
     growth_bend : float
         That of the second difference of the growth's logarithm.
-    rim : float
-        Of the radius of a contact that is estimated, how much is left out: it is too wide, and free skin does
-        not break loose.
     """
 
     power: float
     onset_bend: float
     growth_bend: float
-    rim: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,7 +129,7 @@ def test_contact_is_estimated_if_it_is_not_given(slid):
     assert found.contact[INSIDE].mean() > 0.97
     assert found.contact.sum() < 1.1 * INSIDE.sum()
     stuck = [np.count_nonzero(one.status == 2) for one in (found, slid[0])]
-    assert stuck[0] == pytest.approx(stuck[1], rel=0.1)
+    assert stuck[0] == pytest.approx(stuck[1], rel=0.15)
 
 
 def test_blocks_make_no_difference_and_a_result_changes_nothing(slid):
