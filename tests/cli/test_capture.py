@@ -5,6 +5,8 @@ import re
 import numpy as np
 import pytest
 from commands import run
+from faults import failing
+from mishaps import state_of
 from served_rig import served_rig
 
 from mirrorskin import io
@@ -152,6 +154,25 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         assert recording.shape[0] == int(kept[1])
         assert recording.state.startswith("cut short")
     assert not rig.machine.moving()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["read", "write"])
+def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path, kind):
+    words = ("vertical", "--stop", "1mm", "--step", "500um", "--settle", "0s", "-o")
+    with failing(kind) as calls:
+        assert capture(emulated, *words, tmp_path / "sound.h5").code == 0
+    for number in range(0, calls.count, 1 + calls.count // 8):
+        path = tmp_path / f"{number}.h5"
+        with failing(kind, number):
+            ended = capture(emulated, *words, path)
+        where = f"{number} of {calls.count}: {ended}"
+        if ended.code:
+            assert ended.code in (1, 2), where
+            assert re.fullmatch("mirrorskin: .+\n", ended.said), where
+        assert re.fullmatch("complete|cut short: .*", state_of(path) or "complete"), where
+        assert not list(tmp_path.glob("*.part")), where
+        assert not emulated[0].machine.moving(), where
 
 
 @pytest.mark.parametrize(
