@@ -19,6 +19,7 @@ _EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's
 _ROUNDS = 20
 _SETTLED = 1e-3  # of the way, in a round
 _FARTHEST = 0.08  # of the way, by which an onset changes in a round
+_LOCKING = 0.05  # pixels: sigma of how far displacements are drawn to halves of a pixel
 _POWER_SIGMA = 0.1  # those of slides and twists differ by twice that
 _APART = 9  # nodes, beyond which errors of onsets do not depend on each other
 _NEVER = 1.5  # of the way: an onset that has not come
@@ -58,14 +59,21 @@ class OnsetMap:
 
 
 def fit_onsets(
-    departure: Doubles, sigma: Doubles, way: Doubles, window: float, radius: float, expected: Expected
+    departure: Doubles,
+    sigma: Doubles,
+    way: Doubles,
+    window: float,
+    radius: float,
+    expected: Expected,
+    locking: Doubles,
 ) -> OnsetMap:
     """Fit ``growth (way - onset)^power``, zero before the onset, to departures as windows see them.
 
     A window's answer is the mean over it. Where the onset changes by ``slope`` from node to node, that is the
     mean over onsets within +- slope window / 2. The map of growth is smooth, with small second differences,
     and that of onsets with small third ones: under a ball it is a paraboloid. Both are found together by
-    Gauss-Newton steps. To what noise makes uncertain, sigma adds by how much another power changes the onset.
+    Gauss-Newton steps, and with them by how much displacements are drawn to halves of a pixel. To what noise
+    makes uncertain, sigma adds by how much another power changes the onset.
 
     Parameters
     ----------
@@ -75,12 +83,14 @@ def fit_onsets(
     window : nodes, over which a departure is a mean
     radius : nodes, of a disc as large as the contact
     expected : of the motion
+    locking : (2, T, rows, columns), mm, what an amplitude of a pixel along x, or y, would add to departures
     """
     power = expected.power
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
     data = _whitened(np.where(known, departure * scale, 0.0))
     length, times = float(way[-1]), (way / way[-1])[:, None, None]
+    locks = _whitened(np.where(known, locking * scale, 0.0))
     second, third = (_bending(known.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
     begin = _begin(data, scale, times, onset_stiff, power)
@@ -89,7 +99,7 @@ def fit_onsets(
     onset, usual = begin
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
     floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
-    log_growth = np.zeros_like(onset)
+    log_growth, lock = np.zeros_like(onset), np.zeros(2)
     for number in range(_ROUNDS):
         half = np.hypot(*np.gradient(onset)) * window / 2
         half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(way))  # wider at first
@@ -98,16 +108,43 @@ def fit_onsets(
         columns = np.stack([-rate, shape])
         normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
         blocks = [[sparse.diags(part) for part in row] for row in normal]
-        system = splu((sparse.bmat(blocks) + stiff + floor).tocsc())
-        pull = np.sum(columns * (data - shape), axis=1).ravel()
-        step = system.solve(pull - stiff @ np.stack([onset, log_growth]).ravel()).reshape(2, *onset.shape)
+        system = _Normal((sparse.bmat(blocks) + stiff + floor).tocsc(), columns, locks)
+        off = np.stack([onset, log_growth]).ravel()
+        left = data - shape - np.tensordot(lock, locks, 1)
+        step, more = system.solve(left, -(stiff @ off), -lock / _LOCKING**2)
         change = np.clip(step[0], -_FARTHEST, _FARTHEST)
-        onset, log_growth = onset + change, log_growth + np.clip(step[1], -0.3, 0.3)
+        onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
         if number > 3 and np.abs(change).max() < _SETTLED:
             break
     other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
-    shift = system.solve(np.sum(columns * (other - shape), axis=1).ravel()).reshape(2, *onset.shape)[0]
-    return OnsetMap(length * onset, length * np.sqrt(_variances(system, onset.shape) + shift**2))
+    shift = system.solve(other - shape)[0][0]
+    return OnsetMap(length * onset, length * np.sqrt(system.variances() + shift**2))
+
+
+class _Normal:
+    """The normal equations of both maps, with those of the locking, which all nodes share, as a border."""
+
+    def __init__(self, normal: Any, columns: Doubles, locks: Doubles) -> None:
+        self._lu, self._columns, self._locks = splu(normal), columns, locks
+        self._cross = np.einsum("ityx,ktyx->iyxk", columns, locks).reshape(-1, len(locks))
+        self._freed = np.asarray(self._lu.solve(self._cross))
+        own = np.einsum("ityx,jtyx->ij", locks, locks) + np.identity(len(locks)) / _LOCKING**2
+        self._inner = np.linalg.inv(own - self._cross.T @ self._freed)
+
+    def solve(
+        self, left: Doubles, pull: Doubles | float = 0.0, lock_pull: Doubles | float = 0.0
+    ) -> tuple[Doubles, Doubles]:
+        """Return the step of the maps, (2, rows, columns), and of the locking, by what data leave."""
+        step = self._lu.solve(np.sum(self._columns * left, axis=1).ravel() + pull)
+        more = self._inner @ (np.einsum("ktyx,tyx->k", self._locks, left) + lock_pull - self._cross.T @ step)
+        return np.asarray((step - self._freed @ more).reshape(2, *left.shape[1:])), more
+
+    def variances(self) -> Doubles:
+        """Return those of the first map."""
+        shape = self._columns.shape[2:]
+        shared = np.einsum("nk,kl,nl->n", self._freed, self._inner, self._freed)
+        found: Doubles = _variances(self._lu, shape) + shared.reshape(2, *shape)[0]
+        return found
 
 
 def _whitened(values: Doubles) -> Doubles:
@@ -115,8 +152,8 @@ def _whitened(values: Doubles) -> Doubles:
 
     Of frames whose errors have the covariance (I + J) / 2, J being all ones: those of the outcome have I.
     """
-    part = 1 - 1 / math.sqrt(len(values) + 1)
-    whitened: Doubles = math.sqrt(2) * (values - part * values.mean(axis=0))
+    part = 1 - 1 / math.sqrt(values.shape[-3] + 1)
+    whitened: Doubles = math.sqrt(2) * (values - part * values.mean(axis=-3, keepdims=True))
     return whitened
 
 

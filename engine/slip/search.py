@@ -252,7 +252,8 @@ class SlipSearch:
         if course.way[course.forward - 1] <= 0:
             raise InputError("the body does not move in these frames: take some along a slide or a twist")
         touched = self._touched(tracker, course, departure)
-        onsets = self._fit(tracker, course, departure, sigma, touched)
+        drawn = np.sin(2 * np.pi * moved / self._scale) * self._scale  # to halves of a pixel, amplitude 1
+        onsets = self._fit(tracker, course, departure, sigma, touched, drawn)
         contact = self._contact
         if contact is None:
             contact = (tracker.to_pixels(touched.astype(np.float64)) > 0.5) & (
@@ -326,6 +327,7 @@ class SlipSearch:
         departure: Doubles,
         sigma: Doubles,
         touched: NDArray[np.bool_],
+        drawn: Doubles,
     ) -> OnsetMap:
         """Fit the onsets of the nodes in contact, in a box round them; elsewhere they are NaN."""
         onset, spread = np.full(touched.shape, np.nan), np.full(touched.shape, np.nan)
@@ -340,6 +342,7 @@ class SlipSearch:
             if self._contact is None:
                 expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.position])
             known = np.where(touched, overlap * sigma, np.nan)
+            locking = -np.nan_to_num(course.along(drawn * np.identity(2)[:, None, None, None]))
             found = fit_onsets(
                 departure[: course.forward, *box],
                 known[box],
@@ -347,6 +350,7 @@ class SlipSearch:
                 self.window / self.step,
                 radius,
                 expected,
+                locking[:, : course.forward, *box],
             )
             onset[box], spread[box] = found.onset, found.sigma
         return OnsetMap(onset, spread)
@@ -422,13 +426,22 @@ class _Course:
         cosine, sine = math.cos(moved[0]) - 1, math.sin(moved[0])
         return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
-    def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-        """Return how far nodes lag behind the object, along its way in the last frame, and the sigma."""
+    @cached_property
+    def _unit(self) -> Doubles:
+        """The object's way in the last frame, of length 1, or 0 where it does not move."""
         last = self._object(self.forward - 1)
         length = np.sqrt(np.sum(last**2, axis=-1, keepdims=True))
-        along = np.divide(last, length, out=np.zeros(last.shape), where=length > 0)
-        lags = [np.sum((self._object(k) - part) * along, axis=-1) for k, part in enumerate(moved)]
-        variance = np.einsum("yxi,yxij,yxj->yx", along, covariance, along)
+        unit: Doubles = np.divide(last, length, out=np.zeros(last.shape), where=length > 0)
+        return unit
+
+    def along(self, moved: Doubles) -> Doubles:
+        """Return what of displacements, (..., rows, columns, 2), is along the object's way."""
+        return np.asarray(np.sum(moved * self._unit, axis=-1))
+
+    def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+        """Return how far nodes lag behind the object, along its way in the last frame, and the sigma."""
+        lags = [self.along(self._object(k) - part) for k, part in enumerate(moved)]
+        variance = np.einsum("yxi,yxij,yxj->yx", self._unit, covariance, self._unit)
         return np.stack(lags), np.where(variance > 0, np.sqrt(np.maximum(variance, 0)), np.nan)
 
     def stick_ratio(self, onsets: NDArray[np.float32]) -> Doubles:

@@ -39,15 +39,19 @@ def departure(x, y, way):
 
 
 @cache
-def slide(direction=(1.0, 0.0), count=20):
-    """Frames of a body that slides along a direction, y up, and the places where it was, mm."""
+def slide(direction=(1.0, 0.0), count=20, drawn=0.0):
+    """Frames of a body that slides along a direction, y up, and the places where it was, mm.
+
+    The skin seems drawn to halves of a pixel by so many pixels, as coarsely sampled texture does.
+    """
     right, up = direction
     frames = []
     for k in range(count):
         way = k * STEP
 
         def lag(x, y, way=way):
-            return way - departure(x, y, way)
+            moved = way - departure(x, y, way)
+            return moved + drawn * np.sin(2 * np.pi * moved)
 
         frames.append(
             SPECKLE.frame(
@@ -86,6 +90,15 @@ def test_slip_is_told_from_stick_within_a_pixel(slid):
     assert (slipped & true & part).sum() >= 0.98 * (true & part).sum()
     assert (slipped & true & part).sum() >= 0.98 * (slipped & part).sum()
     assert (found.status[~INSIDE] == 3).all()
+
+
+def test_texture_that_seems_drawn_to_halves_of_a_pixel_does_not_pass_for_slip():
+    frames, places = slide(count=18, drawn=0.06)
+    estimator = search()
+    estimator.push(frames, displacement=places)
+    found, true = estimator.result(), onset(COLUMN, ROW) * PIXEL
+    assert np.sqrt(np.nanmean((found.slip_onset - true)[INSIDE] ** 2)) < 0.3 * STEP * PIXEL
+    assert (found.status[INSIDE] == 1).sum() == pytest.approx((true[INSIDE] < places[-1, 0]).sum(), rel=0.02)
 
 
 def test_the_moment_of_slip_is_known_within_a_frame_and_its_sigma_is_of_that_size(slid):
