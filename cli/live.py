@@ -17,7 +17,7 @@ from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
-    from mirrorskin.engine.live import LivePress, LiveRotation, LiveSlip, Loop
+    from mirrorskin.engine.live import LiveEstimator, Loop
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource
@@ -80,6 +80,8 @@ def command(
     angle: scans.Angle = None,
     wait: scans.Wait = None,
     tilt: scans.Tilt = None,
+    rock: scans.Rock = False,
+    phase: scans.Phase = None,
     turns: scans.Turns = None,
     phase_step: scans.PhaseStep = None,
     rate: scans.Rate = None,
@@ -116,7 +118,7 @@ class _Live:
         if given["contact"] is not None:
             open_result(given["contact"])  # refused before anything moves
         self._loop: Loop | None = None
-        self._estimator: LivePress | LiveRotation | LiveSlip | None = None
+        self._estimator: LiveEstimator | None = None
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
@@ -180,16 +182,18 @@ class _Live:
             finally:
                 gc.unfreeze()
 
-    def _make_estimator(self, source: LiveSource, rate: float) -> LivePress | LiveRotation | LiveSlip:
+    def _make_estimator(self, source: LiveSource, rate: float) -> LiveEstimator:
         """Make what estimates the maps; the source has its references."""
-        from mirrorskin.engine.live import LivePress, LiveRotation, LiveSlip, choose_window
-        from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, TwistPlan
+        from mirrorskin.engine.live import LivePress, LiveRocking, LiveRotation, LiveSlip, choose_window
+        from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan
 
         given, plan = self._given, self._plan
         known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
         if isinstance(plan, AxialPlan):
             window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
             return LiveRotation(source, window=window, every=every, **known)
+        if isinstance(plan, RockPlan):
+            return LiveRocking(source, **known)
         if isinstance(plan, HorizontalPlan | TwistPlan):
             return LiveSlip(source, contact=self._given["contact"], **known)
         threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]

@@ -38,7 +38,7 @@ class LiveView:
         self, where: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float] | None = None
     ) -> None:
         self._x, _ = pixel_axes(shape, pixel_size or (1.0, 1.0))
-        self._heights, self._lengths = _Range(), _Range()
+        self._heights, self._lengths, self._slopes = _Range(), _Range(), _Range()
         self._greys = _Range()
         self._stream = open_stream(where, "--view")
         self._stream.send_blueprint(_blueprint(pixel_size is not None))
@@ -65,6 +65,8 @@ class LiveView:
         if update.displacement is not None:
             length = np.sqrt(np.sum(update.displacement**2, axis=-1))
             log("displacement", rr.Image(self._lengths.colour(length)))
+        if update.slope is not None:
+            log("slope", rr.Image(self._slopes.colour(update.slope)))
         if update.contact_area is not None:
             log("contact/area", rr.Scalars(update.contact_area))
         log("status", rr.TextDocument(self._told(update, status), media_type="text/markdown"))
@@ -90,6 +92,9 @@ class LiveView:
         if update.displacement is not None:
             low, high = (1e3 * end for end in self._lengths.ends)
             lines.append(f"displacement from {low:.1f} (violet) to {high:.1f} µm (yellow)")
+        if update.slope is not None:
+            low, high = self._slopes.ends
+            lines.append(f"slope from {low:.3f} (violet) to {high:.3f} (yellow)")
         if update.contact_area is not None:
             lines.append(f"contact {update.contact_area:.2f} mm²")
         return "\n\n".join(lines)
@@ -138,6 +143,7 @@ def _blueprint(scaled: bool) -> Any:
             rrb.Spatial2DView(origin="height", name="Height"),
             rrb.Spatial2DView(origin="normals", name="Normals"),
             rrb.Spatial2DView(origin="displacement", name="Displacement of the skin"),
+            rrb.Spatial2DView(origin="slope", name="Slope"),
             rrb.Spatial2DView(origin="section", name=across),
             rrb.TimeSeriesView(origin="contact", name="Contact, mm²"),
             rrb.TextDocumentView(origin="status", name="Status"),

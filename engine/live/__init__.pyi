@@ -1,5 +1,6 @@
 from .loop import LATENCY, LiveEstimator, Loop
 from .press import LivePress
+from .rocking import LiveRocking
 from .rotation import LiveRotation, choose_window
 from .slip import LiveSlip
 from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
@@ -15,6 +16,7 @@ __all__ = [
     "Latency",
     "LiveEstimator",
     "LivePress",
+    "LiveRocking",
     "LiveRotation",
     "LiveSlip",
     "Loop",

@@ -160,7 +160,8 @@ class Loop:
         if used.any():
             last = int(np.flatnonzero(used)[-1])
             at = math.nan if block.time is None else float(block.time[last])
-            place = getattr(block, self._estimator.position)[last]
+            name = self._estimator.position
+            place = getattr(block, "tilt" if name == "pose" else name)[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
             self._monitor.time(PUSHED, self._source.now() - now)
@@ -177,7 +178,7 @@ class Loop:
         self._monitor.updated()
         self._monitor.time(UPDATED, done - begun)
         self._arrived.append(self._taken)
-        if any(one is not None for one in (update.height, update.normals, update.displacement)):
+        if any(one is not None for one in (update.height, update.normals, update.displacement, update.slope)):
             self._monitor.time(SHOWN, done - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)

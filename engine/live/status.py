@@ -34,6 +34,7 @@ class Maps(TypedDict, total=False):
     height_lag: int
     offset_unknown: bool
     displacement: NDArray[np.float32] | None
+    slope: NDArray[np.float32] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +52,8 @@ class Update:
         Of the newest of them, seconds on the scale of ``Block.time``; NaN where the source has none.
     motion : {"vertical", "axial", "horizontal", "twist"}
     position : float
-        Of the body in the newest frame: travel, mm; phase or twist, radians; of a slide the length of its
-        displacement, mm.
+        Of the body in the newest frame: travel, mm; phase, twist or, of a body that rocks, tilt, radians; of
+        a slide the length of its displacement, mm.
     picture : ndarray, (H, W), uint8, uint16 or float32
         The newest frame, raw counts.
     height : ndarray, (H, W), float32
@@ -71,6 +72,8 @@ class Update:
         Whether heights are relative, the mean of each connected piece being 0.
     displacement : ndarray, (H, W, 2), float32
         Millimetres along x and y that the skin has moved since the first frame.
+    slope : ndarray, (H, W), float32
+        Of a body that rocks: millimetres that the surface rises for each along its way.
     """
 
     frames: int
@@ -86,6 +89,7 @@ class Update:
     height_lag: int = 0
     offset_unknown: bool = False
     displacement: NDArray[np.float32] | None = None
+    slope: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True)

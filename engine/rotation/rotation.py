@@ -188,17 +188,7 @@ def estimate_rotation(
     wall = wall_response_of(source) if gain is None else None
     passes = _Passes(source, header, open_device(device), method, noise, per_turn, memory_limit, progress)
     if at_poses(source, tilt):
-        found = passes.at_poses(heights)
-        known = found.normals
-        poses: dict[str, ProcessValue] = {
-            "tilt": known.tilt,
-            "tilt_from": "each frame: this is their root mean square",
-            "frames": known.frames,
-            "noise": known.noise,
-        }
-        if isinstance(known, PoseNormals) and known.direction is not None:
-            poses["slope_direction"] = known.direction
-        return replace(found, process={"method": method, **poses})
+        return passes.at_poses(heights)
     if heights is not None and tilt == "estimate":
         raise InputError(f"{source.name}: frames are registered by a tilt that is known: give it")
     if wall is None:
@@ -353,6 +343,27 @@ def at_poses(source: Source, tilt: float | Literal["estimate"] | None = None) ->
     return first is not None and first.tilt is not None
 
 
+def rotation_at_poses(normals: Normals, device: Device) -> Rotation:
+    """Return the edges that belong to normals, or slopes, of any known poses, and how they came about."""
+    process: dict[str, ProcessValue] = {
+        "method": "exact",
+        "tilt": normals.tilt,
+        "tilt_from": "each frame: this is their root mean square",
+        "frames": normals.frames,
+        "noise": normals.noise,
+    }
+    if isinstance(normals, PoseNormals) and normals.direction is not None:
+        process["slope_direction"] = normals.direction
+    return Rotation(normals, normals.sigma, _edges_of(normals, device), device, process)
+
+
+def _edges_of(normals: Normals, device: Device) -> NDArray[np.uint8]:
+    maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact]
+    if normals.contact.ndim == 3:
+        return np.stack([find_edges(*turn, device=device) for turn in zip(*maps, strict=True)])
+    return find_edges(*maps, device=device)
+
+
 def _check_method(source: Source, method: str) -> None:
     if method not in NORMAL_METHODS:
         known = ", ".join(NORMAL_METHODS)
@@ -440,7 +451,7 @@ class _Passes:
             frames = _Edited(self.source, partial(_with_tilts, self.source.header.tilt))
             feed(frames, estimator, range(count), self.progress)
             normals = estimator.result()
-        return self._with_edges(normals)
+        return rotation_at_poses(normals, self.device)
 
     def _first_heights(self, response: Response) -> Doubles:
         """Find from the first turn how high the object is, less the press, (H, W), mm."""
@@ -505,13 +516,7 @@ class _Passes:
         return replace(found, normals=normals, independent_sigma=independent)
 
     def _with_edges(self, normals: Normals) -> Rotation:
-        """Find the edges that belong to normals."""
-        maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact]
-        if normals.contact.ndim == 3:
-            edges = np.stack([find_edges(*turn, device=self.device) for turn in zip(*maps, strict=True)])
-        else:
-            edges = find_edges(*maps, device=self.device)
-        return Rotation(normals, normals.sigma, edges, self.device)
+        return Rotation(normals, normals.sigma, _edges_of(normals, self.device), self.device)
 
 
 class _Edited(Closing):

@@ -136,6 +136,24 @@ def test_a_rotation_is_told_and_kept(fake, tmp_path):
     assert result.height is not None
 
 
+def test_rocking_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
+    fake.picture = slanted()
+    fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    words = ["axial", "--rock", "--press", "1mm", "--tilt", "3deg", "--speed", "10deg/s", "--latency", "5s"]
+    done = fake.run(*words, "--record", str(record), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    assert counted(done.output)[1] > 20
+    result = io.open_result(output)
+    assert set(np.unique(result.status)) == {4}
+    assert result.height is None
+    assert abs(np.median(result.slope)) == pytest.approx(math.tan(0.3), rel=0.03)
+    with io.open_recording(record, live=True) as recording:
+        again = engine.reconstruct(recording)
+    np.testing.assert_array_equal(again.slope, result.slope)
+    np.testing.assert_array_equal(again.slope_sigma, result.slope_sigma)
+
+
 def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     sent = []
@@ -225,6 +243,7 @@ def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
         (["vertical", "--stop", "9mm", "--speed", "1mm/s"], "9"),
         ([*PRESS, "-o", "rig.toml"], "rig.toml"),
         (["axial", "--press", "1mm", "--rate", "40"], "frames a turn"),
+        (["axial", "--rock", "--press", "1mm", "--speed", "5deg/s"], "zenith_gain"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(fake, monkeypatch, tmp_path, words, told):
