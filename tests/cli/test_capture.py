@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from commands import run
-from faults import failing
+from injected_faults import failing
 from mishaps import state_of
 from served_rig import served_rig
 

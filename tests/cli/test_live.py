@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from faults import failing
+from injected_faults import failing
 from mishaps import state_of
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
 from speckle import Speckle

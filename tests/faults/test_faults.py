@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from batches import press, rotation
 from commands import run
-from faults import KINDS, failing
+from injected_faults import KINDS, failing
 
 from mirrorskin import io
 from mirrorskin.kernels import device as device_layer
