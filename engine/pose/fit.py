@@ -26,8 +26,8 @@ _FEWEST = 20  # pixels that two maps must share
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 _STEPS, _STILL = 40, 1e-2  # steps at most, and the step in standard deviations that ends them
 _BLOCKS = 100  # whose scatter tells as much of the covariance's form as independence does
-_POOR = 2.0  # chi square from which on other starts are tried
-_ANGLES, _SHIFTS, _REACH, _SHARED, _TRIED = 24, 7, 0.4, 0.3, 6  # of the search
+_POOR = 2.0  # typical chi square from which on other starts are tried
+_ANGLES, _SHIFTS, _REACH, _SHARED, _TRIED = 24, 13, 0.8, 0.2, 6  # of the search
 _NONE = np.zeros((6, 0))
 _LONGEST = 0.35  # of the object's size: the longest step
 
@@ -44,6 +44,8 @@ class Equations:
         J'Wr, and `scores`, (blocks, 6), of each block.
     chi_square : float
         For each degree of freedom, `compared` in all.
+    typical : float
+        Median of that over the blocks, which a dent in the object does not change.
     """
 
     def __init__(self, sums: NDArray[np.float32], size: float, beside: bool) -> None:
@@ -61,6 +63,8 @@ class Equations:
         self.pixels = max(float(self.normals.sum()), float(self.heights.sum()))
         self.compared = float(expected.sum())
         self.chi_square = float(chi.sum()) / max(self.compared, 1e-9)
+        used = expected > 0
+        self.typical = float(np.median(chi[used] / expected[used])) if used.any() else math.inf
 
     def free(self, noise: float | None = None) -> Doubles:
         """Return orthonormal directions, (6, k), about which the maps say nothing.
@@ -135,10 +139,10 @@ class PairFit:
         One that is ``near`` needs no coarse maps.
         """
         levels = [self] if near else self._levels()
-        found, chi_square = self._descend(levels, start or STILL)
-        if start is None and not chi_square < _POOR:
+        found, typical = self._descend(levels, start or STILL)
+        if start is None and not typical < _POOR:
             other = self._descend(levels, levels[-1].search())
-            found, chi_square = min((found, chi_square), other, key=lambda one: one[1])
+            found, typical = min((found, typical), other, key=lambda one: one[1])
             start = other[0] if found is other[0] else None
         if found is None:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
@@ -165,12 +169,12 @@ class PairFit:
     def _descend(
         self, levels: list[PairFit], start: Motion | None, free: Doubles = _NONE
     ) -> tuple[Motion | None, float]:
-        """Return the motion that is found from a start, from the coarsest maps on, and its chi square."""
+        """Return the motion that is found from a start, and its typical chi square."""
         motion = start
         for level in reversed(levels):
             if motion is not None:
                 motion = level.refine(motion, free)
-        return motion, math.inf if motion is None else self.equations(motion).chi_square
+        return motion, math.inf if motion is None else self.equations(motion).typical
 
     def search(self) -> Motion | None:
         """Return the best of the motions that are found from turns about z and shifts of all sizes."""
@@ -187,8 +191,8 @@ class PairFit:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
-                if now.pixels > _SHARED * len(self.first.points) and now.chi_square < least:
-                    best, least = motion, now.chi_square
+                if now.pixels > _SHARED * len(self.first.points) and now.typical < least:
+                    best, least = motion, now.typical
         return best
 
     def _starts(self) -> Iterator[Motion]:

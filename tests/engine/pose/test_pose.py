@@ -77,6 +77,15 @@ def test_large_motions_are_found_from_nothing() -> None:
     assert pose.chi_square == pytest.approx(1, abs=0.1)
 
 
+def test_a_motion_that_leaves_little_in_common_is_found_and_no_other() -> None:
+    rng = np.random.default_rng(0)
+    pair = (sampled(bumpy, (0, 0, 0), shift, rng=rng, shape=(40, 50)) for shift in ((0, 0, 0), (1.5, 0, 0)))
+    pose = engine.estimate_pose(*pair)
+    assert pose.chi_square < 1.2
+    np.testing.assert_allclose(pose.rotation, 0, atol=0.01)
+    np.testing.assert_allclose(pose.translation, (1.5, 0, 0), atol=0.01)
+
+
 def test_a_start_leads_to_the_same_motion() -> None:
     rng = np.random.default_rng(2)
     vector, shift = np.array([0.05, -0.1, 1.7]), np.array([0.6, -0.4, 0.1])
