@@ -157,6 +157,7 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize("kind", ["read", "write"])
 def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path, kind):
     words = ("vertical", "--stop", "1mm", "--step", "500um", "--settle", "0s", "-o")
