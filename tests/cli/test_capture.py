@@ -158,14 +158,14 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
 
 @pytest.mark.slow
 @pytest.mark.real_time
-@pytest.mark.parametrize("kind", ["read", "write"])
-def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path, kind):
+def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
+    # Reads alone: the emulated stage's line and camera write and close in this process, as files do.
     words = ("vertical", "--stop", "1mm", "--step", "500um", "--settle", "0s", "-o")
-    with failing(kind) as calls:
+    with failing("read") as calls:
         assert capture(emulated, *words, tmp_path / "sound.h5").code == 0
     for number in range(0, calls.count, 1 + calls.count // 8):
         path = tmp_path / f"{number}.h5"
-        with failing(kind, number):
+        with failing("read", number):
             ended = capture(emulated, *words, path)
         where = f"{number} of {calls.count}: {ended}"
         if ended.code:
