@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.types import Floats, InputError
 
+_GREATEST = 1e12  # mm, rad or s
+
 
 @runtime_checkable
 class Positions(Protocol):
@@ -133,8 +135,10 @@ def check_finite(
         needed = "two numbers a frame are" if width else "one number a frame is"
         raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
-    known = np.isfinite(array[start:stop]).all(axis=tuple(range(1, array.ndim)))
+    known = (np.abs(array[start:stop]) <= _GREATEST).all(axis=tuple(range(1, array.ndim)))
     if not np.all(known):
         frame = start + int(np.argmin(known))
-        raise InputError(f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number")
+        raise InputError(
+            f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number, at most {_GREATEST:g}"
+        )
     return array[start:stop].astype(np.float64)

@@ -294,6 +294,13 @@ class Device:
         other._kernels = _ThreadKernels()
         return other
 
+    def flush(self) -> None:
+        """Have the device begin what it was given, without waiting for it."""
+        try:
+            self.queue.flush()
+        except cl.Error as error:
+            raise failed(self, "begin its work", error) from error
+
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
         try:
@@ -328,7 +335,10 @@ class Device:
         self, file: str | Path, options: tuple[str, ...], more: str
     ) -> tuple[cl.Program, dict[str, Signature]]:
         path = file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
-        source = _read_source(path) + more
+        try:
+            source = _read_source(path) + more
+        except OSError as error:
+            raise DeviceError(f"the kernel {path} cannot be read ({error}); install the program anew") from error
         start = time.perf_counter()
         try:
             with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one

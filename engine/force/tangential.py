@@ -25,6 +25,7 @@ _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
 _UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y runs up, rows run down
 _TOLERANCE, _ROUGH = 1e-5, 1e-3  # of the greatest displacement; the second, of damped tractions
 _STEPS = 400  # of conjugate gradients
+_FARTHEST = 1e6  # mm
 _LEAST_KNOWN = 0.8  # of the contact that must have a displacement
 _DAMPING = 1e-4, 1e4  # of what a contact as a whole gives way by
 
@@ -155,6 +156,8 @@ def _checked(
     if not touches.any():
         raise InputError("nothing touches: there is no traction to find")
     known = np.isfinite(moved).all(axis=-1)
+    if known.any() and not (farthest := np.abs(moved[known]).max()) < _FARTHEST:
+        raise InputError(f"a displacement is {farthest:.3g} mm: less than {_FARTHEST:g} are needed")
     share = np.count_nonzero(known & touches) / np.count_nonzero(touches)
     if not np.isfinite(spread).any() or np.any(spread < 0):
         raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")

@@ -57,7 +57,7 @@ class WarmStartIntegrator:
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
             self._relief = self._multigrid.follow(self._links, deep=self._steps % _DEEP == 0)
-        self._device.queue.flush()
+        self._device.flush()
         self._height = None
 
     def result(self) -> Floats:

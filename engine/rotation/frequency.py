@@ -15,6 +15,7 @@ from mirrorskin.io.arguments import checked
 
 _FEWEST = 8  # frames
 _PIXELS, _SAMPLES = 4096, 2**22  # pixels that are looked at, and samples, at most
+_GREATEST = 1e12  # of a sample
 _FINER = 4  # lines of the periodogram for each that is independent
 _SPARSE = 64  # times the median step between frames, by which there may be more steps than frames
 _SIGNIFICANT = 8.0  # standard deviations of what noise alone explains
@@ -76,6 +77,8 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     counts = flat[:, np.isfinite(flat).all(axis=0)]
     if counts.shape[1] == 0:
         raise InputError("every pixel has a missing sample: no frequency can be estimated")
+    if (greatest := np.abs(counts).max()) > _GREATEST:
+        raise InputError(f"a sample is {greatest:.3g}: at most {_GREATEST:g} can be")
     counts -= counts.mean(axis=0)
     if not counts.any():
         raise InputError("nothing oscillates: all samples of a pixel are the same")
@@ -114,9 +117,10 @@ def frequency_of(source: Source, time: Doubles) -> Frequency:
 def _periodogram_peak(counts: Doubles, time: Doubles) -> tuple[float, float]:
     """Return where the pixels' periodograms have their maximum, and the width of a line, hertz."""
     step = float(np.median(np.diff(time)))
-    place = np.rint((time - time[0]) / step).astype(np.intp)
-    if place[-1] > _SPARSE * len(time):
+    place = np.rint((time - time[0]) / step)
+    if not place[-1] <= _SPARSE * len(time):
         raise InputError("frame times are too uneven to find a frequency in: give it")
+    place = place.astype(np.intp)
     grid = np.zeros((place[-1] + 1, counts.shape[1]))
     grid[place] = counts
     lines = np.fft.rfft(grid, _FINER * len(grid), axis=0)

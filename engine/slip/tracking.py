@@ -238,8 +238,8 @@ class _Level:
         measured = normals[..., AFFINE, AFFINE].copy()
         normal = normals.reshape(-1, PARAMETERS, PARAMETERS)
         scale = np.sqrt(np.einsum("nii->ni", normal))
-        usable = (scale > 0).all(axis=1)
-        scale[~usable] = 1
+        usable = ((scale > 0) & np.isfinite(scale)).all(axis=1)
+        scale[~usable], normal[~usable] = 1, np.eye(PARAMETERS)
         normal /= scale[:, :, None] * scale[:, None, :]
         usable &= np.linalg.eigvalsh(normal)[:, 0] > 1e-5  # singular otherwise, within rounding
         normal[~usable] = np.eye(PARAMETERS)

@@ -108,6 +108,11 @@ def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:
         part = array.copy()
         part.flat[3] = value
         yield f"{name} in part", part.astype(np.float32)
+    most = np.finfo(sound.dtype).max / 4 if sound.dtype.kind == "f" else np.iinfo(np.int64).max
+    part = array.copy()
+    part.flat[3] = most
+    yield "huge in part", part.astype(sound.dtype if sound.dtype.kind == "f" else np.float64)
+    yield "all huge", np.full_like(part, most)
     yield "transposed", np.asarray(sound).T
     yield "one too few", np.asarray(sound)[:-1]
     yield "complex array", array * 1j
@@ -119,15 +124,43 @@ def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:
 
 def trial(name: str, argument: str, value: Any) -> str | None:
     """Call a function with one argument replaced; return what is wrong with how it ended, None if nothing."""
-    function, arguments = calls()[name]
     try:
-        answer = function(**{**arguments, argument: value})
+        answer(name, **{argument: value})
     except REFUSALS as refusal:
         return "refuses in more than a line" if "\n" in str(refusal) else None
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    infinite = [part for part, values in _arrays(answer) if np.isinf(values).any()]
-    return f"infinite {', '.join(infinite)}" if infinite else None
+    return None
+
+
+def answer(name: str, **changed: Any) -> None:
+    """Call a function with some arguments replaced; no map of its answer may hold infinite values."""
+    function, arguments = calls()[name]
+    infinite = [
+        part for part, values in _arrays(function(**{**arguments, **changed})) if np.isinf(values).any()
+    ]
+    assert not infinite, f"infinite {', '.join(infinite)}"
+
+
+def to_bytes(name: str) -> bytes:
+    """Return the numbers of a call's arrays, one after the other."""
+    return b"".join(sound.tobytes() for sound in _given_arrays(name).values())
+
+
+def call_with(name: str, data: bytes) -> None:
+    """Call a function with arrays of other numbers; where there are too few, the last arrays are shorter."""
+    changed = {}
+    for argument, sound in _given_arrays(name).items():
+        part, data = data[: sound.nbytes], data[sound.nbytes :]
+        rows = len(part) // sound[:1].nbytes
+        stored = np.uint8 if sound.dtype == bool else sound.dtype
+        values = np.frombuffer(part[: rows * sound[:1].nbytes], stored)
+        changed[argument] = values.reshape(rows, *sound.shape[1:]).astype(sound.dtype)
+    answer(name, **changed)
+
+
+def _given_arrays(name: str) -> dict[str, np.ndarray]:
+    return {one: sound for one, sound in calls()[name][1].items() if isinstance(sound, np.ndarray)}
 
 
 def _arrays(answer: Any) -> Iterator[tuple[str, np.ndarray]]:

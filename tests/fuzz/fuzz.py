@@ -1,7 +1,7 @@
 """Damaged files of every kind, read as users read them: nothing may crash, hang, or end in a traceback.
 
-``make fuzz`` damages recordings, results, calibrations, settings, lists of phases, height maps and what a
-controller says, and has a process of its own read each. What is neither read nor refused in one line is kept.
+``make fuzz`` damages recordings, results, calibrations, settings, lists of phases, height maps, what a controller
+says, and the arrays that the public functions are called with, and has a process of its own read each. What is neither read nor refused in one line is kept.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ NUMBERS = [0, 1, 2, 7, 8, 0xFF, 1 << 15, 1 << 31, (1 << 31) - 1, (1 << 32) - 1, 
 def make_samples(folder: Path) -> list[Path]:
     """Write a small file of every kind and packing."""
     from calibrations import a_calibration
+    from calls import calls, to_bytes
     from commands import run
 
     from mirrorskin import io
@@ -72,6 +73,9 @@ def make_samples(folder: Path) -> list[Path]:
     (folder / "batch.toml").write_text(BATCH)
     (folder / "phases.csv").write_text("0deg\n45deg 90.5deg\n3.1rad # last\n")
     (folder / "controller.txt").write_bytes(REPLIES)
+    for name in calls():
+        if arrays := to_bytes(name):
+            (folder / f"{name}.call").write_bytes(arrays)
     np.save(folder / "heights.npy", np.linspace(0, 1, 300).reshape(15, 20))
     return sorted(folder.iterdir())
 
@@ -101,6 +105,8 @@ def damage(data: bytearray, chance: random.Random) -> str:
 
 def read(path: str) -> bool:
     """Read a file in every way; tell whether one of them took it for good."""
+    from calls import call_with
+
     from mirrorskin import engine, io
     from mirrorskin.cli.settings import read_settings
     from mirrorskin.cli.stack import read_phases
@@ -115,6 +121,7 @@ def read(path: str) -> bool:
         ".csv": [lambda path: read_phases(Path(path))],
         ".npy": [lambda path: load_height_map(path, (0.1, 0.1))],
         ".txt": [listen],
+        ".call": [lambda path: call_with(Path(path).stem, Path(path).read_bytes())],
     }
     for reader in readers[Path(path).suffix]:
         try:
@@ -208,7 +215,7 @@ def attack(
             sample = chance.choice(samples)
             data = bytearray(whole[sample])
             damage(data, chance)
-            mutant = Path(folder) / f"mutant{sample.suffix}"
+            mutant = Path(folder) / sample.name
             mutant.write_bytes(data)
             outcome = reader.read(mutant)
             if outcome not in ("read", "refused"):

@@ -13,11 +13,12 @@ from mirrorskin import io
 sys.path.insert(0, str(Path(__file__).parent / "layouts"))
 import make
 
-NAMES = sorted(path.name for path in make.FOLDER.glob("*.h5"))
+FILES = [str(path.relative_to(make.FOLDER)) for path in sorted(make.FOLDER.rglob("*.h5"))]
+NAMES = [name for name in FILES if "/" not in name]
 
 
 def of(what):
-    return [name for name in NAMES if f"-{what}-" in f"-{name}"]
+    return [name for name in FILES if f"-{what}-" in f"-{Path(name).name}"]
 
 
 @pytest.mark.parametrize("name", of("recording"))
@@ -33,6 +34,10 @@ def test_a_recording_of_any_layout_is_read(name):
                 np.testing.assert_array_equal(
                     getattr(recording.header, map_name), getattr(source.header, map_name)
                 )
+        assert (recording.truth is not None) == ("truth" in name)
+        if recording.truth is not None:
+            for one in ("height", "zenith", "azimuth", "contact"):
+                np.testing.assert_array_equal(getattr(recording.truth, one), getattr(make.TRUTH, one))
     np.testing.assert_array_equal(block.frames, source.frames)
     if source.motion == "axial":
         np.testing.assert_array_equal(block.phase, make.PHASE)
@@ -42,7 +47,7 @@ def test_a_recording_of_any_layout_is_read(name):
 
 @pytest.mark.parametrize("name", of("result"))
 def test_a_result_of_any_layout_is_read(name):
-    expected = make.PRESS if "press" in name else make.ROTATION
+    expected = make.PRESS if "press-" in name else make.ROTATION
     found = io.open_result(make.FOLDER / name)
     for one in ("height", "height_sigma", "status", "normals", "zenith", "azimuth"):
         np.testing.assert_array_equal(getattr(found, one), getattr(expected, one), err_msg=one)
@@ -51,7 +56,10 @@ def test_a_result_of_any_layout_is_read(name):
 
 @pytest.mark.parametrize("name", of("calibration"))
 def test_a_calibration_of_any_layout_is_read(name):
-    assert_same(io.open_calibration(make.FOLDER / name), a_calibration())
+    found = io.open_calibration(make.FOLDER / name)
+    known = [part for part in found.parts() if found.parts()[part] is not None]
+    assert name.startswith("early") or "stiffness" in known  # which came later
+    assert_same(found, a_calibration(only=known))
 
 
 def structure(path):

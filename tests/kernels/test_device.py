@@ -6,9 +6,11 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from injected_faults import lost
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
@@ -240,6 +242,20 @@ def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
     monkeypatch.setattr(device, "_program", refuse)
     with pytest.raises(DeviceError, match="set XDG_CACHE_HOME"):
         device.kernel("limits", "copy_all", ANEW=1, **MACROS)
+
+
+def test_a_kernel_that_cannot_be_read_is_said_so(device, tmp_path):
+    with pytest.raises(DeviceError, match=r"kernel .*gone\.cl cannot be read .*; install the program anew"):
+        device.kernel(tmp_path / "gone.cl", "copy_all")
+
+
+def test_a_queue_that_is_lost_is_said_so(device, monkeypatch):
+    def flush():
+        raise lost()
+
+    monkeypatch.setattr(device, "queue", SimpleNamespace(flush=flush))
+    with pytest.raises(DeviceError, match="cannot begin its work: .*; if that goes on, choose another"):
+        device.flush()
 
 
 def test_the_example_runs():

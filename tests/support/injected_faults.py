@@ -49,7 +49,8 @@ class Calls:
         return watched
 
 
-def _lost() -> Exception:
+def lost() -> Exception:
+    """Return what OpenCL raises once a device is gone."""
     return cl.LogicError(cl._cl._ErrorRecord("", cl.status_code.INVALID_COMMAND_QUEUE, "clFault"))
 
 
@@ -109,8 +110,8 @@ def _writes(calls: Calls, patch: pytest.MonkeyPatch) -> None:
 
 # What happens, and to which calls; what these raise, and whether all later ones fail as well.
 KINDS: dict[str, tuple[Callable[[Calls, pytest.MonkeyPatch], None], Callable[[], Exception], bool]] = {
-    "device lost": (_opencl, _lost, True),
-    "OpenCL call": (_opencl, _lost, False),
+    "device lost": (_opencl, lost, True),
+    "OpenCL call": (_opencl, lost, False),
     "no resources": (_opencl, _exhausted, False),
     "allocation": (_memory, MemoryError, False),
     "read": (_reads, lambda: OSError(errno.EIO, "Input/output error"), False),

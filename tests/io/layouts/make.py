@@ -1,7 +1,8 @@
 """Small files of each layout, which all later versions must read.
 
 ``python tests/io/layouts/make.py`` (in the environment) writes those that are missing: for a new layout, give
-it a new number. A file that is there is never written again.
+it a new number. A file that is there is never written again. Those in ``early`` are the same, written by the
+programs of 20 and 22 November 2026 (commits 5e60a58 and d929ed6).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ PHASE = np.pi / 3 * np.arange(6)
 PIXEL = (0.05, 0.06)
 MAP = np.arange(35, dtype=np.float32).reshape(5, 7) / 8
 HOLED = np.where(np.arange(35).reshape(5, 7) == 9, np.float32(np.nan), MAP)
+TRUTH = io.Truth(MAP, MAP / 8, -MAP / 8, (MAP > 2).astype(np.uint8))
 PROCESS: dict[str, str | int | float | bool] = {"program": "mirrorskin", "source": "Münze.h5", "hold": 2}
 PRESS = io.Result(height=HOLED, height_sigma=MAP, status=np.ones((5, 7), np.uint8), process=PROCESS)
 ROTATION = io.Result(
@@ -70,6 +72,7 @@ def live(path: Path) -> None:
 WRITERS: dict[str, Callable[[Path], object]] = {
     "others-recording-1.h5": by_others,
     "press-recording-1.h5": lambda path: record(a_press(), path),
+    "truth-recording-1.h5": lambda path: record(a_press(), path, truth=TRUTH),
     "live-recording-1.h5": live,
     "gzip-recording-1.h5": lambda path: record(a_rotation(), path, "gzip"),
     "bitshuffle-recording-1.h5": lambda path: record(a_rotation(), path, "bitshuffle"),
