@@ -138,7 +138,6 @@ def check_finite(
     known = (np.abs(array[start:stop]) <= _GREATEST).all(axis=tuple(range(1, array.ndim)))
     if not np.all(known):
         frame = start + int(np.argmin(known))
-        raise InputError(
-            f"{name} is {array[frame]} at frame {frame}: every frame needs a finite number, at most {_GREATEST:g}"
-        )
+        needed = f"every frame needs a finite number, at most {_GREATEST:g}"
+        raise InputError(f"{name} is {array[frame]} at frame {frame}: {needed}")
     return array[start:stop].astype(np.float64)

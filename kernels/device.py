@@ -338,7 +338,9 @@ class Device:
         try:
             source = _read_source(path) + more
         except OSError as error:
-            raise DeviceError(f"the kernel {path} cannot be read ({error}); install the program anew") from error
+            raise DeviceError(
+                f"the kernel {path} cannot be read ({error}); install mirrorskin anew"
+            ) from error
         start = time.perf_counter()
         try:
             with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one

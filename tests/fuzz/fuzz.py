@@ -1,7 +1,8 @@
 """Damaged files of every kind, read as users read them: nothing may crash, hang, or end in a traceback.
 
-``make fuzz`` damages recordings, results, calibrations, settings, lists of phases, height maps, what a controller
-says, and the arrays that the public functions are called with, and has a process of its own read each. What is neither read nor refused in one line is kept.
+``make fuzz`` damages recordings, results, calibrations, settings, lists of phases, height maps, what a
+controller says, and the arrays that public functions are given, and has a process of its own read each. What
+is neither read nor refused in one line is kept.
 """
 
 from __future__ import annotations
