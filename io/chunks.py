@@ -1,23 +1,38 @@
-"""Frames in chunks: where they lie in a file, read past HDF5 and unpacked by several threads, each once."""
+"""Frames in chunks: where they lie in a file, read past HDF5 and unpacked by several threads, each once.
+
+Chunks are unpacked outside HDF5's lock, by the C libraries that hdf5plugin and h5py bring, and zlib.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import itertools
 import math
 import os
+import struct
 import weakref
+import zlib
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.codecs import Bytes, Codec, decode
 from mirrorskin.io.hdf5 import chunks_of
 from mirrorskin.io.selection import Place, Region, Span
+
+Bytes = NDArray[np.uint8]
+Codec = Callable[[Bytes, Bytes], None]
+"""Unpack the first bytes into the whole of the second; ValueError if they do not fit."""
+
+_SIZE, _POINTER = ctypes.c_size_t, ctypes.c_void_p
+_WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
 
 
 class ChunkIndex(NamedTuple):
@@ -55,26 +70,16 @@ def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -
         raise ValueError("(chunks are missing)")
     if np.any(offsets + sizes > size):
         raise OSError("truncated: a chunk lies behind the end")
-    if _has_raw_edges(dataset, shape, sizes, masks):
-        return "raw chunks at the edge"
-    return ChunkIndex(dataset.chunks, offsets, sizes, masks)
-
-
-def _has_raw_edges(
-    dataset: h5py.Dataset, shape: tuple[int, ...], sizes: NDArray[np.int64], masks: NDArray[np.int64]
-) -> bool:
-    """Tell whether chunks that are partly outside the dataset may not have gone through its filters.
-
-    A dataset can be made so, and HDF5 does not tell whether one is; but then they have the size of raw ones.
-    """
-    if not dataset.id.get_create_plist().get_nfilters():
-        return False
-    edge = np.zeros(sizes.shape, bool)
+    # Chunks that are partly outside the dataset may not have gone through its filters, and HDF5 does not
+    # tell; but then they have the size of raw ones.
+    edge = np.zeros(grid, bool)
     for axis, (n, c) in enumerate(zip(shape, dataset.chunks, strict=True)):
         if n % c:
             np.moveaxis(edge, axis, 0)[-1] = True
     raw = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    return bool(np.any(edge & (sizes == raw) & (masks == 0)))
+    if dataset.id.get_create_plist().get_nfilters() and np.any(edge & (sizes == raw) & (masks == 0)):
+        return "raw chunks at the edge"
+    return ChunkIndex(dataset.chunks, offsets, sizes, masks)
 
 
 class Chunks:
@@ -103,7 +108,7 @@ class Chunks:
         self._index, self._codecs, self._threads = index, codecs, threads
         self._close_file = weakref.finalize(self, os.close, file)
         self._pools: dict[int, ThreadPoolExecutor] = {}  # of each process: threads stay behind in a fork
-        self._scratch: list[_Scratch] = []
+        self._rooms: list[dict[str, Bytes]] = []  # memory that one thread uses again and again
 
     def lend(self, start: int, stop: int) -> None:
         """Lend nothing that was not read."""
@@ -115,14 +120,14 @@ class Chunks:
         work = deque(itertools.product(*ranges))
 
         def take_chunks() -> None:
-            scratch = self._scratch.pop() if self._scratch else _Scratch()
+            rooms: dict[str, Bytes] = self._rooms.pop() if self._rooms else {}
             try:
                 with suppress(IndexError):  # there is none left
                     while True:
-                        self._fetch_chunk(work.popleft(), spans, out, scratch)
+                        self._fetch_chunk(work.popleft(), spans, out, rooms)
             finally:
                 work.clear()  # after an error, so that the others stop, too
-                self._scratch.append(scratch)
+                self._rooms.append(rooms)
 
         helpers: list[Future[None]] = []
         try:
@@ -146,7 +151,7 @@ class Chunks:
         self._close_file()
 
     def _fetch_chunk(
-        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], scratch: _Scratch
+        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], rooms: dict[str, Bytes]
     ) -> None:
         """Write what a chunk holds of the part with these spans."""
         source, target = [], []
@@ -158,33 +163,26 @@ class Chunks:
         first = position[0] * self.length
         with self._place.reading(first, min(first + self.length, self._frames)):
             if wanted.shape == self._shape and wanted.flags.c_contiguous:
-                self._decode(position, wanted.reshape(-1).view(np.uint8), scratch)
+                self._decode(position, wanted.reshape(-1).view(np.uint8), rooms)
             else:
-                unpacked = scratch.room("unpacked", self._size)
-                self._decode(position, unpacked, scratch)
+                unpacked = _room(rooms, "unpacked", self._size)
+                self._decode(position, unpacked, rooms)
                 wanted[...] = unpacked.view(self._dtype).reshape(self._shape)[*source]
 
-    def _decode(self, position: tuple[int, ...], out: Bytes, scratch: _Scratch) -> None:
+    def _decode(self, position: tuple[int, ...], out: Bytes, rooms: dict[str, Bytes]) -> None:
         offset, size = int(self._index.offsets[position]), int(self._index.sizes[position])
         if not self._codecs:
             _read(self._file, offset, out)
             return
-        packed = scratch.room("packed", size)
+        packed = _room(rooms, "packed", size)
         _read(self._file, offset, packed)
         decode(self._codecs, int(self._index.filter_masks[position]), packed, out)
 
 
-class _Scratch:
-    """Memory that one thread uses again and again."""
-
-    def __init__(self) -> None:
-        self._rooms: dict[str, Bytes] = {}
-
-    def room(self, name: str, size: int) -> Bytes:
-        room = self._rooms.get(name)
-        if room is None or room.size < size:
-            room = self._rooms[name] = np.empty(size + size // 8, np.uint8)
-        return room[:size]
+def _room(rooms: dict[str, Bytes], name: str, size: int) -> Bytes:
+    if name not in rooms or rooms[name].size < size:
+        rooms[name] = np.empty(size + size // 8, np.uint8)
+    return rooms[name][:size]
 
 
 def _read(file: int, offset: int, out: Bytes) -> None:
@@ -194,3 +192,145 @@ def _read(file: int, offset: int, out: Bytes) -> None:
         if not count:
             raise OSError("truncated: the file became shorter")
         done += count
+
+
+def find_codecs(dataset: h5py.Dataset) -> list[Codec] | str:
+    """Return what undoes each filter of a dataset, in the order of writing, or the name of an unknown one."""
+    plist = dataset.id.get_create_plist()
+    codecs, count = [], plist.get_nfilters()
+    for index, (code, _, values, name) in enumerate(map(plist.get_filter, range(count))):
+        try:
+            codecs.append(_MAKERS[code](values))
+        except (OSError, AttributeError, LookupError):  # no library, another one, an unknown filter
+            return name.decode(errors="replace").split(";")[0].strip() or str(code)
+        if code != h5py.h5z.FILTER_SHUFFLE and index < count - 1:
+            return "packed twice"  # nobody knows how much is in between
+    return codecs
+
+
+def decode(codecs: list[Codec], filter_mask: int, packed: Bytes, out: Bytes) -> None:
+    """Unpack a chunk."""
+    steps = [codec for bit, codec in enumerate(codecs) if not filter_mask >> bit & 1] or [_shuffle((1,))]
+    for codec in steps[:0:-1]:
+        between = np.empty_like(out)
+        codec(packed, between)
+        packed = between
+    steps[0](packed, out)
+
+
+def _shuffle(values: tuple[int, ...]) -> Codec:
+    """HDF5's shuffle: the first bytes of all samples come first, and so on."""
+
+    def decode(packed: Bytes, out: Bytes) -> None:
+        _check(packed.size, out.size)
+        out.reshape(-1, values[0])[...] = packed.reshape(values[0], -1).T
+
+    return decode
+
+
+def _deflate(_values: tuple[int, ...]) -> Codec:
+    def decode(packed: Bytes, out: Bytes) -> None:
+        stream = zlib.decompressobj()
+        try:
+            unpacked = stream.decompress(packed.data, out.size + 1)
+        except zlib.error as error:
+            raise ValueError(f"({error})") from error
+        if not stream.eof:
+            raise ValueError("(the chunk is too short, or too long)")
+        _check(len(unpacked), out.size)
+        out[...] = np.frombuffer(unpacked, np.uint8)
+
+    return decode
+
+
+def _lzf(_values: tuple[int, ...]) -> Codec:
+    unsigned = ctypes.c_uint
+    types = unsigned, _POINTER, unsigned, _POINTER, unsigned
+    function = _function(h5py.h5z.__file__, "lzf_decompress", *types)
+
+    def decode(packed: Bytes, out: Bytes) -> None:
+        _check(function(packed.ctypes.data, packed.size, out.ctypes.data, out.size), out.size)
+
+    return decode
+
+
+def _bitshuffle(values: tuple[int, ...]) -> Codec:
+    """Bitshuffle: blocks of which the bits are sorted by their place; LZ4 or Zstandard packs them.
+
+    Chunks begin with their unpacked size and that of a block; each block begins with its packed size.
+    """
+    itemsize, method = values[2], values[4] if len(values) > 4 else 0
+    name = {2: "bshuf_decompress_lz4", 3: "bshuf_decompress_zstd"}[method]
+    function = _function(_plugin("bshuf"), name, ctypes.c_int64, _POINTER, _POINTER, _SIZE, _SIZE, _SIZE)
+    default = _function(_plugin("bshuf"), "bshuf_default_block_size", _SIZE, _SIZE)(itemsize or 1)
+
+    def decode(packed: Bytes, out: Bytes) -> None:
+        if packed.size < _HEAD.size:
+            raise ValueError("(the chunk is too short)")
+        total, block = _HEAD.unpack_from(packed.data)
+        _check(total, out.size)
+        block = block // itemsize or default
+        _check_blocks(packed, out.size, block * itemsize, itemsize)
+        count = out.size // itemsize
+        used = function(packed.ctypes.data + _HEAD.size, out.ctypes.data, count, itemsize, block)
+        _check(used, packed.size - _HEAD.size)
+
+    return decode
+
+
+def _check_blocks(packed: Bytes, size: int, block: int, itemsize: int) -> None:
+    """Hold that all blocks of bitshuffle lie in the chunk: the library trusts what they say of themselves."""
+    group = 8 * itemsize  # bits are sorted among eight samples; what is left over is stored as it is
+    if block <= 0 or block % group:
+        raise ValueError("(blocks of a wrong size)")
+    whole, rest = divmod(size, block)
+    place, end, data, word = _HEAD.size, packed.size - size % group, packed.data, _WORD.unpack_from
+    try:
+        for _ in range(whole + (rest >= group)):
+            place += _WORD.size + word(data, place)[0]
+    except struct.error as error:
+        raise ValueError("(the chunk is too short)") from error
+    _check(place, end)
+
+
+def _blosc(_values: tuple[int, ...]) -> Codec:
+    library, whole = _plugin("blosc"), ctypes.c_int
+    validate = _function(library, "blosc_cbuffer_validate", whole, _POINTER, _SIZE, _POINTER)
+    function = _function(library, "blosc_decompress_ctx", whole, _POINTER, _POINTER, _SIZE, whole)
+
+    def decode(packed: Bytes, out: Bytes) -> None:
+        size = _SIZE()
+        if validate(packed.ctypes.data, packed.size, ctypes.byref(size)) < 0:
+            raise ValueError("(no chunk of Blosc)")
+        _check(size.value, out.size)
+        _check(function(packed.ctypes.data, out.ctypes.data, out.size, 1), out.size)
+
+    return decode
+
+
+_MAKERS: dict[int, Callable[[tuple[int, ...]], Codec]] = {
+    h5py.h5z.FILTER_SHUFFLE: _shuffle,
+    h5py.h5z.FILTER_DEFLATE: _deflate,
+    h5py.h5z.FILTER_LZF: _lzf,
+    32008: _bitshuffle,
+    32001: _blosc,
+}
+
+
+def _check(found: int, needed: int) -> None:
+    if found != needed:
+        raise ValueError(f"(a chunk gives {found} bytes where {needed} are needed)")
+
+
+def _plugin(name: str) -> str:
+    import hdf5plugin
+
+    return str(Path(hdf5plugin.PLUGIN_PATH) / f"libh5{name}.so")
+
+
+@functools.cache
+def _function(library: str, name: str, result: Any, *arguments: Any) -> Any:
+    """Return a function of a C library; calls of it leave the interpreter's lock."""
+    function = getattr(ctypes.CDLL(library), name)
+    function.restype, function.argtypes = result, arguments
+    return function

@@ -1,33 +1,115 @@
-"""The frames of a dataset, all or some of them, or a part of each: the fastest way to fetch them."""
+"""The frames of a dataset, all or some of them, or a part of each, by the fastest way to fetch them.
+
+Frames in one piece are mapped; chunks are decoded by threads; the rest is read by HDF5.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import logging
 import math
 import mmap
 import os
+import signal
+import sys
 import tempfile
 import weakref
+from contextlib import suppress
 from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.chunks import Chunks, chunk_index
-from mirrorskin.io.codecs import find_codecs
-from mirrorskin.io.mapped import PADDING, MappedFrames
+from mirrorskin.io.chunks import Chunks, chunk_index, find_codecs
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.selection import Place, Region, Span
-from mirrorskin.io.types import InputError
+from mirrorskin.io.types import Closing, InputError
 
 _log = logging.getLogger("mirrorskin.io")
 
 _LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is given
 _MAPPED = 4  # times as many of a mapped file are lent at once: they are in the system's cache
+_PADDING = 64  # bytes behind the last sample that must be there, too: kernels load their last word whole
 
 
-class Hdf5Frames:
+class MappedFrames:
+    """Frames in one piece, from some byte of an open file on; whole ones are lent where they lie.
+
+    OSError: the file is too short, or cannot be mapped. The descriptor may be closed afterwards. At most
+    ``span`` bytes are lent at once, and at most a quarter of the machine's memory: a kernel that comes by
+    them again and again must find them there.
+    """
+
+    length, how, scratch_bytes = 1, "mapped", 0
+
+    def __init__(
+        self,
+        file: int,
+        place: Place,
+        offset: int,
+        shape: tuple[int, int, int],
+        dtype: np.dtype[Any],
+        span: int,
+    ) -> None:
+        self._place, self._frame = place, math.prod(shape[1:]) * dtype.itemsize
+        self._end = offset + shape[0] * self._frame
+        size = os.fstat(file).st_size
+        self._check_length(size)
+        base = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
+        if sys.platform == "linux":
+            _survive_lost_pages()
+        length = min(size, self._end + _PADDING) - base
+        pages = mmap.mmap(file, length, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ, offset=base)
+        _maps[pages] = np.frombuffer(pages, np.uint8).ctypes.data, base
+        self._map: mmap.mmap | None = pages
+        self._offset = offset - base
+        self._frames = np.ndarray(shape, dtype, self._map, self._offset)
+        # Whole pages are mapped, to the end of the last.
+        reach = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
+        self._lendable = (reach - _PADDING - self._offset) // self._frame if self._frames.flags.aligned else 0
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        self._longest = max(1, min(span, memory // 4) // self._frame)
+        self._used = self._dropped = 0
+
+    def lend(self, start: int, stop: int) -> NDArray[Any] | None:
+        """Return whole frames where they lie, perhaps fewer; None if the first cannot be lent."""
+        stop = min(stop, start + self._longest, self._lendable)
+        if stop <= start:
+            return None
+        self._turn_to(start, stop)
+        return self._frames[start:stop]
+
+    def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
+        """Copy a part into ``out``."""
+        self._turn_to(*frames)
+        out[...] = self._frames[slice(*frames), *region.slices]
+
+    def close(self) -> None:
+        """Let go of the pages; those that were lent live on with the frames."""
+        self._frames = self._frames[:0].copy()  # a view would hold the mapping
+        self._map = None
+
+    def _turn_to(self, start: int, stop: int) -> None:
+        """See that frames are there, and let go of those before the block before."""
+        with self._place.reading(start, stop):
+            if self._map is None:
+                raise ValueError("(it is closed)")
+            self._check_length(self._map.size())
+            # Pages that were used count to the memory of this process.
+            behind = self._offset + min(self._used, start) * self._frame
+            behind -= behind % mmap.PAGESIZE
+            if behind > self._dropped:
+                self._map.madvise(mmap.MADV_DONTNEED, self._dropped, behind - self._dropped)
+            self._dropped, self._used = behind, start
+
+    def _check_length(self, size: int) -> None:
+        if size < self._end:
+            raise OSError("truncated: the file became shorter")
+
+
+class Hdf5Frames(Closing):
     """A dataset that HDF5 itself reads, in one thread; ``why`` says what keeps us from doing so."""
 
     def __init__(self, dataset: h5py.Dataset, place: Place, why: str) -> None:
@@ -44,32 +126,13 @@ class Hdf5Frames:
         with self._place.reading(*frames):
             self._dataset.read_direct(out, (slice(*frames), *region.slices))
 
-    def close(self) -> None:
-        """Do nothing: the file is the recording's to close."""
-
 
 class Stack:
-    """Frames of a dataset (T, H, W) whose claims were checked, numbered from 0, read in order.
+    """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and of each the ``region``.
 
     Nobody writes to frames that are returned where they lie, as long as someone refers to them. A chunk is
-    unpacked once: frames of chunks that hold more of them than are read at a time are kept, in memory or on
-    disk.
-
-    Parameters
-    ----------
-    dataset : h5py.Dataset
-    path : str
-        What messages call the file.
-    count : int
-        How many frames the dataset has; it may still grow.
-    numbers : ndarray, (n,), int
-        Those that are wanted, in order; others are not read.
-    region : Region
-        What is wanted of each.
-    memory_limit : int, optional
-        Bytes of unpacked frames to keep.
-    threads : int, optional
-        How many unpack chunks, by default one a core.
+    unpacked once: frames of chunks that hold more of them than are read at a time are kept, in memory of so
+    many bytes or on disk.
     """
 
     def __init__(
@@ -79,8 +142,8 @@ class Stack:
         count: int,
         numbers: NDArray[np.intp],
         region: Region,
-        memory_limit: int | None = None,
-        threads: int | None = None,
+        memory_limit: int | None,
+        threads: int | None,
     ) -> None:
         self.shape, self.dtype = (len(numbers), *region.shape), dataset.dtype.newbyteorder("=")
         self._place, self._limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
@@ -138,7 +201,7 @@ class Stack:
     def _unpack(self, start: int, stop: int) -> None:
         """Unpack all chunks of some frames into memory; if there is no room, those of all frames to disk."""
         frame, count = math.prod(self.shape[1:]) * self.dtype.itemsize, self._end - self._first
-        size = min(self._frames.length, count) * frame + PADDING
+        size = min(self._frames.length, count) * frame + _PADDING
         # While the next are unpacked, someone may still work on those before.
         alive = 1 if stop - start == count else 2
         fits = alive * size + self._frames.scratch_bytes <= self._limit
@@ -169,8 +232,8 @@ class Stack:
         what = f"{self._place.path}: {self._place.dataset} is unpacked to disk, {size / 1e9:.3g} GB"
         remedy = "name a folder with more room in TMPDIR, raise --memory, or repack it in chunks of one frame"
         with as_input_error(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
-            os.posix_fallocate(file.fileno(), 0, size + PADDING)
-            return mmap.mmap(file.fileno(), size + PADDING)
+            os.posix_fallocate(file.fileno(), 0, size + _PADDING)
+            return mmap.mmap(file.fileno(), size + _PADDING)
 
 
 def _open(
@@ -222,3 +285,50 @@ def _why_only_hdf5(dataset: h5py.Dataset) -> str:
     if dataset.id.get_type() != h5py.h5t.py_create(dataset.dtype.newbyteorder("=")):
         return "byte order" if not dataset.dtype.isnative else "bits"
     return ""
+
+
+# Whoever touches a page that its file has no longer gets SIGBUS, which ends the program: a kernel's thread
+# may do so between the check of a block and its end. Such pages are replaced by empty ones; that the file is
+# not as it was is told by the check of the next block, or by that of the source's fingerprint at the end.
+
+_maps: weakref.WeakKeyDictionary[mmap.mmap, tuple[int, int]] = weakref.WeakKeyDictionary()
+"""Pages of files: their address, and where they begin in the file."""
+
+_FIXED, _WITH_ADDRESS = 0x10, 4  # MAP_FIXED, SA_SIGINFO
+_FAULT = 16  # bytes from the begin of a siginfo_t to the address that was touched
+_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t)
+
+
+class _Action(ctypes.Structure):
+    """A struct sigaction of Linux's C libraries."""
+
+    _fields_ = (
+        ("handler", ctypes.c_void_p),
+        ("mask", ctypes.c_char * 128),
+        ("flags", ctypes.c_int),
+        ("restorer", ctypes.c_void_p),
+    )
+
+
+@functools.cache
+def _survive_lost_pages() -> Any:
+    """Replace lost pages when one is touched; any other SIGBUS is left to who had it before."""
+    libc, before = ctypes.CDLL(None), _Action()
+    libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    libc.mmap.restype = ctypes.c_void_p
+
+    def replace(number: int, info: int, _: int) -> None:
+        touched = ctypes.c_size_t.from_address(info + _FAULT).value
+        with suppress(OSError):  # a file that does not even tell its size
+            for pages, (address, base) in list(_maps.items()):
+                kept = max(0, -(-(pages.size() - base) // mmap.PAGESIZE)) * mmap.PAGESIZE
+                if address + kept <= touched < address + -(-len(pages) // mmap.PAGESIZE) * mmap.PAGESIZE:
+                    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _FIXED
+                    libc.mmap(address + kept, len(pages) - kept, mmap.PROT_READ, flags, -1, 0)
+                    return
+        libc.sigaction(number, ctypes.byref(before), None)
+
+    handler = _HANDLER(replace)
+    action = _Action(ctypes.cast(handler, ctypes.c_void_p).value, flags=_WITH_ADDRESS)
+    libc.sigaction(signal.SIGBUS, ctypes.byref(action), ctypes.byref(before))
+    return handler  # kept, since the system calls it

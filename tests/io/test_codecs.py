@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fetching import ONLY_HDF5, PACKINGS, compressible, write
 
-from mirrorskin.io import codecs
+from mirrorskin.io import chunks
 
 CHECKED = [name for name in PACKINGS if name not in ("raw", "shuffle")]
 
@@ -18,7 +18,7 @@ def packed_chunk(path, packing, dtype="u2", shape=(2, 31, 37)):
     frames = compressible(shape, dtype) // 5 * 5
     write(path, frames, shape, packing)
     with h5py.File(path) as file:
-        found = codecs.find_codecs(file["x"])
+        found = chunks.find_codecs(file["x"])
         mask, data = file["x"].id.read_direct_chunk((0, 0, 0))
     assert mask == 0
     return np.frombuffer(data, "u1").copy(), frames, found
@@ -31,7 +31,7 @@ def packed_chunk(path, packing, dtype="u2", shape=(2, 31, 37)):
 def test_bitshuffle_s_odd_ends_are_unpacked(tmp_path, cname, shape, dtype):
     data, frames, found = packed_chunk(tmp_path / "a.h5", hdf5plugin.Bitshuffle(cname=cname), dtype, shape)
     out = np.zeros(frames.nbytes, "u1")
-    codecs.decode(found, 0, data, out)
+    chunks.decode(found, 0, data, out)
     assert out.tobytes() == frames.tobytes()
 
 
@@ -43,7 +43,7 @@ def test_every_packer_of_blosc_is_known(tmp_path, cname, shuffle):
         tmp_path / "a.h5", hdf5plugin.Blosc(cname=cname, shuffle=shuffle), "f4"
     )
     out = np.zeros(frames.nbytes, "u1")
-    codecs.decode(found, 0, data, out)
+    chunks.decode(found, 0, data, out)
     assert out.tobytes() == frames.tobytes()
 
 
@@ -52,10 +52,10 @@ def test_a_chunk_of_another_size_is_refused(tmp_path, packing):
     data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
     for size in (frames.nbytes - 2, frames.nbytes + 2, frames.nbytes // 2, 2 * frames.nbytes):
         with pytest.raises(ValueError, match=r"^\("):
-            codecs.decode(found, 0, data, np.zeros(size, "u1"))
+            chunks.decode(found, 0, data, np.zeros(size, "u1"))
     for length in (0, 1, 3, 8, 12, 15, len(data) // 2, len(data) - 1):
         with pytest.raises(ValueError, match=r"^\("):
-            codecs.decode(found, 0, data[:length].copy(), np.zeros(frames.nbytes, "u1"))
+            chunks.decode(found, 0, data[:length].copy(), np.zeros(frames.nbytes, "u1"))
 
 
 @pytest.mark.parametrize("packing", CHECKED)
@@ -73,7 +73,7 @@ def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
             bad[keep:] = generator.integers(0, 256, len(bad) - keep)
         out = np.zeros(frames.nbytes + 64, "u1")
         try:
-            codecs.decode(found, 0, bad, out[:-64])
+            chunks.decode(found, 0, bad, out[:-64])
         except ValueError as error:
             assert str(error).startswith("(")  # noqa: PT017
             refused += 1
@@ -85,11 +85,11 @@ def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
 def test_what_is_not_known_is_named(tmp_path, packing):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         stack = file.create_dataset("x", (4, 5, 7), "u2", chunks=(1, 5, 7), **ONLY_HDF5[packing])
-        assert isinstance(codecs.find_codecs(stack), str)
+        assert isinstance(chunks.find_codecs(stack), str)
 
 
 def test_a_library_that_is_not_there_leaves_it_to_hdf5(tmp_path, monkeypatch):
-    monkeypatch.setattr(codecs, "_plugin", lambda name: str(tmp_path / name))
+    monkeypatch.setattr(chunks, "_plugin", lambda name: str(tmp_path / name))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         stack = file.create_dataset("x", (4, 5, 7), "u2", chunks=(1, 5, 7), **hdf5plugin.Bitshuffle())
-        assert codecs.find_codecs(stack) == "bitshuffle"
+        assert chunks.find_codecs(stack) == "bitshuffle"

@@ -92,9 +92,9 @@ def count_unpacked(monkeypatch):
     counts = Counter()
     decode, fetch = Chunks._decode, Hdf5Frames.fetch
 
-    def counted(self, position, out, room):
+    def counted(self, position, out, rooms):
         counts[position] += 1
-        decode(self, position, out, room)
+        decode(self, position, out, rooms)
 
     def asked(self, frames, region, out):
         spans, chunk = (frames, region.rows, region.columns), self._dataset.chunks or (1, *out.shape[1:])
