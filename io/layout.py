@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeGuard, cast
 
@@ -151,11 +152,11 @@ class Layout:
 
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
         """Read when each frame was taken, and where the body was; travel or phase may be given; check it."""
-        name, time = POSITIONS[motion], self._cut(self._series("time", (self._count,)))
+        name, time = POSITIONS[motion], self._cut(self._series("time"))
         if name not in _REMEDIES:
-            return {"time": time, name: self._cut(self._series(name, (self._count, *_width(name))))}
+            return {"time": time, name: self._cut(self._series(name))}
         where = f"{self._file.path}: {SERIES[name][0] if given is None else f'the {name} given'}"
-        given = self._series(name, (self._count,), _REMEDIES[name]) if given is None else given
+        given = self._series(name, remedy=_REMEDIES[name]) if given is None else given
         if given is None:
             remedy = _REMEDIES[name]
             raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
@@ -168,14 +169,13 @@ class Layout:
         """Read when some frames of the part were taken, and where a live run thought the body to be then."""
         name = POSITIONS[motion]
         known = [name, "tilt"] if motion == "axial" and self._is_of_each("tilt") else [name]
-        time = self._cut(self._series("time", (self._count,)))
+        time = self._cut(self._series("time"))
         found = {"time": None if time is None else time[chosen]}
         for one in known:
-            place, unit = LIVE[one]
-            values = self._cut(self._per_frame(place, (self._count, *_width(one)), unit))
+            values = self._cut(self._series(one, LIVE))
             if values is None:
                 raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
-            where = f"{self._file.path}: {place} of the frames that were used"
+            where = f"{self._file.path}: {LIVE[one][0]} of the frames that were used"
             found[one] = check_finite(values[chosen], len(chosen), where, width=_width(one))
         return found
 
@@ -206,18 +206,17 @@ class Layout:
     def _cut(self, values: Floats | None) -> Floats | None:
         return None if values is None else values[slice(*self._part.frames)]
 
-    def _series(self, name: str, shape: Shape, remedy: str = "") -> Floats | None:
-        place, unit = SERIES[name]
-        return self._per_frame(place, shape, unit, remedy)
-
-    def _per_frame(self, name: str, shape: Shape, unit: str, remedy: str = "") -> Floats | None:
+    def _series(
+        self, name: str, places: Mapping[str, tuple[str, str]] = SERIES, remedy: str = ""
+    ) -> Floats | None:
         """Read what there is one of a frame; while a recording is written, there may be more already."""
-        rows = shape[0] if self._find(STATE) is not None else None
-        return self._read(name, shape, unit=unit, remedy=remedy, rows=rows)
+        place, unit = places[name]
+        rows = self._count if self._find(STATE) is not None else None
+        return self._read(place, (self._count, *_width(name)), unit=unit, remedy=remedy, rows=rows)
 
     def _pixel_size(self) -> tuple[float, float] | None:
         x, y = (self._scalar(f"{DETECTOR}/{axis}_pixel_size", "mm", "give --pixel-size") for axis in "xy")
-        if x is None and y is None:
+        if x is y is None:
             return None
         if x is None or y is None:
             raise InputError(
@@ -251,7 +250,7 @@ class Layout:
 
     def _each(self, name: str) -> Floats | None:
         """Read a number of each frame of the part, if that is what there is."""
-        values = self._series(name, (self._count,)) if self._is_of_each(name) else None
+        values = self._series(name) if self._is_of_each(name) else None
         where = f"{self._file.path}: {SERIES[name][0]}"
         return None if values is None else check_finite(values, self._count, where, self._part.frames)
 

@@ -14,12 +14,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import new_hdf5
+from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
-from mirrorskin.io.writing import fixed_text
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)

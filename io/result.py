@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.arguments import checked
+from mirrorskin.io.atomic import Item, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
-from mirrorskin.io.writing import Item, process_items, write_file
 
 MARK = "mirrorskin_result"
 UNITS = (

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file, write_item
 from mirrorskin.io.calibration.source import check_camera
 from mirrorskin.io.calibration.types import (
     BITS,
@@ -28,7 +29,6 @@ from mirrorskin.io.calibration.types import (
 )
 from mirrorskin.io.hdf5 import Hdf5File, Node, read_process
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
-from mirrorskin.io.writing import Item, fixed_text, process_items, write_file, write_item
 
 MARK, VERSION = "mirrorskin_calibration", 1
 """The attribute of the group that holds a calibration, and the layout that is written and read here."""

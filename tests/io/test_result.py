@@ -10,7 +10,7 @@ import pytest
 from stacks import assert_same, plot_of, record, sphere
 
 from mirrorskin import io
-from mirrorskin.io import writing
+from mirrorskin.io import atomic
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 
@@ -145,7 +145,7 @@ def test_a_file_that_is_written_like_the_one_before_is_what_hdf5_would_write(tmp
     paths = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "c.h5"
     for seed, path in enumerate(paths[:2]):
         io.save_result(result(seed), path)
-    monkeypatch.setattr(writing, "_layouts", {})
+    monkeypatch.setattr(atomic, "_layouts", {})
     io.save_result(result(1), paths[2])
     first, like, anew = (path.read_bytes() for path in paths)
     assert like == anew != first

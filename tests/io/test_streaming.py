@@ -19,7 +19,7 @@ from growing import Feed, frames_of, stream
 from stacks import plot_of, read_all
 
 from mirrorskin import io
-from mirrorskin.io import growing, streaming
+from mirrorskin.io import streaming
 from mirrorskin.io.recorder import COMPRESSIONS
 from mirrorskin.io.types import MOTIONS
 
@@ -179,7 +179,7 @@ def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_pat
 
 
 def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch):
-    source, append = Feed(3), growing.GrowingRecording.append
+    source, append = Feed(3), streaming.GrowingRecording.append
 
     def waits(self, block):
         until_left.wait(30)
@@ -187,14 +187,14 @@ def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch)
 
     until_left = threading.Event()
     source.__class__ = type("Telling", (Feed,), {"__exit__": lambda self, *error: until_left.set()})
-    monkeypatch.setattr(growing.GrowingRecording, "append", waits)
+    monkeypatch.setattr(streaming.GrowingRecording, "append", waits)
     stream(source, tmp_path / "a.h5")
     assert until_left.is_set()
     assert len(held(tmp_path / "a.h5")["data"]) == 3
 
 
 def test_a_disk_that_is_too_slow_ends_it_and_nothing_waits(tmp_path, monkeypatch):
-    append, released = growing.GrowingRecording.append, threading.Event()
+    append, released = streaming.GrowingRecording.append, threading.Event()
 
     def slow(self, block):
         assert released.wait(30)
@@ -204,7 +204,7 @@ def test_a_disk_that_is_too_slow_ends_it_and_nothing_waits(tmp_path, monkeypatch
         def __exit__(self, *error):
             released.set()
 
-    monkeypatch.setattr(growing.GrowingRecording, "append", slow)
+    monkeypatch.setattr(streaming.GrowingRecording, "append", slow)
     monkeypatch.setattr(streaming, "_BACKLOG", 6 * 35)
     with pytest.raises(io.InputError, match=r"a\.h5: the disk is too slow: 0 MB of frames wait for it; take"):
         stream(Released(20, (2,)), tmp_path / "a.h5")

@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from mirrorskin.io import atomic, writing
+from mirrorskin.io import atomic
 from mirrorskin.kernels import array, device, memory
 
 _CLOSE = os.close
@@ -126,7 +126,7 @@ def failing(kind: str, number: int = -1) -> Iterator[Calls]:
     calls = Calls(make, number, lasting)
     device._open.cache_clear()  # devices are opened and kernels made anew
     memory.free()
-    writing._layouts.clear()
+    atomic._layouts.clear()
     with pytest.MonkeyPatch.context() as patch:
         watch(calls, patch)
         yield calls
