@@ -21,7 +21,7 @@ from mirrorskin.hw.camera_thread import ThreadedCamera
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
-from mirrorskin.io.frames import quiet_opencv
+from mirrorskin.io.pictures import quiet_opencv
 
 _log = logging.getLogger("mirrorskin.hw")
 

@@ -1,42 +1,39 @@
-"""A result becomes a file that other programs open; the suffix says which kind."""
+"""A result as a file that other programs open (``docs/formats.md``, exports); the suffix says which kind."""
 
 from __future__ import annotations
 
 import csv
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io import pictures
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.export_formats import (
-    Encoded,
-    encode_npz,
-    encode_ply,
-    encode_png,
-    encode_stl,
-    encode_tiff,
-    encode_xyz,
-    height_datum,
-    notes_of,
-)
-from mirrorskin.io.types import InputError, Result
+from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
+from mirrorskin.io.os_errors import legible
+from mirrorskin.io.result import unit_of
+from mirrorskin.io.types import Floats, InputError, Result
 
-_FORMATS: dict[str, Callable[[Result], Encoded]] = {
-    ".ply": encode_ply,
-    ".stl": encode_stl,
-    ".xyz": encode_xyz,
-    ".png": encode_png,
-    ".tif": encode_tiff,
-    ".tiff": encode_tiff,
-    ".npz": encode_npz,
-}
 _SECTION, _ARRAYS = ".csv", ".npz"
+_SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
+_FROM_PROCESS = {_SOURCE: "source", _DATE: "date", "turn": "turn"}
+_NORMAL = "nx", "ny", "nz"
+_POINT_UNITS = dict.fromkeys(("x", "y", "z", "sigma"), "mm")  # of a point's columns; the others have none
+_MOST = np.iinfo(np.uint16).max
+_FLAT = 1e-6  # mm a count, where all heights are one
+_PLY_TYPES = {"f4": "float", "u1": "uchar"}
+_STL_HEAD = 80  # bytes of free text, which must not begin with "solid": that would be STL as text
+_PNG_KEYWORDS = {_SOURCE: "Title", _DATE: "Creation Time", _SOFTWARE: "Software"}
+_CENTIMETRE = 10.0  # mm
+_METRE = 1e-3  # m a mm
+_NO_DATA = 42113  # the tag by which GDAL names the value of holes
 
 
 @checked
@@ -83,18 +80,22 @@ def export_result(
     check_export(result, path)
     suffix = path.suffix.lower()
     if suffix == _SECTION:
-        holds = _save_section(result, path, section)
+        if section is None:
+            raise InputError(
+                f"{path}: a table takes a cross-section, and none is given: export something else"
+            )
+        units = {name: "mm" for name in section if name != "filled"}
+        save_table(path, section, units, _notes_of(result))
+        holds = f"{len(section['height'])} points of a cross-section"
     else:
         try:
-            if points and suffix == ".ply":
-                parts, holds = encode_ply(result, points=True)
-            else:
-                parts, holds = _FORMATS[suffix](result)
+            with_points = {"points": True} if points and suffix == ".ply" else {}
+            parts, holds = _FORMATS[suffix](result, **with_points)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         write_new(path, parts)
     relative = suffix != _ARRAYS and result.offset_unknown is not None and result.offset_unknown.any()
-    return f"{holds}, heights {height_datum(result)}" if relative else holds
+    return f"{holds}, heights {_height_datum(result)}" if relative else holds
 
 
 def check_export(result: Result, path: str | Path) -> None:
@@ -113,14 +114,6 @@ def check_export(result: Result, path: str | Path) -> None:
     if result.x is None or result.y is None:
         again = "reconstruct it again with --pixel-size"
         raise InputError(f"{path} needs millimetres, and the result has no pixel size: {again}, {remedy}")
-
-
-def _save_section(result: Result, path: Path, section: Mapping[str, NDArray[Any]] | None) -> str:
-    if section is None:
-        raise InputError(f"{path}: a table takes a cross-section, and none is given: export something else")
-    units = {name: "mm" for name in section if name != "filled"}
-    save_table(path, section, units, notes_of(result))
-    return f"{len(section['height'])} points of a cross-section"
 
 
 def save_table(
@@ -167,3 +160,281 @@ def _cells(values: NDArray[Any]) -> Iterator[str]:
     """Yield numbers with as many digits as float32 has, and nothing for NaN."""
     for value in values.tolist():
         yield "" if math.isnan(value) else f"{value:.9g}"
+
+
+class _Encoded(NamedTuple):
+    """A file's parts, and what they hold, in a few words."""
+
+    parts: list[bytes]
+    holds: str
+
+
+def _encode_ply(result: Result, points: bool = False) -> _Encoded:
+    """Encode a surface of triangles, or points alone, as binary PLY."""
+    notes = {"unit": "mm"} | _notes_of(result)
+    if points:
+        columns = _points(result)
+        return _Encoded(_ply(columns, None, notes), f"{len(columns['x'])} points")
+    mesh = _surface(result)
+    columns = _points(result, mesh.pixels)
+    if result.normals is not None:
+        # Programs shade by them, and paint black what has none.
+        missing = np.isnan(columns[_NORMAL[0]])
+        for name, values in zip(_NORMAL, normals_around(mesh, missing).T, strict=True):
+            columns[name] = columns[name].copy()
+            columns[name][missing] = values
+        notes["normals"] = "of the result where it has them, elsewhere of the triangles around"
+    return _Encoded(_ply(columns, mesh.faces, notes), _size(mesh))
+
+
+def _encode_stl(result: Result) -> _Encoded:
+    """Encode a surface as binary STL, with its unit in the head: there is no other place for it."""
+    mesh, notes = _surface(result), _notes_of(result)
+    title = ", ".join(["unit mm", *(notes[name] for name in (_SOFTWARE, _DATE, _SOURCE) if name in notes)])
+    normals = face_vectors(mesh)
+    triangles = np.zeros(
+        len(normals), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    )
+    triangles["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    triangles["corners"] = mesh.vertices[mesh.faces]
+    head = title.encode("ascii", "backslashreplace")[:_STL_HEAD].ljust(_STL_HEAD, b" ")
+    count = np.uint32(len(triangles)).astype("<u4").tobytes()
+    return _Encoded([head, count, triangles.tobytes()], _size(mesh))
+
+
+def _encode_xyz(result: Result) -> _Encoded:
+    """Encode points as text, one a line, after comments, of which the last names the columns."""
+    columns = _points(result)
+    names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
+    head = [*(f"{name}: {note}" for name, note in _notes_of(result).items()), " ".join(names)]
+    formats = ["%d" if values.dtype.kind == "u" else "%.6f" for values in columns.values()]
+    file = BytesIO()
+    rows = np.stack([values.astype(np.float64) for values in columns.values()], axis=1)
+    np.savetxt(file, rows, formats, header="\n".join(head), encoding="utf-8")
+    return _Encoded([file.getvalue()], f"{len(rows)} points")
+
+
+def _encode_png(result: Result) -> _Encoded:
+    """Encode heights as a grey picture of 16 bits.
+
+    Its resolution is pixels a metre, and texts tell the scale of heights: for people, in numbers, and under
+    the keys that Gwyddion documents for pictures of 16 bits.
+    """
+    counts, notes = _counts(result), _notes_of(result)
+    width, height = counts.pixel_size
+    size = width * _METRE, height * _METRE
+    return _Encoded(pictures.encode_png(counts.values, size, _texts(counts, notes)), str(counts))
+
+
+def _encode_tiff(result: Result) -> _Encoded:
+    """Encode heights as a grey picture of 16 bits.
+
+    Its resolution is pixels a centimetre, GDAL's tag marks holes, and the scale of heights is in a
+    description that ImageJ reads, so that it shows millimetres.
+    """
+    import tifffile
+
+    counts, notes = _counts(result), _notes_of(result)
+    width, height = counts.pixel_size
+    file = BytesIO()
+    tifffile.imwrite(
+        file,
+        counts.values,
+        photometric="minisblack",
+        resolution=(_CENTIMETRE / width, _CENTIMETRE / height),
+        resolutionunit="CENTIMETER",
+        description=_description(counts, notes).encode(),
+        software=notes.get(_SOFTWARE, ""),
+        metadata=None,
+        extratags=[(_NO_DATA, "s", 0, "0", True)],
+    )
+    return _Encoded([file.getvalue()], str(counts))
+
+
+def _encode_npz(result: Result) -> _Encoded:
+    """Encode the maps, where the pixels are, and as JSON their units and how they came about.
+
+    Nothing in it needs ``allow_pickle``.
+    """
+    arrays: dict[str, Any] = {**result.maps(), **result.series()}
+    more = {"x": result.x, "y": result.y, "offset_unknown": result.offset_unknown}
+    arrays |= {name: values for name, values in more.items() if values is not None}
+    units = {name: unit for name in arrays if (unit := unit_of(name, result.process)) is not None}
+    arrays |= {"units": json.dumps(units), "process": json.dumps(dict(result.process))}
+    file = BytesIO()
+    np.savez(file, **arrays)
+    return _Encoded([file.getvalue()], ", ".join(result.maps()))
+
+
+def _notes_of(result: Result) -> dict[str, str]:
+    """Say in lines where heights come from, from where they count, and how many were not measured."""
+    process = result.process
+    maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
+    notes = {name: _line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
+    if maker:
+        notes[_SOFTWARE] = _line(maker)
+    notes["heights"] = _height_datum(result)
+    if result.height is not None and result.filled is not None and result.filled.any():
+        known = np.isfinite(result.height)
+        filled, of = np.count_nonzero(known & (result.filled > 0)), np.count_nonzero(known)
+        notes["filled"] = f"{filled} of {of} heights were not measured but filled"
+    return notes
+
+
+def _height_datum(result: Result) -> str:
+    """Say from where heights count: not from the rest sheet where their offset is unknown."""
+    unknown = result.offset_unknown
+    count, of = (0, 0) if unknown is None else (np.count_nonzero(unknown), unknown.size)
+    if not count:
+        return "from the sheet at rest"
+    return f"relative{'' if count == of else f' in {count} of {of} pieces'}: the mean of a piece is 0"
+
+
+def _line(value: object) -> str:
+    return legible(" ".join(str(value).split()))
+
+
+def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
+    assert result.height is not None
+    assert result.x is not None
+    assert result.y is not None
+    return result.height, result.x, result.y
+
+
+def _points(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
+    height, x, y = _grid(result)
+    chosen = np.flatnonzero(np.isfinite(height)) if pixels is None else pixels
+    row, column = np.unravel_index(chosen, height.shape)
+    columns: dict[str, NDArray[Any]] = {
+        "x": x[column].astype(np.float32),
+        "y": y[row].astype(np.float32),
+        "z": height[row, column],
+    }
+    if result.normals is not None:
+        columns |= dict(zip(_NORMAL, result.normals[row, column].T, strict=True))
+    if result.height_sigma is not None:
+        columns["sigma"] = result.height_sigma[row, column]
+    if result.filled is not None:
+        columns["filled"] = (result.filled[row, column] > 0).astype(np.uint8)
+    return columns
+
+
+def _surface(result: Result) -> Mesh:
+    mesh = surface_mesh(*_grid(result), component=result.component)
+    if not mesh.faces.size:
+        raise InputError("no three known heights are neighbours, so there is no surface: export points, .xyz")
+    return mesh
+
+
+def _size(mesh: Mesh) -> str:
+    size = " x ".join(f"{length:.4g}" for length in np.ptp(mesh.vertices, axis=0))
+    return f"{len(mesh.faces)} triangles between {len(mesh.vertices)} points, {size} mm"
+
+
+def _ply(
+    columns: Mapping[str, NDArray[Any]], faces: NDArray[np.int32] | None, notes: Mapping[str, str]
+) -> list[bytes]:
+    vertices = np.empty(
+        len(columns["x"]), [(name, f"<{values.dtype.str[1:]}") for name, values in columns.items()]
+    )
+    for name, values in columns.items():
+        vertices[name] = values
+    head = ["ply", "format binary_little_endian 1.0"]
+    head += [
+        f"comment {name}: {note.encode('ascii', 'backslashreplace').decode()}" for name, note in notes.items()
+    ]
+    head += [f"element vertex {len(vertices)}"]
+    head += [f"property {_PLY_TYPES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
+    body = [vertices.tobytes()]
+    if faces is not None:
+        head += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles = np.empty(len(faces), [("count", "u1"), ("vertices", "<i4", 3)])
+        triangles["count"], triangles["vertices"] = 3, faces
+        body.append(triangles.tobytes())
+    return ["\n".join([*head, "end_header\n"]).encode("ascii"), *body]
+
+
+class _Counts(NamedTuple):
+    """A map of heights in 16 bits: its height is ``offset + step * counts``."""
+
+    values: NDArray[np.uint16]  # 1 at the lowest height, 65535 at the highest, 0 where there is no answer
+    offset: float  # mm
+    step: float  # mm a count
+    pixel_size: tuple[float, float]  # mm
+    first: tuple[float, float]  # x and y of the top left pixel's centre, mm
+
+    def __str__(self) -> str:
+        return f"height in mm = {self.offset!r} + {self.step!r} x count; count 0: no answer"
+
+
+def _counts(result: Result) -> _Counts:
+    """Spread the known heights of a result over 16 bits."""
+    height, x, y = _grid(result)
+    known = np.isfinite(height)
+    heights = np.where(known, height, np.nan).astype(np.float64)
+    lowest, highest = float(np.nanmin(heights)), float(np.nanmax(heights))
+    step = (highest - lowest) / (_MOST - 1) or _FLAT
+    values = np.rint((np.where(known, heights, lowest) - lowest) / step) + 1
+    # Of a single row or column, a pixel is as long as it is wide.
+    sizes = [abs(float(axis[-1] - axis[0])) / (len(axis) - 1) for axis in (x, y) if len(axis) > 1]
+    if not sizes:
+        raise InputError("a result of one pixel does not tell how large that is: export it as .xyz or .npz")
+    counts = np.where(known, values, 0).astype(np.uint16)
+    return _Counts(counts, lowest - step, step, (sizes[0], sizes[-1]), (float(x[0]), float(y[0])))
+
+
+def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the scale of heights in words, and as Gwyddion reads it: in metres, with y down the picture."""
+    yield "Description", str(counts)
+    yield "height offset", f"{counts.offset!r} mm"
+    yield "height step", f"{counts.step!r} mm"
+    yield "pixel size", " ".join(f"{size!r}" for size in counts.pixel_size) + " mm"
+    for name, note in notes.items():
+        yield _PNG_KEYWORDS.get(name, name), note
+    rows, columns = counts.values.shape
+    (width, height), (x, y) = counts.pixel_size, counts.first
+    lengths = {
+        "XReal": columns * width,
+        "YReal": rows * height,
+        "XOffset": x - width / 2,
+        "YOffset": -y - height / 2,
+        "ZMin": counts.offset,
+        "ZMax": counts.offset + counts.step * _MOST,
+    }
+    for name, length in lengths.items():
+        yield f"Gwy::{name}", repr(length * _METRE)
+    for name in ("XYUnit", "ZUnit"):
+        yield f"Gwy::{name}", "m"  # as its source has them
+        yield f"Gwy::{name}s", "m"  # as its guide has them
+    yield "Gwy::Title", notes.get(_SOURCE, "height")
+
+
+def _description(counts: _Counts, notes: Mapping[str, str]) -> str:
+    (width, height), (x, y) = counts.pixel_size, counts.first
+    lines: dict[str, object] = {
+        "ImageJ": "1.54",
+        "unit": "cm",  # of the resolution
+        "xorigin": -x / width,
+        "yorigin": y / height,
+        "inverty": "true",
+        "cf": 0,  # heights are a straight line of counts: c0 + c1 x count
+        "c0": counts.offset,
+        "c1": counts.step,
+        "vunit": "mm",
+        "min": 1,
+        "max": int(counts.values.max()),
+        "scale": counts,
+    }
+    lines |= {name: note.replace("\\", r"\\") for name, note in notes.items()}  # which begins an escape
+    return "".join(f"{name}={note}\n" for name, note in lines.items())
+
+
+_FORMATS: dict[str, Callable[..., _Encoded]] = {
+    ".ply": _encode_ply,
+    ".stl": _encode_stl,
+    ".xyz": _encode_xyz,
+    ".png": _encode_png,
+    ".tif": _encode_tiff,
+    ".tiff": _encode_tiff,
+    ".npz": _encode_npz,
+}

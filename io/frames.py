@@ -1,18 +1,33 @@
-"""Other people's frames, whatever they come in, as sources that are read in order."""
+"""Other people's frames as sources that are read in order: folders of pictures, TIFF, videos."""
 
 from __future__ import annotations
 
+import os
+import re
 from abc import ABC, abstractmethod
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.pictures import (
+    PICTURE_SUFFIXES,
+    TIFF_SUFFIXES,
+    count_pages,
+    quiet_opencv,
+    read_pages,
+    read_picture,
+)
 from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_strokes
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
+
+# OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.
+_FFMPEG = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_FFMPEG_CAPTURE_OPTIONS": "fflags;discardcorrupt"}
 
 
 def open_frames(
@@ -46,9 +61,6 @@ def open_frames(
     >>> open_frames("pictures", Header("vertical"), travel=Steps(0.1)).shape  # doctest: +SKIP
     (240, 480, 640)
     """
-    from mirrorskin.io.pictures import PICTURE_SUFFIXES, Pictures
-    from mirrorskin.io.video import Video
-
     path = Path(path)
     for motion, name, positions, options in (
         ("vertical", "travel", travel, "--travel-step"),
@@ -60,11 +72,6 @@ def open_frames(
             raise InputError(f"{path}: frames of {header.motion} motion have no {name}: leave {options} out")
     pictures = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
     return (Pictures if pictures else Video)(path, header, travel, phase)
-
-
-if TYPE_CHECKING:
-    from mirrorskin.io.pictures import Pictures
-    from mirrorskin.io.video import Video
 
 
 class FrameSequence(Closing, ABC):
@@ -100,14 +107,13 @@ class FrameSequence(Closing, ABC):
         start = self._next
         if start == self.shape[0]:
             return None
-        stop = self._unbroken(start, min(start + len(out), self.shape[0]))
+        stop = min(start + len(out), self.shape[0])
+        stop = next((k for k in range(start + 1, stop) if self._lost[k]), stop)
         frames = out[: stop - start]
         self._fill(start, frames)
         self._next = stop
         series = {"time": self._time, "travel": self.travel, "phase": self._phase}
-        known: dict[str, Any] = {
-            name: values[start:stop] for name, values in series.items() if values is not None
-        }
+        known: dict[str, Any] = {name: one[start:stop] for name, one in series.items() if one is not None}
         return Block(frames, start, **known, dropped=self._lost[start])
 
     def rewind(self) -> None:
@@ -118,10 +124,6 @@ class FrameSequence(Closing, ABC):
     def _fill(self, start: int, out: NDArray[Any]) -> None:
         """Read the frames from number ``start`` on into the whole of ``out``."""
 
-    def _unbroken(self, start: int, stop: int) -> int:
-        """Stop before the first frame that others were lost before."""
-        return next((k for k in range(start + 1, stop) if self._lost[k]), stop)
-
     def _along(self, given: ArrayLike | Positions | None) -> ArrayLike | None:
         """Write out positions; of steps, a lost frame is one as well."""
         if isinstance(given, Steps):
@@ -130,15 +132,211 @@ class FrameSequence(Closing, ABC):
         return along(given, self.shape[0])
 
 
-@contextmanager
-def quiet_opencv() -> Iterator[Any]:
-    """Lend OpenCV with its own messages kept off the terminal: the caller raises its own."""
-    import cv2  # takes longer than everything else that mirrorskin.io imports
+class Pictures(FrameSequence):
+    """A stack of PNG or TIFF pictures, 8 or 16 bits or (TIFF) float32, as a source that can be rewound.
 
-    # OpenCV 5 moved it.
-    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
-    level = set_level(0)
+    In a folder, the frames are the pictures whose names are alike but for one number, the last that differs,
+    and they come in its order: ``image2.png`` before ``image10.png``. Numbers may start anywhere; one that is
+    missing is a frame that was lost, so the block after it says ``dropped``. A TIFF's pages are in order.
+    Colour becomes grey as in ``read_picture``.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        header: Header,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
+    ) -> None:
+        self._path = Path(path)
+        self._folder = _find_sequence(self._path) if self._path.is_dir() else None
+        count = len(self._folder.files) if self._folder else _count_frames(self._path)
+        self._first, first = next(self._pictures(0, 1))
+        super().__init__(
+            str(path),
+            header,
+            (count, *first.shape),
+            first.dtype,
+            travel=travel,
+            phase=phase,
+            lost=self._folder.lost if self._folder else None,
+            left_out=self._folder.left_out if self._folder else (),
+        )
+
+    def _fill(self, start: int, out: NDArray[Any]) -> None:
+        for frame, (label, picture) in zip(out, self._pictures(start, start + len(out)), strict=True):
+            if picture.shape != frame.shape or picture.dtype != frame.dtype:
+                raise InputError(
+                    f"{label} is {_kind(picture)}, but {self._first} is {_kind(frame)}: "
+                    "all frames must have the same size and depth"
+                )
+            frame[...] = picture
+
+    def _pictures(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
+        if self._folder is None:
+            return read_pages(self._path, start, stop)
+        return ((str(file), read_picture(file)) for file in self._folder.files[start:stop])
+
+
+class _Folder(NamedTuple):
+    files: list[Path]
+    lost: list[int]
+    left_out: tuple[str, ...]
+
+
+def _find_sequence(folder: Path) -> _Folder:
+    """Find the numbered pictures of a folder, in order, and how many are missing before each."""
     try:
-        yield cv2
+        files = sorted(file for file in folder.iterdir() if file.is_file())
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror}") from error
+    families = _families([f for f in files if f.suffix.lower() in PICTURE_SUFFIXES and f.name[0] != "."])
+    if not families:
+        raise InputError(
+            f"{folder} holds no numbered PNG or TIFF pictures: name them frame1.png, frame2.png, ..."
+        )
+    most = max(map(len, families.values()))
+    rivals = [family for family in families if len(families[family]) >= min(most, 2)]
+    if len(rivals) > 1:
+        patterns = ", ".join(f"{before}#{after}" for before, after in rivals[:3])
+        raise InputError(f"{folder} holds {len(rivals)} sequences, {patterns}: keep one in the folder")
+    frames = sorted(families[rivals[0]])
+    for (number, file), (following, twin) in pairwise(frames):
+        if number == following:
+            raise InputError(f"{file} and {twin.name} have the same number: remove one of them")
+    numbers = [number for number, _ in frames]
+    chosen = {file: None for _, file in frames}
+    lost = [0, *(after - before - 1 for before, after in pairwise(numbers))]
+    return _Folder(list(chosen), lost, tuple(file.name for file in files if file not in chosen))
+
+
+def _families(files: list[Path]) -> dict[tuple[str, str], list[tuple[int, Path]]]:
+    """Group files by what stands before and after the last number in which some of them differ."""
+    places = {
+        file: [
+            (file.stem[: match.start()], int(match.group()), file.stem[match.end() :])
+            for match in re.finditer("[0-9]+", file.stem)
+        ]
+        for file in files
+    }
+    alike = Counter((before, after) for found in places.values() for before, _, after in found)
+    families = defaultdict(list)
+    for file, found in places.items():
+        if found:
+            differing = [place for place in found if alike[place[0], place[2]] > 1]
+            before, number, after = (differing or found)[-1]
+            families[before, after].append((number, file))
+    return families
+
+
+def _count_frames(path: Path) -> int:
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder")
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        raise InputError(f"{path} is no stack of frames: name the folder that its pictures are in")
+    return count_pages(path)
+
+
+def _kind(picture: NDArray[Any]) -> str:
+    rows, columns = picture.shape
+    return f"{columns} x {rows} {picture.dtype}"
+
+
+class Video(FrameSequence):
+    """The frames of an AVI or MP4 as grey uint8, as a source that can be rewound.
+
+    The file is decoded once to count its frames, because what containers say is often wrong. Grey is the
+    luma of ITU-R BT.601 of what a player shows, in full range (0 to 255); a rotation that the file asks
+    for is applied, so ``shape`` is that of the upright picture. ``time`` is what the file says of each
+    frame, from the first; where that does not increase, the frame's number over the frame rate.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        header: Header,
+        travel: ArrayLike | Positions | None = None,
+        phase: ArrayLike | Positions | None = None,
+    ) -> None:
+        self._path = Path(path)
+        if not self._path.is_file():
+            raise InputError(f"{path}: there is no such file")
+        shape, time = self._survey()
+        super().__init__(str(path), header, shape, np.dtype(np.uint8), travel=travel, phase=phase, time=time)
+        self._capture = self._open()
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        super().rewind()
+        self._capture.release()
+        self._capture = self._open()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._capture.release()
+
+    def _fill(self, start: int, out: NDArray[Any]) -> None:
+        with quiet_opencv() as cv2:
+            for index, frame in enumerate(out, start):
+                decoded, picture = self._capture.read()
+                if not decoded:
+                    raise InputError(
+                        f"{self.name}: frame {index} cannot be decoded any more: was it changed?"
+                    )
+                if picture.shape[:2] != frame.shape:
+                    raise InputError(
+                        f"{self.name}: the size of the picture changes at frame {index}: cut it there"
+                    )
+                frame[...] = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+
+    def _open(self) -> Any:
+        with quiet_opencv() as cv2, _ffmpeg_settings():
+            capture = cv2.VideoCapture(str(self._path.absolute()), cv2.CAP_FFMPEG)
+            if not capture.isOpened():
+                raise InputError(f"{self._path} cannot be opened as a video: it is damaged, cut off, or none")
+            # FFmpeg's tags of the deeper pixel formats end in the number of bits.
+            bits = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) >> 24
+            if 8 < bits <= 16:
+                raise InputError(
+                    f"{self._path} has {bits} bits a sample, but only 8 would be read: "
+                    "save it as 16-bit pictures"
+                )
+            capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+            return capture
+
+    def _survey(self) -> tuple[tuple[int, int, int], Floats | None]:
+        """Decode all frames once: how many, how large, and when."""
+        capture = self._open()
+        stamps: list[float] = []
+        with quiet_opencv() as cv2:
+            declared, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+            decoded, first = capture.read()
+            while decoded:
+                stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+                decoded = capture.grab()
+        capture.release()
+        if not stamps:
+            raise InputError(f"{self._path} has no frames that can be decoded")
+        if len(stamps) < declared:
+            raise InputError(
+                f"{self._path} should have {declared:.0f} frames, but {len(stamps)} can be decoded: "
+                "it is damaged or cut off; copy it again, or encode anew what there is"
+            )
+        return (len(stamps), *first.shape[:2]), _times(np.asarray(stamps) / 1000, rate)
+
+
+def _times(stamps: Floats, rate: float) -> Floats | None:
+    if np.all(np.isfinite(stamps)) and np.all(np.diff(stamps) > 0):
+        return np.asarray(stamps - stamps[0])
+    return np.arange(len(stamps)) / rate if 0 < rate < np.inf else None
+
+
+@contextmanager
+def _ffmpeg_settings() -> Iterator[None]:
+    added = {name: value for name, value in _FFMPEG.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
     finally:
-        set_level(level)
+        for name in added:
+            del os.environ[name]

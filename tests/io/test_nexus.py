@@ -135,7 +135,7 @@ with silx.io.open(sys.argv[1]) as file:
 
 def test_a_recording_under_way_is_shown_as_far_as_it_has_come(tmp_path):
     path, frames = tmp_path / "rec.h5", random_stack("uint8", (T, H, W))
-    known = header("vertical"), frames.shape, frames.dtype, "raw"
+    known = header("vertical"), frames.shape, frames.dtype, "raw", None, ()
     with path.open("wb") as place, GrowingRecording(path, place.fileno(), *known) as recording:
         recording.append(io.Block(frames[:4], 0, time=TRAVEL[:4], travel=TRAVEL[:4]))
         recording.publish()

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 
 from mirrorskin.io import Header, InputError, Source, Steps, open_frames
-from mirrorskin.io.pictures import Pictures
+from mirrorskin.io.frames import Pictures
 
 HEADER = Header("vertical", pixel_size=(0.03, 0.03))
 SHAPE = (6, 9)

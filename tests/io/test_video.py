@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import Header, InputError, Source
-from mirrorskin.io.video import Video, _times
+from mirrorskin.io.frames import Video, _times
 
 HEADER = Header("axial", tilt=0.04)
 SHAPE = (48, 64)
@@ -177,7 +177,7 @@ def test_decoders_print_nothing_and_the_environment_stays(video):
     program = """
 import os, sys
 from mirrorskin.io import Header, InputError
-from mirrorskin.io.video import Video
+from mirrorskin.io.frames import Video
 for path in sys.argv[1:]:
     try:
         with Video(path, Header("axial")) as source:
