@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-browser|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-browser|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-browser docs lint types fuzz bench portability gpu-check gpu clean
+.PHONY: demo test test-all test-browser test-hardware docs lint types fuzz bench portability gpu-check gpu clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -34,6 +34,12 @@ test-all: $(READY)
 # Pages in a real browser, which the system brings: Debian's package chromium.
 test-browser: .venv/.browser
 	@$(BIN)/python -m pytest tests/browser
+
+# The rig before GRBL's own firmware, the program GRBL; docs/rig.md tells how it is built.
+test-hardware: $(READY)
+	@test -x "$(GRBL)" || { echo 'make test-hardware GRBL=PATH: PATH must be a program (docs/rig.md)' >&2; exit 1; }
+	GRBL="$(realpath $(GRBL))" $(BIN)/python -m pytest tests/hw/test_rig_faults.py tests/hw/test_grbl_emulated.py
+	PYTHONPATH=tests/support $(BIN)/python tests/support/rig_faults.py "$(realpath $(GRBL))"
 
 # The site, in site/; warnings are errors.
 docs: .venv/.docs

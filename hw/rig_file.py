@@ -48,6 +48,7 @@ class Axis(msgspec.Struct, frozen=True, kw_only=True):
     zero: float
     limits: tuple[float, float]
     speed: float
+    steps: Annotated[float, Meta(gt=0, description="a number above 0", examples=[250.0])] | None = None
 
     def __post_init__(self) -> None:
         low, high = self.limits
@@ -395,6 +396,7 @@ zero = -20.0                    # the machine's coordinate at which the travel i
 # unit = "mm"
 limits = [-10.0, 3.0]
 speed = 5.0                     # mm/s
+# steps = 250.0                 # a mm: what the controller's $102 must be, if that is to be checked
 
 [stage.pitch]                   # degrees, 0 upright; leave pitch and roll out if the stage only presses
 letter = "X"
@@ -403,6 +405,7 @@ zero = 0.0
 # unit = "deg"
 limits = [-5.0, 5.0]
 speed = 20.0                    # degrees/s
+# steps = 250.0
 
 [stage.roll]
 letter = "Y"
@@ -411,6 +414,7 @@ zero = 0.0
 # unit = "deg"
 limits = [-5.0, 5.0]
 speed = 20.0
+# steps = 250.0
 
 # [stage.x]                     # mm to the right in the picture, 0 where the body is lowered
 # letter = "A"
@@ -419,6 +423,7 @@ speed = 20.0
 # unit = "mm"
 # limits = [-2.0, 2.0]
 # speed = 1.0                   # mm/s
+# steps = 250.0
 
 # [stage.y]                     # mm up the picture
 # letter = "B"
@@ -427,6 +432,7 @@ speed = 20.0
 # unit = "mm"
 # limits = [-2.0, 2.0]
 # speed = 1.0
+# steps = 250.0
 
 # [stage.twist]                 # degrees about the body's axis, counter-clockwise in the picture
 # letter = "C"
@@ -435,6 +441,7 @@ speed = 20.0
 # unit = "deg"
 # limits = [-45.0, 45.0]
 # speed = 20.0                  # degrees/s
+# steps = 250.0
 
 [camera]
 source = 0                      # a camera's number, or a file or URL in quotes

@@ -52,12 +52,14 @@ _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
 _SPEED = 1200.0, 1200.0, 600.0, 300.0, 300.0, 2400.0
 _ACCELERATION = 800.0, 800.0, 400.0, 200.0, 200.0, 1600.0
 _LENGTH = 20.0, 20.0, 10.0, 5.0, 5.0, 100.0
-_MACHINE = (
+MACHINE = (
     _HOMING
     | dict(enumerate(_SPEED, 110))
     | dict(enumerate(_ACCELERATION, 120))
     | dict(enumerate(_LENGTH, 130))
 )
+"""The controller's ``$`` settings."""
+
 _FIRST = "# An emulated rig; it is there as long as the program that wrote this runs.\n"
 
 
@@ -84,6 +86,9 @@ class EmulatedRig:
         What the body turns about, from the rest sheet's centre, mm.
     home : bool
         Whether the machine has switches, and must find them before it moves.
+    machine : GrblMachine, optional
+        Another controller with the settings ``MACHINE``, where its axes begin at 0; the rig lacks
+        the axes that it lacks.
     **scene
         Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
 
@@ -108,6 +113,7 @@ class EmulatedRig:
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
         home: bool = False,
+        machine: GrblMachine | None = None,
         **scene: Any,
     ) -> None:
         self._levels = replace(camera or Camera(), frame_rate=rate, seed=seed)
@@ -115,10 +121,10 @@ class EmulatedRig:
         self._make = functools.partial(Twin, object=object, camera=self._levels, **of_twin)
         self._pivot, self._home = pivot, home
         self._seen = self._make(movement=_Anywhere(pivot))
-        self._axes = _axes(home)
+        self._axes = _axes(home, _AXES if machine is None else machine.axes)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
         start[self._axes["travel"].letter] += _LIFT
-        self.machine = GrblMachine({**_MACHINE, 20: home, 22: home}, axes=_AXES, start=start)
+        self.machine = machine or GrblMachine({**MACHINE, 20: home, 22: home}, axes=_AXES, start=start)
         self._make_camera = functools.partial(
             TwinCamera, self._seen, self.where, delay=delay, jitter=jitter, seed=seed, pivot=pivot
         )
@@ -220,7 +226,7 @@ class _Anywhere(Axial):
         return pose_at(Position(PRESS, *lean, x, y, turn * math.cos(4 * phase)), self.pivot)
 
 
-def _axes(home: bool) -> dict[str, Any]:
+def _axes(home: bool, letters: str) -> dict[str, Any]:
     """Describe the axes: one that has homed counts from its upper end, another from where it began."""
 
     def zero(middle: float) -> float:
@@ -235,7 +241,8 @@ def _axes(home: bool) -> dict[str, Any]:
     )
     twist = TwistAxis(letter="C", zero=zero(-50.0), limits=(-TURN, TURN), speed=40.0)
     travel = TravelAxis(letter="Z", direction=-1, zero=upper, limits=(-_HIGHEST, PRESS), speed=10.0)
-    return {"travel": travel, "pitch": pitch, "roll": roll, "x": x, "y": y, "twist": twist}
+    axes = {"travel": travel, "pitch": pitch, "roll": roll, "x": x, "y": y, "twist": twist}
+    return {name: axis for name, axis in axes.items() if axis.letter in letters}
 
 
 def _toml(table: Mapping[str, Any], name: str = "") -> Iterator[str]:

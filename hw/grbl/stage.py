@@ -37,6 +37,7 @@ _RESTS = 3  # reports of rest elsewhere, until that is where it stays
 _MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
 _HOMING = 60.0  # seconds, where the settings do not say how long it takes
 _SLOWING = 1.25  # times the longest ramp, that a hold may take
+_SAME_STEPS = 1e-4  # relative, as $100 to $105 are told
 _LETTERS = "XYZABC"
 _UNLOCK = "release it with 'mirrorskin rig unlock'"
 
@@ -298,6 +299,12 @@ class GrblStage(Closing):
                 controller.settings.get(number + _LETTERS.index(letter), 0.0) for number in (100, 110, 120)
             )
             rate /= 60
+            expected = getattr(self._settings, motion).steps
+            if steps > 0 and expected is not None and abs(steps / expected - 1) > _SAME_STEPS:
+                raise InputError(
+                    f"{self.name}: ${100 + _LETTERS.index(letter)} is {steps:g} steps where the rig file has "
+                    f"{expected:g}: it goes {steps / expected:.3g} times as far; correct one of them"
+                )
             if steps > 0:
                 self._rounding = max(self._rounding, 0.5 / steps)
                 if not controller.firmware.lower().startswith("grblhal"):

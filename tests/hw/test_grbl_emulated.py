@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from firmware import PROGRAM, Firmware
 from msgspec import structs
 from scripted_grbl import stage_settings
 from served_rig import allow_delays
@@ -24,20 +26,21 @@ def patience(monkeypatch):
     allow_delays(monkeypatch, 1.0)
 
 
-@pytest.fixture
-def stage():
-    """A stage on an emulated controller whose axes begin at 0."""
-    machine = GrblMachine(QUICK)
-    with GrblPort(machine) as port:
+@pytest.fixture(params=["emulator", "firmware"] if PROGRAM else ["emulator"])
+def stage(request, tmp_path):
+    """A stage on a controller whose axes begin at 0."""
+    emulated = request.param == "emulator"
+    machine = GrblMachine(QUICK) if emulated else Firmware(PROGRAM, tmp_path, QUICK)
+    with nullcontext() if emulated else machine, GrblPort(machine) as port:
         axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
-        with GrblStage(stage_settings(port=port.url, timeout=2.0, **axes)) as opened:
+        with GrblStage(stage_settings(port=port.url, timeout=2.0 if emulated else 10.0, **axes)) as opened:
             yield opened, machine, port
 
 
-def _rests(machine, seconds=3.0):
+def _until(moving, machine, seconds=3.0):
     end = time.monotonic() + seconds
-    while machine.moving():
-        assert time.monotonic() < end, "the stage moves on"
+    while machine.moving() != moving:
+        assert time.monotonic() < end, "the stage moves on" if machine.moving() else "it does not move"
         time.sleep(0.002)
 
 
@@ -92,11 +95,11 @@ def test_reports_tell_where_the_machine_was(stage):
 def test_whatever_fails_the_machine_is_stopped(stage, fault):
     opened, machine, port = stage
     opened.move(Position(-4.5), 0.5)
-    assert machine.moving()
+    _until(True, machine)
     {"silence": port.silence, "garble": lambda: port.garble(100_000)}[fault]()
     with pytest.raises(HardwareError):
         opened.wait()
-    _rests(machine)
+    _until(False, machine)
     assert machine.position()["Z"] < 4
 
 

@@ -6,6 +6,7 @@ import threading
 import time
 
 import pytest
+from msgspec import structs
 from scripted_grbl import ScriptedGrbl, stage_settings
 
 from mirrorskin.hw.errors import HardwareError
@@ -105,6 +106,15 @@ def test_what_is_beyond_the_limits_is_refused_before_anything_is_sent(opened):
     time.sleep(0.05)
     assert port.lines == sent
     assert stage.error is None
+
+
+def test_steps_other_than_the_rig_files_are_refused():
+    settings, port = stage_settings(), ScriptedGrbl(settings={102: 500.0})
+    same = stage_settings(travel=structs.replace(settings.travel, steps=500.0))
+    GrblStage(same, port).close()
+    other = stage_settings(travel=structs.replace(settings.travel, steps=250.0))
+    with pytest.raises(InputError, match=r"\$102 is 500 steps .* has 250: it goes 2 times as far"):
+        GrblStage(other, ScriptedGrbl(settings={102: 500.0}))
 
 
 def test_a_speed_below_the_firmwares_is_refused_before_anything_is_sent(opened):

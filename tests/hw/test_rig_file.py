@@ -48,6 +48,7 @@ zero = -20
 unit = "mm"
 limits = [-5, 3]
 speed = 4
+steps = 100.0
 
 [stage.pitch]
 letter = "A"
@@ -56,6 +57,7 @@ zero = 7.5
 unit = "deg"
 limits = [-6.0, 4.0]
 speed = 90
+steps = 200.0
 
 [stage.roll]
 letter = "C"
@@ -64,6 +66,7 @@ zero = 0.25
 unit = "deg"
 limits = [-5.0, 5.0]
 speed = 45
+steps = 300.0
 
 [stage.x]
 letter = "X"
@@ -72,6 +75,7 @@ zero = 0.5
 unit = "mm"
 limits = [-1.5, 2.5]
 speed = 0.75
+steps = 400.0
 
 [stage.y]
 letter = "Y"
@@ -80,6 +84,7 @@ zero = 0.0
 unit = "mm"
 limits = [-3.5, 3.5]
 speed = 1.25
+steps = 500.0
 
 [stage.twist]
 letter = "B"
@@ -88,6 +93,7 @@ zero = 180.0
 unit = "deg"
 limits = [-30.0, 60.0]
 speed = 12.5
+steps = 600.0
 
 [camera]
 source = "http://localhost:8000/video"
@@ -461,5 +467,6 @@ def test_the_template_loads_with_all_its_keys_and_says_their_defaults(rig, tmp_p
     tables |= {f"stage.{name}": said["stage"][name] for name in said["stage"] if f"stage.{name}" in TABLES}
     for table, model in TABLES.items():
         assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
-    sideways = {name: getattr(rig(whole).stage, name) for name in ("x", "y", "twist")}
-    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), **sideways)
+    axes = {name: structs.replace(axis, steps=250.0) for name, axis in plain.stage.axes.items()}
+    axes |= {name: getattr(rig(whole).stage, name) for name in ("x", "y", "twist")}
+    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), **axes)

@@ -1,0 +1,193 @@
+"""What goes wrong on a rig while it captures, and how that ends; run, it prints a table.
+
+``python tests/support/rig_faults.py [PROGRAM]`` has every fault on the emulated controller, and on GRBL's own
+firmware if its program is given.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from firmware import Firmware
+from msgspec import structs
+
+from mirrorskin import io
+from mirrorskin.hw.emulator.rig import MACHINE, EmulatedRig
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig.plans import VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.sweep import SweepScan
+
+LATE = 5.0
+"""Seconds after which everybody must have been told."""
+
+_PAUSE, _ATTEMPTS = 2.0, 5  # seconds
+_SHAPE, _STEPS = (24, 32), 250.0
+_SILENT = "silence", "killed", "paused for 2 s"
+
+
+def _says(words: bytes) -> Callable[[EmulatedRig], None]:
+    """Another program sends something to the controller."""
+    return lambda emulated: emulated.machine.receive(words)
+
+
+def _interrupt(emulated: EmulatedRig) -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+    threading.Event().wait(LATE)
+
+
+FAULTS: dict[str, tuple[Callable[[EmulatedRig], Any], str]] = {
+    "silence": (lambda emulated: emulated.port.silence(), "no longer answers"),
+    "garbage": (lambda emulated: emulated.port.garble(100_000), ""),
+    "killed": (lambda emulated: emulated.machine.cut_power(), "no longer answers"),
+    "paused for 2 s": (lambda emulated: emulated.machine.pause(_PAUSE), "no longer answers"),
+    "plug pulled": (lambda emulated: emulated.port.unplug(), ""),
+    "soft reset by another program": (_says(b"\x18"), ""),
+    "hold by another program": (_says(b"!"), "hold"),
+    "door by another program": (_says(b"\x84"), "door"),
+    "G92 by another program": (_says(b"G92Z1\n"), "offset"),
+    "G10 by another program": (_says(b"G10L2P1Z1\n"), "offset"),
+    "move by another program": (_says(b"G91\nG1Z-1F60\nG90\n"), ""),
+    "camera stalls": (lambda emulated: emulated.camera.stall(), "gave no frame"),
+    "camera lost": (lambda emulated: emulated.camera.lose(), "was lost"),
+    "Ctrl-C": (_interrupt, "stopped by the user"),
+    "none": (lambda emulated: None, ""),
+}
+"""What happens to a rig in the middle of a press, and words of what is said of it."""
+
+
+FIRMWARE_ONLY = {
+    "paused for 2 s",
+    "door by another program",
+    "G92 by another program",
+    "G10 by another program",
+}
+"""What the emulator does not know."""
+
+SETTINGS: dict[str, tuple[dict[int, float], str]] = {
+    "reports in inches ($13=1)": ({13: 1}, "set $13=0"),
+    "work position in reports ($10=0)": ({10: 0}, ""),
+    "axis slower than asked ($112)": ({112: 30}, "at most 0.5 mm/s"),
+    "steps per mm changed ($102)": ({102: 500}, "$102 is 500 steps where the rig file has 250"),
+    "axis shorter than asked ($132, $20)": ({22: 1, 20: 1, 132: 4}, "soft limits"),
+}
+"""What is set in the controller before a rig is opened, and words of what is said; "" if it works."""
+
+
+@dataclass
+class Ending:
+    """How a capture ended."""
+
+    error: BaseException | None
+    moved: float  # seconds that the stage went on
+    told: float  # seconds until the reader was told
+    count: int  # frames that can be read
+    state: str
+
+
+class TooBusyError(Exception):
+    """The rig failed by itself before its fault came."""
+
+
+@contextmanager
+def _rig(controller: str, folder: Path, changed: Mapping[int, float]) -> Iterator[EmulatedRig]:
+    """Run the twin on the "emulator", or on a firmware's program, with some settings changed."""
+    with ExitStack() as stack:
+        machine = None
+        if controller == "emulator":
+            assert not changed
+        else:
+            three = {number: value for number, value in MACHINE.items() if number < 110 or number % 10 < 3}
+            machine = stack.enter_context(Firmware(controller, folder, {**three, 20: 0, 22: 0, **changed}))
+        emulated = EmulatedRig(shape=_SHAPE, pixel_size=0.2, rate=50.0, delay=0.01, machine=machine)
+        stack.enter_context(emulated).camera.take(1, 30.0)
+        yield emulated
+
+
+def capture(
+    fault: str, controller: str, folder: Path, changed: Mapping[int, float] = MappingProxyType({})
+) -> Ending:
+    """Press slowly on the "emulator" or a firmware's program, and have a fault after some frames.
+
+    Emulators that are late, where other programs have the processors, are borne if the fault is another.
+    """
+    at, error, path = None, None, folder / "cut.h5"
+    with _rig(controller, folder, changed) as emulated:
+        settings = emulated.settings
+        stage = structs.replace(settings.stage, travel=structs.replace(settings.stage.travel, steps=_STEPS))
+        if controller == "emulator":
+            stage = settings.stage
+        camera = structs.replace(settings.camera, delay=0.01, dark=16.0)
+        try:
+            with Rig(GrblStage(stage), emulated.camera, replace(settings, camera=camera, stage=stage)) as rig:
+                if not fault.startswith("camera"):
+                    rig._stall = LATE
+                if fault not in _SILENT:
+                    rig.stage._link._limit = lambda: LATE
+                scan = SweepScan(rig, VerticalPlan(0.0, 3.0, speed=0.6))
+                with io.StreamRecorder(scan, path) as recorder:
+                    room = np.empty((4, *scan.shape[1:]), scan.dtype)
+                    while recorder.read(room) is not None:
+                        if at is None and recorder.count > 8:
+                            at = time.monotonic()
+                            FAULTS[fault][0](emulated)
+        except (HardwareError, io.InputError, KeyboardInterrupt) as caught:
+            error = caught
+        told = time.monotonic()
+        if changed and at is None:
+            return Ending(error, 0.0, 0.0, 0, "")
+        if at is None:
+            raise TooBusyError(str(error))
+        time.sleep(0.3)
+        moved = [one - at for one in np.arange(at, time.monotonic(), 0.01) if emulated.machine.moving(one)]
+    with io.open_recording(path) as recording:
+        count, state = recording.shape[0], recording.state
+    return Ending(error, max(moved, default=0.0), told - at, count, state)
+
+
+def try_capture(fault: str, controller: str, changed: Mapping[int, float] = MappingProxyType({})) -> Ending:
+    """Capture, some times at most, until the fault comes."""
+    for _ in range(_ATTEMPTS):
+        with suppress(TooBusyError), tempfile.TemporaryDirectory() as folder:
+            return capture(fault, controller, Path(folder), changed)
+    raise TooBusyError(f"{fault}: {controller} is late in each of {_ATTEMPTS} attempts")
+
+
+def main() -> None:
+    """Print the table."""
+    programs = sys.argv[1:]
+    print("| fault | controller | it moved on for | told after | said | frames kept |")
+    print("|---|---|---|---|---|---|")
+    for fault in FAULTS:
+        for controller in ["emulator", *programs]:
+            if controller != "emulator" or fault not in FIRMWARE_ONLY:
+                _print(fault, controller, try_capture(fault, controller))
+    for fault, (changed, _) in SETTINGS.items():
+        for program in programs:
+            _print(fault, program, try_capture("none", program, changed))
+
+
+def _print(fault: str, controller: str, ending: Ending) -> None:
+    name = "emulator" if controller == "emulator" else "firmware"
+    said = "stopped by the user" if isinstance(ending.error, KeyboardInterrupt) else str(ending.error or "-")
+    said = re.sub(r"stage /dev/\S+: | \(device reports.*\?\)\)", "", said)
+    times = f"{ending.moved:.2f} s | {ending.told:.2f} s" if ending.count else "- | -"
+    print(f"| {fault} | {name} | {times} | {said} | {ending.count or '-'} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
