@@ -398,7 +398,10 @@ BAD = {
         "a camera 40.0 mm above the sheet is not",
     ),
     "a camera below": (["vertical", "--camera-distance=-1mm"], "distance -1.0 of the camera cannot be"),
-    "a travel beyond numbers": (["vertical", "--travel-step", "1e308mm"], "travel is inf at frame 2"),
+    "a travel beyond numbers": (
+        ["vertical", "--travel-step", "1e308mm"],
+        "travel is 1e+308 at frame 1: every frame needs a finite number, at most 1e+12",
+    ),
     "a displacement beyond numbers": (
         ["horizontal", "--displacement-step", "1e308mm,0mm"],
         "displacement is not finite at frame 2",
