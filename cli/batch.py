@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 # How the commands name results unasked.
 _RESULTS = ("-result.h5", "-correlation.h5", "-fused.h5")
+_SHARD = re.compile("([0-9]{1,6})/([0-9]{1,6})")
 _ROWS = 12  # of files that have ended
 # What other commands have as options, a batch has in its settings.
 _OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
@@ -63,17 +64,27 @@ def command(
     scheduler: Annotated[
         str | None, Option(metavar="ADDRESS", help="Use a Dask cluster: tcp://node1:8786.")
     ] = None,
+    shard: Annotated[
+        str | None,
+        Option(metavar="K/N", help="Do only the K-th of N parts: 1/4 on one machine, 2/4 on the next, ..."),
+    ] = None,
     memory: options.Memory = "256MB",
     as_json: options.Json = False,
 ) -> None:
     """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
+    _refuse_both(device, workers, scheduler)
+    part, parts = _shard(shard)
+    found = _find(recordings, output)
+
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.settings import read_settings
     from mirrorskin.engine.batch.jobs import make_jobs
 
-    _refuse_both(device, workers, scheduler)
     plan = read_settings(settings, bytes_of(memory, "--memory"))
-    jobs = make_jobs(_find(recordings, output), output)
+    # All are named before they are parted, so that every machine gives a recording's result the same name.
+    jobs = make_jobs(found, output)
+    if parts > 1:
+        jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]
     _prepare(output, jobs)
     outcomes: list[Outcome] = []
     start = time.perf_counter()
@@ -99,6 +110,16 @@ def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: s
         raise InputError(f"{' and '.join(names)} each tell who does the work: give one of them")
 
 
+def _shard(text: str | None) -> tuple[int, int]:
+    """Return which part of how many is to be done."""
+    from mirrorskin.io import InputError
+
+    part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(text or "1/1")) else (0, 0)
+    if not 1 <= part <= parts:
+        raise InputError(f"--shard {text}: a part and how many there are is needed; write e.g. 1/4")
+    return part, parts
+
+
 def _find(words: Sequence[str], folder: Path) -> list[Path]:
     """Find the recordings; results that lie among them are left out."""
     from mirrorskin.io import InputError
@@ -113,6 +134,8 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
         if not answers:
             raise InputError(f"{word}: no file answers to that: name recordings")
         found += answers
+    if not any(map(os.path.lexists, found)):
+        raise InputError(f"{found[0]}: no such file")
     recordings = [path for path in found if not _is_result(path, folder)]
     if not recordings:
         raise InputError(f"{words[0]}: nothing but results: name recordings")
@@ -166,17 +189,28 @@ def _run(
     scheduler: str | None,
     show: _Show,
 ) -> Generator[Outcome, None, None]:
-    """Do the jobs here, or on a cluster."""
+    """Do the jobs here, or on a cluster; devices and workers are asked for only if something is to do."""
+    from mirrorskin.engine.batch.work import find_settled
+
+    todo = []
+    for job in jobs:
+        settled = find_settled(job, plan)
+        if settled is None:
+            todo.append(job)
+        else:
+            yield settled
+    if not todo:
+        return
     if workers is not None or scheduler is not None:
         from mirrorskin.engine.batch.cluster import run_cluster
 
-        yield from run_cluster(jobs, plan, address=scheduler, workers=workers)
+        yield from run_cluster(todo, plan, address=scheduler, workers=workers)
         return
     from mirrorskin.engine.batch.local import default_devices, run_local
     from mirrorskin.kernels.device import open_device
 
     named = [open_device(name) for name in device or ()]
-    yield from run_local(jobs, plan, list(dict.fromkeys(named)) or default_devices(), show.under_way)
+    yield from run_local(todo, plan, list(dict.fromkeys(named)) or default_devices(), show.under_way)
 
 
 @contextmanager

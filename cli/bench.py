@@ -46,13 +46,13 @@ def measure(
     list_: Annotated[bool, Option("--list", help="Name the cases, and run none.")] = False,
 ) -> None:
     """Time the kernels and whole paths against the limits and against others; check their accuracy."""
+    if context.invoked_subcommand is not None:
+        _refuse_options(context)
+        return
     from mirrorskin.bench import run, suite
     from mirrorskin.cli.output import progress
     from mirrorskin.kernels.device import open_device
 
-    if context.invoked_subcommand is not None:
-        _refuse_options(context)
-        return
     names = suite.choose(case or suite.NAMES)
     if list_:
         click.echo(json.dumps(names, indent=2) if as_json else "\n".join(names))

@@ -13,6 +13,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import click
 
+_WRITTEN = {"--output", "--record"}  # options that name what a command writes; other paths are read
+
 
 class Option:
     """What is said of an option, in click's settings: ``Annotated[float, Option("--rate", help=...)]``."""
@@ -101,6 +103,23 @@ class _Argument(click.Argument):
         return self.make_metavar(ctx), f"{self._help}{'  [required]' if self.required else ''}"
 
 
+class _Missing(click.ClickException):
+    exit_code = 2
+
+
+class _ExistingPath(click.Path):
+    """What a command reads: one that is not there is told before anything heavy is imported."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            Path(value).stat()
+        except (FileNotFoundError, NotADirectoryError):
+            raise _Missing(f"{value}: no such file") from None
+        except OSError:  # the command says more of it
+            pass
+        return super().convert(value, param, ctx)
+
+
 class _Words(click.Choice[Any]):
     """The values of an enumeration."""
 
@@ -144,7 +163,7 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     kind = get_args(kind)[0] if many else kind
     settings = dict(said.settings)
     bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
-    settings["type"] = _type(kind, bounds)
+    settings["type"] = _type(kind, bounds, written=not _WRITTEN.isdisjoint(said.names))
     settings["required"] = parameter.default is parameter.empty
     if parameter.default is not parameter.empty and not many:
         default = parameter.default
@@ -160,11 +179,11 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     return click.Option([*names, parameter.name], multiple=many, **{"show_default": True, **settings})
 
 
-def _type(kind: Any, bounds: dict[str, Any]) -> Any:
+def _type(kind: Any, bounds: dict[str, Any], *, written: bool) -> Any:
     if bounds:
         return (click.IntRange if kind is int else click.FloatRange)(**bounds)
     if kind is Path:
-        return click.Path(path_type=Path)
+        return (click.Path if written else _ExistingPath)(path_type=Path)
     return _Words(kind) if issubclass(kind, StrEnum) else kind
 
 

@@ -68,6 +68,7 @@ app: LazyGroup = make_command(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+click.version_option(package_name="mirrorskin", message="%(prog)s %(version)s")(app)
 app.help = "Shape from active tactile sensors with a mirror-like skin."
 
 

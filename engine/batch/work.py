@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,6 +25,8 @@ from mirrorskin.kernels.errors import DeviceError
 
 State = Literal["done", "kept", "failed"]
 
+_KEPT = "there already"
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -39,6 +42,24 @@ class Outcome:
     bytes: int = 0  # of frames, unpacked, that were reconstructed
     device: str = ""  # its title
     motion: str = ""  # of the recording, if it could be opened
+
+
+def find_settled(job: Job, plan: Plan) -> Outcome | None:
+    """Return what became of a job with which there is nothing to do, for which no device is needed.
+
+    Its result is there already, or its recording is not.
+    """
+    if os.path.exists(job.source) and not os.path.exists(job.target):  # noqa: PTH110  # which never raise
+        return None
+    start = time.perf_counter()
+    try:
+        with io.open_recording(job.source, memory_limit=plan.memory_limit, **plan.opening) as source:
+            made, motion = _is_made(job, source, plan.digest(source.motion)), source.motion
+    except InputError as error:
+        return Outcome(job, "failed", str(error), time.perf_counter() - start)
+    except Exception:
+        return None  # who does the job says what is wrong
+    return Outcome(job, "kept", _KEPT, time.perf_counter() - start, motion=motion) if made else None
 
 
 def run_job(
@@ -71,7 +92,7 @@ def _done(
     """Make the result of an open recording, or find it made."""
     target, digest = outcome.job.target, plan.digest(source.motion)
     if _is_made(outcome.job, source, digest):
-        return replace(outcome, state="kept", message="there already")
+        return replace(outcome, state="kept", message=_KEPT)
     with as_input_error(f"{target.parent} cannot be made", "choose another folder for results"):
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)

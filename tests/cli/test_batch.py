@@ -17,7 +17,7 @@ from commands import run
 
 from mirrorskin import io
 from mirrorskin.cli.main import main
-from mirrorskin.engine.batch import cluster
+from mirrorskin.engine.batch import cluster, local
 from mirrorskin.engine.batch.jobs import make_jobs
 from mirrorskin.engine.batch.work import Outcome
 
@@ -71,6 +71,25 @@ def test_what_is_finished_is_kept_until_the_settings_change():
     assert io.open_result("out/a-result.h5").process["threshold"] == 0.3
 
 
+@pytest.mark.parametrize("place", [["--workers", "2"], ["--scheduler", "tcp://127.0.0.1:1"], []])
+def test_where_nothing_is_to_do_no_worker_and_no_device_is_asked_for(monkeypatch, place):
+    presses("a.h5")
+    run("batch", "a.h5", "-o", "out")
+    monkeypatch.setattr(cluster, "run_cluster", None)
+    monkeypatch.setattr(local, "default_devices", None)
+    ended = run("batch", "a.h5", "no.h5", "-o", "out", *place)
+    assert "0 done, 1 kept, 1 failed" in ended.out
+
+
+def test_the_shards_of_a_batch_are_the_whole_of_it_and_name_results_alike():
+    names = ["mon/x.h5", "tue/x.h5", "a.h5", "b.h5", "c.h5"]
+    presses(*names)
+    run("batch", *names, "-o", "whole")
+    counts = [run("batch", *names[::-1], "-o", "out", "--shard", f"{part}/2").out for part in (1, 2)]
+    assert ["3 done, 0 kept" in counts[0], "2 done, 0 kept" in counts[1]] == [True, True]
+    assert results("out") == results("whole")
+
+
 def test_patterns_are_understood_when_quoted():
     presses("a.h5", "b.h5", "deep/er/c.h5", "deep/d.nxs")
     Path("e.h5").mkdir()
@@ -109,12 +128,12 @@ def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding
         main()
     out.flush()
     lines = out.buffer.getvalue().decode(encoding).splitlines()
-    assert [line.split(" in ")[0] for line in lines[:3]] == [
+    assert [line.split(" in ")[0] for line in lines[1:4]] == [
         "done: a?b.h5",
         "done: a?.h5",
         "done: ?.h5" if encoding == "ascii" else "done: é.h5",
     ]
-    assert lines[3] == lines[4] == "failed: no?: no such file"
+    assert lines[0] == lines[4] == "failed: no?: no such file"
     assert "3 done, 0 kept, 1 failed" in lines[5]
 
 
@@ -131,7 +150,7 @@ def test_json_tells_of_every_file():
         "failed": 1,
         "bytes": 8 * 5 * 7,
     }
-    first, second = told["files"]
+    second, first = told["files"]
     assert (first["source"], first["result"], first["state"]) == ("a.h5", "out/a-result.h5", "done")
     assert (first["motion"], first["bytes"]) == ("vertical", 8 * 5 * 7)
     assert (second["state"], second["message"]) == ("failed", "b.h5: no such file")
@@ -180,10 +199,15 @@ def test_a_terminal_shows_a_table(monkeypatch):
         (["-o", "out"], "FILE..."),
         (["a.h5", "-o", "out", "--memory", "5"], "a unit is needed"),
         (["a.h5", "-o", "out", "--workers", "0"], "--workers"),
+        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and how many there are is needed"),
+        (["no.h5", "-o", "out"], "no.h5: no such file"),
         (["a.h5", "-o", "out", "--workers", "2", "--device", "0"], "--device and --workers"),
         (["a.h5", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], "--workers and --scheduler"),
-        (["a.h5", "-o", "out", "--settings", "no.toml"], "no.toml cannot be read: No such file"),
-        (["out-result.h5", "out-result.nxs", "out-result.h5.h5", "-o", "out"], "would be the result of two"),
+        (["a.h5", "-o", "out", "--settings", "no.toml"], "no.toml: no such file"),
+        (
+            ["a.h5", "out-result.h5", "out-result.nxs", "out-result.h5.h5", "-o", "out"],
+            "would be the result of two",
+        ),
     ],
 )
 def test_a_wrong_call_is_one_line_and_makes_nothing(folder, words, said):

@@ -142,7 +142,7 @@ def test_files_go_to_the_folder_that_is_named(cases, tmp_path, monkeypatch):
     assert (tempfile.tempdir, os.environ.get("TMPDIR")) == before
     code, _, said = mirrorskin("bench", "--case", "one", "--folder", tmp_path / "none")
     assert code == 2
-    assert "none is no folder" in said
+    assert "none: no such file" in said
 
 
 @pytest.fixture
@@ -176,7 +176,7 @@ def test_a_page_is_made_of_runs_without_a_device(runs, tmp_path, monkeypatch):
     ("words", "said"),
     [
         (["compare", "A.json"], "Missing argument 'B.json'"),
-        (["compare", "A.json", "none.json"], "none.json cannot be read"),
+        (["compare", "A.json", "none.json"], "none.json: no such file"),
         (["compare", "A.json", "text.md"], "text.md is no JSON"),
         (["compare", "A.json", "other.json"], "other.json: date is missing"),
         (["compare", "A.json", "C.json"], "no work in common"),

@@ -161,7 +161,7 @@ def test_what_is_given_is_used(folder, words, name, value):
         (["simulate", "sideways", "-o", "a.h5"], "sideways"),
         (["reconstruct"], "REC.h5"),
         (["nonsense"], "nonsense"),
-        (["reconstruct", "a.h5", "--travel-start", "1mm"], "--travel-step"),
+        (["reconstruct", ".", "--travel-start", "1mm"], "--travel-step"),
         (
             [
                 "import",

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 from commands import run
@@ -15,12 +16,12 @@ from mirrorskin.cli.main import main
 sys.argv = ["mirrorskin", *sys.argv[1:]]
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
     main()
-print(json.dumps([name for name in sys.modules if name.startswith("mirrorskin.")]))
+print(json.dumps(list(sys.modules)))
 """
 
 
 def loaded(*words):
-    """Return which of our modules a command needs."""
+    """Return which modules a command needs."""
     done = subprocess.run([sys.executable, "-c", LOADED, *words], capture_output=True, text=True, check=True)
     return set(json.loads(done.stdout))
 
@@ -56,13 +57,33 @@ def test_no_command_needs_anything_heavy_before_it_runs():
     assert not heavy
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--version"],
+        ["reconstruct", "no.h5"],
+        ["fuse", "no.h5", "no.h5"],
+        ["import", "no.avi", "--motion", "vertical", "-o", "a.h5"],
+        ["capture", "vertical", "--rig", "no.toml", "-o", "a.h5"],
+        ["measure", "no.h5"],
+    ],
+)
+def test_a_file_that_is_not_there_is_told_before_anything_heavy_is_imported(words):
+    assert not loaded(*words) & set(HEAVY)
+
+
+def test_the_version_is_that_of_the_package():
+    assert run("--version").out == f"mirrorskin {version('mirrorskin')}\n"
+
+
 @pytest.fixture(scope="module")
 def commands():
     return app.commands
 
 
 def test_help_needs_no_command():
-    assert loaded("--help") == {"mirrorskin.cli", "mirrorskin.cli.groups", "mirrorskin.cli.main"}
+    ours = {name for name in loaded("--help") if name.startswith("mirrorskin.")}
+    assert ours == {"mirrorskin.cli", "mirrorskin.cli.groups", "mirrorskin.cli.main"}
 
 
 def test_a_command_s_help_needs_no_other():

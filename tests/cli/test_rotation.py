@@ -236,6 +236,7 @@ def test_options_of_a_press_are_refused_for_a_rotation(option):
 def test_options_of_a_rotation_are_refused_for_a_press(option):
     record(sphere(), Path("press.h5"))
     Path("phases.txt").write_text("1deg")
+    Path("turn.h5").touch()
     told = refused("reconstruct", "press.h5", option, *ROTATION[option])
     assert told == f"press.h5 is of vertical motion, of which {option} says nothing: leave it out"
 

@@ -89,6 +89,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     ],
 )
 def test_what_cannot_be_learned_from_is_refused_in_a_line(words, complaint):
+    Path("rig.toml").touch()
     ended = run("calibrate", "elastic", *words, "--ball", "4mm", "-o", "cal.h5")
     assert ended.code == 2
     assert complaint in ended.said

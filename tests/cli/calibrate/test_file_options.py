@@ -154,6 +154,7 @@ def test_a_wrong_calibration_is_refused_by_reconstruct(known, change, said):
 def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(monkeypatch, command, known, change, said):
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, name="left"))
     monkeypatch.setattr(rig, "open_rig", None)
+    Path("rig.toml").touch()
     save(**known)
     if change is not None:
         change(Path("cal.h5"))

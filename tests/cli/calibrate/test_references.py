@@ -1,5 +1,7 @@
 """``mirrorskin calibrate references`` from recordings to the calibration file."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -95,6 +97,7 @@ def test_a_camera_whose_dark_level_is_cut_off_is_told(scene, tmp_path):
 )
 def test_a_call_that_cannot_be_is_one_line(scene, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(scene)
+    Path("rig.toml").touch()
     ended = run("calibrate", "references", "-o", tmp_path / "cal.h5", *words)
     assert ended.code == 2
     assert said in ended.said
@@ -112,6 +115,8 @@ def test_a_rig_is_asked_for_the_dark_and_for_the_ball_at_each_place(scene, tmp_p
 
     monkeypatch.setattr(inputs, "take", take)
     monkeypatch.setattr(inputs, "still_plan", lambda rig, travel=None: travel)
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").touch()
     words = ("--rig", "rig.toml", "--rolled", "--press", "1.5mm", "--places", "3", "--frames", "7")
     ended = run("calibrate", "references", "-o", tmp_path / "cal.h5", *words)
     assert ended.code == 0, ended.said

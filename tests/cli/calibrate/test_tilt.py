@@ -129,6 +129,7 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
     if "bare.h5" in words:
         bare = io.Header("axial", pixel_size=(0.1, 0.1), camera="left")
         record(MadeUp(np.zeros((8, 5, 5), np.uint8), bare, phase=EIGHTHS), "bare.h5")
+    Path("rig.toml").touch()
 
     ended = tilt(*words)
 
@@ -146,6 +147,7 @@ def test_a_rig_is_asked_for_balls_at_several_places(monkeypatch):
         return [calibration.with_name("ball.h5")]
 
     monkeypatch.setattr(inputs, "take", take)
+    Path("rig.toml").touch()
     words = ("--rig", "rig.toml", "--press", "0.45mm", "--tilt", "2deg", "--places", "3", "--flat", "flat.h5")
     ended = tilt(*words)
 

@@ -1,6 +1,7 @@
 """``mirrorskin calibrate zenith``: what reaches the fit, what is written and told, what is refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,6 +100,7 @@ def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
     ],
 )
 def test_a_call_that_cannot_be_is_refused(folder, fitted, words, said):
+    Path("rig.toml").touch()
     ended = calibrate(*words)
     assert ended.code == 2
     assert said in ended.said
