@@ -74,9 +74,8 @@ def _drain(recorder: StreamRecorder) -> None:
 
 
 def _summary(scan: Scan) -> str:
-    counts = scan.rig.camera.counts
     _, rows, columns = scan.shape
     return (
-        f"{scan.count} frames of {columns} x {rows} at {counts.rate:.4g} Hz, {scan.dropped} dropped,"
-        f" {counts.late} late{scan.remark}"
+        f"{scan.count} frames of {columns} x {rows} at {scan.rate:.4g} Hz, {scan.dropped} dropped,"
+        f" {scan.rig.camera.counts.late} late{scan.remark}"
     )

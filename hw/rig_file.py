@@ -185,6 +185,9 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     report_rate: Annotated[
         float, Meta(ge=1, le=100, description="a rate from 1 to 100 Hz", examples=[20.0])
     ] = 20.0
+    silence: Annotated[float, Meta(ge=0.02, le=5, description="a time from 0.02 to 5 s", examples=[0.07])] = (
+        0.07
+    )
     press: Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
     pivot: Annotated[
         tuple[float, float, float] | None,
@@ -267,6 +270,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
         Annotated[float, Meta(ge=0, le=10)] | None,
         Meta(description="a time from 0 to 10 s", examples=[0.03]),
     ] = None
+    stall: Annotated[float, Meta(ge=0.02, le=5, description="a time from 0.02 to 5 s", examples=[0.1])] = 0.1
     pixel_size: Annotated[
         _Side | tuple[_Side, _Side] | None,
         Meta(description="a length above 0, in mm, or a list of a width and a height", examples=[0.03]),
@@ -386,6 +390,7 @@ port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://ho
 home = true                     # the stage has switches, and must home before it moves
 # timeout = 2.0                 # s that an answer may take
 # report_rate = 20.0            # Hz: how often its position is asked for at rest
+# silence = 0.07                # s without an answer, in motion, after which it is stopped
 press = 2.0                     # mm: greatest travel, whatever the axis could do
 # pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: what the body turns about
 
@@ -452,6 +457,7 @@ size = [640, 480]               # columns, rows
 # exposure = 0.004              # s
 # gain = 1.0
 # rate = 60.0                   # Hz
+# stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
 # delay = 0.03                  # s from the middle of the exposure to the frame's arrival, if it is known
 pixel_size = 0.03               # mm at the sheet
 # dark = 12                     # counts without light, or a picture's file

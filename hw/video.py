@@ -32,6 +32,8 @@ READ_TIMEOUT = 2.0  # seconds without a picture after which a stream or camera c
 _ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
 _RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if asked to
 _GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # what FFmpeg calls the grey ones
+_JPEG, _JPEG_END = "MJPG", b"\xff\xd9"
+_FROZEN, _CHANGES = 5, 16  # pictures in a row without a changed pixel, after so many that had some
 _MANUAL = 1.0  # V4L2's "manual exposure"
 _EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
 _STALEST = 0.5  # seconds: a camera's own time that is older is not a time of this clock
@@ -54,7 +56,8 @@ class VideoCamera(ThreadedCamera):
     these are on the clock of ``time.monotonic``, else that of the arrival here.
 
     A file plays once at its own rate, and ends with an error that says so. Of a stream, the pictures that
-    waited while it was opened are left out.
+    waited while it was opened are left out. A picture of another size counts as a loss, and so do five in a
+    row without a changed pixel if no two were alike before.
 
     A camera or stream that is lost is opened again, for at most 10 s; it is logged that it is lost, and
     that it is back. Numbers then go on after as many as the time away had room for. ``error`` stays None
@@ -84,6 +87,7 @@ class VideoCamera(ThreadedCamera):
         super().__init__(self._source.name, settings.shape, settings.dtype, settings.rate, slots)
         self._lost: float | None = None  # since when
         self._pause = _PAUSES[0]
+        self._repeats = _Repeats()
         self._refusal: InputError | None = None
         self._ready, self._stop = threading.Event(), threading.Event()
         # OpenCV may hang in a driver: the program's end must not wait for that.
@@ -155,7 +159,10 @@ class VideoCamera(ThreadedCamera):
                 time = capture.grab()
                 if time is None:
                     break
-                capture.retrieve(self._slot())
+                slot = self._slot()
+                capture.retrieve(slot)
+                if self._repeats.frozen(slot):
+                    return f"{self.name} gives the same picture again and again"
                 if pace is not None:
                     self._stop.wait(pace.due(capture.position) - clock.monotonic())
                     time = clock.monotonic()
@@ -193,6 +200,27 @@ class VideoCamera(ThreadedCamera):
         return missing
 
 
+class _Repeats:
+    """Tells a stream that stands still from a scene that does: noise makes all pictures differ."""
+
+    def __init__(self) -> None:
+        self._last: NDArray[Any] | None = None
+        self._changes = self._alike = (
+            0  # pictures that differ from the one before; those in a row that do not
+        )
+        self._noisy = True  # no two were alike, but for those of this row
+
+    def frozen(self, picture: NDArray[Any]) -> bool:
+        """Take the next picture, whose memory stays as it is until the one after it was taken."""
+        if self._last is not None and all(map(np.array_equal, picture, self._last)):  # row by row
+            self._alike += 1
+        else:
+            self._noisy &= self._alike == 0
+            self._changes, self._alike = self._changes + 1, 0
+        self._last = picture
+        return self._noisy and self._changes > _CHANGES and self._alike >= _FROZEN
+
+
 class _Pace:
     """When the pictures of a file that begins to play now are due."""
 
@@ -221,7 +249,8 @@ class Capture:
         self._trusts = source.kind == "device"
         self._last = -math.inf
         try:
-            self._raw = _configure(self._video, source, settings)
+            self._jpeg = source.kind != "device" and _as_jpeg(self._video)
+            self._raw = _configure(self._video, source, settings) and not self._jpeg
             declared = float(self._video.get(cv2.CAP_PROP_FPS))
             self._declared = declared if math.isfinite(declared) and declared > 0 else _USUAL_RATE
             if source.kind == "stream":
@@ -247,9 +276,11 @@ class Capture:
         """Write the picture that was grabbed to a frame, (H, W)."""
         try:
             done, picture = self._video.retrieve(out if self._raw else self._picture)
+            if self._jpeg:
+                picture = _decode(picture) if done else None
         except cv2.error as error:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from error
-        if not done:
+        if not done or picture is None:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: see camera.fourcc")
         if picture is not out:
             self._picture = picture
@@ -313,11 +344,26 @@ def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> boo
         asked = [name for name in ("fourcc", "exposure", "gain") if getattr(settings, name) is not None]
         if asked:
             _log.warning("%s: %s can only be set where it is sent from", source.name, " and ".join(asked))
+        if source.kind == "stream" and settings.delay is not None:
+            what = "delay is that of another connection: leave it out, and each sweep measures its own"
+            _log.warning("%s: %s", source.name, what)
         raw = _is_grey(video, source)
     _check_size(video, source, settings)
     if raw:
         video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     return raw
+
+
+def _as_jpeg(video: Any) -> bool:
+    """Have the pictures of a stream of JPEGs as they were sent: OpenCV would scale those of another size."""
+    return _letters(video.get(cv2.CAP_PROP_FOURCC)) == _JPEG and video.set(cv2.CAP_PROP_FORMAT, -1)
+
+
+def _decode(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """Return the luma of a JPEG, (H, W), uint8; None of one that is cut short."""
+    if _JPEG_END not in data[..., -64:].tobytes():  # some cameras pad
+        return None
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
 
 
 def _set_up(video: Any, source: VideoSource, settings: CameraSettings) -> None:

@@ -289,6 +289,7 @@ def _open_file(path: Path, real: str) -> h5py.File:
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
 _HEAD = 16  # bytes at the begin of a heap, and of each of its objects
 _BULK = 1 << 16  # bytes of a dataset that is not looked through
+_SMALL = 1 << 20  # bytes of a file that are looked through in less time than its datasets are found
 
 
 def _check_heaps(file: h5py.File) -> None:
@@ -298,7 +299,8 @@ def _check_heaps(file: h5py.File) -> None:
     """
     with Path(file.filename).open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
         start = 0
-        for stop, after in (*sorted(_bulk(file)), (len(data), len(data))):
+        bulk = sorted(_bulk(file)) if len(data) > _SMALL else ()
+        for stop, after in (*bulk, (len(data), len(data))):
             for heap in _HEAP.finditer(data, start, stop):
                 _check_heap(data, heap.start())
             start = after

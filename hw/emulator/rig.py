@@ -43,6 +43,7 @@ TILT = 9.0
 SHIFT, TURN = 2.0, 45.0
 """Greatest displacement along x and y, mm, and greatest twist, degrees, either way."""
 
+_SILENCE, _STALL = 0.07, 0.1  # seconds that the emulators may be silent in motion
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
 # GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are
@@ -163,7 +164,12 @@ class EmulatedRig:
     def settings(self) -> RigSettings:
         """What a rig file would say."""
         stage = StageSettings(
-            port=self.port.url, home=self._home, press=PRESS, pivot=self._pivot, **self._axes
+            port=self.port.url,
+            home=self._home,
+            silence=_SILENCE,
+            press=PRESS,
+            pivot=self._pivot,
+            **self._axes,
         )
         return RigSettings(Path("emulated"), "emulated rig", stage, self._camera_settings())
 
@@ -204,6 +210,7 @@ class EmulatedRig:
             size=(columns, rows),
             dtype=cast(Literal["uint8", "uint16", "float32"], self._seen.dtype.name),
             rate=self._seen.frame_rate,
+            stall=_STALL,
             pixel_size=header.pixel_size,
             bright=self._levels.bright,
             zenith_gain=None if gain is None else gain * math.radians(1.0),

@@ -30,6 +30,7 @@ from mirrorskin.hw.grbl.replies import (
     salvage,
 )
 from mirrorskin.hw.grbl.report_times import SLICE, Answer, ReportTimes
+from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.io import InputError
 
 _WRITE = 0.25  # seconds after which a line that takes nothing more is broken
@@ -119,7 +120,7 @@ class Stopping:
 ASK, HOLD, RESET = b"?", b"!", b"\x18"
 
 _TICK = 0.01  # seconds between two looks at the clock
-_SILENCE, _TRIPS = 0.07, 4  # seconds, and usual round trips at least, that a question may be open in motion
+_TRIPS = 4  # usual round trips at least, that a question may be open in motion
 _OPENING_PERIOD = 0.05  # seconds between questions at most, until `begin`
 _MOVING_PERIOD = 0.025  # the same in motion and during a stop: how soon a silence shows
 _ANSWER_LOST = 0.5  # seconds at rest after which an answer that is out will not come
@@ -151,8 +152,7 @@ class Link:
         self,
         port: serial.Serial,
         name: str,
-        timeout: float,
-        period: float,
+        settings: StageSettings,
         on_report: Callable[[TimedStatus], None],
     ) -> None:
         self.error: HardwareError | None = None  # what went wrong, first of all
@@ -167,10 +167,11 @@ class Link:
         self.patience: float | None = None  # seconds that it may be silent while it homes
         self._port = port
         self._name = name
-        self._timeout = timeout
-        self._period = period
+        self._timeout = settings.timeout
+        self._silence = settings.silence
+        self._period = 1 / settings.report_rate
         self._on_report = on_report
-        self._times = ReportTimes(period)
+        self._times = ReportTimes(self._period)
         self._splitter = Splitter()
         self._replies: list[Reply] = []
         self._refused: Refusal | None = None
@@ -191,6 +192,12 @@ class Link:
         """Seconds from a question to its answer, of late; NaN before the first."""
         with self.lock:
             return self._times.usual
+
+    @property
+    def longest_trip(self) -> float:
+        """The longest of late; NaN before the first."""
+        with self.lock:
+            return self._times.longest
 
     # What others call
 
@@ -354,6 +361,8 @@ class Link:
     def _answered(self, refusal: Refusal | None) -> None:
         line = self.window.answer()
         if line is None:
+            if self._active and not self.stopping.begun:
+                self.halt("it answered a line that nobody here sent: let no other program speak to it")
             return
         self._last_line = time.monotonic()
         self.rests = 0
@@ -404,7 +413,7 @@ class Link:
     def _limit(self) -> float:
         if self.patience is not None:
             return self.patience
-        return max(_SILENCE, _TRIPS * self._times.usual) if self._moving() else self._timeout
+        return max(self._silence, _TRIPS * self._times.usual) if self._moving() else self._timeout
 
     def _moving(self) -> bool:
         if self.window.busy or self.seen is None:

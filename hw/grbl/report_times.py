@@ -51,6 +51,11 @@ class ReportTimes:
         """Seconds of the usual round trip; NaN before the first."""
         return statistics.median(self._trips) if self._trips else math.nan
 
+    @property
+    def longest(self) -> float:
+        """Seconds of the longest of the latest round trips; NaN before the first."""
+        return max(self._trips, default=math.nan)
+
     def listened(self, began: float, now: float) -> None:
         """Note that somebody listened for `SLICE` seconds at most; an answer is noted afterwards."""
         if self._open:

@@ -102,7 +102,7 @@ class GrblStage(Closing):
         self._due = 0.0
         self._ramp = 0.0  # seconds that a move takes longer because it speeds up and slows down
         opened = open_port(settings.port, settings.baud, self.name) if port is None else port
-        self._link = Link(opened, self.name, settings.timeout, 1 / settings.report_rate, self._on_report)
+        self._link = Link(opened, self.name, settings, self._on_report)
         try:
             self._controller = self._open(unlock)
         except BaseException:
@@ -133,6 +133,11 @@ class GrblStage(Closing):
     def round_trip(self) -> float:
         """Seconds from a question for a report to its answer, of late; NaN before the first."""
         return self._link.round_trip
+
+    @property
+    def longest_trip(self) -> float:
+        """Seconds of the longest of these of late; NaN before the first."""
+        return self._link.longest_trip
 
     def home(self) -> None:
         """Find the axes' switches; returns when they are found."""
@@ -481,7 +486,8 @@ def _identity(link: Link, name: str, timeout: float) -> Controller:
     for said in link.ask("$$", timeout):
         if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):
             settings[said.number] = float(said.value)
-    firmware = link.banner.text.partition(" [")[0] if link.banner else f"Grbl {version}"
+    kind = "grblHAL" if {"FIRMWARE", "NEWOPT"} & answers.keys() else "Grbl"
+    firmware = link.banner.text.partition(" [")[0] if link.banner else f"{kind} {version}"
     return Controller(firmware, settings)
 
 

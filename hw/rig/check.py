@@ -29,6 +29,7 @@ _SOFT_LIMITS, _HOMING, _RATES, _LENGTHS = 20, 22, 110, 130  # numbers of GRBL's 
 _REPORT_SHARE = 0.8  # of the reports asked for
 _POLL = 0.02  # seconds between two looks for more
 _ROUND_TRIP_MAX = 0.05  # seconds that a report may take
+_SPARE = 3.0  # times the longest wait seen, that a limit should be; told if it is not twice that
 _ROUNDING = 1e-6  # how far numbers of the controller may be beyond ours by rounding
 
 _FRAME_TIMEOUT = 5.0  # seconds that a camera may take to its first frame
@@ -216,6 +217,15 @@ def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     if stage.round_trip > _ROUND_TRIP_MAX:
         remedy = "positions in motion are as uncertain as this is long; use a shorter or faster line"
     yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
+    yield _wait("stage", "longest round trip", stage.longest_trip, settings.silence, "stage.silence")
+
+
+def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Finding:
+    """Compare the longest wait for something with how long a move bears to wait for it."""
+    remedy = ""
+    if longest > 2 / _SPARE * limit:
+        remedy = f"good runs may be stopped; set {key} = {_SPARE * longest:.2g}, or run less beside it"
+    return _rated(part, what, f"{longest * 1e3:.1f} ms, of {limit * 1e3:.0f} ms that a move bears", remedy)
 
 
 def _listen(stage: GrblStage, settings: StageSettings) -> list[float]:
@@ -240,14 +250,18 @@ def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
     camera.take(1, _FRAME_TIMEOUT)
     camera.flush()
     before, dropped, end = camera.counts, 0, time.monotonic() + _PERIOD
+    times: list[float] = []
     while True:
         frames = camera.take(_BATCH, _FRAME_TIMEOUT)
         dropped += frames.dropped
+        times += frames.time.tolist()
         if time.monotonic() >= end:
             break
     after = camera.counts
     yield _rate(after, settings)
     yield _losses(dropped, after, before)
+    longest = float(np.max(np.diff(times), initial=0.0))
+    yield _wait("camera", "longest wait for a frame", longest, settings.stall, "camera.stall")
     yield _brightness(frames.pixels[-1].copy())
 
 

@@ -26,6 +26,7 @@ _FRAMES, _MOST_FRAMES = 60, 150  # one way, at least and at most
 _PRESSED = 0.5  # share of a press that comes before the move
 _LONGEST_DELAY = 0.6  # seconds that late frames are waited for
 _BLOCK = 8  # frames
+_WANDER = 0.5  # seconds whose frames are late alike
 _EVEN_RATIO = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
 _SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
 
@@ -90,7 +91,7 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     def place(times: Floats) -> Floats:
         return np.where(times < turned, down.at(times), way.length - up.at(times))
 
-    clock, clock_error = log.clock()
+    clock, clock_error = frame_times(*log.arrivals())
     delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
     rig.go(plan.first)
     report_errors = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
@@ -138,17 +139,9 @@ class _FrameLog:
         self._numbers: list[NDArray[np.int64]] = []
         self.pictures: list[Floats] = []
 
-    def clock(self) -> tuple[Floats, float]:
-        """Return when the frames arrived, (n,), seconds, and the standard error of all of them together.
-
-        If the camera keeps time, that is taken from a straight line through all of them.
-        """
-        number, time = np.concatenate(self._numbers), np.concatenate(self._times)
-        line = even_times(number, time, len(time))
-        off, near_off = (np.std(time - even) for even in (line, even_times(number, time)))
-        if off > _EVEN_RATIO * near_off:
-            return time, 0.0
-        return line, float(off / math.sqrt(len(time)))
+    def arrivals(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the frames' numbers, (n,), and when they arrived, (n,), seconds."""
+        return np.concatenate(self._numbers), np.concatenate(self._times)
 
     def follow(self, move: Move) -> Move:
         """Watch until a move is over."""
@@ -172,6 +165,22 @@ class _FrameLog:
 
 
 # The estimate from frames and places
+
+
+def frame_times(number: NDArray[np.int64], arrival: Floats) -> tuple[Floats, float]:
+    """Return the times that frames are taken to have arrived at, (n,), seconds, and how far these may be off.
+
+    Numbers and arrivals are (n,). If the camera keeps time, the times are those of a straight line through
+    all arrivals. They may be off by what the mean of half a second of arrivals is off that line, in root
+    mean square: chance hardly counts in it, but a line or a buffer that is later now and then does, since it
+    may be so in a scan as well.
+    """
+    line = even_times(number, arrival, len(arrival))
+    late = arrival - line
+    blocks = max(2, round((arrival[-1] - arrival[0]) / _WANDER))
+    wander = math.sqrt(np.mean([np.mean(block) ** 2 for block in np.array_split(late, blocks)]))
+    keeps_time = np.std(late) <= _EVEN_RATIO * np.std(arrival - even_times(number, arrival))
+    return (line if keeps_time else arrival), wander
 
 
 def block_means(frames: NDArray[Any], blocks: int = _BLOCKS) -> Floats:

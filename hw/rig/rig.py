@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _TICK = 0.02  # seconds from one look of the guard to the next
 _PAUSE = 0.5  # seconds that the guard may be late: frames that come meanwhile have no time
-_STALL, _STALL_PERIODS = 0.1, 3  # seconds, and frame periods, without a frame that a move bears
+_STALL_PERIODS = 3  # without a frame, that a move bears at least
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
 _JOIN = 5.0
@@ -33,8 +33,8 @@ class Move:
     Of one that is `timed`, frames' arrivals tell where the body was.
     """
 
-    def __init__(self, stage: GrblStage, began: float, timed: bool) -> None:
-        self._stage, self.timed = stage, timed
+    def __init__(self, stage: GrblStage, began: float, timed: bool, reconnects: int) -> None:
+        self._stage, self.timed, self.reconnects = stage, timed, reconnects
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
         self.error: Exception | None = None  # why it did not come to its end
         self.rest: Report | None = None  # where it came to rest
@@ -70,10 +70,10 @@ class Rig(Closing):
 
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
-    the rig for anything gets the reason. Frames are missed after 0.1 s or three periods, whichever is longer;
-    a computer that is too busy to look that often gives the camera more time. If it does not look for 0.5 s
-    in a timed move, when frames came is not known, and the move ends. Only moves that the rig begins are
-    guarded.
+    the rig for anything gets the reason. Frames are missed after ``camera.stall`` or three periods, whichever
+    is longer; a computer that is too busy to look that often gives the camera more time. If it does not look
+    for 0.5 s in a timed move, when frames came is not known, and the move ends. Only moves that the rig
+    begins are guarded.
 
     Examples
     --------
@@ -84,7 +84,6 @@ class Rig(Closing):
     def __init__(self, stage: GrblStage, camera: Camera, settings: RigSettings) -> None:
         self.stage, self.camera, self.settings = stage, camera, settings
         self.name = settings.name
-        self._stall = _STALL
         self._move: Move | None = None
         self._fault: HardwareError | None = None
         self._looked = -math.inf  # when the guard last did
@@ -125,9 +124,9 @@ class Rig(Closing):
         self.check()
         if self.camera.latest == -math.inf:
             self.take(1)  # a camera that is still starting is not missed later
-        began = time.monotonic()
+        began, reconnects = time.monotonic(), self.camera.counts.reconnects
         move()
-        self._move = Move(self.stage, began, timed)
+        self._move = Move(self.stage, began, timed, reconnects)
         return self._move
 
     def end(self, move: Move) -> Report:
@@ -195,19 +194,24 @@ class Rig(Closing):
                 looked, seen, silence = move, latest, 0.0
             else:
                 silence += _TICK if passed < 2 * _TICK else _TICK / 2
-            fault = _paused(passed) if paused else self._fault_after(silence)
+            fault = _paused(passed) if paused else self._fault_after(move, silence)
             if fault is not None:
                 self._fault = self._fault or fault  # first, or the stop would pass for the cause
                 self.stage.stop()
                 return
             self._looked = last
 
-    def _fault_after(self, silence: float) -> HardwareError | None:
-        """Return what is wrong after so many seconds without a frame."""
+    def _fault_after(self, move: Move, silence: float) -> HardwareError | None:
+        """Return what is wrong with a move after so many seconds without a frame."""
         wrong = self.stage.error or self.camera.error
         if wrong is not None:
             return wrong
-        if silence < max(self._stall, _STALL_PERIODS * self.period):
+        if move.timed and self.camera.counts.reconnects > move.reconnects:
+            return HardwareError(
+                f"{self.camera.name} was lost while the stage moved, which was stopped; it is back, and its"
+                " frames may be later than before: begin anew"
+            )
+        if silence < max(self.settings.camera.stall, _STALL_PERIODS * self.period):
             return None
         return HardwareError(
             f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"

@@ -52,6 +52,11 @@ class Scan(Closing):
         raise NotImplementedError
 
     @property
+    def rate(self) -> float:
+        """Frames a second that the camera gave."""
+        return self.rig.camera.counts.rate
+
+    @property
     def remark(self) -> str:
         """What else there is to say of the scan, to be put behind a list; often nothing."""
         return ""

@@ -73,6 +73,12 @@ class SweepScan(Scan):
         return max(1, math.ceil(_SLOWER * turn * rate / self._turn_frames))
 
     @property
+    def rate(self) -> float:
+        """Frames a second that the camera gave, from the first to the last of the scan."""
+        number, time = (np.concatenate(one) for one in zip(*self._frames, strict=True))
+        return float(np.ptp(number) / np.ptp(time)) if len(time) > 1 else super().rate
+
+    @property
     def remark(self) -> str:
         """How late the camera was."""
         late = f"; frames {1e3 * self.delay.seconds:.1f} ms after their exposure"

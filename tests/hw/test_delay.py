@@ -1,8 +1,10 @@
+import math
+
 import numpy as np
 import pytest
 
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.delay import block_means, estimate_delay
+from mirrorskin.hw.rig.delay import block_means, estimate_delay, frame_times
 from mirrorskin.hw.rig.plans import Trapezoid
 
 PATH = Trapezoid(1.0, 0.6, 10.0)
@@ -46,6 +48,22 @@ def test_the_standard_error_is_what_the_estimate_scatters_by():
     scatter = np.std([one.seconds for one in found])
     told = np.mean([one.error for one in found])
     assert 0.5 < scatter / told < 1.7
+
+
+def test_frames_that_are_late_in_turn_make_the_delay_as_uncertain():
+    number, random = np.arange(300), np.random.default_rng(3)
+    even = number / 60
+    for wander, least, most in ((0.0, 0.0, 0.0012), (0.008, 0.003, 0.008)):
+        late = wander * np.sin(math.tau * even / 2) + 0.003 * random.standard_normal(len(even))
+        _, error = frame_times(number, even + late)
+        assert least <= error < most
+
+
+def test_frames_of_a_camera_that_keeps_time_lie_on_a_line():
+    even = np.arange(300) / 60
+    arrival = even + 0.003 * np.random.default_rng(3).standard_normal(len(even))
+    times, _ = frame_times(np.arange(300), arrival)
+    assert np.abs(times - even).max() < 0.001
 
 
 def test_lamps_that_warm_up_do_not_matter():

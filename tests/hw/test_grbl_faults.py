@@ -131,6 +131,13 @@ def test_a_reset_by_others_is_told(moving):
     assert "was reset" in failure(stage)[0]
 
 
+@pytest.mark.parametrize("answer", ["ok", "error:9"])
+def test_an_answer_to_another_program_is_told(moving, answer):
+    stage, port = moving
+    port.say(answer)
+    assert "it answered a line that nobody here sent" in failure(stage)[0]
+
+
 @pytest.mark.parametrize("state", ["Hold:0", "Door:1"])
 def test_a_state_that_nobody_asked_for_is_told(moving, state):
     stage, port = moving

@@ -48,6 +48,12 @@ def test_it_tells_where_it_is_and_who_it_is(opened):
     assert 0 < stage.round_trip < 5
 
 
+def test_grblhal_is_not_called_grbl(opened):
+    said = "[VER:1.1f.20250101:]\r\n[OPT:VNMSL,35,1024]\r\n[NEWOPT:ENUMS,RT+]\r\n[FIRMWARE:grblHAL]\r\nok"
+    stage, _ = opened(ScriptedGrbl(answers={"$I": said}))
+    assert stage.firmware == "grblHAL 1.1f.20250101"
+
+
 def test_reports_of_work_coordinates_are_turned_into_the_machines(opened):
     stage, _ = opened(ScriptedGrbl(place=(31.0, 40.0, 9.0), work=True))
     assert stage.report().position.travel == pytest.approx(1)

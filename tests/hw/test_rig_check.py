@@ -71,7 +71,7 @@ class Stage:
     """A stage that is where it is sent at once, or as far off as it is told."""
 
     firmware = "Grbl 1.1h"
-    round_trip = 0.004
+    round_trip = longest_trip = 0.004
     clock = None
 
     def __init__(
@@ -108,14 +108,15 @@ class Camera:
 
     name, clock = "camera", None
 
-    def __init__(self, picture=None, rate=100.0, lost=0, **counts):
+    def __init__(self, picture=None, rate=100.0, lost=0, every=0.01, **counts):
+        self._every = every
         self._picture = np.arange(35, dtype=np.uint8).reshape(5, 7) if picture is None else picture
         self.shape, self.dtype = self._picture.shape, self._picture.dtype
         self.counts, self._after = Counts(rate=rate), counts
         self._lost, self.closed = lost, False
 
     def take(self, most, timeout):
-        self.clock.sleep(0.01)
+        self.clock.sleep(self._every)
         lost, self._lost = (self._lost, 0) if self.counts.frames else (0, self._lost)
         self.counts = replace(self.counts, frames=self.counts.frames + 1, **self._after)
         return Frames(self._picture[None], np.zeros(1, np.int64), np.array([self.clock.now]), lost)
@@ -213,6 +214,14 @@ def test_slow_and_missing_reports_are_told():
     assert look(slow)["round trip of a report"].verdict == "warning"
 
 
+def test_an_answer_that_came_late_asks_for_more_silence():
+    late = Stage()
+    late.longest_trip = 0.06
+    found = look(late)["longest round trip"]
+    assert (found.verdict, found.found) == ("warning", "60.0 ms, of 70 ms that a move bears")
+    assert "set stage.silence = 0.18" in found.remedy
+
+
 # Moves
 
 
@@ -285,6 +294,12 @@ def test_a_camera_that_is_as_its_file_says_is_sound():
     assert found["brightness"].found == "0 to 34, median 17; 0.00% saturated, 2.86% black"
     total = int(found["frames"].found.split()[0])
     assert 90 <= total <= 110
+
+
+def test_a_frame_that_came_late_asks_for_a_longer_stall():
+    found = film(Camera(every=0.08))["longest wait for a frame"]
+    assert (found.verdict, found.found) == ("warning", "80.0 ms, of 100 ms that a move bears")
+    assert "set camera.stall = 0.24" in found.remedy
 
 
 def test_lost_frames_and_reconnections_are_told():

@@ -38,6 +38,7 @@ baud = 9600
 home = false
 timeout = 1
 report_rate = 10
+silence = 0.25
 press = 2
 pivot = [0, 1, -10.5]
 
@@ -105,6 +106,7 @@ exposure = 0.004
 gain = 2
 rate = 60
 delay = 0.03
+stall = 0.2
 pixel_size = [0.03, 0.04]
 dark = 12
 bright = 4000.5

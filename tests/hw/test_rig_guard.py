@@ -52,6 +52,14 @@ def test_a_camera_that_is_lost_stops_the_stage_and_is_named(rig):
         rig.check()
 
 
+def test_a_camera_that_came_back_in_a_timed_move_stops_it(rig):
+    rig.begin(lambda: rig.stage.move(Position(2.0), 0.5), timed=True)
+    rig.camera.reconnects += 1
+    assert stopped(rig.stage)
+    with pytest.raises(HardwareError, match=r"was lost while the stage moved.* begin anew"):
+        rig.check()
+
+
 def test_a_stage_that_fails_is_stopped_and_named(rig):
     begin(rig)
     rig.stage.error = HardwareError("fake stage: ALARM:1")

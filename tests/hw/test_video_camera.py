@@ -289,6 +289,66 @@ def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monke
     assert driver.opened > 2
 
 
+def feed(driver, opened, pictures) -> None:
+    """Let the camera have pictures one by one, each of them taken, after a first."""
+    opened.take(1, SOON)
+    for picture in pictures:
+        driver.pictures.put(picture)
+        opened.take(1, SOON)
+
+
+def test_a_camera_that_gives_one_picture_again_and_again_is_lost(driver, open_camera, caplog) -> None:
+    pictures = noise(20)
+    driver.pictures.put(pictures[0])
+    opened = open_camera()
+    feed(driver, opened, [*pictures[1:], *[pictures[-1]] * 4])
+    driver.pictures.put(pictures[-1])
+    with pytest.raises(HardwareError, match="was lost"):
+        opened.take(1, 0.3)
+    assert "gives the same picture again and again" in caplog.records[0].getMessage()
+
+
+def test_pictures_without_noise_may_be_alike(driver, open_camera) -> None:
+    pictures = noise(20)
+    driver.pictures.put(pictures[0])
+    opened = open_camera()
+    feed(driver, opened, [pictures[0], *pictures[1:], *[pictures[-1]] * 20])
+    assert opened.counts.frames == 41
+
+
+def write_mjpeg(path, *pictures: np.ndarray) -> None:
+    path.write_bytes(b"".join(cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures))
+
+
+def test_a_stream_that_changes_its_size_is_not_scaled(tmp_path) -> None:
+    smooth = cv2.resize(noise(1)[0], (64, 48))
+    write_mjpeg(tmp_path / "film.mjpg", *[smooth] * 3, cv2.resize(smooth, (128, 96)))
+    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    take(opened, 3)
+    with pytest.raises(HardwareError, match="128 x 96 uint8, and 64 x 48 uint8 is asked for"):
+        opened.take(1, SOON)
+    opened.close()
+
+
+def test_a_jpeg_gives_its_luma(tmp_path) -> None:
+    colours = cv2.resize(np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8), (64, 48))
+    write_mjpeg(tmp_path / "film.mjpg", *[colours] * 2)
+    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    luma = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY).astype(int)
+    assert np.abs(take(opened, 1)[0][0] - luma).mean() < 3  # what the packing costs
+    opened.close()
+
+
+def test_a_jpeg_that_is_cut_short_is_not_made_up(tmp_path) -> None:
+    whole = cv2.imencode(".jpg", noise(1, (48, 64))[0])[1].tobytes()
+    (tmp_path / "film.mjpg").write_bytes(2 * whole + whole[: len(whole) // 2])
+    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    take(opened, 2)
+    with pytest.raises(HardwareError, match="a picture cannot be decoded"):
+        opened.take(1, SOON)
+    opened.close()
+
+
 def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
     monkeypatch.setattr(video, "_FIRST_FRAME", 0.2)
     monkeypatch.setattr(video, "_CLOSING", 0.2)

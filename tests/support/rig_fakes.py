@@ -166,12 +166,13 @@ class FakeCamera:
         self._start = time.monotonic()
         self._next, self._last, self._dropped = 0, -math.inf, 0
         self._silent = math.inf
+        self.reconnects = 0
         self.error = None
         self.closed = False
 
     @property
     def counts(self):
-        return Counts(self._next, 0, 0, self._rate, 0)
+        return Counts(self._next, 0, 0, self._rate, self.reconnects)
 
     @property
     def latest(self):

@@ -132,12 +132,12 @@ def capture(
         if controller == "emulator":
             stage = settings.stage
         camera = structs.replace(settings.camera, delay=0.01, dark=16.0)
+        if not fault.startswith("camera"):
+            camera = structs.replace(camera, stall=LATE)
+        if fault not in _SILENT:
+            stage = structs.replace(stage, silence=LATE)
         try:
             with Rig(GrblStage(stage), emulated.camera, replace(settings, camera=camera, stage=stage)) as rig:
-                if not fault.startswith("camera"):
-                    rig._stall = LATE
-                if fault not in _SILENT:
-                    rig.stage._link._limit = lambda: LATE
                 scan = SweepScan(rig, VerticalPlan(0.0, 3.0, speed=0.6))
                 with io.StreamRecorder(scan, path) as recorder:
                     room = np.empty((4, *scan.shape[1:]), scan.dtype)

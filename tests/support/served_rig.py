@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from mirrorskin.hw.emulator import rig as emulators
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.grbl import link as links
 from mirrorskin.hw.rig import rig as rigs
@@ -16,10 +17,10 @@ from mirrorskin.hw.rig import rig as rigs
 
 def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
     """Let emulators be late, where other programs have the processors; that is no fault of the rig."""
-    patch.setattr(rigs, "_STALL", seconds)
     patch.setattr(rigs, "_PAUSE", seconds)
+    patch.setattr(emulators, "_SILENCE", seconds)
+    patch.setattr(emulators, "_STALL", seconds)
     patch.setattr(links, "_WRITE", seconds)
-    patch.setattr(links.Link, "_limit", lambda link: link.patience or seconds)
 
 
 @contextmanager
