@@ -129,6 +129,33 @@ def jog(
 
 
 @app.add
+def probe(
+    rig: RigFile,
+    start: Annotated[
+        str | None,
+        Option("--from", metavar="LENGTH", help="First travel.  [default: the least of its limits]"),
+    ] = None,
+    step: Annotated[str, Option(metavar="LENGTH", help="From place to place.")] = "0.05mm",
+) -> None:
+    """Lower the body until the picture shows contact, lift it, and tell the zero of the travel."""
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.hw.rig.probe import find_contact
+    from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig_file import load_rig
+
+    settings = load_rig(rig)
+    travel, each = settings.stage.travel, length(step, "--step")
+    first = travel.low if start is None else length(start, "--from")
+    with open_rig(settings) as opened:
+        contact = find_contact(opened, first, each)
+    zero = travel.coordinate(contact)
+    click.echo(
+        f"{rig}: first contact at a travel of {contact:.4g} mm, give or take {each / 2:.2g} mm;"
+        f" for a travel of 0 there set zero = {zero:.6g} in [stage.travel]"
+    )
+
+
+@app.add
 def unlock(rig: RigFile) -> None:
     """End an alarm, a hold or an open door after a look at the machine, or stop what moves it.
 

@@ -258,3 +258,21 @@ def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path
     assert "set $22=1, or home = false" in ended.said
     assert ended.said.count("\n") == 1
     assert not rig.machine.moving()
+
+
+def test_contact_is_found_and_the_zero_told(emulated):
+    ended = run("rig", "probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
+    assert ended.code == 0, ended.said
+    found = re.search(
+        r"first contact at a travel of (\S+) mm, give or take 0.1 mm; .* set zero = (\S+) in", ended.out
+    )
+    assert (
+        -0.11 <= float(found[1]) <= 0.31
+    )  # the sphere's top lies at 0, and its light needs a pixel of contact
+    assert float(found[2]) == pytest.approx(emulated[0].settings.stage.travel.coordinate(float(found[1])))
+
+
+def test_contact_from_the_start_is_refused(emulated):
+    ended = run("rig", "probe", emulated[1], "--from", "2.5mm", "--step", "0.1mm")
+    assert ended.code == 1
+    assert "no contact between travels of 2.5 and 3 mm" in ended.said

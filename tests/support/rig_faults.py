@@ -60,7 +60,7 @@ FAULTS: dict[str, tuple[Callable[[EmulatedRig], Any], str]] = {
     "hold by another program": (_says(b"!"), "hold"),
     "door by another program": (_says(b"\x84"), "door"),
     "G92 by another program": (_says(b"G92Z1\n"), "offset"),
-    "G10 by another program": (_says(b"G10L2P1Z1\n"), "offset"),
+    "G10 by another program": (_says(b"G10L2P1Z1\n"), ""),
     "move by another program": (_says(b"G91\nG1Z-1F60\nG90\n"), ""),
     "camera stalls": (lambda emulated: emulated.camera.stall(), "gave no frame"),
     "camera lost": (lambda emulated: emulated.camera.lose(), "was lost"),
