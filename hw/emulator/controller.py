@@ -20,7 +20,7 @@ from mirrorskin.hw.emulator.gcode import GrblError, Interpreter
 from mirrorskin.hw.emulator.motion import BLOCKS, Line, Move, Path, Place, Planner, shifted, stays_inside
 
 BANNER = "Grbl 1.1h ['$' for help]"
-BUILD = "[VER:1.1h.20190825:]"
+BUILD = "[VER:1.1h.20190830:]"
 RX_BUFFER = 128  # bytes that the receive buffer holds
 LINE_TIME = 1e-3  # seconds that a line takes to be read
 HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
@@ -280,11 +280,11 @@ class Controller:
                 self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
         elif text == "I":
             self._say(BUILD)
-            self._say(f"[OPT:VM,{BLOCKS},{RX_BUFFER}]")
+            self._say(f"[OPT:V,{BLOCKS},{RX_BUFFER}]")
         elif text == "H":
             yield from self._home()
         else:
-            raise GrblError(3)
+            raise GrblError(2)  # of what could be a setting, it misses the number
 
     def _home(self) -> _Steps:
         """Home one axis after the other: to the switch, off it, slowly to it again, and off it."""

@@ -77,7 +77,7 @@ class Interpreter:
                 if code not in _GROUP_OF:
                     raise GrblError(20)
                 if _GROUP_OF[code] in codes:
-                    raise GrblError(21)
+                    raise GrblError(24 if _GROUP_OF[code] == "motion" else 21)
                 codes[_GROUP_OF[code]] = code
             elif letter not in self.axes and letter not in "FIJK":
                 raise GrblError(20)

@@ -106,7 +106,7 @@ def test_it_greets_and_with_homing_is_locked_until_it_is_told_otherwise() -> Non
         ("G2X1Y1F100", "error:35"),
         ("G0X1" + "0" * 76, "error:11"),
         ("$H", "error:5"),
-        ("$J=X1F100", "error:3"),
+        ("$FOO", "error:2"),
     ],
 )
 def test_a_line_is_answered(line: str, reply: str) -> None:
@@ -136,7 +136,7 @@ def test_settings_and_build_are_told() -> None:
     lines = Bench({110: 1234.5, 27: 0.5}).send("$$")
     assert lines[-1] == "ok"
     assert {"$110=1234.500", "$27=0.5", "$13=0", "$132=200.000"} < set(lines)
-    assert Bench().send("$I") == ["[VER:1.1h.20190825:]", "[OPT:VM,15,128]", "ok"]
+    assert Bench().send("$I") == ["[VER:1.1h.20190830:]", "[OPT:V,15,128]", "ok"]
 
 
 def test_a_report_tells_state_place_speed_and_now_and_then_the_offset() -> None:

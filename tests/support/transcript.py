@@ -1,0 +1,124 @@
+"""What GRBL's own firmware answers, kept as a transcript that the emulated controller is held to.
+
+``python tests/support/transcript.py PROGRAM > tests/hw/grbl-1.1h.txt`` makes it anew; docs/rig.md tells how
+the program is built.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from firmware import Firmware
+
+SETTINGS = {20: 0, 22: 0} | {
+    base + axis: value for base, value in ((100, 250.0), (110, 1200.0), (120, 200.0)) for axis in range(3)
+}
+REST = "(rest)"
+"""In place of a line: ask until it rests."""
+
+RESET, HOLD, RESUME, WAIT = "(reset)", "(hold)", "(resume)", "(wait)"
+_BYTES = {RESET: b"\x18", HOLD: b"!", RESUME: b"~"}
+REQUESTS = (
+    *("?", "$I", "$$", "G21G90G94", "g53 g1 x2 y1 z-1 f300", REST, "G91", "G1X-0.5F600", REST, "G90"),
+    *("G1X0Y0Z0F240", WAIT, HOLD, REST, RESUME, REST, "G17", "G2X2Y0I1J0F300", REST, "G3X0Y0I-1F300", REST),
+    *("$FOO", "G5", "G1XF1", "1G", "$H", "G1X1X2", "G0G1X1", "G2X1Y1", "G2X1Y0I0.1", "G2I1", "Q1"),
+    *("G1X3F60", "$$", "G1X4", RESET, "?", "G1X1F100", "$X", "?", "G1X1", RESET, "?"),
+)
+_QUIET = 0.3  # seconds without a word, after what no line answers
+_LONGEST = 20.0
+_POLL = 0.05
+_STATUS = re.compile(r"<([^|>]*)\|MPos:([-\d.,]+)")
+
+
+class Exchange(NamedTuple):
+    """What was sent, what was said until it was done with, and how many seconds that took."""
+
+    sent: str
+    said: list[str]
+    seconds: float
+
+
+def play(
+    machine: Firmware, now: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+) -> Iterator[Exchange]:
+    """Send the requests, each when the one before is done with."""
+    listen(machine, now, sleep, lambda lines, quiet: quiet > _QUIET)
+    for request in REQUESTS:
+        began = now()
+        if request == REST:
+            said: list[str] = []
+            while not said or not re.match("<(Idle|Hold:0)", said[-1]):
+                sleep(_POLL)
+                machine.receive(b"?")
+                said = listen(machine, now, sleep, lambda lines, _: bool(lines))
+            yield Exchange(request, said[-1:], now() - began)
+            continue
+        if request == WAIT:
+            sleep(_QUIET)
+            yield Exchange(request, [], _QUIET)
+            continue
+        machine.receive(_BYTES.get(request) or (b"?" if request == "?" else f"{request}\n".encode()))
+        if request in _BYTES:
+            last = "Grbl" if request == RESET else ""
+            said = listen(
+                machine,
+                now,
+                sleep,
+                lambda lines, quiet, last=last: quiet > _QUIET and last in " ".join(lines),
+            )
+        elif request == "?":
+            said = listen(machine, now, sleep, lambda lines, _: bool(lines))
+        else:
+            said = listen(machine, now, sleep, lambda lines, _: re.match("ok|error", (lines or [""])[-1]))
+        yield Exchange(request, said, now() - began)
+
+
+def listen(
+    machine: Firmware,
+    now: Callable[[], float],
+    sleep: Callable[[float], None],
+    done: Callable[[list[str], float], object],
+) -> list[str]:
+    """Return the lines that it says until that is all."""
+    heard, since, end = "", now(), now() + _LONGEST
+    while not done([line for line in heard.split("\r\n")[:-1] if line], now() - since):
+        assert now() < end, heard
+        sleep(0.002)
+        if more := machine.take().decode():
+            heard, since = heard + more, now()
+    return [line for line in heard.split("\r\n")[:-1] if line]
+
+
+def write(exchanges: Iterable[Exchange]) -> Iterator[str]:
+    """Yield the lines of a transcript."""
+    for sent, said, seconds in exchanges:
+        yield f"> {sent}"
+        yield from (f"< {line}" for line in said)
+        yield f"= {seconds:.2f}"
+
+
+def read(path: Path) -> list[Exchange]:
+    """Read a transcript."""
+    found: list[Exchange] = []
+    for line in path.read_text().splitlines():
+        kind, text = line[:1], line[2:]
+        if kind == ">":
+            found.append(Exchange(text, [], 0.0))
+        elif kind == "<":
+            found[-1].said.append(text)
+        elif kind == "=":
+            found[-1] = found[-1]._replace(seconds=float(text))
+    return found
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as folder, Firmware(sys.argv[1], Path(folder), SETTINGS) as firmware:
+        print("# What GRBL 1.1h's firmware answers: > sent, < said, = seconds until it was done with.")
+        for line in write(play(firmware)):
+            print(line, flush=True)
