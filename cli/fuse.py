@@ -25,6 +25,7 @@ def command(
     ] = None,
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
+    travel: options.Travel = None,
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
     tilt: options.Tilt = None,
@@ -54,6 +55,7 @@ def command(
     known = stack_options(
         travel_step=travel_step,
         travel_start=travel_start,
+        travel=travel,
         phase_step=phase_step,
         phases=phases,
         tilt=tilt,
@@ -68,7 +70,7 @@ def command(
         _open(vertical, "vertical", dataset, known, limit) as pressed,
         _open(axial, "axial", dataset, known, limit) as turned,
     ):
-        io.check_output(target, vertical, axial, phases, calibration)
+        io.check_output(target, vertical, axial, phases, travel, calibration)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_sources(
@@ -87,10 +89,13 @@ def command(
 def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:
     """Open a recording; a file in another layout has the motion of its place on the command line."""
     from mirrorskin import io
+    from mirrorskin.io.arrays import NUMPY_SUFFIXES
     from mirrorskin.io.hdf5 import Hdf5File
     from mirrorskin.io.layout import MARK
 
-    with Hdf5File(path) as file:
-        ours = file.marked(MARK)
+    ours = False
+    if path.suffix.lower() not in NUMPY_SUFFIXES:
+        with Hdf5File(path) as file:
+            ours = file.marked(MARK)
     mine = known if ours else {**known, "motion": place}
     return io.open_recording(path, dataset=None if ours else dataset, memory_limit=limit, **mine)

@@ -13,12 +13,14 @@ from mirrorskin.cli.groups import Argument, Option
 
 def command(
     frames: Annotated[
-        Path, Argument(metavar="VIDEO-OR-FOLDER", help="AVI, MP4, or numbered PNG/TIFF pictures.")
+        Path,
+        Argument(metavar="FRAMES", help="AVI, MP4, NPY, NPZ, or a folder of numbered PNG/TIFF pictures."),
     ],
     output: options.NewRecording,
     motion: Annotated[options.MotionName, Option(help="How the body moved.")],
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
+    travel: options.Travel = None,
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
     tilt: options.Tilt = None,
@@ -30,10 +32,11 @@ def command(
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.stack import stack_options
 
-    io.check_output(output, frames, phases)
+    io.check_output(output, frames, phases, travel)
     known = stack_options(
         travel_step=travel_step,
         travel_start=travel_start,
+        travel=travel,
         phase_step=phase_step,
         phases=phases,
         tilt=tilt,
@@ -48,6 +51,12 @@ def command(
         progress("importing", source.shape[0]) as show,
     ):
         recorder.drain(show)
+    if header.pixel_size is None:
+        click.echo(
+            f"{output}: no pixel size: holes are not filled, and normals, slip and measures need it;"
+            " give --pixel-size here or to 'reconstruct'",
+            err=True,
+        )
     for name in source.left_out:
         click.echo(f"left out: {name}", err=True)
     count, rows, columns = source.shape

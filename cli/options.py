@@ -37,6 +37,10 @@ TravelStep = Annotated[str | None, Option(metavar="LENGTH", help="Travel from fr
 TravelStart = Annotated[
     str | None, Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
 ]
+Travel = Annotated[
+    Path | None,
+    Option(metavar="FILE", help="Travel of all frames, mm, one number a frame: a text, CSV or NPY."),
+]
 PhaseStep = Annotated[str | None, Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
 Phases = Annotated[
     Path | None,

@@ -39,6 +39,7 @@ _OWN = {
             "method",
             "travel_step",
             "travel_start",
+            "travel",
             "dark",
             "bright",
             "event",
@@ -73,7 +74,7 @@ _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}
 
 def command(
     context: click.Context,
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, NPY or NPZ.")],
     output: Annotated[
         Path | None,
         Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"),
@@ -82,6 +83,7 @@ def command(
     motion: options.Motion = None,
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
+    travel: options.Travel = None,
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
     tilt: Annotated[
@@ -181,6 +183,7 @@ def command(
         motion=motion,
         travel_step=travel_step,
         travel_start=travel_start,
+        travel=travel,
         phase_step=phase_step,
         phases=phases,
         tilt=None if tilt == _ESTIMATE else tilt,
@@ -193,7 +196,7 @@ def command(
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, recording, phases, heights, calibration, contact)
+        io.check_output(target, recording, phases, travel, heights, calibration, contact)
         calibrated = _calibrated(source, calibration, pixel_size)
         arguments: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if modulus is not None:

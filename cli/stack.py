@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -32,6 +33,7 @@ def stack_options(
     motion: MotionName | None = None,
     travel_step: str | None = None,
     travel_start: str | None = None,
+    travel: Path | None = None,
     phase_step: str | None = None,
     phases: Path | None = None,
     tilt: str | None = None,
@@ -46,7 +48,7 @@ def stack_options(
     options = StackOptions()
     if motion is not None:
         options["motion"] = motion.value
-    options |= _travel(travel_step, travel_start, where) | _phase(phase_step, phases, where)
+    options |= _travel(travel_step, travel_start, travel, where) | _phase(phase_step, phases, where)
     if tilt is not None:
         options["tilt"] = angle(tilt, f"{where}tilt")
     if pixel_size is not None:
@@ -58,10 +60,14 @@ def stack_options(
     return options
 
 
-def _travel(step: str | None, start: str | None, where: str) -> StackOptions:
+def _travel(step: str | None, start: str | None, listed: Path | None, where: str) -> StackOptions:
     from mirrorskin.cli.quantity import length
     from mirrorskin.io import InputError, Steps
 
+    if listed is not None:
+        if step is not None or start is not None:
+            raise InputError("--travel gives the travel of all frames: leave --travel-step and -start out")
+        return {"travel": read_travel(listed)}
     if step is not None:
         first = length(start or "0mm", f"{where}travel-start")
         return {"travel": Steps(length(step, f"{where}travel-step"), first)}
@@ -110,42 +116,76 @@ def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
 
 
 @dataclass(frozen=True, slots=True)
-class ListedPhases:
-    """The phases that a file lists, one a frame, radians; see ``io.Positions``."""
+class Listed:
+    """The positions that a file lists, one a frame, mm or radians; see ``io.Positions``."""
 
     path: Path
-    radians: tuple[float, ...]
+    what: str
+    values: tuple[float, ...]
 
     def positions(self, count: int) -> Floats:
-        """Return the phases of ``count`` frames; InputError if the file lists another number."""
+        """Return the positions of ``count`` frames; InputError if the file lists another number."""
         import numpy as np
 
         from mirrorskin.io import InputError
 
-        if len(self.radians) != count:
+        if len(self.values) != count:
             raise InputError(
-                f"{self.path} lists {len(self.radians)} phases for {count} frames: one a frame is needed"
+                f"{self.path} lists {len(self.values)} {self.what} for {count} frames: one a frame is needed"
             )
-        return np.array(self.radians)
+        return np.array(self.values)
 
 
-def read_phases(path: Path) -> ListedPhases:
+def read_phases(path: Path) -> Listed:
     """Read angles with their units, one a line or several between blanks; ``#`` begins a comment."""
     from mirrorskin.cli.quantity import angle
+
+    return _listed(path, "phases", "write one angle a frame in it, such as 178.1deg", angle)
+
+
+def read_travel(path: Path) -> Listed:
+    """Read the travel of each frame: an array of NumPy's, mm, or a text of lengths, mm where no unit stands.
+
+    In a text they stand between blanks, commas or semicolons; ``#`` begins a comment, and a first line that
+    begins with a letter is a head.
+    """
+    from mirrorskin.cli.quantity import length
+
+    if path.suffix.lower() == ".npy":
+        from mirrorskin.io.arrays import read_array
+
+        return Listed(path, "travels", tuple(map(float, read_array(path).reshape(-1))))
+
+    def millimetres(text: str, where: str) -> float:
+        try:
+            return float(text)
+        except ValueError:
+            return length(text, where)
+
+    remedy = "write one length a frame in it, such as 0.15mm"
+    return _listed(path, "travels", remedy, millimetres, table=True)
+
+
+def _listed(
+    path: Path, what: str, remedy: str, read: Callable[[str, str], float], *, table: bool = False
+) -> Listed:
+    """Read a text of positions; in a ``table``, commas and semicolons are blanks, and there may be a head."""
     from mirrorskin.io import InputError
 
-    remedy = "write one angle a frame in it, such as 178.1deg"
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; {remedy}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is no text: {remedy}") from error
-    radians = tuple(
-        angle(word, f"{path}, line {number}:")
+    if table:
+        lines = [line.replace(",", " ").replace(";", " ") for line in lines]
+        lines[:1] = ["" if line.strip()[:1].isalpha() else line for line in lines[:1]]
+    values = tuple(
+        read(word, f"{path}, line {number}:")
         for number, line in enumerate(lines, 1)
         for word in line.partition("#")[0].split()
     )
-    if not radians:
-        raise InputError(f"{path} lists no phases: {remedy}")
-    return ListedPhases(path, radians)
+    if not values:
+        raise InputError(f"{path} lists no {what}: {remedy}")
+    return Listed(path, what, values)

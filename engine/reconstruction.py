@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+
+from numpy.typing import ArrayLike
 
 from mirrorskin import io
 
@@ -12,17 +15,33 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    source: Source, calibration: Calibration | str | Path | None = None, **options: Any
+    source: Source | ArrayLike,
+    calibration: Calibration | str | Path | None = None,
+    *,
+    travel: ArrayLike | None = None,
+    phase: ArrayLike | None = None,
+    displacement: ArrayLike | None = None,
+    twist: ArrayLike | None = None,
+    pixel_size: float | tuple[float, float] | None = None,
+    **options: Any,
 ) -> Result:
     """Reconstruct what was touched, by the method that fits the source's motion.
 
     Parameters
     ----------
-    source : Source
-        An open recording, or anything else that frames come from. It is rewound first, if it can be.
+    source : Source or array_like, (T, H, W), uint8, uint16 or float32
+        An open recording, or anything else that frames come from, which is rewound first, if it can be; or
+        the frames themselves.
     calibration : Calibration or path, optional
         What is known of the sensor, or a file that holds it; by default what the recording carries, if
         anything.
+    travel, phase, twist : array_like, (T,), optional
+        Of frames in an array: mm of a press, radians of a rotation or a twist. One position of each frame,
+        which also tells the motion.
+    displacement : array_like, (T, 2), optional
+        Of frames in an array: mm along x and y of a slide.
+    pixel_size : float or (float, float), optional
+        Of frames in an array: mm along x and y at the sheet.
     **options
         Those of `mirrorskin.engine.press.press.reconstruct_press` for a vertical motion, of
         `mirrorskin.engine.rotation.rotation.reconstruct_rotation` for an axial one, of
@@ -35,18 +54,26 @@ def reconstruct(
 
     Examples
     --------
+    >>> import numpy as np
+    >>> frames = np.zeros((5, 3, 4), np.uint8)
+    >>> frames[3:] = 255
+    >>> reconstruct(frames, travel=[0.0, 0.1, 0.2, 0.3, 0.4], pixel_size=0.03).height[0].tolist()
+    [-0.25, -0.25, -0.25, -0.25]
+
     >>> from mirrorskin import engine, hw
     >>> from mirrorskin.hw.twin import Vertical
     >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> engine.reconstruct(press).height.shape
     (40, 40)
     """
-    known = calibrated(source, calibration)
-    if source.motion == "vertical":
+    given = {"travel": travel, "phase": phase, "displacement": displacement, "twist": twist}
+    opened = _as_source(source, given, pixel_size)
+    known = calibrated(opened, calibration)
+    if opened.motion == "vertical":
         from mirrorskin.engine.press.press import reconstruct_press
 
         result = reconstruct_press(known, **options)
-    elif source.motion == "axial":
+    elif opened.motion == "axial":
         from mirrorskin.engine.rotation.rotation import reconstruct_rotation
 
         result = reconstruct_rotation(known, **options)
@@ -55,6 +82,28 @@ def reconstruct(
 
         result = reconstruct_slip(known, **options)
     return undistorted(result, known)
+
+
+def _as_source(
+    source: Source | ArrayLike,
+    positions: Mapping[str, ArrayLike | None],
+    pixel_size: float | tuple[float, float] | None,
+) -> Source:
+    """Return frames in an array as a source."""
+    if hasattr(source, "read") and hasattr(source, "header"):
+        opened = cast("Source", source)
+        if pixel_size is not None or any(values is not None for values in positions.values()):
+            raise io.InputError(
+                f"{opened.name} has positions and pixel size of its own: give them with frames in an array"
+            )
+        return opened
+    if isinstance(source, str | Path):
+        raise io.InputError(f"{source} is a path: open it with io.open_recording")
+    from mirrorskin.io.arguments import as_array
+    from mirrorskin.io.arrays import ArrayRecording
+
+    size = (pixel_size, pixel_size) if isinstance(pixel_size, float | int) else pixel_size
+    return ArrayRecording(as_array("frames", source), positions, {"pixel_size": size})
 
 
 def calibrated(source: Source, calibration: Calibration | str | Path | None = None) -> Source:

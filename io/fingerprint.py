@@ -30,10 +30,10 @@ def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
     """Return the files that frames lie in, the recording itself first, each as it was when it was opened."""
     with as_input_error(f"{file.path}: {dataset.name}"):
         root = os.fstat(file.root.id.get_vfd_handle())
-        found = {Path(file.root.filename): _state(root)}
+        found = {Path(file.root.filename): state_of(root)}
         for path, part, _ in _parts(file, dataset):
             opened = path.stat() if part is None else os.fstat(part.file.id.get_vfd_handle())
-            found.setdefault(path, _state(opened))
+            found.setdefault(path, state_of(opened))
     return found
 
 
@@ -74,7 +74,7 @@ def check_unchanged(origins: Mapping[Path, State]) -> None:
 
 
 def _compare(path: Path, found: os.stat_result, state: State) -> None:
-    if _state(found) != state:
+    if state_of(found) != state:
         raise InputError(f"{path} was changed while it was open: start again")
 
 
@@ -107,7 +107,8 @@ def modified(origins: Mapping[Path, State]) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
-def _state(found: os.stat_result) -> State:
+def state_of(found: os.stat_result) -> State:
+    """Return what tells whether a file was changed."""
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 

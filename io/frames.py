@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arrays import NUMPY_SUFFIXES, ArrayRecording, open_array
 from mirrorskin.io.pictures import (
     PICTURE_SUFFIXES,
     TIFF_SUFFIXES,
@@ -35,8 +36,8 @@ def open_frames(
     header: Header,
     travel: ArrayLike | Positions | None = None,
     phase: ArrayLike | Positions | None = None,
-) -> Pictures | Video:
-    """Open a folder of numbered pictures, a TIFF of many pages, or a video.
+) -> Pictures | Video | ArrayRecording:
+    """Open a folder of numbered pictures, a TIFF of many pages, a video, or an array of NumPy's.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def open_frames(
 
     Returns
     -------
-    Pictures or Video
+    Pictures, Video or ArrayRecording
         A source that can be rewound.
 
     Raises
@@ -62,8 +63,12 @@ def open_frames(
     (240, 480, 640)
     """
     path = Path(path)
+    if path.suffix.lower() in NUMPY_SUFFIXES:
+        where = {"travel": travel, "phase": phase}
+        known = {"tilt": header.tilt, "pixel_size": header.pixel_size, "title": header.title}
+        return open_array(path, None, where, known, header.motion, None, None)
     for motion, name, positions, options in (
-        ("vertical", "travel", travel, "--travel-step"),
+        ("vertical", "travel", travel, "--travel-step or --travel"),
         ("axial", "phase", phase, "--phase-step or --phases"),
     ):
         if header.motion == motion and positions is None:

@@ -57,7 +57,7 @@ POSITIONS: dict[Motion, str] = {
 }
 """Which series says where the body was, of each motion."""
 
-_REMEDIES = {"travel": "give --travel-step", "phase": "give --phase-step or --phases"}
+_REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-step or --phases"}
 
 
 @dataclass(frozen=True, slots=True)

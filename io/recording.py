@@ -197,13 +197,14 @@ def open_recording(
     live: bool = False,
     override_motion: bool = False,
 ) -> Recording:
-    """Open a stack of frames in HDF5.
+    """Open a stack of frames in HDF5, or in an array that ``numpy.save`` or ``numpy.savez`` wrote.
 
     Parameters
     ----------
     path : str or Path
     dataset : str, optional
-        Name of the stack; needed where the file is not a recording of ours and holds several.
+        Name of the stack, or of an archive's array; needed where the file is not a recording of ours and
+        holds several.
     motion : str, optional
         What the file does not say; one that contradicts the file is refused.
     travel, phase, tilt, pixel_size
@@ -240,13 +241,22 @@ def open_recording(
     ...     print(recording.motion, recording.shape)
     vertical (240, 480, 640)
     """
+    if Path(path).suffix.lower() in (".npy", ".npz"):
+        from mirrorskin.io.arrays import open_array
+
+        if live:
+            raise InputError(f"{path} is no recording of a live run: leave --live out")
+        known = {"tilt": tilt, "pixel_size": pixel_size}
+        return open_array(
+            Path(path), dataset, {"travel": travel, "phase": phase}, known, motion, region, frames
+        )
     with ExitStack() as opening:
         file = opening.enter_context(Hdf5File(Path(path), memory_limit))
         ours = file.marked(MARK)
         file.check_layout(MARK)
         stack, state = _find_stack(file, dataset, ours)
         shape = (state.count, *_shape(stack)[1:])
-        cut = _cut(str(path), shape, frames, region)
+        cut = cut_out(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size, override_motion)
         state, truth, numbers = state.of(slice(*cut.frames)), layout.truth(), np.arange(*cut.frames)
@@ -268,7 +278,7 @@ def _shape(stack: h5py.Dataset) -> tuple[int, int, int]:
     return frames, rows, columns
 
 
-def _cut(
+def cut_out(
     name: str, shape: tuple[int, int, int], frames: tuple[int, int | None] | None, region: Region | None
 ) -> Selection:
     """Return what is wanted of a stack, if it has that."""

@@ -52,6 +52,7 @@ def desk(tmp_path_factory):
         cv2.imwrite(str(place / "frames" / f"frame{number}.png"), frame)
         video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
     video.release()
+    np.save(place / "frames.npy", frames)
     with h5py.File(place / "theirs.h5", "w") as file:
         file["raw/images"] = frames
     known_things(place)

@@ -250,7 +250,18 @@ def test_an_import_does_not_overwrite_its_own_pictures(tmp_path):
 def test_an_import_names_what_it_left_out(tmp_path):
     for name in ("frame0", "frame1", "ambient"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((8, 9), 9, np.uint8))
-    words = ["import", ".", "-o", "press.h5", "--motion", "vertical", "--travel-step", "1mm"]
+    words = [
+        "import",
+        ".",
+        "-o",
+        "press.h5",
+        "--motion",
+        "vertical",
+        "--travel-step",
+        "1mm",
+        "--pixel-size",
+        "1mm",
+    ]
     with contextlib.chdir(tmp_path):
         ended = run(*words)
     assert ended.code == 0

@@ -121,7 +121,7 @@ CASES = {
     ),
     "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "leave one out"),
     "seven phases": (theirs, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
-    "no such phases": (theirs, ["--phases", "gone.txt"], "gone.txt cannot be read: No such file"),
+    "no such phases": (theirs, ["--phases", "gone.txt"], "gone.txt: no such file"),
     "a number": (theirs, ["--phases", "number.txt"], "number.txt, line 2: 45: a unit is needed"),
     "a length": (theirs, ["--phase-step", "45mm"], "--phase-step 45mm: millimeters are not an angle"),
     "one phase": (theirs, ["--phase-step", "0deg"], "1 different phases"),

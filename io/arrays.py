@@ -1,0 +1,233 @@
+"""Frames in an array, in memory or in a file of NumPy's, as a recording."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io.fingerprint import State, check_unchanged, modified, state_of
+from mirrorskin.io.layout import COMPLETE, POSITIONS
+from mirrorskin.io.positions import Positions, along, check_finite
+from mirrorskin.io.recording import Recording, cut_out
+from mirrorskin.io.selection import Region
+from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
+
+NUMPY_SUFFIXES = (".npy", ".npz")
+_EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes of frames, of which so many are hashed
+# A damaged head is parsed as Python.
+_ERRORS = (
+    *(ValueError, EOFError, OSError, KeyError, SyntaxError, TypeError, RuntimeError, AttributeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+_KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are no frames
+_NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
+
+
+class ArrayRecording(Recording):
+    """Frames in an array, (T, H, W), as a recording of a motion; see ``Recording``.
+
+    Parameters
+    ----------
+    frames : ndarray, (T, H, W), uint8, uint16 or float32
+    positions : mapping
+        ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
+    header : mapping
+        What else is known: ``tilt``, ``pixel_size``, ``dark``, ``bright``; see ``Header``.
+    motion : str, optional
+        By default the one that has the position that is given.
+    region, wanted
+        The part of the picture, and the first frame and the end, that are wanted.
+    name : str
+        What to call it in messages.
+    origins : mapping
+        The file that it comes from, as it was when it was opened.
+
+    Raises
+    ------
+    InputError
+        Frames, positions or header cannot be used.
+    """
+
+    left_out: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        frames: NDArray[Any],
+        positions: Mapping[str, ArrayLike | Positions | None],
+        header: Mapping[str, Any],
+        motion: Motion | None = None,
+        region: Region | None = None,
+        wanted: tuple[int, int | None] | None = None,
+        name: str = "the array of frames",
+        origins: Mapping[Path, State] | None = None,
+    ) -> None:
+        if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
+            raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
+        if frames.dtype not in FRAME_DTYPES:
+            raise InputError(
+                f"{name} is of type {frames.dtype}: frames are uint8, uint16 or float32; convert it first"
+            )
+        self.path, self.name, self.dataset, self._files = Path(name), name, "", dict(origins or {})
+        self.motion, series = _motion(name, positions, motion)
+        self.full_shape = frames.shape[0], frames.shape[1], frames.shape[2]
+        cut = cut_out(name, self.full_shape, wanted, region)
+        self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
+        self.which = f"{cut.frames[0]}:{cut.frames[1]}"
+        self._frames = frames[slice(*cut.frames), *cut.region.slices]
+        self.shape = self._frames.shape[0], self._frames.shape[1], self._frames.shape[2]
+        self.dtype = self._frames.dtype
+        self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
+        given = along(positions[series], self.full_shape[0])
+        assert given is not None
+        width = (2,) if series == "displacement" else ()
+        where = f"{name}: the {series} given"
+        setattr(self, series, check_finite(given, self.full_shape[0], where, cut.frames, width))
+        maps = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
+        known = {one: value[cut.region.slices] for one, value in maps.items() if value is not None}
+        size = header.get("pixel_size")
+        if size is not None and not all(1e-9 < one < 1e6 for one in size):
+            raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
+        self.header = Header(self.motion, **{"title": self.path.stem, **header, **known})
+        self.truth, self.used, self.dropped, self.state = None, None, None, COMPLETE
+        self.storage, self._next, self._hash = "one piece", 0, ""
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Return the next frames where they lie, as many as ``out`` holds."""
+        return self.lend(len(block_memory(out, self.shape, self.dtype)))
+
+    def lend(self, most: int) -> Block | None:
+        """Return the next frames where they lie, at most so many; None at the end."""
+        frames = self._frames[self._next : self._next + most]
+        return self._block(frames, lent=False) if len(frames) else None
+
+    def fingerprint(self) -> str:
+        """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames."""
+        check_unchanged(self._files)
+        if not self._hash:
+            frames = self._frames
+            digest = hashlib.sha256(f"{self.full_shape} {self.dtype} {self.which} {self.region}".encode())
+            for frame in frames[:: max(1, _EVERY // frames[0].nbytes)]:
+                flat = np.ascontiguousarray(frame).reshape(-1).view(np.uint8)
+                for start in range(0, len(flat), _EVERY):
+                    digest.update(flat[start : start + _TAKEN].tobytes())
+            self._hash = digest.hexdigest()
+        return self._hash
+
+    def find_damage(self) -> None:
+        """Return None: there are no checksums."""
+
+    @property
+    def carried(self) -> None:
+        """No calibration: an array carries none."""
+
+    @property
+    def how(self) -> str:
+        """How the frames are fetched."""
+        return "where they lie"
+
+    @property
+    def modified(self) -> str:
+        """When the file was written last; empty of an array in memory."""
+        return modified(self._files) if self._files else ""
+
+    def close(self) -> None:
+        """Let go of the frames."""
+        self._frames = self._frames[:0]
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn what NumPy says of a damaged file into a line that names it."""
+    try:
+        yield
+    except InputError:
+        raise
+    except _ERRORS as error:
+        said = " ".join(str(error).split())
+        raise InputError(f"{path} is no array of NumPy's ({said}): write it with numpy.save") from error
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """Read an array of numbers that ``numpy.save`` wrote."""
+    with _naming(path):
+        array = np.load(path, allow_pickle=False)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "buif":
+        raise InputError(f"{path} is no array of numbers: write one with numpy.save")
+    return array
+
+
+def open_array(
+    path: Path,
+    dataset: str | None,
+    positions: Mapping[str, ArrayLike | Positions | None],
+    header: Mapping[str, Any],
+    motion: Motion | None,
+    region: Region | None,
+    wanted: tuple[int, int | None] | None,
+) -> ArrayRecording:
+    """Open a stack that ``numpy.save`` or ``numpy.savez`` wrote; see ``open_recording``.
+
+    An archive may also hold ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and ``dark``
+    and ``bright``; what is given comes first.
+    """
+    held: dict[str, NDArray[Any]] = {}
+    with _naming(path):
+        origins = {path: state_of(path.stat())}
+        if path.suffix.lower() == ".npy":
+            frames = np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                chosen = dataset or _stack_of(path, archive.files)
+                if chosen not in archive.files:
+                    names = ", ".join(archive.files)
+                    raise InputError(f"{path} holds no array {chosen!r}: choose from {names}")
+                held = {one: archive[one] for one in archive.files if one in _KNOWN}
+                frames = archive[chosen]
+    maps: dict[str, Any] = {one: held[one] for one in ("dark", "bright") if one in held}
+    given = {one: value for one, value in positions.items() if value is not None}
+    known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}
+    return ArrayRecording(frames, known, {**maps, **header}, motion, region, wanted, str(path), origins)
+
+
+def _stack_of(path: Path, names: Iterable[str]) -> str:
+    """Return the name of the stack of an archive."""
+    others = [one for one in names if one not in _KNOWN]
+    if "frames" in others or len(others) == 1:
+        return "frames" if "frames" in others else others[0]
+    raise InputError(f"{path} holds the arrays {', '.join(names)}: choose the frames with --dataset")
+
+
+def _motion(
+    name: str, positions: Mapping[str, ArrayLike | Positions | None], motion: Motion | None
+) -> tuple[Motion, str]:
+    """Return the motion, and the position that it has."""
+    if motion is not None and motion not in MOTIONS:
+        raise InputError(f"{name}: unknown motion {motion!r}: give one of {', '.join(MOTIONS)}")
+    given = [one for one, values in positions.items() if values is not None]
+    fitting = [one for one in MOTIONS if POSITIONS[one] in given and motion in (None, one)]
+    if len(fitting) != 1:
+        if motion is not None:
+            raise InputError(f"{name}: {motion} motion needs the {POSITIONS[motion]} of each frame: give it")
+        problem = (
+            "does not say where the body was in each frame" if not given else f"has {' and '.join(given)}"
+        )
+        raise InputError(f"{name} {problem}: give one of {_NEEDED}")
+    return fitting[0], POSITIONS[fitting[0]]
+
+
+def _map(name: str, what: str, value: Any, shape: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return a reference as a map of the whole picture."""
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.dtype.kind not in "buif" or array.shape not in ((), shape):
+        raise InputError(f"{name}: {what} has shape {array.shape}: a number, or a map {shape}, is needed")
+    return np.broadcast_to(array.astype(np.float32), shape)

@@ -1,0 +1,175 @@
+"""Stacks that NumPy wrote, and the travel of each frame in a file: through the command line and in Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import run
+from stacks import ball, read_all, record
+
+from mirrorskin import engine, io
+
+TRAVEL = np.arange(1, 13) * 0.1
+STEPS = ("--travel-step", "0.1mm", "--travel-start", "0.1mm")
+SIZE = ("--pixel-size", "0.1mm")
+
+
+@pytest.fixture(scope="module")
+def stack(tmp_path_factory):
+    """The frames of a ball, and what its recording gives without references."""
+    path = record(ball((12, 16), (0.1, 0.1), TRAVEL), tmp_path_factory.mktemp("ball") / "ball.h5")
+    with io.open_recording(path, pixel_size=(0.1, 0.1)) as recording:
+        frames = read_all(recording, 12).frames
+        return frames, engine.reconstruct(recording, dark=0, bright=255)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch, stack):
+    """Work in a folder that holds the frames as an array and as an archive."""
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", stack[0])
+    np.savez("ball.npz", frames=stack[0], travel=TRAVEL, dark=np.float64(0), bright=np.full((12, 16), 255.0))
+    return tmp_path
+
+
+def heights(*words):
+    ended = run("reconstruct", *words, "-o", "out.h5")
+    assert ended.code == 0, ended.said
+    return io.open_result("out.h5").height
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("ball.npy", *STEPS, *SIZE, "--dark", 0, "--bright", 255),
+        ("ball.npz", *SIZE),
+        ("ball.npz", "--dataset", "frames", *STEPS, *SIZE),
+    ],
+)
+def test_an_array_has_the_heights_of_a_recording_of_the_same_frames(stack, words):
+    np.testing.assert_array_equal(heights(*words), stack[1].height)
+
+
+def test_a_region_of_an_array_is_that_part_of_the_picture():
+    heights("ball.npz", *SIZE, "--no-fill")
+    whole = io.open_result("out.h5")
+    heights("ball.npz", *SIZE, "--no-fill", "--region", "3,2,8x6")
+    part = io.open_result("out.h5")
+    np.testing.assert_array_equal(part.height, whole.height[2:8, 3:11])
+    np.testing.assert_array_equal(part.x, whole.x[3:11])
+
+
+def test_an_imported_array_is_a_recording(stack):
+    assert run("import", "ball.npy", "--motion", "vertical", *STEPS, *SIZE, "-o", "rec.h5").code == 0
+    np.testing.assert_array_equal(heights("rec.h5", "--dark", 0, "--bright", 255), stack[1].height)
+
+
+def test_a_batch_keeps_what_was_made_of_an_array_until_the_array_changes():
+    assert "1 done" in run("batch", "ball.npz", "-o", "out").out
+    assert "1 kept" in run("batch", "ball.npz", "-o", "out").out
+    np.savez("ball.npz", frames=np.load("ball.npy") // 2, travel=TRAVEL, dark=0.0, bright=255.0)
+    assert "1 done" in run("batch", "ball.npz", "-o", "out").out
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t.txt", "\n".join(f"{one:.1f}" for one in TRAVEL)),
+        ("t.txt", "# stage\n" + " ".join(f"{1000 * one:.0f}um" for one in TRAVEL)),
+        ("t.csv", "travel (mm),\r\n" + "\r\n".join(f"{one:.1f}," for one in TRAVEL)),
+    ],
+)
+def test_the_travel_of_each_frame_is_read_from_a_text(stack, name, text):
+    Path(name).write_bytes(text.encode())
+    found = heights("ball.npy", "--travel", name, *SIZE, "--dark", 0, "--bright", 255)
+    np.testing.assert_allclose(found, stack[1].height, atol=1e-6)
+
+
+def test_the_travel_of_a_real_stage_places_heights():
+    uneven = TRAVEL**2
+    np.save("t.npy", uneven)
+    even = heights("ball.npy", *STEPS, "--no-fill", "--no-subframe")
+    found = heights("ball.npy", "--travel", "t.npy", "--no-fill", "--no-subframe")
+    np.testing.assert_allclose(found, -(even**2), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["ball.npy"], "ball.npy does not say where the body was in each frame: give one of travel"),
+        (["ball.npy", "--motion", "axial"], "ball.npy: axial motion needs the phase of each frame"),
+        (["ball.npy", *STEPS, "--live"], "leave --live out"),
+        (
+            ["ball.npz", "--dataset", "none"],
+            "holds no array 'none': choose from frames, travel, dark, bright",
+        ),
+        (["ball.npy", "--travel", "ball.npz"], "ball.npz is no text: write one length a frame in it"),
+        (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
+        (["ball.npy", "--travel", "t.txt", *STEPS], "leave --travel-step and -start out"),
+        (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
+        (["cut.npy", *STEPS], "cut.npy is no array of NumPy's"),
+        (["cut.npz", *STEPS], "cut.npz is no array of NumPy's"),
+        (["double.npy", *STEPS], "double.npy is of type float64: frames are uint8, uint16 or float32"),
+        (["flat.npy", *STEPS], "flat.npy has shape (4, 5): frames, (T, H, W)"),
+        (["two.npz", *STEPS], "two.npz holds the arrays a, b: choose the frames with --dataset"),
+    ],
+)
+def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
+    Path("t.txt").write_text("0.1 0.2")
+    for name in ("cut.npy", "cut.npz"):
+        Path(name).write_bytes(Path(f"ball{Path(name).suffix}").read_bytes()[:700])
+    np.save("double.npy", np.zeros((4, 5, 6)))
+    np.save("flat.npy", np.zeros((4, 5), np.uint8))
+    np.savez("two.npz", a=np.zeros((4, 5, 6), np.uint8), b=np.zeros((4, 5, 6), np.uint8))
+    ended = run("reconstruct", *words, "-o", "out.h5")
+    assert (ended.code, ended.said.count("\n")) == (2, 1), ended.said
+    assert said in ended.said
+
+
+def test_an_import_without_the_pixel_size_says_what_needs_it():
+    words = ("import", "ball.npy", "--motion", "vertical", *STEPS, "-o", "rec.h5")
+    assert "no pixel size" in run(*words).said
+    assert run(*words, *SIZE).said == ""
+
+
+# In Python.
+
+
+def test_frames_in_memory_have_a_result_that_can_be_saved(stack):
+    frames, expected = stack
+    found = engine.reconstruct(frames, travel=TRAVEL, pixel_size=0.1, dark=0, bright=255)
+    np.testing.assert_array_equal(found.height, expected.height)
+    np.testing.assert_array_equal(found.x, expected.x)
+    io.save_result(found, "saved.h5")
+    np.testing.assert_array_equal(io.open_result("saved.h5").height, expected.height)
+
+
+def test_frames_with_phases_are_a_rotation():
+    phase = np.arange(8) * np.pi / 4
+    frames = np.broadcast_to((100 + 20 * np.cos(phase))[:, None, None], (8, 6, 7)).astype(np.float32)
+    found = engine.reconstruct(
+        frames, phase=phase, tilt=0.05, pixel_size=(0.1, 0.1), gain=400.0, offset=0.0, noise=0.5
+    )
+    assert found.normals.shape == (6, 7, 3)
+    assert found.process["source"] == "the array of frames"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "does not say where the body was"),
+        ({"travel": TRAVEL, "phase": TRAVEL}, "has travel and phase: give one of"),
+        ({"travel": TRAVEL[:3]}, "travel given has shape \\(3,\\) for 12 frames"),
+        ({"travel": TRAVEL, "pixel_size": -1.0}, "pixel size"),
+    ],
+)
+def test_frames_in_memory_that_do_not_fit_are_refused(stack, given, said):
+    with pytest.raises(io.InputError, match=said):
+        engine.reconstruct(stack[0], **given)
+
+
+def test_a_recording_has_its_own_travel(folder):
+    with io.open_recording("ball.npz") as opened, pytest.raises(io.InputError, match="of its own"):
+        engine.reconstruct(opened, travel=TRAVEL)
