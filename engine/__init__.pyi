@@ -1,4 +1,5 @@
 from .errors import NotConverged
+from .estimator import run
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
 from .fusion import fuse
@@ -24,6 +25,7 @@ from .rotation.normals_pose import PoseEstimator, PoseNormals
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
 from .slip.search import Slip, SlipSearch
+from .streaming import Estimator
 from .tiling import free_memory
 
 __all__ = [
@@ -32,6 +34,7 @@ __all__ = [
     "Correlation",
     "Correlator",
     "Displacement",
+    "Estimator",
     "Force",
     "Frequency",
     "Growth",
@@ -72,6 +75,7 @@ __all__ = [
     "invert_laplacian",
     "measure",
     "reconstruct",
+    "run",
     "score",
     "stitch",
 ]

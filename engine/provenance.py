@@ -35,16 +35,13 @@ def signature() -> dict[str, str]:
 
 
 def attach_provenance(
-    result: Result, source: Source, device: Device, process: dict[str, ProcessValue]
+    result: Result, source: Source, device: Device | None, process: dict[str, ProcessValue]
 ) -> Result:
     """Return a result with the pixels' places, how its maps came about, and the calibration if any."""
     own = source.source if isinstance(source, io.Calibrated) else source
-    known: dict[str, ProcessValue] = {
-        **signature(),
-        "device": device.info.title,
-        "driver": device.info.driver,
-        "source": source.name,
-    }
+    known: dict[str, ProcessValue] = {**signature(), "source": source.name}
+    if device is not None:
+        known |= {"device": device.info.title, "driver": device.info.driver}
     x = y = None
     if source.header.pixel_size is not None:  # from the centre of the whole picture
         shape = own.full_shape if isinstance(own, io.Recording) else own.shape

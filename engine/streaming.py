@@ -18,16 +18,33 @@ Progress = Callable[[int], None]
 class Estimator(Protocol):
     """Takes frames as they come, and returns maps of those so far.
 
-    ``push(frames, travel=...)`` takes the next frames of a press, ``push(frames, phase=...)`` those of a
-    rotation: frames (n, H, W) as a plain array and one position a frame, mm or radians, as a keyword. A
-    device that shares the host's memory reads them where they lie, and ``push`` waits until it has; the
-    keyword ``lent=True`` says that nobody writes to their memory as long as it is referred to, so it need not
-    wait. Only what kernels cannot read in place is copied, such as frames that are not in C order. The same
+    ``push(frames)`` takes the next frames, (n, H, W), any number of them. What it needs to know of each frame
+    besides, it names as parameters: ``push(frames, *, travel)`` of a press, ``push(frames, *, phase)`` of a
+    rotation; see `mirrorskin.io.Block`. The memory of frames may be written anew when it returns. The same
     frames give the same result, bit by bit, however they are cut into pushes.
 
-    ``result()`` returns the maps of the frames so far as plain arrays in a data class. It changes nothing: it
-    may be called again, and more frames may follow. ``reset()`` forgets the frames, and what was estimated
-    from them; parameters, references and device buffers stay.
+    ``result()`` returns the maps of the frames so far as plain arrays, by name or in a data class. It changes
+    nothing: it may be called again, and more frames may follow. ``reset()`` forgets the frames, and what was
+    estimated from them; parameters, references and device buffers stay.
+    """
+
+    def push(self, *args: Any, **kwargs: Any) -> None:
+        """Take in the next frames."""
+
+    def result(self) -> Any:
+        """Return the maps of the frames so far."""
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+
+
+class DeviceEstimator(Estimator, Protocol):
+    """An estimator that says where frames are to be read to, and where it works.
+
+    ``push(frames, travel=..., lent=False)`` or ``push(frames, phase=..., lent=False)``: a device that shares
+    the host's memory reads frames where they lie, and ``push`` waits until it has; ``lent=True`` says that
+    nobody writes to their memory as long as it is referred to, so it need not wait. Only what kernels cannot
+    read in place is copied, such as frames that are not in C order.
     """
 
     position: str
@@ -41,19 +58,10 @@ class Estimator(Protocol):
     def room(self) -> NDArray[Any]:
         """Where the next frames may be written, (n, H, W)."""
 
-    def push(self, *args: Any, **kwargs: Any) -> None:
-        """Take in the next frames: ``push(frames, *, travel, lent=False)``, or ``phase``."""
-
-    def result(self) -> Any:
-        """Return the maps of the frames so far."""
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
-
 
 def feed(
     source: Source,
-    estimator: Estimator,
+    estimator: DeviceEstimator,
     frames: range,
     progress: Progress | None = None,
     long: bool = False,
@@ -67,7 +75,7 @@ def feed(
     ----------
     source : Source
         It is rewound first, if it can be.
-    estimator : Estimator
+    estimator : DeviceEstimator
     frames : range
         Which of them, in steps of 1; those before are read and dropped.
     progress : callable, optional
@@ -97,14 +105,14 @@ def feed(
         known.result()
 
 
-def push_block(estimator: Estimator, block: Block, part: slice = slice(None)) -> None:
+def push_block(estimator: DeviceEstimator, block: Block, part: slice = slice(None)) -> None:
     """Push what a source yields, or a part of it: frames and their positions."""
     where = getattr(block, estimator.position)
     known = {estimator.position: None if where is None else where[part]}
     estimator.push(block.frames[part], **known, lent=block.lent)
 
 
-def _read_in_place(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+def _read_in_place(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
     """Read frames to where the estimator wants them."""
     while count > 0:
         block = source.read(estimator.room[:count])
@@ -114,7 +122,7 @@ def _read_in_place(source: Source, estimator: Estimator, count: int) -> Iterator
         count -= len(block.frames)
 
 
-def _lent_or_read(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+def _lent_or_read(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
     """Take frames where they lie, as many at once as is possible, as long as the source lends them."""
     lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
     most = max(1, estimator.device.max_allocation // (math.prod(source.shape[1:]) * source.dtype.itemsize))
@@ -124,7 +132,7 @@ def _lent_or_read(source: Source, estimator: Estimator, count: int) -> Iterator[
     yield from _read_in_place(source, estimator, count)
 
 
-def _read_ahead(source: Source, estimator: Estimator, count: int) -> Iterator[Block]:
+def _read_ahead(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
     """Read frames to two places in turns, one while the other is copied from."""
     length = max(1, len(estimator.room) // 2)
     shape = max(1, min(length, count)), *estimator.room.shape[1:]

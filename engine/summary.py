@@ -19,7 +19,7 @@ class Summary:
     Attributes
     ----------
     what : {"height", "slope", "normals", "azimuth", "slip"}
-        The maps that count.
+        The maps that count; or the name of the first of a user's own.
     pixels, answered : int
         All (of slip those in contact), and those with an answer; in each turn, where each has maps of its
         own.
@@ -73,7 +73,7 @@ class Summary:
         filled = f" ({self.filled} filled)" if self.filled else ""
         parts = [
             f"{self.what} at {self.answered} of {self.pixels} pixels{turns}{filled}",
-            f"{quantity}from {self.lowest:.3f} to {self.highest:.3f} {self.unit}",
+            f"{quantity}from {self.lowest:.3f} to {self.highest:.3f} {self.unit}".rstrip(),
         ]
         if self.in_contact is not None:
             parts.append(f"in contact at {self.in_contact}")
@@ -101,7 +101,7 @@ def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have an answer, and find the range of the answers.
 
     They are slip; heights; slopes of a body that rocked; normals where there are some and all heights are
-    relative; else azimuths, whose modulation is given.
+    relative; else azimuths, whose modulation is given; else the first map of the user's own.
     """
     if result.slip_onset is not None:
         return _summarise_slip(result)
@@ -114,6 +114,9 @@ def summarise(result: Result) -> Summary:
         answers, values, names = result.zenith, np.degrees(result.zenith), ("normals", "zenith", "deg")
     elif result.height is None and result.azimuth is not None and result.modulation is not None:
         answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")
+    elif result.height is None and result.own_maps:
+        name, answers = next(iter(result.own_maps.items()))
+        values, names = answers, (name, name, "")
     what, quantity, unit = names
     answered = np.isfinite(answers)
     lowest, highest = _range(values if answers is height else values[answered]) or (np.nan, np.nan)

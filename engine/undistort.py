@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
-from mirrorskin.io.result import map_shape
+from mirrorskin.io.result import map_shape, with_fields
 from mirrorskin.io.selection import source_region
 from mirrorskin.io.types import UNDISTORTED
 
@@ -131,7 +130,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
                 room = made[name][turn][band]
                 room[...] = values.reshape(room.shape)
     changed: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
-    return replace(result, **changed)
+    return with_fields(result, changed)
 
 
 def _resampled(maps: Maps, points: SamplePoints) -> Maps:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.atomic import Item, process_items, write_file
+from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
@@ -33,8 +33,9 @@ _DTYPES = (
     | dict.fromkeys(("x", "y", *SERIES), np.float64)
 )
 _MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
+_TAKEN = {*NO_MAPS, "turn", "height_errors", "units", "file", "allow_pickle"}  # in files, or to write them
 _VECTORS = {"normals": 3, "displacement": 2, "traction": 2}  # and how many components they have
-_MOVED, _OFFSETS = "displacement", "offset_unknown"
+_MOVED, _OFFSETS, _OWN = "displacement", "offset_unknown", "own_maps"
 _ALONG_THE_WAY = ("slip_onset", "slip_onset_sigma", "way")
 _RESULT, _PROCESS = "/entry/result", "/entry/process"
 _AGAIN = "reconstruct it again"
@@ -45,6 +46,48 @@ def unit_of(name: str, process: Mapping[str, ProcessValue]) -> str | None:
     if name in _ALONG_THE_WAY:
         return "rad" if process.get("motion") == "twist" else "mm"
     return UNITS.get(name)
+
+
+def result_of(
+    maps: Mapping[str, ArrayLike], shape: tuple[int, int], process: Mapping[str, ProcessValue]
+) -> Result:
+    """Return a result of copies of maps by name; names that results do not know become ``own_maps``.
+
+    Parameters
+    ----------
+    maps : mapping of array_like, (H, W), or of vectors as in `Result`
+        Those that results know get the type that they have there.
+    shape : (int, int)
+    process : mapping
+
+    Raises
+    ------
+    InputError
+        A map is of another shape, holds no numbers, or has a name that cannot be.
+
+    Examples
+    --------
+    >>> result_of({"height": [[0.5, 1.0]], "total": [[7, 8]]}, (1, 2), {}).own_maps["total"].tolist()
+    [[7, 8]]
+    """
+    found: dict[str, NDArray[Any]] = {}
+    for name, given in maps.items():
+        if not str(name).isidentifier() or name in _TAKEN:
+            taken = ", ".join(sorted(_TAKEN))
+            raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
+        values, size = np.array(given), (*shape, _VECTORS[name]) if name in _VECTORS else shape
+        if values.shape != size or values.dtype.kind not in "buif":
+            raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
+        own = np.uint8 if values.dtype.kind == "b" else values.dtype
+        found[name] = values.astype(_DTYPES.get(name, np.float32) if name in _MAPS else own, copy=False)
+    return with_fields(Result(process=process), found)
+
+
+def with_fields(result: Result, values: Mapping[str, Any]) -> Result:
+    """Return a result with other maps and fields; what is no field's name is a map of the user's own."""
+    known = {field.name for field in fields(Result)}
+    own = {name: one for name, one in values.items() if name not in known}
+    return replace(result, **{name: one for name, one in values.items() if name in known}, own_maps=own)
 
 
 @checked
@@ -91,6 +134,8 @@ def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Ite
         yield Item(f"{_RESULT}/{name}", values, attributes | _units(name, result))
     if result.offset_unknown is not None:
         yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
+    if result.own_maps:
+        yield Item(f"{_RESULT}/{_OWN}", fixed_text([*result.own_maps]), {})
     for name, value in result.numbers().items():
         yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
     for name, series in result.series().items():
@@ -143,10 +188,11 @@ def open_result(path: str | Path) -> Result:
     (480, 640)
     """
     with _opened(Path(path)) as file:
-        maps: dict[str, Any] = {
-            name: file.read(node, shape, remedy=_AGAIN).astype(_DTYPES.get(name, np.float32), copy=False)
-            for name, (node, shape) in _find_maps(file).items()
-        }
+        maps: dict[str, Any] = {}
+        for name, (node, shape) in _find_maps(file).items():
+            values = file.read(node, shape, remedy=_AGAIN)
+            own = values.dtype if name not in (*_MAPS, "x", "y") else np.float32
+            maps[name] = values.astype(_DTYPES.get(name, own), copy=False)
         maps |= _read_offsets(file, maps.get("component"))
         numbers = {name: file.find(f"{_RESULT}/{name}") for name in SCALARS}
         maps |= {
@@ -161,7 +207,8 @@ def open_result(path: str | Path) -> Result:
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
                 raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
-        return Result(**maps, process=read_process(file, _PROCESS), calibration=carried_by(file))
+        carried = Result(process=read_process(file, _PROCESS), calibration=carried_by(file))
+        return with_fields(carried, maps)
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
@@ -188,7 +235,10 @@ def _opened(path: Path) -> Iterator[Hdf5File]:
 def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
     """Find the maps and axes that are there, and the shapes of a result, or of one for each turn."""
     group = file.find(_RESULT)
-    found = {} if group is None else {name: file.walk(group, name) for name in (*_MAPS, "x", "y")}
+    listed = file.find(f"{_RESULT}/{_OWN}")
+    own = [] if listed is None else [name for name in file.texts(listed, _AGAIN) if name not in _TAKEN]
+    names = dict.fromkeys((*_MAPS, *own, "x", "y"))
+    found = {} if group is None else {name: file.walk(group, name) for name in names}
     there = {name: node for name, node in found.items() if node is not None}
     size = _size_of(there)
     if size is None:
@@ -214,8 +264,8 @@ def _read_offsets(file: Hdf5File, component: NDArray[np.int32] | None) -> dict[s
 
 def _size_of(found: Mapping[str, Node]) -> Shape | None:
     """Return (H, W) or (turns, H, W), the size of the first map, if it is one."""
-    for name in _MAPS:
-        if name in found:
+    for name in found:
+        if name not in ("x", "y"):
             shape: Shape = getattr(found[name], "shape", None) or ()
             size = _size(name, shape)
             return size if len(size) in (2, 3) else None
@@ -270,7 +320,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
     chosen: dict[str, Any] = {name: values[turn] for name, values in maps.items()}
     if result.component is not None:
         chosen |= _renumbered(result.component[turn], result.offset_unknown)
-    return replace(result, **chosen, process={**result.process, "turn": turn})
+    return with_fields(result, chosen | {"process": {**result.process, "turn": turn}})
 
 
 def _renumbered(

@@ -319,6 +319,8 @@ class Result:
         Newtons at the greatest travel, normal to the sheet, and the standard deviation that is expected.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres of the pixel centres from the picture's centre; y runs up the picture.
+    own_maps : mapping of ndarray, (H, W)
+        Those of a user's own estimator, by names that are none of the above; see `mirrorskin.engine.run`.
     process : mapping
         Program, version, date, every parameter, device, source and its hash.
     calibration : Calibration or None
@@ -367,13 +369,14 @@ class Result:
     force_y_sigma: float | None = None
     x: Floats | None = None
     y: Floats | None = None
+    own_maps: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     calibration: Calibration | None = None
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps that were computed, by name."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in NO_MAPS}
-        return {name: value for name, value in values.items() if value is not None}
+        return {name: value for name, value in values.items() if value is not None} | {**self.own_maps}
 
     def numbers(self) -> dict[str, float]:
         """Return the single numbers that were computed, by name."""
@@ -419,7 +422,7 @@ SCALARS = ("force", "force_sigma", "force_x", "force_x_sigma", "force_y", "force
 SERIES = ("way", "stick_ratio")
 """What a result has of each frame."""
 
-NO_MAPS = ("offset_unknown", *SCALARS, *SERIES, "x", "y", "process", "calibration")
+NO_MAPS = ("offset_unknown", *SCALARS, *SERIES, "x", "y", "own_maps", "process", "calibration")
 """What a result has besides maps."""
 
 UNDISTORTED = "undistorted"

@@ -1,8 +1,9 @@
-"""The examples in docstrings run, and print what they say."""
+"""The examples in docstrings run, and print what they say; those of the folder of examples run."""
 
 import doctest
 import importlib
 import inspect
+import runpy
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,10 @@ def test_every_public_function_has_an_example(package):
     functions = {name: getattr(package, name) for name in package.__all__}
     lacking = [name for name, it in functions.items() if inspect.isfunction(it) and ">>> " not in it.__doc__]
     assert lacking == []
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "examples").glob("*.py")), ids=lambda file: file.stem)
+def test_a_script_of_the_examples_runs_and_says_what_it_found(file, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(file), run_name="__main__")
+    assert "median error 0.0" in capsys.readouterr().out

@@ -22,7 +22,7 @@ from mirrorskin.engine.live.status import (
     Status,
     Update,
 )
-from mirrorskin.engine.streaming import Estimator, push_block
+from mirrorskin.engine.streaming import DeviceEstimator, push_block
 from mirrorskin.io import Block, InputError, LiveSource
 
 LATENCY = 0.1
@@ -36,7 +36,7 @@ _PATIENCE = 0.01  # seconds that an update waits at least for maps that take lon
 _MARGIN = 0.001  # seconds before that, in which nothing is begun any more
 
 
-class LiveEstimator(Estimator, Protocol):
+class LiveEstimator(DeviceEstimator, Protocol):
     """An estimator that can return maps at any time, and does what can wait when there is time to spare.
 
     Its ``result()`` is a `mirrorskin.io.Result`.

@@ -21,7 +21,7 @@ from mirrorskin.kernels.errors import DeviceError
 REFUSALS = (io.InputError, engine.NotConverged, DeviceError)
 SHAPE = (16, 20)
 _COUNTS = "mean", "cosine", "sine", "residual"  # of a pixel's samples, which may be infinite themselves
-ELSEWHERE = {"reconstruct", "free_memory"}
+ELSEWHERE = {"reconstruct", "run", "free_memory"}
 """Public functions that take no arrays of numbers: sources and nothing, which other tests see to."""
 
 _ROW, _COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)

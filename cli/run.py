@@ -1,0 +1,107 @@
+"""``mirrorskin run``: a user's own estimator."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
+
+Own = Annotated[
+    str,
+    Argument(metavar="MODULE:CLASS", help="Your class, in a module or file: mine:Sum, or mine.py:Sum."),
+]
+Settings = Annotated[
+    list[str] | None,
+    Option("--set", metavar="NAME=VALUE", help="A parameter of the class, more than once if you like."),
+]
+
+
+def command(
+    estimator: Own,
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5.")],
+    output: Annotated[
+        Path | None,
+        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-CLASS.h5"),
+    ] = None,
+    settings: Settings = None,
+    dataset: options.Dataset = None,
+    motion: options.Motion = None,
+    travel_step: options.TravelStep = None,
+    travel_start: options.TravelStart = None,
+    phase_step: options.PhaseStep = None,
+    phases: options.Phases = None,
+    pixel_size: options.PixelSize = None,
+    region: options.Region = None,
+    frames: options.Frames = None,
+    live: Annotated[
+        bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
+    ] = False,
+    memory: options.Memory = "256MB",
+    as_json: options.Json = False,
+) -> None:
+    """Run an estimator of your own over a recording.
+
+    See docs/estimators.md.
+    """
+    from mirrorskin import engine, io
+    from mirrorskin.cli.output import progress, save_and_report
+    from mirrorskin.cli.quantity import memory as bytes_of
+    from mirrorskin.cli.stack import stack_options
+
+    make = load_estimator(estimator, settings)
+    known = stack_options(
+        motion=motion,
+        travel_step=travel_step,
+        travel_start=travel_start,
+        phase_step=phase_step,
+        phases=phases,
+        pixel_size=pixel_size,
+        region=region,
+        frames=frames,
+    )
+    limit = bytes_of(memory, "--memory")
+    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
+        target = output or recording.with_name(f"{recording.stem}-{estimator.rpartition(':')[2]}.h5")
+        io.check_output(target, recording, phases)
+        with progress("running", source.shape[0]) as show:
+            result = engine.run(source, make, memory_limit=limit, progress=show)
+    save_and_report(result, target, None, as_json)
+
+
+def load_estimator(name: str, settings: list[str] | None = None) -> Any:
+    """Return what makes the estimator that is named MODULE:CLASS or FILE.py:CLASS, with parameters set."""
+    import ast
+    import functools
+    import importlib
+
+    from mirrorskin.io import InputError
+
+    place, _, kind = name.rpartition(":")
+    file = Path(place) if place.endswith(".py") else None
+    if not place or not kind.isidentifier():
+        raise InputError(f"{name}: name a class as MODULE:CLASS or FILE.py:CLASS")
+    folder, module = (Path(), place) if file is None else (file.parent, file.stem)
+    sys.path.insert(0, str(folder.resolve()))
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # what the module itself imports
+        raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
+    made = getattr(found, kind, None)
+    if not callable(made):
+        own = [one for one, it in vars(found).items() if isinstance(it, type) and it.__module__ == module]
+        raise InputError(f"{name}: there is no class {kind} in {place}; it has {', '.join(own) or 'none'}")
+    values: dict[str, Any] = {}
+    for setting in settings or ():
+        parameter, equals, text = setting.partition("=")
+        if not equals or not parameter.isidentifier():
+            raise InputError(f"--set {setting}: NAME=VALUE is needed, such as threshold=0.5")
+        try:
+            values[parameter] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            values[parameter] = text
+    return functools.partial(made, **values) if values else made
