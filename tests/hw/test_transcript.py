@@ -24,12 +24,10 @@ def emulated():
     return list(play(GrblMachine(SETTINGS, clock=lambda: now), lambda: now, sleep))
 
 
-@pytest.fixture(scope="module", params=["emulator", "firmware"])
+@pytest.fixture(scope="module", params=["emulator", *(["firmware"] if PROGRAM else [])])
 def answered(request, tmp_path_factory):
     if request.param == "emulator":
         return emulated()
-    if not PROGRAM:
-        pytest.skip("no program of the firmware: make test-hardware GRBL=PATH")
     with Firmware(PROGRAM, tmp_path_factory.mktemp("grbl"), SETTINGS) as firmware:
         return list(play(firmware))
 
