@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Option
+from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,7 +19,7 @@ Point = tuple[float, float]
 
 
 def command(
-    result: options.ResultFile,
+    result: Annotated[Path, Argument(metavar="RES.h5", help="Result, or for .mcap a recording.")],
     output: Annotated[
         list[Path],
         Option(
@@ -27,7 +27,7 @@ def command(
             "-o",
             metavar="FILE",
             help="File to write, more than once if you like: a mesh .ply or .stl, points .xyz, heights in"
-            " 16 bits .png or .tif, a cross-section .csv, arrays .npz.",
+            " 16 bits .png or .tif, a cross-section .csv, arrays .npz, ROS 2 messages .mcap.",
         ),
     ],
     turn: options.Turn = None,
@@ -38,6 +38,8 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.quantity import segment
     from mirrorskin.io.export import check_export
+    from mirrorskin.io.frames import MCAP_SUFFIX
+    from mirrorskin.io.recording import is_recording
 
     suffixes = {path.suffix.lower() for path in output}
     for given, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
@@ -48,6 +50,11 @@ def command(
         if path.resolve() in (other.resolve() for other in output[:number]):
             raise io.InputError(f"{path} is to be written twice: name another output with -o")
         io.check_output(path, result)
+    if suffixes == {MCAP_SUFFIX} and is_recording(result):
+        with io.open_recording(result) as recording:
+            for path in output:
+                click.echo(f"{path}: {io.save_messages(recording, path)}")
+        return
     found = io.select_turn(io.open_result(result), turn)
     for path in output:
         check_export(found, path)

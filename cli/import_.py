@@ -14,7 +14,9 @@ from mirrorskin.cli.groups import Argument, Option
 def command(
     frames: Annotated[
         Path,
-        Argument(metavar="FRAMES", help="AVI, MP4, NPY, NPZ, or a folder of numbered PNG/TIFF pictures."),
+        Argument(
+            metavar="FRAMES", help="AVI, MP4, NPY, NPZ, MCAP, or a folder of numbered PNG/TIFF pictures."
+        ),
     ],
     output: options.NewRecording,
     motion: Annotated[options.MotionName, Option(help="How the body moved.")],
@@ -25,6 +27,7 @@ def command(
     phases: options.Phases = None,
     tilt: options.Tilt = None,
     pixel_size: options.PixelSize = None,
+    topic: Annotated[str | None, Option(metavar="TOPIC", help="Of an MCAP file: that of the images.")] = None,
     compression: options.Compression = options.CompressionName.raw,
 ) -> None:
     """Make a recording of a video or pictures."""
@@ -45,7 +48,7 @@ def command(
     header = io.Header(
         motion.value, title=frames.stem, tilt=known.get("tilt"), pixel_size=known.get("pixel_size")
     )
-    source = io.open_frames(frames, header, known.get("travel"), known.get("phase"))
+    source = io.open_frames(frames, header, known.get("travel"), known.get("phase"), topic)
     with (
         io.Recorder(source, output, compression.value) as recorder,
         progress("importing", source.shape[0]) as show,

@@ -14,6 +14,7 @@ from .calibration.types import (
 from .description import describe
 from .export import export_result, save_table
 from .frames import open_frames
+from .mcap import save_messages
 from .mesh import Mesh, surface_mesh
 from .positions import Steps
 from .recorder import Recorder
@@ -67,6 +68,7 @@ __all__ = [
     "open_result",
     "pixel_axes",
     "save_calibration",
+    "save_messages",
     "save_result",
     "save_table",
     "select_turn",

@@ -21,7 +21,7 @@ from mirrorskin.io.os_errors import legible
 from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats, InputError, Result
 
-_SECTION, _ARRAYS = ".csv", ".npz"
+_SECTION, _ARRAYS, _ROS = ".csv", ".npz", ".mcap"
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
 _FROM_PROCESS = {_SOURCE: "source", _DATE: "date", "turn": "turn"}
 _NORMAL = "nx", "ny", "nz"
@@ -53,7 +53,8 @@ def export_result(
     path : str or Path
         Its suffix chooses the format: ``.ply`` and ``.stl``, a surface of triangles; ``.xyz``, points as
         text; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their scale, and 0 for no
-        answer; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section.
+        answer; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section; ``.mcap``, ROS 2 messages, as
+        ``save_messages`` writes them.
     section : mapping of ndarray, (n,), optional
         The cross-section, by name; lengths are mm, and ``filled`` is 1 where a height was not measured.
     points : bool, optional
@@ -87,6 +88,10 @@ def export_result(
         units = {name: "mm" for name in section if name != "filled"}
         save_table(path, section, units, _notes_of(result))
         holds = f"{len(section['height'])} points of a cross-section"
+    elif suffix == _ROS:
+        from mirrorskin.io.mcap import save_messages
+
+        holds = save_messages(result, path)
     else:
         try:
             with_points = {"points": True} if points and suffix == ".ply" else {}
@@ -100,7 +105,7 @@ def export_result(
 
 def check_export(result: Result, path: str | Path) -> None:
     """Refuse what cannot be exported, before any work is done for it."""
-    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION)
+    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, _ROS)
     if suffix not in known:
         wrong = f"{suffix} is no format" if suffix else "its name does not say a format"
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")

@@ -27,6 +27,7 @@ from mirrorskin.io.pictures import (
 from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_strokes
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
 
+MCAP_SUFFIX = ".mcap"
 # OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.
 _FFMPEG = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_FFMPEG_CAPTURE_OPTIONS": "fflags;discardcorrupt"}
 
@@ -36,8 +37,9 @@ def open_frames(
     header: Header,
     travel: ArrayLike | Positions | None = None,
     phase: ArrayLike | Positions | None = None,
-) -> Pictures | Video | ArrayRecording:
-    """Open a folder of numbered pictures, a TIFF of many pages, a video, or an array of NumPy's.
+    topic: str | None = None,
+) -> FrameSequence | ArrayRecording:
+    """Open numbered pictures, a TIFF of many pages, a video, NumPy's arrays, or ROS 2 messages in MCAP.
 
     Parameters
     ----------
@@ -45,11 +47,13 @@ def open_frames(
     header : Header
         How the body moved, and what else holds for all frames.
     travel, phase : Positions or array_like, (T,), optional
-        Millimetres and radians, one a frame, or ``Steps``.
+        Millimetres and radians, one a frame, or ``Steps``; an MCAP file may have them itself.
+    topic : str, optional
+        That of the images, in an MCAP file of more than one.
 
     Returns
     -------
-    Pictures, Video or ArrayRecording
+    FrameSequence or ArrayRecording
         A source that can be rewound.
 
     Raises
@@ -63,6 +67,9 @@ def open_frames(
     (240, 480, 640)
     """
     path = Path(path)
+    messages = path.suffix.lower() == MCAP_SUFFIX
+    if topic is not None and not messages:
+        raise InputError(f"{path}: only an MCAP file has topics: leave --topic out")
     if path.suffix.lower() in NUMPY_SUFFIXES:
         where = {"travel": travel, "phase": phase}
         known = {"tilt": header.tilt, "pixel_size": header.pixel_size, "title": header.title}
@@ -71,10 +78,14 @@ def open_frames(
         ("vertical", "travel", travel, "--travel-step or --travel"),
         ("axial", "phase", phase, "--phase-step or --phases"),
     ):
-        if header.motion == motion and positions is None:
+        if header.motion == motion and positions is None and not messages:
             raise InputError(f"{path}: frames of {motion} motion need their {name}: give {options}")
         if header.motion != motion and positions is not None:
             raise InputError(f"{path}: frames of {header.motion} motion have no {name}: leave {options} out")
+    if messages:
+        from mirrorskin.io.mcap import Messages
+
+        return Messages(path, header, travel, phase, topic)
     pictures = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
     return (Pictures if pictures else Video)(path, header, travel, phase)
 

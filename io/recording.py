@@ -336,6 +336,12 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
     return stack, state
 
 
+def is_recording(path: str | Path) -> bool:
+    """Return whether a file of HDF5 is one of our recordings."""
+    with Hdf5File(Path(path)) as file:
+        return file.marked(MARK)
+
+
 def _only_stack(file: Hdf5File) -> str:
     if file.marked(RESULT_MARK):
         raise InputError(f"{file.path} is a result: give the recording that it was made from")

@@ -1,0 +1,141 @@
+"""ROS 2 messages in MCAP files, read back by the reader of their own packages, and by ours."""
+
+import cv2
+import numpy as np
+import pytest
+from commands import run
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
+from stacks import record, sphere
+
+from mirrorskin import io
+
+HEIGHT = np.array([[1.0, np.nan, 0.5], [0.25, 0.0, -1.0]], np.float32)
+AXIS = {"x": np.array([-1.0, 0.0, 1.0]), "y": np.array([0.5, -0.5])}
+IMAGE = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
+
+
+def messages(path):
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [(one[1].topic, one[2].log_time, one[3]) for one in reader.iter_decoded_messages()]
+
+
+def test_a_result_becomes_points_in_metres_with_their_sigma(tmp_path):
+    normals = np.zeros((2, 3, 3), np.float32)
+    normals[..., 2] = 1.0
+    result = io.Result(
+        height=HEIGHT,
+        height_sigma=np.full_like(HEIGHT, 0.01),
+        normals=normals,
+        force=2.5,
+        process={"date": "2026-11-23T12:00:00+00:00", "program": "mirrorskin"},
+        **AXIS,
+    )
+    assert io.export_result(result, tmp_path / "a.mcap") == "5 points"
+    found = {topic: (time, said) for topic, time, said in messages(tmp_path / "a.mcap")}
+    assert set(found) == {"/surface", "/height", "/force"}
+    time, cloud = found["/surface"]
+    assert time == 1795435200_000000000
+    names = [field.name for field in cloud.fields]
+    assert names == ["x", "y", "z", "sigma", "normal_x", "normal_y", "normal_z"]
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, len(names))
+    known = [(x, y, HEIGHT[i, j]) for i, y in enumerate(AXIS["y"]) for j, x in enumerate(AXIS["x"])]
+    expected = [one for one in known if np.isfinite(one[2])]
+    np.testing.assert_allclose(points[:, :3], np.array(expected) * 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(points[:, 3:], [[1e-5, 0, 0, 1]] * 5, rtol=1e-6)
+    picture = found["/height"][1]
+    assert (picture.encoding, picture.height, picture.width) == ("32FC1", 2, 3)
+    np.testing.assert_allclose(np.frombuffer(picture.data, "<f4").reshape(2, 3), HEIGHT * 1e-3, rtol=1e-6)
+    assert found["/force"][1].wrench.force.z == 2.5
+
+
+def test_a_result_without_millimetres_is_refused(tmp_path):
+    with pytest.raises(io.InputError, match="--pixel-size"):
+        io.export_result(io.Result(height=HEIGHT), tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_comes_back_through_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    record(sphere(), "rec.h5")
+    assert run("export", "rec.h5", "-o", "rec.mcap").code == 0
+    done = run("import", "rec.mcap", "-o", "back.h5", "--motion", "vertical", "--pixel-size", "0.1mm")
+    assert done.code == 0, done.said
+    with io.open_recording("rec.h5") as before, io.open_recording("back.h5") as after:
+        room = np.empty(before.shape, before.dtype)
+        frames = before.read(room).frames.copy()
+        np.testing.assert_array_equal(after.read(room).frames, frames)
+        np.testing.assert_allclose(after.travel, before.travel, rtol=1e-12)
+
+
+@pytest.fixture
+def film(tmp_path):
+    """Write pictures as images of an encoding on topics, by the packages' own writer."""
+
+    def write(*topics, encoding="mono8", kind="sensor_msgs/msg/Image"):
+        path = tmp_path / "film.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file)
+            schema = writer.register_msgdef(
+                kind, IMAGE if kind.endswith("/Image") else "string format\nuint8[] data"
+            )
+            for number in range(3):
+                for topic, picture in topics:
+                    picture = picture + picture.dtype.type(number)
+                    data = {"format": "png", "data": cv2.imencode(".png", picture)[1].tobytes()}
+                    if kind.endswith("/Image"):
+                        size = {"height": len(picture), "width": picture.shape[1], "is_bigendian": 0}
+                        data = size | {
+                            "encoding": encoding,
+                            "step": picture[0].nbytes,
+                            "data": picture.tobytes(),
+                        }
+                    writer.write_message(topic, schema, data, number * 10_000_000)
+            writer.finish()
+        return path
+
+    return write
+
+
+def frames_of(path, **known):
+    header = io.Header("vertical")
+    with io.open_frames(path, header, travel=io.Steps(0.1), **known) as source:
+        assert source.shape[0] == 3
+        return source.read(np.empty(source.shape, source.dtype))
+
+
+def test_grey_colours_and_compressed_images_are_read(film):
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    block = frames_of(film(("/a", grey)))
+    np.testing.assert_array_equal(block.frames[2], grey + 2)
+    np.testing.assert_allclose(block.time, [0, 0.01, 0.02])
+    deep = grey.astype(np.uint16) * 1000
+    np.testing.assert_array_equal(frames_of(film(("/a", deep), encoding="mono16")).frames[0], deep)
+    equal = np.repeat(grey[:, :, None], 3, axis=2)
+    np.testing.assert_array_equal(frames_of(film(("/a", equal), encoding="rgb8")).frames[1], grey + 1)
+    packed = film(("/a", deep), kind="sensor_msgs/msg/CompressedImage")
+    np.testing.assert_array_equal(frames_of(packed).frames[0], deep)
+
+
+def test_of_several_topics_one_is_named(film):
+    one, other = np.zeros((2, 3), np.uint8), np.full((2, 3), 9, np.uint8)
+    path = film(("/left", one), ("/right", other))
+    with pytest.raises(io.InputError, match=r"topics of images are /left, /right: name one with --topic"):
+        frames_of(path)
+    assert frames_of(path, topic="/right").frames[0, 0, 0] == 9
+
+
+def test_a_file_that_is_cut_off_or_none_is_refused(film, tmp_path):
+    path = film(("/a", np.zeros((2, 3), np.uint8)))
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:300])
+    (tmp_path / "none.mcap").write_bytes(b"none")
+    for name in ("cut.mcap", "none.mcap"):
+        with pytest.raises(io.InputError, match=name):
+            frames_of(tmp_path / name)
+
+
+def test_images_that_are_not_grey_values_are_refused(film):
+    with pytest.raises(io.InputError, match="encoding 'bayer_rggb8'"):
+        frames_of(film(("/a", np.zeros((2, 4), np.uint8)), encoding="bayer_rggb8"))
