@@ -12,7 +12,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Annotated
 
 import click
@@ -77,6 +77,7 @@ class _OneLine:
     """Print usage errors and the project's own, and only those, as one line, and exit with their code."""
 
     debug = False
+    signalled = 0  # the exit code of a signal that came; libraries make another error of it at times
 
     def __enter__(self) -> None: ...
 
@@ -85,6 +86,8 @@ class _OneLine:
     ) -> None:
         if isinstance(error, KeyboardInterrupt | click.Abort):
             sys.exit(_INTERRUPTED)
+        if isinstance(error, Exception) and self.signalled:
+            sys.exit(self.signalled)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
         no_memory = isinstance(error, MemoryError)
         code = 1 if no_memory else getattr(error, "exit_code", None)
@@ -109,9 +112,19 @@ class _OneLine:
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
     """Let signals end the program by an exception, so that nothing half-written stays behind."""
+    _OneLine.signalled = 0
+
+    def end(number: int, frame: FrameType | None) -> None:
+        _OneLine.signalled = 128 + number
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.exit(128 + number)
+
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
-            signal.signal(getattr(signal, name), lambda number, frame: sys.exit(128 + number))
+            signal.signal(getattr(signal, name), end)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
+        signal.signal(signal.SIGINT, end)
     told = sys.unraisablehook
 
     def insist(lost: sys.UnraisableHookArgs) -> None:

@@ -237,6 +237,30 @@ def test_a_signal_that_comes_in_a_destructor_ends_the_command_too(name, code):
     assert (run.returncode, run.stdout, run.stderr) == (code, "", "")
 
 
+CONFUSED = """
+import signal, sys
+from mirrorskin.cli import info, main
+
+def command():
+    try:
+        signal.raise_signal(signal.{name})
+    except BaseException:
+        raise TypeError("as compiled libraries make of it") from None
+
+info.command = command
+sys.argv = ["mirrorskin", "info"]
+main.main()
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 128 + signal.SIGTERM), ("SIGINT", 130)])
+def test_a_signal_that_a_library_makes_another_error_of_ends_the_command(name, code):
+    run = subprocess.run(
+        [sys.executable, "-c", CONFUSED.format(name=name)], capture_output=True, text=True, timeout=60
+    )
+    assert (run.returncode, run.stdout, run.stderr) == (code, "", "")
+
+
 def test_an_import_does_not_overwrite_its_own_pictures(tmp_path):
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"frame{number}.png"), np.full((8, 9), 9, np.uint8))
