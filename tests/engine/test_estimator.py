@@ -1,5 +1,8 @@
 """Estimators of users' own: the answer is NumPy's, whatever frames come from and however they are cut."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from stacks import TRAVEL, MadeUp, random_stack, record, sphere
@@ -125,6 +128,21 @@ def test_ours_are_run_as_well(device):
     np.testing.assert_array_equal(found.height, onset.height)
     np.testing.assert_array_equal(found.own_maps["frame"], onset.frame)
     assert found.process["noise"] == onset.noise
+    assert found.process["device"] == device.info.title
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
+    page = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text(encoding="utf-8")
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[2], known := {})
+    frames = random_stack(dtype)
+    record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")
+    estimator = known["LightOnDevice"](frames.shape[1:], frames.dtype, device=device)
+    light = (frames > 100).sum(axis=0)
+    for at_once in (1, 3, 100):
+        with io.open_recording(tmp_path / "rec.h5") as recording:
+            found = engine.run(recording, estimator, memory_limit=2 * at_once * frames[0].nbytes)
+        np.testing.assert_array_equal(found.own_maps["light"], light)
     assert found.process["device"] == device.info.title
 
 

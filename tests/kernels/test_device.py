@@ -90,6 +90,23 @@ def test_a_kernel_of_ones_own_runs_and_may_use_what_ours_share(device, tmp_path)
         device.kernel(tmp_path / "worse.cl", "worse")
 
 
+TWICE = """
+#include "common.clh"
+__kernel void twice(__global int *values, const int count) {
+    const int item = get_global_id(0);
+    if (item < count) values[item] *= 2;
+}
+"""
+
+
+def test_a_kernel_in_a_text_runs_and_one_that_does_not_compile_is_quoted(device):
+    values = device.given("values", np.arange(5), np.int32)
+    device.kernel(TWICE, "twice")(5, values=values, count=5, moved=40)
+    assert values.download().tolist() == [0, 2, 4, 6, 8]
+    with pytest.raises(DeviceError, match=r"text\.cl line 5 does not compile.*`if .item < count. valus"):
+        device.kernel(TWICE.replace("values[item]", "valus[item]"), "twice")
+
+
 def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
     mine = device.kernel("limits", "copy_all", **MACROS)
     assert device.kernel("limits", "copy_all", **MACROS) is mine
