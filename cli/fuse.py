@@ -45,7 +45,7 @@ def command(
 ) -> None:
     """Make one surface of a press and a rotation."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, save_and_report
+    from mirrorskin.cli.output import progress, report_levels, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle
     from mirrorskin.cli.stack import stack_options
@@ -83,6 +83,9 @@ def command(
                 device=device,
                 progress=show,
             )
+    report_levels(
+        str(vertical), {name.removeprefix("vertical_"): said for name, said in result.process.items()}
+    )
     save_and_report(result, target, device, as_json)
 
 

@@ -205,12 +205,13 @@ class _Live:
         output = self._given["output"]
         if output is None:
             return
-        from mirrorskin.cli.output import report_contact, report_missing_maps, save_and_report
+        from mirrorskin.cli.output import report_contact, report_levels, report_missing_maps, save_and_report
 
         assert self._estimator is not None
         result = self._estimator.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
+        report_levels(self._settings.name, result.process)
         save_and_report(result, output, self._given["device"], as_json=False)
 
 

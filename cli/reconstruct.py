@@ -174,7 +174,13 @@ def command(
 ) -> None:
     """Reconstruct heights from a press, normals and heights from a rotation, or slip."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import progress, report_contact, report_missing_maps, save_and_report
+    from mirrorskin.cli.output import (
+        progress,
+        report_contact,
+        report_levels,
+        report_missing_maps,
+        save_and_report,
+    )
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.quantity import per_angle, pressure
     from mirrorskin.cli.stack import stack_options
@@ -224,6 +230,7 @@ def command(
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
     report_contact(str(recording), result.process)
+    report_levels(str(recording), result.process)
     save_and_report(result, target, device, as_json)
 
 

@@ -108,6 +108,11 @@ class ArrayRecording(Recording):
         frames = self._frames[self._next : self._next + most]
         return self._block(frames, lent=False) if len(frames) else None
 
+    def frame(self, number: int) -> NDArray[Any]:
+        """Return one frame, (H, W)."""
+        frame: NDArray[Any] = self._frames[number]
+        return frame
+
     def fingerprint(self) -> str:
         """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames."""
         check_unchanged(self._files)

@@ -128,6 +128,11 @@ class Recording(Closing):
         known = {name: values[here] for name, values in series.items() if values is not None}
         return Block(frames, here.start, **known, origin=self.origin, lent=lent)
 
+    def frame(self, number: int) -> NDArray[Any]:
+        """Return one frame, (H, W), whichever is the next to be read."""
+        frame: NDArray[Any] = self._stack.read(number, np.empty((1, *self.shape[1:]), self.dtype))[0]
+        return frame
+
     def rewind(self) -> None:
         """Go back to the first frame."""
         self._next = 0

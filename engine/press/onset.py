@@ -285,6 +285,11 @@ class OnsetSearch:
         self._noise.reset(noise)
 
     @property
+    def falls(self) -> bool:
+        """Whether it looks for releases, while travel falls."""
+        return self._release
+
+    @property
     def travel(self) -> NDArray[np.float64]:
         """The travel of the frames so far, (T,), mm."""
         return np.array(self._travel.values, np.float64)

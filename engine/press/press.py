@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.press.changepoint import ChangePointSearch
+from mirrorskin.engine.press.estimated_levels import EstimatedLevels, EstimatedLevelSearch, estimate_levels
 from mirrorskin.engine.press.levels import Levels, LevelSearch, check_levels
 from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch, check_event
 from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 PressMethod = Literal["threshold", "change-point"]
 METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
 
+_ESTIMATED = "estimated from the frames"
 _LIGHT_AT_START = 3  # of an onset's status
 
 
@@ -71,7 +73,9 @@ def reconstruct_press(
         The sheet's inclinations at which thresholds are passed, radians, for ``slope_min`` and ``slope_max``;
         one for each threshold.
     dark, bright : array_like, scalar or (H, W), optional
-        Counts without and with full light, instead of the source's own.
+        Counts without and with full light, instead of the source's own. What neither gives is estimated from
+        the frames, and its uncertainty added to ``height_sigma``; where they do not tell, it is the end of
+        the range of their type. ``process`` says which.
     noise : float, optional
         Standard deviation of a sample, counts; by default estimated from the first two frames.
     fill : bool
@@ -109,14 +113,20 @@ def reconstruct_press(
     oscillates = _oscillates(source)
     frames = range(source.shape[0]) if oscillates else _frames_of(source, event)
     size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
+    low = source.header.dark if dark is None else dark
+    high = source.header.bright if bright is None else bright
+    guess = None
+    if (low is None or high is None) and method == "threshold":
+        guess = estimate_levels(source, frames, low, high)
     search = _search(
         source,
         method,
         subframe,
         oscillates,
         levels and levels[0],
-        dark=source.header.dark if dark is None else dark,
-        bright=source.header.bright if bright is None else bright,
+        guess,
+        dark=guess.dark if guess and low is None else low,
+        bright=guess.bright if guess and high is None else high,
         threshold=threshold,
         hold=hold,
         noise=noise,
@@ -144,6 +154,9 @@ def reconstruct_press(
         "dark": "each pixel's own" if twice else level_origin(source, "dark", dark),
         "bright": "each pixel's own" if twice else level_origin(source, "bright", bright),
     }
+    if guess is not None:
+        process |= {"dark": f"{guess.dark:.4g}, {_ESTIMATED}"} if low is None else {}
+        process |= {"bright": f"{guess.bright:.4g}, {_ESTIMATED}"} if high is None else {}
     result, done = finish_press(onset, source, search.travel, event, threshold, fill, modulus)
     if isinstance(found, Strokes):
         result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}
@@ -267,8 +280,9 @@ def _search(
     subframe: bool,
     oscillates: bool,
     levels: list[float] | None,
+    guess: EstimatedLevels | None,
     **options: Any,
-) -> OnsetSearch | ChangePointSearch | StrokeSearch | LevelSearch:
+) -> OnsetSearch | ChangePointSearch | StrokeSearch | LevelSearch | EstimatedLevelSearch:
     """Return the estimator of a method, if the source can feed it."""
     shape, dtype = source.shape[1:], source.dtype
     if levels is not None and (oscillates or method != "threshold"):
@@ -283,6 +297,8 @@ def _search(
     if oscillates:
         del options["event"]  # it finds both
         return StrokeSearch(shape, dtype, subframe=subframe, **options)
+    if guess is not None:
+        return EstimatedLevelSearch(shape, dtype, guess, subframe=subframe, **options)
     if method == "threshold":
         return OnsetSearch(shape, dtype, subframe=subframe, **options)
     if not subframe:

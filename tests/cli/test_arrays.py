@@ -13,14 +13,14 @@ from mirrorskin import engine, io
 
 TRAVEL = np.arange(1, 13) * 0.1
 STEPS = ("--travel-step", "0.1mm", "--travel-start", "0.1mm")
-SIZE = ("--pixel-size", "0.1mm")
+SIZE = ("--pixel-size", "0.4mm")
 
 
 @pytest.fixture(scope="module")
 def stack(tmp_path_factory):
     """The frames of a ball, and what its recording gives without references."""
-    path = record(ball((12, 16), (0.1, 0.1), TRAVEL), tmp_path_factory.mktemp("ball") / "ball.h5")
-    with io.open_recording(path, pixel_size=(0.1, 0.1)) as recording:
+    path = record(ball((12, 16), (0.4, 0.4), TRAVEL), tmp_path_factory.mktemp("ball") / "ball.h5")
+    with io.open_recording(path, pixel_size=(0.4, 0.4)) as recording:
         frames = read_all(recording, 12).frames
         return frames, engine.reconstruct(recording, dark=0, bright=255)
 
@@ -139,7 +139,7 @@ def test_an_import_without_the_pixel_size_says_what_needs_it():
 
 def test_frames_in_memory_have_a_result_that_can_be_saved(stack):
     frames, expected = stack
-    found = engine.reconstruct(frames, travel=TRAVEL, pixel_size=0.1, dark=0, bright=255)
+    found = engine.reconstruct(frames, travel=TRAVEL, pixel_size=0.4, dark=0, bright=255)
     np.testing.assert_array_equal(found.height, expected.height)
     np.testing.assert_array_equal(found.x, expected.x)
     io.save_result(found, "saved.h5")
@@ -173,3 +173,18 @@ def test_frames_in_memory_that_do_not_fit_are_refused(stack, given, said):
 def test_a_recording_has_its_own_travel(folder):
     with io.open_recording("ball.npz") as opened, pytest.raises(io.InputError, match="of its own"):
         engine.reconstruct(opened, travel=TRAVEL)
+
+
+def test_levels_that_nobody_gave_are_named():
+    words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5")
+    said = run(*words).said
+    assert "ball.npy: no dark and bright given; estimated as " in said
+    assert said.count("\n") == 1
+    assert run(*words, "--dark", 0).said.startswith("ball.npy: no bright given; ")
+    assert "no dark" not in run(*words, "--dark", 0, "--bright", 255).said
+
+
+def test_levels_that_the_frames_do_not_show_are_warned_of():
+    np.save("dark.npy", np.full((4, 5, 6), 12, np.uint8))
+    said = run("reconstruct", "dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
+    assert "the range of their type is assumed, and heights may be wrong" in said
