@@ -48,7 +48,8 @@ def command(
     header = io.Header(
         motion.value, title=frames.stem, tilt=known.get("tilt"), pixel_size=known.get("pixel_size")
     )
-    source = io.open_frames(frames, header, known.get("travel"), known.get("phase"), topic)
+    with progress("counting frames", None) as show:
+        source = io.open_frames(frames, header, known.get("travel"), known.get("phase"), topic, show)
     with (
         io.Recorder(source, output, compression.value) as recorder,
         progress("importing", source.shape[0]) as show,

@@ -148,8 +148,11 @@ def report_contact(name: str, process: Mapping[str, object]) -> None:
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on a terminal, none in a pipe; yields a function that takes how much is done."""
+def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar on a terminal, none in a pipe; yields a function that takes how much is done.
+
+    How much there is may be unknown.
+    """
     if not sys.stderr.isatty():
         yield lambda done: None
         return

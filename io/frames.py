@@ -6,7 +6,7 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +38,7 @@ def open_frames(
     travel: ArrayLike | Positions | None = None,
     phase: ArrayLike | Positions | None = None,
     topic: str | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> FrameSequence | ArrayRecording:
     """Open numbered pictures, a TIFF of many pages, a video, NumPy's arrays, or ROS 2 messages in MCAP.
 
@@ -50,6 +51,8 @@ def open_frames(
         Millimetres and radians, one a frame, or ``Steps``; an MCAP file may have them itself.
     topic : str, optional
         That of the images, in an MCAP file of more than one.
+    progress : callable, optional
+        Called with the number of frames of a video that were counted so far.
 
     Returns
     -------
@@ -87,7 +90,7 @@ def open_frames(
 
         return Messages(path, header, travel, phase, topic)
     pictures = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
-    return (Pictures if pictures else Video)(path, header, travel, phase)
+    return Pictures(path, header, travel, phase) if pictures else Video(path, header, travel, phase, progress)
 
 
 class FrameSequence(Closing, ABC):
@@ -273,11 +276,12 @@ class Video(FrameSequence):
         header: Header,
         travel: ArrayLike | Positions | None = None,
         phase: ArrayLike | Positions | None = None,
+        progress: Callable[[int], None] | None = None,
     ) -> None:
         self._path = Path(path)
         if not self._path.is_file():
             raise InputError(f"{path}: there is no such file")
-        shape, time = self._survey()
+        shape, time = self._survey(progress)
         super().__init__(str(path), header, shape, np.dtype(np.uint8), travel=travel, phase=phase, time=time)
         self._capture = self._open()
 
@@ -320,7 +324,7 @@ class Video(FrameSequence):
             capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
             return capture
 
-    def _survey(self) -> tuple[tuple[int, int, int], Floats | None]:
+    def _survey(self, progress: Callable[[int], None] | None) -> tuple[tuple[int, int, int], Floats | None]:
         """Decode all frames once: how many, how large, and when."""
         capture = self._open()
         stamps: list[float] = []
@@ -329,6 +333,8 @@ class Video(FrameSequence):
             decoded, first = capture.read()
             while decoded:
                 stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+                if progress:
+                    progress(len(stamps))
                 decoded = capture.grab()
         capture.release()
         if not stamps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -30,12 +31,28 @@ def command(
         raise io.InputError(
             f"{output} cannot be made: {error.strerror}; choose another folder with -o"
         ) from error
-    pressed = {one.name: presses.run(one, output, device) for one in presses.EXPERIMENTS}
-    turned = {one.name: rotation.run(one, output, device) for one in rotation.EXPERIMENTS}
+    done = itertools.count(1)
+    total = len(presses.EXPERIMENTS) + len(rotation.EXPERIMENTS) + 5
+
+    def say(step: str) -> None:
+        click.echo(f"{next(done)} of {total}: {step}", err=True)
+
+    pressed, turned = {}, {}
+    for press in presses.EXPERIMENTS:
+        say(press.title)
+        pressed[press.name] = presses.run(press, output, device)
+    for turn in rotation.EXPERIMENTS:
+        say(turn.title)
+        turned[turn.name] = rotation.run(turn, output, device)
+    say("a press and a rotation, fused")
     shaped = shapes.run(output, device)
+    say("the force of a press")
     forces = force.run(force.EXPERIMENT, output, device)
+    say("presses that oscillate, rock and dither")
     vibrated = vibration.run(vibration.EXPERIMENT, output, device)
+    say("a ball that slides and twists")
     slipped = slip.run(slip.EXPERIMENT, output, device)
+    say("an object that moves between touches")
     followed = pose.run(pose.EXPERIMENT, output, device)
     if as_json:
         others = {"force": forces, "vibration": vibrated, "slip": slipped, "pose": followed}

@@ -62,7 +62,11 @@ def shown(tmp_path_factory):
         patch.setattr(view, "normal_figure", watch_normals)
         patch.setattr(view, "surface_figure", watch_surfaces)
         ended = run("demo", "-o", folder)
-    assert (ended.code, ended.said) == (0, "")
+    assert ended.code == 0
+    steps = ended.said.splitlines()
+    assert [step.split(":")[0] for step in steps] == [
+        f"{n} of {len(steps)}" for n in range(1, len(steps) + 1)
+    ]
     return ended.out.splitlines(), folder, figures
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import Header, InputError, Source
-from mirrorskin.io.frames import Video, _times
+from mirrorskin.io.frames import Video, _times, open_frames
 
 HEADER = Header("axial", tilt=0.04)
 SHAPE = (48, 64)
@@ -45,6 +45,12 @@ def video(request, tmp_path):
 @pytest.fixture
 def exact(tmp_path):
     return encode(tmp_path / "exact.avi", "FFV1")
+
+
+def test_frames_are_counted_aloud(exact):
+    counted = []
+    open_frames(exact, HEADER, phase=np.arange(COUNT), progress=counted.append)
+    assert counted == list(range(1, COUNT + 1))
 
 
 def drain(source, size=None):
