@@ -14,6 +14,7 @@ import click
 
 from mirrorskin.cli import options, scans
 from mirrorskin.cli.groups import Option
+from mirrorskin.cli.run import Settings, load_estimator
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _ENDING = "SIGINT", "SIGTERM", "SIGHUP"
 _LATENCY = "100ms"
+_OURS = ("window", "threshold", "hold", "noise", "contact", "device")  # options of our own estimators
 _THRESHOLD, _HOLD = 0.5, 2
 # What would bring a map that is missing: keys of the rig file.
 _REMEDIES = {
@@ -88,6 +90,11 @@ def command(
     settle: scans.Settle = None,
     frames: scans.StepFrames = None,
     contact: options.Contact = None,
+    estimator: Annotated[
+        str | None,
+        Option(metavar="MODULE:CLASS", help="Your own; see docs/estimators.md.", show_default="the motion's"),
+    ] = None,
+    settings: Settings = None,
     calibration: options.Calibration = None,
     device: options.Device = None,
 ) -> None:
@@ -96,13 +103,19 @@ def command(
     from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig_file import load_rig
 
-    settings = load_rig(rig_file)
-    plan = scans.make_plan(context.params, settings)  # from the options above
+    rig = load_rig(rig_file)
+    plan = scans.make_plan(context.params, rig)  # from the options above
+    own = None if estimator is None else load_estimator(estimator, settings)
+    ours = [name for name in _OURS if context.params[name] is not None]
+    if (own and ours) or (settings and not own):
+        told = f"--{ours[0]} says nothing of" if own else "--set is for"
+        raise io.InputError(f"{told} an --estimator of your own: leave it out")
     for path, others in ((record, ()), (output, (record,))):
         if path is not None:
             io.check_output(path, rig_file, calibration, contact, *others)
-    known = scans.open_calibration(calibration, settings)
-    _Live(settings, plan, {**context.params, "latency": duration(latency, "--latency")}, known).run()
+    known = scans.open_calibration(calibration, rig)
+    given = {**context.params, "latency": duration(latency, "--latency"), "own": own}
+    _Live(rig, plan, given, known).run()
 
 
 class _Live:
@@ -184,10 +197,19 @@ class _Live:
 
     def _make_estimator(self, source: LiveSource, rate: float) -> LiveEstimator:
         """Make what estimates the maps; the source has its references."""
-        from mirrorskin.engine.live import LivePress, LiveRocking, LiveRotation, LiveSlip, choose_window
+        from mirrorskin.engine.live import (
+            LiveOwn,
+            LivePress,
+            LiveRocking,
+            LiveRotation,
+            LiveSlip,
+            choose_window,
+        )
         from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan
 
         given, plan = self._given, self._plan
+        if given["own"] is not None:
+            return LiveOwn(source, given["own"])
         known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
         if isinstance(plan, AxialPlan):
             window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])

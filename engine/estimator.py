@@ -86,12 +86,12 @@ def run(
     first = next(pieces, None)
     if first is None:
         raise InputError(f"{name}: there is none, and at least one is needed")
-    made, done = _made(estimator, first[0]), 0
-    wanted = _wanted(made, first[1], name)
-    if unused := known.keys() - set(wanted):
+    made, done = prepare(estimator, first[0].shape[1:], first[0].dtype), 0
+    told = wanted(made, first[1], name)
+    if unused := known.keys() - set(told):
         raise InputError(f"{_name(made)}.push takes no {', '.join(sorted(unused))}: leave that out")
     for frames, there in itertools.chain([first], pieces):
-        made.push(frames, **{one: there[one] for one in wanted})
+        made.push(frames, **{one: there[one] for one in told})
         done += len(frames)
         if progress:
             progress(done)
@@ -122,9 +122,9 @@ def finish(estimator: Estimator, shape: tuple[int, ...], source: Source | None) 
     return replace(result, process={**result.process, **told})
 
 
-def _made(estimator: Estimator | Maker, frames: NDArray[Any]) -> Estimator:
-    """Return an estimator for frames such as these, made if need be, that has seen none."""
-    made, arguments = estimator, (frames.shape[1:], frames.dtype)
+def prepare(estimator: Estimator | Maker, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Estimator:
+    """Return an estimator for frames of a shape and type, made if need be, that has seen none."""
+    made, arguments = estimator, ((shape[0], shape[1]), dtype)
     if isinstance(estimator, type) or not hasattr(estimator, "push"):
         try:
             called, settings = getattr(estimator, "func", estimator), getattr(estimator, "keywords", {})
@@ -141,7 +141,7 @@ def _made(estimator: Estimator | Maker, frames: NDArray[Any]) -> Estimator:
     return made
 
 
-def _wanted(estimator: Estimator, there: Mapping[str, Any], name: str) -> list[str]:
+def wanted(estimator: Estimator, there: Mapping[str, Any], name: str) -> list[str]:
     """Return which of the things that are known of frames ``push`` takes."""
     _, *parameters = inspect.signature(estimator.push).parameters.values()
     needed = [one.name for one in parameters if one.default is one.empty and one.kind in _NAMED]

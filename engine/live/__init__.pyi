@@ -1,4 +1,5 @@
 from .loop import LATENCY, LiveEstimator, Loop
+from .own import LiveOwn
 from .press import LivePress
 from .rocking import LiveRocking
 from .rotation import LiveRotation, choose_window
@@ -15,6 +16,7 @@ __all__ = [
     "WAITED",
     "Latency",
     "LiveEstimator",
+    "LiveOwn",
     "LivePress",
     "LiveRocking",
     "LiveRotation",

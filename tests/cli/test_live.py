@@ -5,6 +5,7 @@ import re
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from speckle import Speckle
 from mirrorskin import engine, io
 from mirrorskin.cli import live
 from mirrorskin.cli.groups import make_command
+from mirrorskin.cli.run import load_estimator
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.engine.streaming import push_block
@@ -312,7 +314,7 @@ def test_the_status_is_a_table_and_a_line():
 
 
 def test_ctrl_c_while_frames_are_pushed_comes_after_them():
-    guard, pushed = live._Guard(), []
+    guard, pushed, before = live._Guard(), [], signal.getsignal(signal.SIGINT)
 
     def push():
         with guard.installed():
@@ -324,7 +326,7 @@ def test_ctrl_c_while_frames_are_pushed_comes_after_them():
     with pytest.raises(KeyboardInterrupt):
         push()
     assert pushed == [1]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
@@ -348,3 +350,36 @@ def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
         again = engine.reconstruct(recording, contact=np.ones(SHAPED, np.uint8))
     np.testing.assert_array_equal(again.displacement, result.displacement)
     np.testing.assert_array_equal(again.slip_onset, result.slip_onset)
+
+
+OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":SteepestRise"
+
+
+def test_an_estimator_of_the_user_s_gives_the_same_live_as_over_the_recording(fake, tmp_path):
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    done = fake.run(*PRESS, "--estimator", OWN, "--record", str(record), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    assert counted(done.output)[4] > 1
+    with io.open_recording(record, live=True) as recording:
+        again = engine.run(recording, load_estimator(OWN), memory_limit=2 * 7 * np.prod(SHAPE))
+    result = io.open_result(output)
+    assert np.isfinite(result.height).sum() > 20
+    assert result.process["live"]
+    assert result.maps().keys() == {"height", "rise"} == again.maps().keys()
+    for name, values in again.maps().items():
+        np.testing.assert_array_equal(result.maps()[name], values)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([*PRESS, "--estimator", OWN, "--hold", "3"], "--hold says nothing of an --estimator of your own"),
+        ([*PRESS, "--set", "a=1"], "--set is for an --estimator of your own"),
+        ([*PRESS, "--estimator", f"{OWN}r"], "there is no class SteepestRiser"),
+        ([*TURN, "--estimator", OWN], "SteepestRise.push needs travel: "),
+    ],
+)
+def test_an_estimator_that_cannot_be_is_one_clear_line(fake, words, told):
+    done = fake.run(*words)
+    assert isinstance(done.exception, io.InputError)
+    assert told in str(done.exception)

@@ -111,8 +111,9 @@ def test_what_the_page_says_runs():
     Path("light_on_device.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
         words = line.partition(" #")[0].replace("device=gpu", "device=cpu").split()[1:]
-        ended = run(*words)
-        assert ended.code == 0, ended.said
+        if not {"live", "--live"} & {*words}:  # tests/cli/test_live.py
+            ended = run(*words)
+            assert ended.code == 0, ended.said
     known = {}
     exec(own + code, known)
     assert known["result"].own_maps["light"].any()
