@@ -1,0 +1,242 @@
+"""``mirrorskin sample``: data to try things on, as a real sensor would give them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import click
+
+from mirrorskin.cli.groups import Argument, Option
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mirrorskin import hw
+
+_SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
+_SEED = 11
+_PIVOT = (0.3, -0.2, 2.0)  # mm
+_AT = ((0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2))  # mm, where the balls lie
+_FLAT_FRAMES = 16
+_BOARD, _DPI = "dots:7x5:1mm", 1200  # as the README prints it
+_LEAN = 2e-5  # how obliquely the board's camera looks, 1/pixel
+_BLUR, _NOISE = 0.5, 1.0  # of its picture: pixels and counts, one sigma
+
+
+class SampleName(StrEnum):
+    """What there is to try things on."""
+
+    press = "press"
+    turn = "turn"
+    slide = "slide"
+    calibration = "calibration"
+    stack = "stack"
+    pictures = "pictures"
+    video = "video"
+
+
+def command(
+    name: Annotated[SampleName, Argument(help="What to make.")],
+    output: Annotated[
+        Path,
+        Option("--output", "-o", metavar="FILE-OR-FOLDER", help="Folder for calibration and pictures."),
+    ],
+) -> None:
+    """Make data to try things on.
+
+    A press on and a turn about a ball of 10 mm, and a slide of a textured sheet (.h5); all that a sensor is
+    calibrated with; the press as other programs have it: a stack without any more (.h5), numbered pictures,
+    and a video (.avi). Light, lens and pixels are those of a real camera; the calibration's sensor has a real
+    wall and uneven lamps as well. 'simulate' has an option for each of these.
+    """
+    from mirrorskin import io
+
+    folder = name in (SampleName.calibration, SampleName.pictures)
+    if folder and not output.is_dir():
+        try:
+            output.mkdir()
+        except OSError as error:
+            raise io.InputError(f"{output} cannot be made: {error.strerror}; name another with -o") from error
+    elif not folder:
+        io.check_output(output)
+    _MAKERS[name](output)
+    click.echo(f"{output}: {_HOLDS[name]}")
+
+
+_HOLDS = {
+    SampleName.press: "a ball of 10 mm, pressed by 30 steps of 0.1 mm",
+    SampleName.turn: "the same ball under a body that leans by 2.5 degrees, at 8 phases of a turn",
+    SampleName.slide: "a ball under a textured sheet that slides by 30 steps of 0.01 mm",
+    SampleName.calibration: "dark.h5, flat.h5, photo.png, ball-1.h5 to ball-5.h5 (4 mm, turned),"
+    " press-ball.h5 (4 mm, pressed with 1.5 N), other.h5 (6 mm, turned)",
+    SampleName.stack: "the frames of the press in the dataset /raw/images, and nothing else",
+    SampleName.pictures: "the frames of the press as numbered PNG",
+    SampleName.video: "the frames of the press as a video",
+}
+
+
+def _twin(
+    diameter: float, movement: hw.twin.Movement, at: tuple[float, float] = (0.0, 0.0), **more: Any
+) -> hw.Twin:
+    """Return a ball under a sensor whose camera has noise of both kinds, uneven pixels and a lens."""
+    from mirrorskin import hw
+    from mirrorskin.hw.twin import Camera, Sphere
+
+    camera = Camera(
+        noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5, seed=_SEED
+    )
+    known = {"shape": _SHAPE, "pixel_size": _PIXEL, "camera": camera, "movement": movement}
+    return hw.Twin(object=Sphere(diameter), object_shift=at, **known | more)
+
+
+def _record(twin: hw.Twin, path: Path) -> None:
+    from mirrorskin import io
+    from mirrorskin.cli.output import progress
+
+    with (
+        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
+        progress(f"making {path.name}", twin.shape[0]) as show,
+    ):
+        recorder.drain(show)
+
+
+def _pressed() -> hw.Twin:
+    from mirrorskin import io
+    from mirrorskin.hw.twin import Vertical
+
+    return _twin(10.0, Vertical(io.Steps(0.1, 0.1).positions(30)))
+
+
+def _make_press(path: Path) -> None:
+    _record(_pressed(), path)
+
+
+def _make_turn(path: Path) -> None:
+    _record(_twin(10.0, _turn(1.5), pattern="linear"), path)
+
+
+def _turn(press: float) -> hw.twin.Axial:
+    from mirrorskin import io
+    from mirrorskin.hw.twin import Axial
+
+    return Axial(io.Steps(math.pi / 4).positions(8), math.radians(2.5), press, _PIVOT)
+
+
+def _make_slide(path: Path) -> None:
+    import numpy as np
+
+    from mirrorskin.hw.twin import Horizontal, SheetTexture
+
+    way = np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1)
+    small = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
+    _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path)
+
+
+def _frames() -> NDArray[np.uint8]:
+    import numpy as np
+
+    twin = _pressed()
+    frames = np.empty(twin.shape, np.uint8)
+    twin.read(frames)
+    return frames
+
+
+def _make_stack(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file["raw/images"] = _frames()
+
+
+def _make_pictures(folder: Path) -> None:
+    import cv2
+
+    for number, frame in enumerate(_frames()):
+        cv2.imwrite(str(folder / f"frame{number:02d}.png"), frame)
+
+
+def _make_video(path: Path) -> None:
+    import cv2
+
+    from mirrorskin import io
+
+    size = (_SHAPE[1], _SHAPE[0])
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
+    if not film.isOpened():
+        raise io.InputError(f"{path} cannot be written as a video: name a file that ends with .avi")
+    for frame in _frames():
+        film.write(frame)
+    film.release()
+
+
+def _make_calibration(folder: Path) -> None:
+    """Record what a sensor with a real wall, uneven lamps and a lens near the sheet is calibrated with."""
+    import cv2
+    import numpy as np
+
+    from mirrorskin.hw.twin import Body, Camera, Vertical
+
+    camera = Camera(noise=1.5, gain_deviation=0.05, distance=200.0, seed=_SEED)
+    body = Body(asymmetry=0.05, asymmetry_azimuth=0.7)
+    real = {"optics": "cylinder", "pattern": "linear", "body": body, "camera": camera}
+    for name, light in (("dark", 0.0), ("flat", 1.0)):
+        _record_flat(folder / f"{name}.h5", camera, light)
+    for number, at in enumerate(_AT, 1):
+        _record(_twin(4.0, _turn(0.4), at, **real), folder / f"ball-{number}.h5")
+    _record(_twin(6.0, _turn(0.8), (0.5, -0.4), **real), folder / "other.h5")
+    travel = Vertical(np.arange(0.0, 1.21, 0.04))
+    _record(_twin(4.0, travel, contact="elastic", **real), folder / "press-ball.h5")
+    cv2.imwrite(str(folder / "photo.png"), _photograph())
+
+
+def _record_flat(path: Path, camera: hw.twin.Camera, light: float) -> None:
+    """Record a field that is all alike."""
+    import numpy as np
+
+    from mirrorskin import io
+    from mirrorskin.hw.twin.camera import Sensor
+    from mirrorskin.io.arrays import ArrayRecording
+
+    sensor, field = Sensor(camera, _SHAPE), np.full(_SHAPE, light, np.float32)
+    frames = np.empty((_FLAT_FRAMES, *_SHAPE), sensor.dtype)
+    for number, frame in enumerate(frames):
+        sensor.expose(field, number + round(light) * _FLAT_FRAMES, frame)
+    header = {"title": f"flat field, light {light:g}", "pixel_size": (_PIXEL, _PIXEL)}
+    phase = np.linspace(0, math.tau, _FLAT_FRAMES, endpoint=False)
+    with io.Recorder(ArrayRecording(frames, {"phase": phase}, header), path) as recorder:
+        recorder.drain(lambda _: None)
+
+
+def _photograph() -> NDArray[np.uint8]:
+    """Return a picture of the printed board on the sheet, seen a little obliquely."""
+    import cv2
+    import numpy as np
+
+    from mirrorskin.cli.calibrate.scale import board_of
+    from mirrorskin.engine.calibration.board import paint_board
+
+    print_ = paint_board(board_of(_BOARD), _DPI)
+    scale = 25.4 / _DPI / _PIXEL
+    middle = (np.array(_SHAPE[::-1]) - 1) / 2 - scale * (np.array(print_.shape[::-1]) - 1) / 2
+    place = np.array([[scale, 0, middle[0]], [0, scale, middle[1]], [0, 0, 1.0]])
+    lean = np.array([[1, 0, 0], [0, 1, 0], [_LEAN, -_LEAN, 1.0]])
+    smooth = cv2.GaussianBlur(print_, (0, 0), _BLUR / scale)
+    seen = cv2.warpPerspective(smooth, lean @ place, _SHAPE[::-1], borderValue=255)
+    noisy = 30 + 0.7 * seen + _NOISE * np.random.default_rng(_SEED).standard_normal(_SHAPE)
+    return np.rint(noisy).astype(np.uint8)
+
+
+_MAKERS: dict[SampleName, Callable[[Path], None]] = {
+    SampleName.press: _make_press,
+    SampleName.turn: _make_turn,
+    SampleName.slide: _make_slide,
+    SampleName.calibration: _make_calibration,
+    SampleName.stack: _make_stack,
+    SampleName.pictures: _make_pictures,
+    SampleName.video: _make_video,
+}
