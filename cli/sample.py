@@ -73,7 +73,7 @@ _HOLDS = {
     SampleName.turn: "the same ball under a body that leans by 2.5 degrees, at 8 phases of a turn",
     SampleName.slide: "a ball under a textured sheet that slides by 30 steps of 0.01 mm",
     SampleName.calibration: "dark.h5, flat.h5, photo.png, ball-1.h5 to ball-5.h5 (4 mm, turned),"
-    " press-ball.h5 (4 mm, pressed with 1.5 N), other.h5 (6 mm, turned)",
+    " press-ball.h5 (4 mm, pressed with 3 N), other.h5 (6 mm, turned)",
     SampleName.stack: "the frames of the press in the dataset /raw/images, and nothing else",
     SampleName.pictures: "the frames of the press as numbered PNG",
     SampleName.video: "the frames of the press as a video",

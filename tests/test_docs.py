@@ -5,8 +5,6 @@ import shlex
 from pathlib import Path
 
 import click
-import cv2
-import h5py
 import numpy as np
 import pytest
 from commands import run
@@ -17,7 +15,6 @@ from mirrorskin.cli.main import app
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-SMALL = "--size", "48x40", "--pixel-size", "0.25mm"  # for what start.md simulates
 
 
 def blocks_of(page, language):
@@ -41,30 +38,15 @@ FILLED_IN = re.compile(
 COMMAND = app
 
 
-@pytest.fixture
-def desk(tmp_path):
-    """A folder with the frames that somebody brings along."""
-    y, x = np.mgrid[1.0:-1.0:24j, -1.3:1.3:32j]
-    travel = 0.1 * np.arange(1, 13)
-    frames = np.where(travel[:, None, None] > 0.5 * np.hypot(x, y), 180, 10).astype(np.uint8)
-    with h5py.File(tmp_path / "theirs.h5", "w") as file:
-        file["raw/images"] = frames
-    (tmp_path / "frames").mkdir()
-    for number, frame in enumerate(frames):
-        cv2.imwrite(str(tmp_path / "frames" / f"frame{number}.png"), frame)
-    return tmp_path
-
-
 def test_there_are_steps_and_commands():
     assert len(STEPS) >= 10
     assert len(WRITTEN) >= 40
 
 
-def test_the_steps_of_the_start_run_one_after_the_other(desk, monkeypatch):
-    monkeypatch.chdir(desk)
+def test_the_steps_of_the_start_run_one_after_the_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     for words in STEPS:
-        small = SMALL if words[0] == "simulate" else ()
-        ended = run(*words, *small)
+        ended = run(*words)
         assert ended.code == 0, f"{' '.join(words)}: {ended.said}"
     for page in ("start.md", "index.md"):
         (code,) = blocks_of(DOCS / page, "python")

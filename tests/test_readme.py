@@ -8,17 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import boards
-import cv2
-import h5py
 import numpy as np
 import pytest
-from calibration_scenes import BALL, DEPTH, Lab
-from calibration_scorer import ball
 from commands import run
 from mishaps import starved
 from rotations import Setup, direction, expose
-from stacks import record
 
 ROOT = Path(__file__).parent.parent
 TEXT = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/twin.md"))
@@ -42,43 +36,13 @@ RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); import commands; command
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
-    """A folder with the files that the README takes for granted."""
+    """A folder in which the commands run one after the other, each with what those before have made."""
     place = tmp_path_factory.mktemp("desk")
-    frames = np.full((8, 24, 32), 20, np.uint8)
-    frames[4:, 6:18, 8:24] = 220
-    (place / "frames").mkdir()
-    video = cv2.VideoWriter(str(place / "press.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (32, 24))
-    for number, frame in enumerate(frames):
-        cv2.imwrite(str(place / "frames" / f"frame{number}.png"), frame)
-        video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
-    video.release()
-    np.save(place / "frames.npy", frames)
-    with h5py.File(place / "theirs.h5", "w") as file:
-        file["raw/images"] = frames
-    known_things(place)
     yield place
     while SERVERS:
         with SERVERS.pop() as server:
             server.terminate()
             assert server.wait(timeout=30) == 128 + signal.SIGTERM
-
-
-def known_things(place):
-    """Record what a sensor is calibrated with: few pixels, all else as in a lab."""
-    lab = Lab(shape=(96, 100), pixel_size=0.08)
-    balls = [(0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2)]
-    turned = {f"ball-{n}.h5": lab.turned(ball(BALL, at), DEPTH, n) for n, at in enumerate(balls, 1)}
-    recordings = turned | {
-        "dark.h5": lab.flat(0.0, 16, 90),
-        "flat.h5": lab.flat(1.0, 16, 91),
-        "press-ball.h5": lab.pressed(ball(BALL), np.arange(0, 1.21, 0.04), 70),
-        "other.h5": lab.turned(ball(6.0, (0.5, -0.4)), 0.8, 60),
-    }
-    for name, source in recordings.items():
-        record(source, place / name)
-    view = boards.View(shape=lab.shape, scale=lab.pixel_size, focal=200.0)
-    photo = boards.photograph(view, boards.dots(7, 5, 1.0, 0.5), blur=0.5, noise=1.0)
-    cv2.imwrite(str(place / "photo.png"), photo)
 
 
 def test_there_are_commands_to_run():
@@ -122,7 +86,7 @@ def serve(desk, words):
 def test_the_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--size", "48x40", "--pixel-size", "0.25mm", "--frames", "12"]
-    assert run("simulate", "vertical", *words, "-o", "sphere.h5").code == 0
+    assert run("simulate", "vertical", *words, "-o", "press.h5").code == 0
     assert len(PYTHON) == 2
     known = arrays()
     for block in PYTHON:
