@@ -90,7 +90,7 @@ def _twin(
     camera = Camera(
         noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5, seed=_SEED
     )
-    known = {"shape": _SHAPE, "pixel_size": _PIXEL, "camera": camera, "movement": movement}
+    known: dict[str, Any] = {"shape": _SHAPE, "pixel_size": _PIXEL, "camera": camera, "movement": movement}
     return hw.Twin(object=Sphere(diameter), object_shift=at, **known | more)
 
 
@@ -133,7 +133,7 @@ def _make_slide(path: Path) -> None:
     from mirrorskin.hw.twin import Horizontal, SheetTexture
 
     way = np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1)
-    small = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
+    small: dict[str, Any] = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
     _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path)
 
 
@@ -183,7 +183,7 @@ def _make_calibration(folder: Path) -> None:
 
     camera = Camera(noise=1.5, gain_deviation=0.05, distance=200.0, seed=_SEED)
     body = Body(asymmetry=0.05, asymmetry_azimuth=0.7)
-    real = {"optics": "cylinder", "pattern": "linear", "body": body, "camera": camera}
+    real: dict[str, Any] = {"optics": "cylinder", "pattern": "linear", "body": body, "camera": camera}
     for name, light in (("dark", 0.0), ("flat", 1.0)):
         _record_flat(folder / f"{name}.h5", camera, light)
     for number, at in enumerate(_AT, 1):
