@@ -25,7 +25,7 @@ def command(
             "--map",
             metavar="NAME",
             help="Only height, section, normals, edges, status, sigma, histogram, displacement, slip, slope,"
-            " hysteresis, growth, azimuth or modulation; may be given again.",
+            " hysteresis, growth, azimuth, modulation or a map of your own; may be given again.",
             show_default="all that the result has",
         ),
     ] = None,

@@ -173,12 +173,13 @@ def known_of(block: Block) -> dict[str, Any]:
 def _cut(frames: Iterable[ArrayLike], known: Mapping[str, ArrayLike]) -> Iterator[Piece]:
     """Yield an array as a whole, or frames one by one, and what is known of each."""
     given = {name: np.asarray(values) for name, values in known.items()}
-    whole, done = isinstance(frames, np.ndarray), 0
+    whole, done, shape = isinstance(frames, np.ndarray), 0, None
     pieces = [np.asarray(frames)] if whole else (np.asarray(frame)[None] for frame in frames)
     for piece in pieces:
-        if piece.ndim != 3 or 0 in piece.shape or piece.dtype.kind not in "uif":
+        shape = shape or piece.shape[1:]
+        if piece.ndim != 3 or 0 in piece.shape or piece.dtype.kind not in "uif" or piece.shape[1:] != shape:
             raise InputError(
-                f"frames are {piece.dtype} {piece.shape[not whole :]}: numbers (H, W) are needed"
+                f"frames are {piece.dtype} {piece.shape[not whole :]}: numbers (H, W) of one size are needed"
             )
         stop = done + len(piece)
         for name, values in given.items():

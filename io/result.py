@@ -72,7 +72,7 @@ def result_of(
     """
     found: dict[str, NDArray[Any]] = {}
     for name, given in maps.items():
-        if not str(name).isidentifier() or name in _TAKEN:
+        if not _may_be_own(name):
             taken = ", ".join(sorted(_TAKEN))
             raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
         values, size = np.array(given), (*shape, _VECTORS[name]) if name in _VECTORS else shape
@@ -81,6 +81,10 @@ def result_of(
         own = np.uint8 if values.dtype.kind == "b" else values.dtype
         found[name] = values.astype(_DTYPES.get(name, np.float32) if name in _MAPS else own, copy=False)
     return with_fields(Result(process=process), found)
+
+
+def _may_be_own(name: str) -> bool:
+    return str(name).isidentifier() and name not in _TAKEN
 
 
 def with_fields(result: Result, values: Mapping[str, Any]) -> Result:
@@ -236,7 +240,7 @@ def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
     """Find the maps and axes that are there, and the shapes of a result, or of one for each turn."""
     group = file.find(_RESULT)
     listed = file.find(f"{_RESULT}/{_OWN}")
-    own = [] if listed is None else [name for name in file.texts(listed, _AGAIN) if name not in _TAKEN]
+    own = () if listed is None else filter(_may_be_own, file.texts(listed, _AGAIN))
     names = dict.fromkeys((*_MAPS, *own, "x", "y"))
     found = {} if group is None else {name: file.walk(group, name) for name in names}
     there = {name: node for name, node in found.items() if node is not None}

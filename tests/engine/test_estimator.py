@@ -206,6 +206,7 @@ def test_what_is_no_estimator_is_refused_in_a_line(estimator, line):
         (FRAMES, {"travel": TRAVEL, "phase": TRAVEL}, "Moments.push takes no phase"),
         (FRAMES[0], {"travel": TRAVEL}, r"frames are uint16 \(5, 7\)"),
         (["text"], {"travel": TRAVEL}, "frames are <U4"),
+        ([FRAMES[0], FRAMES[0, 1:]], {"travel": TRAVEL}, r"frames are uint16 \(4, 7\)"),
     ],
 )
 def test_frames_that_cannot_be_pushed_are_refused_in_a_line(frames, known, line):

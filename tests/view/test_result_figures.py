@@ -50,9 +50,13 @@ def test_a_fused_result_has_all_pictures_but_those_that_tell_less(alone):
         (only(*TURN), ["height", "section", "normals", "edges", "sigma", "histogram"]),
         (only("azimuth", "modulation", "x", "y"), ["azimuth", "modulation"]),
         (only("status"), ["status"]),
+        (
+            io.Result(own_maps={"light": np.eye(24, 32), "count": np.ones((24, 32), np.uint8)}),
+            ["light", "count"],
+        ),
         (only("height", "x", "y", height=np.full((24, 32), np.nan, np.float32)), ["height", "histogram"]),
     ],
-    ids=["press", "rotation", "correlation", "status", "no height known"],
+    ids=["press", "rotation", "correlation", "status", "own", "no height known"],
 )
 def test_what_a_result_has_is_drawn_and_nothing_else(result, names):
     figures = figures_of(result, name="it")

@@ -58,7 +58,8 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "parameters": _groups(parameters),
         "provenance": _groups(provenance),
         "calibration": _calibration_of(result),
-        "maps": [(which, *MAPS[which]) for which in MAPS if which in result.maps()],
+        "maps": [(which, *MAPS[which]) for which in MAPS if which in result.maps()]
+        + [(which, "", "of your own estimator") for which in result.own_maps],
         "units": UNITS,
         "citation": _citation(name, result.process),
     }
@@ -245,7 +246,7 @@ def _untitled(figure: Figure) -> Figure:
 
 def _picture(name: str, png: bytes, wide: bool) -> Picture:
     pixels = _trimmed(np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8))
-    caption, alt = PICTURES[name]
+    caption, alt = PICTURES.get(name) or (f"{name}, of your own estimator.", f"Map of {name}")
     kind, data = packed(pixels)
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     return Picture(caption, alt, source, pixels.shape[1], pixels.shape[0], wide)

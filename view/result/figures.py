@@ -23,6 +23,7 @@ from mirrorskin.view.result.maps import (
     draw_modulation,
     draw_normal_sigma,
     draw_normals,
+    draw_own,
     draw_signed,
     draw_slip_onset,
     draw_status,
@@ -43,7 +44,7 @@ MAPS = (
     *("height", "section", "normals", "edges", "status", "sigma", "histogram", "displacement", "slip"),
     *("slope", "hysteresis", "growth", "azimuth", "modulation"),
 )
-"""What can be drawn, where a result has it."""
+"""What can be drawn, where a result has it; besides, a user's own maps by their names."""
 
 _GRAPHS = "section", "histogram"  # which are no maps
 _IN_A_ROW = 3  # panels; more are put in two rows
@@ -77,12 +78,12 @@ def figures_of(
     section : ((float, float), (float, float)), optional
         Where the section begins and ends, x and y, mm; without it, the row through the apex.
     maps : sequence of str, optional
-        Only these, of `MAPS`.
+        Only these, of `MAPS` or a user's own.
 
     Returns
     -------
     dict of str to Figure
-        Only of what the result has, in the order of `MAPS`.
+        Only of what the result has, in the order of `MAPS`; a user's own follow.
 
     Raises
     ------
@@ -152,6 +153,7 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
             yield _Panel("azimuth", partial(draw_azimuth, sheet=sheet))
         if result.modulation is not None:
             yield _Panel("modulation", partial(draw_modulation, sheet=sheet))
+    yield from (_Panel(name, partial(draw_own, sheet=sheet, name=name)) for name in result.own_maps)
 
 
 def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:

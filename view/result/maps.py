@@ -278,6 +278,13 @@ def draw_signed(axes: Axes, sheet: Sheet, name: str) -> None:
     entitle(axes, title.capitalize())
 
 
+def draw_own(axes: Axes, sheet: Sheet, name: str) -> None:
+    """Draw a map of a user's own estimator."""
+    values = sheet.result.own_maps[name].astype(np.float64)
+    draw_map(axes, sheet, values, name, cmap="viridis")
+    entitle(axes, name, "" if np.isfinite(values).all() else "blue: no answer")
+
+
 def draw_azimuth(axes: Axes, sheet: Sheet) -> None:
     """Draw the azimuth of the normal, in degrees, in colours that go round as it does."""
     assert sheet.result.azimuth is not None
