@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
+from mirrorskin.hw.errors import HardwareError
 from mirrorskin.io import InputError
 
 _ROUNDING = 1e-9  # by which a place may lie beyond a limit, mm and rad
@@ -156,3 +159,54 @@ class Limits:
             f"{name}: {value:.9g} {unit} of {motion} are beyond the axis, which goes from {low:.9g} to "
             f"{high:.9g} {unit}; stay within, or correct the rig file's limits"
         )
+
+
+class Stage(Protocol):
+    """A stage that is open, and moves the body. See ``docs/stages.md``.
+
+    All of it may be used from any thread. What cannot be done is an `InputError`, raised before anything
+    moves; what goes wrong afterwards is a `HardwareError`. A stage that failed or was stopped says so in
+    ``error`` and to every call.
+    """
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+
+    @property
+    def limits(self) -> Limits:
+        """How far the body may go."""
+
+    @property
+    def error(self) -> HardwareError | None:
+        """What is wrong with it; None while all is well."""
+
+    def report(self) -> Report:
+        """Return what it said last; it is asked all the time."""
+
+    def history(self, since: float = -math.inf) -> list[Report]:
+        """Return the reports later than a time, oldest first; those of the last minutes are kept."""
+
+    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+        """Refuse a straight move that it cannot do at a speed, mm/s or rad/s."""
+
+    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+        """Refuse a precession of a half-angle, radians, at a rate, turns a second."""
+
+    def move(self, place: Position, speed: float | None = None) -> None:
+        """Begin to go to a place in a straight line, as fast as it goes unless a speed is given."""
+
+    def follow(self, places: Sequence[Position], speed: float | None = None) -> None:
+        """Begin to go to some places, one after the other; see ``move``."""
+
+    def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
+        """Begin to go round at a half-angle from a phase, where the body stands; see `GrblStage.precess`."""
+
+    def wait(self, timeout: float | None = None) -> Report:
+        """Wait until all is done, and return a report of rest; what interrupts the wait stops the body."""
+
+    def stop(self) -> None:
+        """Stop the body at once, as often as anyone likes; raises nothing."""
+
+    def close(self) -> None:
+        """Stop the body if it moves, and let the hardware go."""

@@ -86,6 +86,14 @@ class Axes:
         self._check_steps(steps / duration, length / duration)
         return Command(f"{_STRAIGHT}{_words(after)}{feed}", duration)
 
+    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+        """Refuse a straight move that is too fast, or too slow for the controller; see ``straight``."""
+        self.straight(start, place, speed)
+
+    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+        """Refuse a precession that cannot be, wherever the work coordinates begin; see ``arcs``."""
+        self.arcs(tilt, turns, rate, 0.0, self.machine(Position()))
+
     def arcs(
         self, tilt: float, turns: float, rate: float, start: float, offset: Mapping[str, float]
     ) -> list[Command]:

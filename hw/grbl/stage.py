@@ -139,6 +139,14 @@ class GrblStage(Closing):
         """Seconds of the longest of these of late; NaN before the first."""
         return self._link.longest_trip
 
+    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+        """Refuse a straight move that is too fast, or too slow for the controller."""
+        self.axes.check_way(start, place, speed)
+
+    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+        """Refuse a precession that is too fast, too slow, or in axes that know no arcs."""
+        self.axes.check_turns(tilt, turns, rate)
+
     def home(self) -> None:
         """Find the axes' switches; returns when they are found."""
         if not self.homes:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.hw.rig_file import StageSettings
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.stage import Position, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats, Motion
-
-if TYPE_CHECKING:
-    from mirrorskin.hw.grbl.stage import GrblStage
 
 _RAMP = 0.1  # seconds in which a stage is taken to reach its speed, as long as nothing else is known
 _STEPS_MAX = 10**6
@@ -122,7 +119,7 @@ class Plan:
         """Return how far along a place is; of those that look alike, the one next to what is expected."""
         raise NotImplementedError
 
-    def begin(self, stage: GrblStage) -> None:
+    def begin(self, stage: Stage) -> None:
         """Tell a stage that stands at the first place to go the way without a halt."""
         raise NotImplementedError
 
@@ -186,7 +183,7 @@ class _Straight(Plan):
         """Where the body goes straight to, one after the other, where it does not halt."""
         return [self.place(self.length)]
 
-    def begin(self, stage: GrblStage) -> None:
+    def begin(self, stage: Stage) -> None:
         """Tell a stage that stands at the first place to go straight to the ends."""
         stage.follow(self.ends, self.speed)
 
@@ -476,7 +473,7 @@ class AxialPlan(Plan):
         assert self.rate is not None
         return Trapezoid.planned(math.tau * self.turns, math.tau * self.rate)
 
-    def begin(self, stage: GrblStage) -> None:
+    def begin(self, stage: Stage) -> None:
         """Tell a stage that leans at phase 0 to go round."""
         stage.precess(self.tilt, self.turns, self.rate or 0.0)
 
@@ -608,7 +605,7 @@ def _check_steps(count: float, least: int) -> None:
         )
 
 
-def check_plan(plan: Plan, settings: StageSettings, name: str, stage: GrblStage | None = None) -> None:
+def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | None = None) -> None:
     """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs.
 
     The body is lowered where x, y and twist are 0, and lifted straight up from where the scan ended: what
@@ -622,9 +619,8 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: GrblStage 
         limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
-    axes = Axes(settings, name) if stage is None else stage.axes
-    if isinstance(plan, AxialPlan):
-        # One turn is as possible as many, wherever the work coordinates begin.
-        axes.arcs(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0, 0.0, axes.machine(Position()))
+    able = Axes(settings, name) if stage is None else stage
+    if isinstance(plan, AxialPlan):  # one turn is as possible as many
+        able.check_turns(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)
     elif isinstance(plan, _Straight):
-        axes.straight(plan.first, ends[0], plan.speed)
+        able.check_way(plan.first, ends[0], plan.speed)

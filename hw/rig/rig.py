@@ -8,16 +8,12 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import RigSettings
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io.types import Closing
-
-if TYPE_CHECKING:
-    from mirrorskin.hw.grbl.stage import GrblStage
 
 _TICK = 0.02  # seconds from one look of the guard to the next
 _PAUSE = 0.5  # seconds that the guard may be late: frames that come meanwhile have no time
@@ -33,7 +29,7 @@ class Move:
     Of one that is `timed`, frames' arrivals tell where the body was.
     """
 
-    def __init__(self, stage: GrblStage, began: float, timed: bool, reconnects: int) -> None:
+    def __init__(self, stage: Stage, began: float, timed: bool, reconnects: int) -> None:
         self._stage, self.timed, self.reconnects = stage, timed, reconnects
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
         self.error: Exception | None = None  # why it did not come to its end
@@ -81,7 +77,7 @@ class Rig(Closing):
     ...     rig.go(Position(travel=1.0))
     """
 
-    def __init__(self, stage: GrblStage, camera: Camera, settings: RigSettings) -> None:
+    def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
         self.stage, self.camera, self.settings = stage, camera, settings
         self.name = settings.name
         self._move: Move | None = None

@@ -55,6 +55,7 @@ class FakeStage:
 
     name = "fake stage"
     axes = Axes(settings().stage, name)
+    check_way, check_turns = axes.check_way, axes.check_turns
 
     def __init__(self, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
         self.limits = limits

@@ -1,0 +1,114 @@
+"""The stage of docs/stages.md, in front of a controller that is made up, moves a rig and stops on faults."""
+
+import re
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_fakes import FakeCamera, settings
+
+from mirrorskin import io
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.scan import StepScan
+from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.stage import Position
+
+PAGE = Path(__file__).parents[2] / "docs" / "stages.md"
+
+
+class Controller:
+    """Goes evenly to where it is sent, and answers each line; in the place of a serial port."""
+
+    def __init__(self):
+        self.way = [(0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]  # time, travel; speed of what began last
+        self.answers, self.silent, self.stopped, self.closed = [], False, 0, False
+
+    def travel(self, at):
+        (t0, a, _), (t1, b, _) = self.way
+        return b if at >= t1 else a + (b - a) * max(0.0, at - t0) / (t1 - t0)
+
+    def write(self, data):
+        now, words = time.monotonic(), data.decode().split()
+        if words[0] == "MOVE":
+            here, there, speed = self.travel(now), float(words[1]), float(words[2])
+            self.way = [(now, here, speed), (now + abs(there - here) / speed, there, speed)]
+        elif words[0] == "STOP":
+            self.stopped += 1
+            self.way = [(now, self.travel(now), 0.0)] * 2
+        state = "run" if now < self.way[1][0] else "idle"
+        self.answers.append(f"{self.travel(now):.5f} {state}" if words[0] == "WHERE?" else "ok")
+
+    def readline(self):
+        answer = self.answers.pop(0)
+        return b"" if self.silent else f"{answer}\n".encode()
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def lab(monkeypatch):
+    """The page's class, opened on a controller."""
+    line = Controller()
+    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
+    example = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
+    made = {"__name__": __name__}
+    exec(example, made)
+    stage = made["LabStage"]("/dev/ttyUSB0")
+    yield stage, line
+    stage.close()
+    assert line.closed
+
+
+def rig_of(stage, line):
+    camera = FakeCamera(
+        lambda at: Position(line.travel(at)),
+        lambda place: np.full((4, 4), 20 + 100 * (place.travel > 0.25), np.uint8),
+        rate=50.0,
+    )
+    return Rig(stage, camera, settings((4, 4), delay=0.0, dark=5.0))
+
+
+def test_steps_and_sweeps_are_recorded(lab, tmp_path):
+    stage, line = lab
+    with rig_of(stage, line) as rig:
+        plan = VerticalPlan(0.0, 0.5, step=0.1)
+        with io.StreamRecorder(StepScan(rig, plan, settle=0.0), tmp_path / "steps.h5") as recorder:
+            while recorder.read() is not None:
+                pass
+        with io.StreamRecorder(
+            SweepScan(rig, VerticalPlan(0.0, 0.5, speed=0.5)), tmp_path / "s.h5"
+        ) as recorder:
+            while recorder.read(np.empty((8, 4, 4), np.uint8)) is not None:
+                pass
+    with io.open_recording(tmp_path / "steps.h5") as steps, io.open_recording(tmp_path / "s.h5") as sweep:
+        np.testing.assert_allclose(steps.travel, 0.1 * np.arange(6), atol=1e-9)
+        bright = sweep.read(np.empty(sweep.shape, np.uint8)).frames[:, 0, 0] > 100
+        assert sweep.travel[bright].min() == pytest.approx(0.25, abs=0.02)  # 0.5 mm/s, 50 frames a second
+
+
+def test_what_it_cannot_do_is_refused_before_it_moves(lab):
+    stage, line = lab
+    with rig_of(stage, line) as rig:
+        for plan, said in (
+            (VerticalPlan(0.0, 1.0, speed=6.0), "too fast"),
+            (VerticalPlan(0.0, 2.5, speed=1.0), "presses deeper"),
+            (AxialPlan(1.0, 0.02, rate=0.5), "tilt"),
+        ):
+            with pytest.raises(io.InputError, match=said):
+                SweepScan(rig, plan)
+    assert line.way[1][1] == -1.0
+
+
+def test_silence_stops_it(lab):
+    stage, line = lab
+    stage.move(Position(1.0), 0.5)
+    line.silent = True
+    with pytest.raises(HardwareError, match="no longer answers"):
+        stage.wait(timeout=5.0)
+    assert line.stopped
+    assert "LabStage" not in sys.modules
