@@ -18,14 +18,12 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.result import result_of
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Block, Source
+    from mirrorskin.io import Source
 
 Maker = Callable[[tuple[int, int], np.dtype[Any]], Estimator]
-
 Piece = tuple[NDArray[Any], dict[str, Any]]
 
-_SERIES = ("time", "travel", "phase", "displacement", "twist", "tilt", "pose")  # of a block
-_LENT = "lent"  # what is known of a block's frames together
+_KNOWN = ("time", "travel", "phase", "displacement", "twist", "tilt", "pose", "lent")  # of a block's frames
 _NAMED = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
@@ -101,6 +99,8 @@ def run(
 def finish(estimator: Estimator, shape: tuple[int, ...], source: Source | None) -> Result:
     """Return an estimator's maps as a result that tells where they come from."""
     found, name = estimator.result(), _name(estimator)
+    if isinstance(found, Result):
+        return found
     if is_dataclass(found):
         found = {field.name: getattr(found, field.name) for field in fields(found)}
     if not isinstance(found, Mapping):
@@ -143,10 +143,10 @@ def prepare(estimator: Estimator | Maker, shape: tuple[int, ...], dtype: np.dtyp
 
 def wanted(estimator: Estimator, there: Mapping[str, Any], name: str) -> list[str]:
     """Return which of the things that are known of frames ``push`` takes."""
-    _, *parameters = inspect.signature(estimator.push).parameters.values()
+    parameters = [*inspect.signature(estimator.push).parameters.values()][1:]
     needed = [one.name for one in parameters if one.default is one.empty and one.kind in _NAMED]
     if lacking := [one for one in needed if one not in there]:
-        has = ", ".join(one for one in there if one != _LENT) or "nothing"
+        has = ", ".join(one for one in there if one != "lent") or "nothing"
         raise InputError(
             f"{_name(estimator)}.push needs {', '.join(lacking)}: {name} has {has} of each frame"
         )
@@ -161,13 +161,8 @@ def _read(source: Source, memory_limit: int) -> Iterator[Piece]:
     if source.rewindable:
         source.rewind()
     while (block := source.read(room)) is not None:
-        yield block.frames, known_of(block)
-
-
-def known_of(block: Block) -> dict[str, Any]:
-    """Return what is known of each frame of a block."""
-    known = {name: getattr(block, name) for name in (*_SERIES, _LENT)}
-    return {name: values for name, values in known.items() if values is not None}
+        known = {name: getattr(block, name) for name in _KNOWN}
+        yield block.frames, {name: values for name, values in known.items() if values is not None}
 
 
 def _cut(frames: Iterable[ArrayLike], known: Mapping[str, ArrayLike]) -> Iterator[Piece]:

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_frames import PIXEL, paced, press_header
 from stacks import TRAVEL, MadeUp, random_stack, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.engine.live import LiveOwn, Loop
 
 FRAMES = random_stack("uint16", (8, 5, 7))
 HEADER = io.Header("vertical", pixel_size=(0.5, 0.6))
@@ -144,6 +146,28 @@ def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype)
             found = engine.run(recording, estimator, memory_limit=2 * at_once * frames[0].nbytes)
         np.testing.assert_array_equal(found.own_maps["light"], light)
     assert found.process["device"] == device.info.title
+
+
+def test_live_updates_hold_the_heights_so_far_and_the_result_all_of_them():
+    class Heights(Moments):
+        def result(self):
+            return {"height": self.moment, "contact": self.total > 0}
+
+    source, updates = paced(FRAMES, press_header(), TRAVEL), []
+    live = LiveOwn(source, Heights)
+    live.warm()
+    Loop(source, live, updates=1e3, on_update=lambda update, status: updates.append(update)).run()
+    assert [update.frames for update in updates] == [*range(1, 9)]
+    for update in updates:
+        so_far = engine.run(FRAMES[: update.frames], Heights, travel=TRAVEL[: update.frames])
+        np.testing.assert_array_equal(update.height, so_far.height)
+        assert update.contact_area == pytest.approx(np.count_nonzero(so_far.contact) * PIXEL**2)
+    np.testing.assert_array_equal(live.result().height, so_far.height)
+
+
+def test_a_result_that_is_one_already_is_left_as_it_is():
+    made = io.Result(height=np.zeros((5, 7), np.float32), process={"mine": 1})
+    assert engine.run(stack(), returning(made)) is made
 
 
 class Bare:
