@@ -83,10 +83,10 @@ def command(
                 device=device,
                 progress=show,
             )
+    save_and_report(result, target, device, as_json)
     report_levels(
         str(vertical), {name.removeprefix("vertical_"): said for name, said in result.process.items()}
     )
-    save_and_report(result, target, device, as_json)
 
 
 def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:

@@ -17,7 +17,10 @@ _WRITTEN = {"--output", "--record"}  # options that name what a command writes; 
 
 
 class Option:
-    """What is said of an option, in click's settings: ``Annotated[float, Option("--rate", help=...)]``."""
+    """What is said of an option, in click's settings: ``Annotated[float, Option("--rate", help=...)]``.
+
+    With ``or_file``, a text with an ending is a file that must be there.
+    """
 
     def __init__(self, *names: str, **settings: Any) -> None:
         self.names, self.settings = names, settings
@@ -120,6 +123,17 @@ class _ExistingPath(click.Path):
         return super().convert(value, param, ctx)
 
 
+class _NameOrFile(click.ParamType[str]):
+    """A text that names something, or a file if it has an ending."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if Path(value).suffix:
+            _ExistingPath().convert(value, param, ctx)
+        return value
+
+
 class _Words(click.Choice[Any]):
     """The values of an enumeration."""
 
@@ -163,7 +177,8 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     kind = get_args(kind)[0] if many else kind
     settings = dict(said.settings)
     bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
-    settings["type"] = _type(kind, bounds, written=not _WRITTEN.isdisjoint(said.names))
+    or_file, written = settings.pop("or_file", False), not _WRITTEN.isdisjoint(said.names)
+    settings["type"] = _NameOrFile() if or_file else _type(kind, bounds, written)
     settings["required"] = parameter.default is parameter.empty
     if parameter.default is not parameter.empty and not many:
         default = parameter.default
@@ -179,7 +194,7 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     return click.Option([*names, parameter.name], multiple=many, **{"show_default": True, **settings})
 
 
-def _type(kind: Any, bounds: dict[str, Any], *, written: bool) -> Any:
+def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
     if bounds:
         return (click.IntRange if kind is int else click.FloatRange)(**bounds)
     if kind is Path:

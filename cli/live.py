@@ -233,8 +233,8 @@ class _Live:
         result = self._estimator.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
-        report_levels(self._settings.name, result.process)
         save_and_report(result, output, self._given["device"], as_json=False)
+        report_levels(self._settings.name, result.process)
 
 
 class _Guard:

@@ -230,8 +230,8 @@ def command(
             )
     report_missing_maps(str(recording), result.process, _REMEDIES)
     report_contact(str(recording), result.process)
-    report_levels(str(recording), result.process)
     save_and_report(result, target, device, as_json)
+    report_levels(str(recording), result.process)
 
 
 def _levels(thresholds: list[str] | None, inclinations: list[str] | None) -> dict[str, Any]:

@@ -65,6 +65,7 @@ def command(
         Option(
             "--object",
             metavar="NAME",
+            or_file=True,
             help="sphere, cone, cylinder, plane, step, texture, coin, or a file:"
             " heights in NPY, PNG or TIFF, or a mesh in STL, PLY or OBJ.",
         ),
@@ -132,7 +133,10 @@ def command(
     contact: sensor.Contact = sensor.ContactName.conform,
     optics: sensor.Optics = sensor.OpticsName.ideal,
     pattern: Annotated[
-        str, Option(metavar="NAME", help="Of the wall: uniform, linear in the zenith, or a picture.")
+        str,
+        Option(
+            metavar="NAME", or_file=True, help="Of the wall: uniform, linear in the zenith, or a picture."
+        ),
     ] = "uniform",
     air_gap: Annotated[str, Option(metavar="LENGTH", help="Between body and wall.")] = "0mm",
     asymmetry: Annotated[float, Option(help="Of the lamps, as a share of their light.")] = 0.0,

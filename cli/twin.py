@@ -29,14 +29,18 @@ def serve(
     ] = Path("emulated-rig"),
     thing: Annotated[
         str,
-        Option("--object", metavar="NAME", help="What to press on, as in 'mirrorskin simulate'."),
+        Option(
+            "--object", metavar="NAME", or_file=True, help="What to press on, as in 'mirrorskin simulate'."
+        ),
     ] = "sphere",
     size: sensor.Size = "320x240",
     pixel_size: sensor.PixelSize = "0.04mm",
     pattern: Annotated[
         str,
         Option(
-            metavar="NAME", help="Of the wall: uniform, for presses; linear, for rotations; or a picture."
+            metavar="NAME",
+            or_file=True,
+            help="Of the wall: uniform, for presses; linear, for rotations; or a picture.",
         ),
     ] = "uniform",
     contact: sensor.Contact = sensor.ContactName.conform,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,14 +20,9 @@ from mirrorskin.io.selection import Region
 from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 
 NUMPY_SUFFIXES = (".npy", ".npz")
-_EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes of frames, of which so many are hashed
-# A damaged head is parsed as Python.
-_ERRORS = (
-    *(ValueError, EOFError, OSError, KeyError, SyntaxError, TypeError, RuntimeError, AttributeError),
-    *(zipfile.BadZipFile, zlib.error),
-)
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are no frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
+_EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes of frames, of which so many are hashed
 
 
 class ArrayRecording(Recording):
@@ -153,11 +147,31 @@ def _naming(path: Path) -> Iterator[None]:
     """Turn what NumPy says of a damaged file into a line that names it."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
-    except _ERRORS as error:
+    except Exception as error:  # a damaged head is parsed as Python: its errors are of many kinds
         said = " ".join(str(error).split())
         raise InputError(f"{path} is no array of NumPy's ({said}): write it with numpy.save") from error
+
+
+def list_arrays(path: Path) -> dict[str, str]:
+    """Return the names of the arrays of a file, and the shape and type of each."""
+    with _naming(path), path.open("rb") as file:
+        if path.suffix.lower() == ".npy":
+            return {"array": _head_of(file)}
+        with zipfile.ZipFile(file) as archive:
+            found = {}
+            for name in archive.namelist():
+                with archive.open(name) as member:
+                    found[name.removesuffix(".npy")] = _head_of(member)
+            return found
+
+
+def _head_of(file: IO[bytes]) -> str:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return f"{' x '.join(map(str, shape)) or 'one number'}, {dtype}"
 
 
 def read_array(path: Path) -> NDArray[Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration, words_of
 from mirrorskin.io.calibration.types import GROUPS, Calibration
@@ -19,7 +20,7 @@ from mirrorskin.io.types import Result
 
 
 def describe(path: str | Path) -> dict[str, str]:
-    """Tell what an HDF5 file holds: a recording, a result, a calibration, or someone else's stacks.
+    """Tell what a file holds: a recording, a result, a calibration, someone else's stacks, NumPy's arrays.
 
     Returns
     -------
@@ -37,6 +38,8 @@ def describe(path: str | Path) -> dict[str, str]:
     'vertical'
     """
     path = Path(path)
+    if path.suffix.lower() in NUMPY_SUFFIXES:
+        return {"kind": "array of NumPy's", **list_arrays(path)}
     with Hdf5File(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,14 @@ def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
     ended = run("reconstruct", *words, "-o", "out.h5")
     assert (ended.code, ended.said.count("\n")) == (2, 1), ended.said
     assert said in ended.said
+
+
+def test_what_an_array_or_an_archive_holds_is_told():
+    assert run("info", "ball.npy").out.split("\n")[1].split(maxsplit=1)[1] == "12 x 12 x 16, uint8"
+    told = json.loads(run("info", "ball.npz", "--json").out)
+    assert (told["travel"], told["dark"]) == ("12, float64", "one number, float64")
+    Path("cut.npz").write_bytes(Path("ball.npz").read_bytes()[:700])
+    assert run("info", "cut.npz").said.startswith("mirrorskin: cut.npz is no array of NumPy's")
 
 
 def test_an_import_without_the_pixel_size_says_what_needs_it():

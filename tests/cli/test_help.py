@@ -66,6 +66,7 @@ def test_no_command_needs_anything_heavy_before_it_runs():
         ["import", "no.avi", "--motion", "vertical", "-o", "a.h5"],
         ["capture", "vertical", "--rig", "no.toml", "-o", "a.h5"],
         ["measure", "no.h5"],
+        ["simulate", "vertical", "--object", "no.stl", "-o", "a.h5"],
     ],
 )
 def test_a_file_that_is_not_there_is_told_before_anything_heavy_is_imported(words):

@@ -350,7 +350,7 @@ BAD = {
     ),
     "compliance without a force": (["vertical", "--compliance", "1um"], "write e.g. 0.01mm/N"),
     "an unknown object": (["vertical", "--object", "teapot"], f"take {', '.join(OBJECT_NAMES)}, or the path"),
-    "a missing object": (["vertical", "--object", "no.stl"], "no.stl: cannot be read: No such file"),
+    "a missing object": (["vertical", "--object", "no.stl"], "no.stl: no such file"),
     "a large object": (["vertical", "--object", "wide.npy"], "is larger than the sensor: it needs a circle"),
     "points": (["vertical", "--object", "points.obj"], NOT_A_SURFACE),
     "a wall": (["vertical", "--object", "wall.obj"], "wall.obj: shows no area seen from above"),
