@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -79,6 +80,9 @@ def run(
     own = cast("Source", source) if hasattr(source, "read") and hasattr(source, "header") else None
     if own is not None and known:
         raise InputError(f"{own.name} says itself what is known of its frames: leave {', '.join(known)} out")
+    if own is None and (isinstance(source, str | os.PathLike) or not isinstance(source, Iterable)):
+        what = "open a path with io.open_recording, or give an array"
+        raise InputError(f"frames are a {type(source).__name__}: {what}")
     name = "the frames given" if own is None else own.name
     pieces = _cut(cast("Iterable[ArrayLike]", source), known) if own is None else _read(own, memory_limit)
     first = next(pieces, None)

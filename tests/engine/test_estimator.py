@@ -220,6 +220,8 @@ def test_what_is_no_estimator_is_refused_in_a_line(estimator, line):
     ("frames", "known", "line"),
     [
         ([], {}, "there is none"),
+        ("press.h5", {}, "frames are a str: open a path with io.open_recording"),
+        (None, {}, "frames are a NoneType"),
         (FRAMES, {}, "push needs travel: the frames given has nothing"),
         (FRAMES, {"travel": TRAVEL[:7]}, r"travel has shape \(7,\): one is needed for each of 8"),
         (
