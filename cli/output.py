@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _NO_GEL = "none: the calibration has no gel"
 _OF_SLIP = ("slipped", "stick_ratio")  # in a summary
-_ASSUMED, _ESTIMATED = "range of the type", "estimated from the frames"  # of dark and bright
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
@@ -118,20 +117,12 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
 
 
 def report_levels(name: str, process: Mapping[str, object]) -> None:
-    """Say which counts of dark and light nobody gave, and what was taken."""
-    taken = {one: str(process.get(one, "")) for one in ("dark", "bright")}
-    missing = [one for one, said in taken.items() if said == _ASSUMED or said.endswith(_ESTIMATED)]
-    if not missing:
-        return
-    remedy = f"give {' and '.join(f'--{one}' for one in missing)}, or take references"
-    if any(taken[one] == _ASSUMED for one in missing):
-        said = (
-            "the frames do not show it: the range of their type is assumed, and heights may be"
-            " wrong by more than height_sigma"
-        )
-    else:
-        said = f"estimated as {' and '.join(taken[one].split(',')[0] for one in missing)} counts"
-    click.echo(printable(f"{name}: no {' and '.join(missing)} given; {said}; {remedy}"), err=True)
+    """Say which levels of dark and bright nobody gave, and what was taken."""
+    from mirrorskin.engine.provenance import missing_levels
+
+    said = missing_levels(process)
+    if said:
+        click.echo(printable(f"{name}: {said}; give --dark and --bright, or take references"), err=True)
 
 
 def report_contact(name: str, process: Mapping[str, object]) -> None:

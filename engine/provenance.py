@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result, Source
     from mirrorskin.io.types import ProcessValue
     from mirrorskin.kernels.device import Device
+
+
+_ASSUMED, _ESTIMATED = "range of the type", "estimated from the frames"  # of levels
 
 
 @functools.cache
@@ -69,7 +72,31 @@ def level_origin(
     """Return where the level of dark or bright pixels came from; see `parameter_origin`."""
     references = source.calibration.references if isinstance(source, io.Calibrated) else None
     whose = "recording" if references is None else "calibration"
-    return parameter_origin(given, getattr(source.header, name), "range of the type", whose)
+    return parameter_origin(given, getattr(source.header, name), _ASSUMED, whose)
+
+
+def estimated_level(counts: float) -> str:
+    """Return what a process says of a level that was estimated."""
+    return f"{counts:.4g}, {_ESTIMATED}"
+
+
+def missing_levels(process: Mapping[str, object]) -> str:
+    """Tell which levels nobody gave, and what was taken, from a process; nothing if all were given.
+
+    Examples
+    --------
+    >>> missing_levels({"dark": 12.0, "bright": estimated_level(182.0)})
+    'no bright given: estimated as 182 counts'
+    """
+    taken = {one: str(process.get(one, "")) for one in ("dark", "bright")}
+    missing = [one for one, said in taken.items() if said == _ASSUMED or said.endswith(_ESTIMATED)]
+    if not missing:
+        return ""
+    counts = [taken[one].partition(",")[0] for one in missing]
+    what = f"estimated as {' and '.join(counts)} counts"
+    if _ASSUMED in counts:
+        what = "the range of the frames' type is taken, and heights may be wrong by more than height_sigma"
+    return f"no {' and '.join(missing)} given: {what}"
 
 
 def parameter_origin(

@@ -12,7 +12,7 @@ from typing import Literal
 from mirrorskin import io
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.provenance import naming
+from mirrorskin.engine.provenance import missing_levels, naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
@@ -104,7 +104,7 @@ def _done(
     return replace(
         outcome,
         state="done",
-        message=str(summarise(result)),
+        message="; ".join(filter(None, (str(summarise(result)), missing_levels(result.process)))),
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
     )

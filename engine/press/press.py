@@ -17,7 +17,7 @@ from mirrorskin.engine.press.estimated_levels import EstimatedLevels, EstimatedL
 from mirrorskin.engine.press.levels import Levels, LevelSearch, check_levels
 from mirrorskin.engine.press.onset import Event, Onset, OnsetSearch, check_event
 from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
-from mirrorskin.engine.provenance import attach_provenance, level_origin
+from mirrorskin.engine.provenance import attach_provenance, estimated_level, level_origin
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 PressMethod = Literal["threshold", "change-point"]
 METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
 
-_ESTIMATED = "estimated from the frames"
 _LIGHT_AT_START = 3  # of an onset's status
 
 
@@ -155,8 +154,8 @@ def reconstruct_press(
         "bright": "each pixel's own" if twice else level_origin(source, "bright", bright),
     }
     if guess is not None:
-        process |= {"dark": f"{guess.dark:.4g}, {_ESTIMATED}"} if low is None else {}
-        process |= {"bright": f"{guess.bright:.4g}, {_ESTIMATED}"} if high is None else {}
+        process |= {"dark": estimated_level(guess.dark)} if low is None else {}
+        process |= {"bright": estimated_level(guess.bright)} if high is None else {}
     result, done = finish_press(onset, source, search.travel, event, threshold, fill, modulus)
     if isinstance(found, Strokes):
         result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}

@@ -187,13 +187,19 @@ def test_a_recording_has_its_own_travel(folder):
 def test_levels_that_nobody_gave_are_named():
     words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5")
     said = run(*words).said
-    assert "ball.npy: no dark and bright given; estimated as " in said
+    assert "ball.npy: no dark and bright given: estimated as " in said
     assert said.count("\n") == 1
-    assert run(*words, "--dark", 0).said.startswith("ball.npy: no bright given; ")
+    assert run(*words, "--dark", 0).said.startswith("ball.npy: no bright given: ")
     assert "no dark" not in run(*words, "--dark", 0, "--bright", 255).said
+
+
+def test_the_line_of_a_file_in_a_batch_names_levels_that_nobody_gave():
+    Path("batch.toml").write_text('[stack]\ntravel-step = "0.1mm"\npixel-size = "0.4mm"\n')
+    out = run("batch", "ball.npy", "-o", "out", "--settings", "batch.toml").out
+    assert "; no dark and bright given: estimated as " in out
 
 
 def test_levels_that_the_frames_do_not_show_are_warned_of():
     np.save("dark.npy", np.full((4, 5, 6), 12, np.uint8))
     said = run("reconstruct", "dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
-    assert "the range of their type is assumed, and heights may be wrong" in said
+    assert "the range of the frames' type is taken, and heights may be wrong" in said
