@@ -99,10 +99,11 @@ def _as_source(
         return opened
     if isinstance(source, str | Path):
         raise io.InputError(f"{source} is a path: open it with io.open_recording")
+    from mirrorskin.engine.integration.validation import check_pixel_size
     from mirrorskin.io.arguments import as_array
     from mirrorskin.io.arrays import ArrayRecording
 
-    size = (pixel_size, pixel_size) if isinstance(pixel_size, float | int) else pixel_size
+    size = None if pixel_size is None else check_pixel_size(pixel_size)
     return ArrayRecording(as_array("frames", source), positions, {"pixel_size": size})
 
 

@@ -171,7 +171,8 @@ def test_frames_with_phases_are_a_rotation():
         ({}, "does not say where the body was"),
         ({"travel": TRAVEL, "phase": TRAVEL}, "has travel and phase: give one of"),
         ({"travel": TRAVEL[:3]}, "travel given has shape \\(3,\\) for 12 frames"),
-        ({"travel": TRAVEL, "pixel_size": -1.0}, "pixel size"),
+        ({"travel": TRAVEL, "pixel_size": -1.0}, "pixel size -1.0"),
+        ({"travel": TRAVEL, "pixel_size": "0.1mm"}, "pixel_size is '0.1mm'"),
     ],
 )
 def test_frames_in_memory_that_do_not_fit_are_refused(stack, given, said):
