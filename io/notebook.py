@@ -10,33 +10,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.result import UNITS, map_shape, unit_of
-from mirrorskin.io.types import Result
+from mirrorskin.io.types import InputError, Result, Shown
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.axes import Axes
+
+    from mirrorskin.io.recording import Recording
 
 _PICTURE = 480  # pixels that the longer side of a picture has at most
 
 
-def as_text(result: Result) -> str:
+def as_text(result: Shown) -> str:
     """Return the maps of a result with their shape, unit and range, a line each."""
     lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
-    return "\n".join([f"Result{_origin(result)}", *(f"  {line}" for line in lines)])
+    return "\n".join([f"{type(result).__name__}{_origin(result)}", *(f"  {line}" for line in lines)])
 
 
-def as_html(result: Result) -> str:
-    """Return a table of the maps, and a picture of the height, or else of the zenith."""
+def as_html(result: Shown) -> str:
+    """Return a table of the maps, and a picture of the height, or of what there is instead."""
     rows = "".join(
         "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
         for row in _rows(result)
     )
-    shown = next(
-        (name for name in ("height", "zenith", "modulation", "slip_onset") if name in result.maps()), None
-    )
-    unit = "" if shown is None else unit_of(shown, result.process) or ""
+    shown = _first(result)
+    unit = "" if shown is None else _unit(shown, result)
     picture = "" if shown is None else _picture(shown, result.maps()[shown], unit)
-    title = f"<p><b>Result</b>{escape(_origin(result))}</p>"
+    title = f"<p><b>{type(result).__name__}</b>{escape(_origin(result))}</p>"
     return f"{title}<div style='display:flex;gap:2em'>{picture}<table>{rows}</table></div>"
+
+
+def recording_as_text(recording: Recording) -> str:
+    """Return what a recording holds, in a line."""
+    count, rows, columns = recording.shape
+    size = recording.header.pixel_size
+    parts = [f"{count} frames of {columns} x {rows} {recording.dtype}", f"{recording.motion} motion"]
+    parts += [] if size is None else [f"pixels of {size[0]:.4g} x {size[1]:.4g} mm"]
+    return f"Recording {recording.name}: {', '.join([*parts, recording.state])}"
+
+
+def recording_as_html(recording: Recording) -> str:
+    """Return what a recording holds, and its last frame."""
+    picture = _picture("last frame", recording.frame(recording.shape[0] - 1), "counts")
+    return f"<p>{escape(recording_as_text(recording))}</p>{picture}"
+
+
+def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
+    """Draw a map; see `Shown.plot`."""
+    import matplotlib.pyplot as plt
+
+    maps = result.maps()
+    chosen = _first(result) if name is None else name
+    if chosen not in maps or maps[chosen].ndim != 2:
+        pictures = ", ".join(one for one, values in maps.items() if values.ndim == 2)
+        raise InputError(f"there is no picture {chosen!r}: choose from {pictures or 'none'}")
+    x, y = (getattr(result, one, None) for one in "xy")
+    extent = None
+    if x is not None and y is not None:
+        a, b = ((one[1] - one[0]) / 2 if len(one) > 1 else 0.5 for one in (x, y))
+        extent = (x[0] - a, x[-1] + a, y[-1] + b, y[0] - b)
+    axes = plt.subplots()[1] if axes is None else axes
+    image = axes.imshow(maps[chosen], extent=extent, interpolation="nearest")
+    places = ("column", "row") if extent is None else ("x [mm]", "y [mm]")
+    axes.set(xlabel=places[0], ylabel=places[1])
+    axes.figure.colorbar(image, ax=axes, label=f"{chosen} {_unit(chosen, result)}".strip())
+    return axes
 
 
 def as_xarray(result: Result) -> xarray.Dataset:
@@ -70,7 +108,18 @@ def as_xarray(result: Result) -> xarray.Dataset:
     return xarray.Dataset(data, coordinates, attrs=dict(result.process))
 
 
-def _rows(result: Result) -> list[tuple[str, str, str]]:
+def _first(result: Shown) -> str | None:
+    """Return the map that shows most."""
+    pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
+    best = ("height", "zenith", "modulation", "slip_onset")
+    return next((name for name in (*best, *pictures) if name in pictures), None)
+
+
+def _unit(name: str, result: Shown) -> str:
+    return unit_of(name, getattr(result, "process", {})) or ""
+
+
+def _rows(result: Shown) -> list[tuple[str, str, str]]:
     """Return name, shape, and unit with range of each map."""
     rows = []
     for name, values in result.maps().items():
@@ -78,13 +127,13 @@ def _rows(result: Result) -> list[tuple[str, str, str]]:
         known = values[np.isfinite(values)] if values.dtype.kind == "f" else values.ravel()
         span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
-        unit = f" {unit_of(name, result.process) or ''}".rstrip() if known.size else ""
+        unit = f" {_unit(name, result)}".rstrip() if known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
     return rows + [(name, "", f"{value:.4g} {UNITS[name]}") for name, value in result.numbers().items()]
 
 
-def _origin(result: Result) -> str:
-    source = result.process.get("source")
+def _origin(result: Shown) -> str:
+    source = getattr(result, "process", {}).get("source")
     return f" of {source}" if source else ""
 
 

@@ -102,6 +102,16 @@ class Recording(Closing):
         self._file, self._dataset, self._origins = file, dataset, origins(file, dataset)
         self._stack, self._next = stack, 0
 
+    def __repr__(self) -> str:
+        from mirrorskin.io.notebook import recording_as_text
+
+        return recording_as_text(self)
+
+    def _repr_html_(self) -> str:
+        from mirrorskin.io.notebook import recording_as_html
+
+        return recording_as_html(self)
+
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``."""
         out = block_memory(out, self.shape, self.dtype)

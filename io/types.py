@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.axes import Axes
 
     from mirrorskin.io.calibration.types import Calibration
 
@@ -249,8 +250,60 @@ class Truth:
     slip_onset: NDArray[np.float32] | None = None
 
 
+class Shown:
+    """Maps that show themselves: as text, in a notebook, and as figures."""
+
+    __slots__ = ()
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """Return the maps that there are, by name."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
+        return {name: one for name, one in values.items() if isinstance(one, np.ndarray) and one.ndim > 1}
+
+    def numbers(self) -> dict[str, float]:
+        """Return the single numbers that there are, by name."""
+        return {}
+
+    def plot(self, name: str | None = None, axes: Axes | None = None) -> Axes:
+        """Draw a map with its scale, in millimetres where the pixels' places are known.
+
+        Parameters
+        ----------
+        name : str, optional
+            Of the map; by default the height, or what there is instead.
+        axes : matplotlib.axes.Axes, optional
+            Where to draw; by default in a new figure.
+
+        Raises
+        ------
+        InputError
+            There is no such map, or it is no picture: vectors, or several turns.
+        ImportError
+            Matplotlib is not installed: ``pip install 'mirrorskin[view]'``.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> result.plot("height").get_xlabel()
+        'x [mm]'
+        """
+        from mirrorskin.io.notebook import plot
+
+        return plot(self, name, axes)
+
+    def __repr__(self) -> str:
+        from mirrorskin.io.notebook import as_text
+
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        from mirrorskin.io.notebook import as_html
+
+        return as_html(self)
+
+
 @dataclass(frozen=True, slots=True, repr=False)
-class Result:
+class Result(Shown):
     """The maps of a reconstruction; one that was not computed is None.
 
     Of a result for each turn of a rotation all maps have a leading axis, (turns, H, W) and (turns, H, W, 3);
@@ -388,16 +441,6 @@ class Result:
         values = {name: getattr(self, name) for name in SERIES}
         return {name: value for name, value in values.items() if value is not None}
 
-    def __repr__(self) -> str:
-        from mirrorskin.io.notebook import as_text
-
-        return as_text(self)
-
-    def _repr_html_(self) -> str:
-        from mirrorskin.io.notebook import as_html
-
-        return as_html(self)
-
     def to_xarray(self) -> xarray.Dataset:
         """Return the maps as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
 
@@ -414,6 +457,27 @@ class Result:
         from mirrorskin.io.notebook import as_xarray
 
         return as_xarray(self)
+
+    @classmethod
+    def from_xarray(cls, dataset: xarray.Dataset) -> Result:
+        """Return the result that a dataset was made of by ``to_xarray``, without its calibration.
+
+        Variables that results do not know become ``own_maps``.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> Result.from_xarray(result.to_xarray()).height.shape
+        (2, 3)
+        """
+        known = {one.name for one in fields(cls)}
+        arrays: dict[str, Any] = {str(name): one.to_numpy() for name, one in dataset.variables.items()}
+        own = {name: arrays[name] for name in map(str, dataset.data_vars) if name not in known}
+        values: dict[str, Any] = {
+            name: float(one) if name in SCALARS else one for name, one in arrays.items() if name in known
+        }
+        process = {str(name): one for name, one in dataset.attrs.items()}
+        return cls(**values, own_maps=own, process=process)
 
 
 SCALARS = ("force", "force_sigma", "force_x", "force_x_sigma", "force_y", "force_y_sigma")

@@ -25,6 +25,7 @@ from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io import InputError
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
@@ -35,8 +36,8 @@ _UNEVEN = 2.0  # weights of links to the right over those down, or back, that th
 _GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+@dataclass(frozen=True, slots=True, repr=False)
+class Surface(Shown):
     """Heights from slopes, known heights, or both.
 
     Attributes

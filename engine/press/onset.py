@@ -14,6 +14,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_int
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_travel
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
@@ -28,8 +29,8 @@ _TILE = 4096  # pixels of a core's item: of long rows more is read at once, in 0
 _LONGEST = 2**30  # no stack is as long, and sums with frames' numbers stay in range
 
 
-@dataclass(frozen=True, slots=True)
-class Onset:
+@dataclass(frozen=True, slots=True, repr=False)
+class Onset(Shown):
     """Where and when a press turned the pixels light, or a release dark again.
 
     Attributes

@@ -22,6 +22,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_int
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
@@ -40,8 +41,8 @@ _ANSWERS = {
 """Maps of a band, by the arguments of kernels."""
 
 
-@dataclass(frozen=True, slots=True)
-class Correlation:
+@dataclass(frozen=True, slots=True, repr=False)
+class Correlation(Shown):
     """The least-squares fit E = mean + cosine cos alpha + sine sin alpha of each pixel.
 
     Attributes

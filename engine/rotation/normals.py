@@ -33,11 +33,12 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_ro
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.device import Device
 
 
-@dataclass(frozen=True)
-class Normals:
+@dataclass(frozen=True, repr=False)
+class Normals(Shown):
     """Which way the pixels' surface faces, and the standard deviation of that.
 
     Attributes

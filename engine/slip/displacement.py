@@ -15,6 +15,7 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -31,8 +32,8 @@ _LAPLACIAN_NOISE = 4 * 20 / 24**2  # of a variance: two standard deviations
 _LEAST_TEXTURED = 0.1  # of the windows; there are as many on a clear sheet where light and dark meet
 
 
-@dataclass(frozen=True, slots=True)
-class Displacement:
+@dataclass(frozen=True, slots=True, repr=False)
+class Displacement(Shown):
     """How far each point of a reference has moved in each frame.
 
     Attributes

@@ -29,6 +29,7 @@ from mirrorskin.engine.slip.status import CLEAR, NO_CONTACT, SLIPPED, STICKS, UN
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.io.types import Shown
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -49,8 +50,8 @@ _LEAST_STUCK = 4  # nodes that a twist's centre and angle are made of
 _STILL = 1e-9  # of the way, by which nobody moves
 
 
-@dataclass(frozen=True, slots=True)
-class Slip:
+@dataclass(frozen=True, slots=True, repr=False)
+class Slip(Shown):
     """How the skin went along with an object that the body slid or turned over.
 
     Attributes

@@ -4,7 +4,9 @@ import re
 import cv2
 import numpy as np
 import pytest
+from stacks import record, sphere
 
+from mirrorskin import engine, io
 from mirrorskin.io import Result, pixel_axes
 
 HEIGHT = np.array([[0.0, -0.5, np.nan], [-1.0, -1.5, -2.0]], np.float32)
@@ -56,3 +58,48 @@ def test_turns_and_vectors_have_dimensions_of_their_own():
     dataset = Result(normals=normals, zenith=normals[..., 0]).to_xarray()
     assert dataset.normals.dims == ("turn", "y", "x", "vector")
     assert dataset.zenith.dims == ("turn", "y", "x")
+
+
+def test_a_dataset_becomes_the_result_again(result):
+    back = io.Result.from_xarray(result.to_xarray())
+    for name, values in result.maps().items():
+        np.testing.assert_array_equal(back.maps()[name], values)
+        assert back.maps()[name].dtype == values.dtype
+    np.testing.assert_array_equal(back.x, result.x)
+    assert dict(back.process) == dict(result.process)
+    assert back.numbers() == result.numbers()
+
+
+def test_a_map_is_drawn_where_its_pixels_are(result):
+    axes = result.plot("height")
+    (image,) = axes.images
+    np.testing.assert_array_equal(image.get_array(), result.height)
+    left, right, bottom, top = image.get_extent()
+    half = (result.x[1] - result.x[0]) / 2
+    assert (left, right) == pytest.approx((result.x[0] - half, result.x[-1] + half))
+    assert bottom < top
+    assert axes.figure.axes[1].get_ylabel() == "height mm"
+
+
+def test_what_is_no_picture_is_not_drawn(result):
+    with pytest.raises(io.InputError, match=r"there is no picture 'depth': choose from height"):
+        result.plot("depth")
+
+
+def test_what_functions_return_shows_itself_in_a_few_lines():
+    frames = np.zeros((5, 30, 40), np.uint8)
+    frames[3:] = 255
+    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert repr(onset).splitlines()[:2] == ["Onset", "  height        30 x 40         -0.25 to -0.25 mm"]
+    assert "<img" in onset._repr_html_()
+    assert onset.plot().get_xlabel() == "column"
+    surface = engine.integrate(np.zeros((8, 9)), np.zeros((8, 9)), 0.1)
+    assert repr(surface).startswith("Surface\n  height        8 x 9")
+
+
+def test_a_recording_shows_itself_in_a_line_and_a_picture(tmp_path):
+    record(sphere(), tmp_path / "rec.h5")
+    with io.open_recording(tmp_path / "rec.h5") as recording:
+        count, rows, columns = recording.shape
+        assert f"rec.h5: {count} frames of {columns} x {rows} uint8, vertical motion" in repr(recording)
+        assert "<img alt='last frame" in recording._repr_html_()
